@@ -1,0 +1,105 @@
+"""What a file held: the mesh in working space, its materials, and how to find the way back to the file.
+
+UVs of `Mesh.corner_uvs`: v up, and every consumer takes them **modulo 1** (textures repeat). Reading shifts whole UV
+islands by integers, so that they lie in the unit square; an island that fits the square but crosses its border (a
+spot whose u runs from -0.05 to 0.99) keeps its place and its faces stay whole, so single coordinates may lie
+anywhere in [-1, 2]. What a rasteriser paints outside the square belongs to the texel on the other side, and a
+texture fetch wraps. A new unwrapping never leaves the square.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class Picture:
+    """An image file, decoded: sRGB-encoded Rec.709, 0..1, upright (row 0 is the top).
+
+    `alpha` is linear coverage 0..1, or None when the file is opaque; rgb is not premultiplied. `notes` are sentences
+    about what was converted on the way in.
+    """
+
+    rgb: Float[np.ndarray, "h w 3"]
+    alpha: Float[np.ndarray, "h w"] | None
+    path: Path
+    notes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Material:
+    """The material that a file gives one texture set. Row 0 of every map is v = 1; maps repeat outside the square.
+
+    The maps are as stored, factors not yet applied: the surface's albedo is `albedo * albedo_factor`, its roughness
+    `roughness * roughness_factor`, its metallic `metallic * metallic_factor`, with 1 where a map is None. They belong
+    to the file's own UVs (`Source.old_uvs`): when `Source.uv` is "new" they have to be carried over to the new ones.
+
+    albedo     linear Rec.709, 0..1
+    normal     unit tangent-space normal, +Y, the file's normal scale applied
+    roughness  perceptual, 0..1
+    metallic   0..1
+    """
+
+    name: str
+    albedo: Float[np.ndarray, "h w 3"] | None
+    normal: Float[np.ndarray, "hn wn 3"] | None
+    roughness: Float[np.ndarray, "hr wr"] | None
+    metallic: Float[np.ndarray, "hm wm"] | None
+    albedo_factor: Float[np.ndarray, " 3"]
+    roughness_factor: float
+    metallic_factor: float
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """Faces start:stop of `Mesh.faces` and the place in the file that they came from; -1 where there is no such thing.
+
+    `texcoord` is the index of the TEXCOORD set that the material's base colour uses (-1: none). `part` is the texture
+    set, or -1 when the faces land in several UDIM tiles and `Mesh.part` decides face by face.
+    """
+
+    node: int
+    mesh: int
+    primitive: int
+    start: int
+    stop: int
+    material: int
+    texcoord: int
+    part: int
+
+
+@dataclass(frozen=True)
+class Source:
+    """Where an asset came from and how to write back to it.
+
+    primitives      in face order, together they cover `Mesh.faces`
+    user_positions  `Mesh.positions` in the file's own units and axes, same order (glTF: world space, node transforms
+                    applied; a skinned mesh in its bind pose)
+    work_from_user  takes user_positions (homogeneous columns) to `Mesh.positions`
+    old_uvs         the authored corner UVs as the file has them, v up; None when it has none
+    uv              "kept" (bit-equal to old_uvs), "shifted" (moved by integers) or "new" (unwrapped here)
+    notes           sentences for the report
+    """
+
+    path: Path
+    kind: str
+    primitives: tuple[Primitive, ...]
+    user_positions: Float[np.ndarray, "v 3"]
+    work_from_user: Float[np.ndarray, "4 4"]
+    old_uvs: Float[np.ndarray, "f 3 2"] | None
+    uv: str
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Asset:
+    """A mesh with one material per texture set (`materials[p]` belongs to `mesh.parts[p]`) and its source."""
+
+    name: str
+    mesh: Mesh
+    materials: tuple[Material, ...]
+    source: Source

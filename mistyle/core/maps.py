@@ -1,0 +1,53 @@
+"""Texture-space records. Row 0 of every map is v = 1: texel (row r, column c) of an (H, W) map has its centre at
+u = (c + 0.5) / W, v = 1 - (r + 0.5) / H."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+
+@dataclass(frozen=True)
+class Texels:
+    """One texture set rasterised: where on the surface each texel lies (paper 4.1.4).
+
+    position and normal are in the working space (zero where not covered); `island` numbers the UV islands from 0,
+    `face` the mesh's faces; both are -1 where no face covers the texel's centre.
+    """
+
+    position: Float[np.ndarray, "h w 3"]
+    normal: Float[np.ndarray, "h w 3"]
+    covered: Bool[np.ndarray, "h w"]
+    island: Int[np.ndarray, "h w"]
+    face: Int[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class Maps:
+    """The material of one texture set.
+
+    albedo     linear Rec.709, 0..1
+    normal     unit tangent-space normal, -1..1, +Y (OpenGL) convention; flat is (0, 0, 1)
+    roughness  perceptual roughness, 0..1 (GGX alpha = roughness squared)
+    metallic   0..1
+    known      whether the texel's albedo was painted by something that saw it
+    """
+
+    albedo: Float[np.ndarray, "h w 3"]
+    normal: Float[np.ndarray, "h w 3"]
+    roughness: Float[np.ndarray, "h w"]
+    metallic: Float[np.ndarray, "h w"]
+    known: Bool[np.ndarray, "h w"]
+
+
+def flat_maps(size: int, albedo: float = 0.5, roughness: float = 0.5, metallic: float = 0.0) -> Maps:
+    """Constant maps: grey, flat, half rough, not metallic, nothing known."""
+    normal = np.zeros((size, size, 3), np.float32)
+    normal[..., 2] = 1
+    return Maps(
+        albedo=np.full((size, size, 3), albedo, np.float32),
+        normal=normal,
+        roughness=np.full((size, size), roughness, np.float32),
+        metallic=np.full((size, size), metallic, np.float32),
+        known=np.zeros((size, size), bool),
+    )

@@ -1,0 +1,66 @@
+"""The mesh as every stage sees it: positions shared by faces, everything else per face corner."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float, Int
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles in the working space: Y up, right-handed, bounding sphere of radius 1 about the origin.
+
+    UVs and normals belong to face corners, so a UV seam never duplicates a position and the user's vertex order
+    survives. `part` says to which texture set a face belongs; `parts` names the sets. Inside one part every UV
+    lies in the unit square, v up.
+    """
+
+    positions: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    corner_normals: Float[np.ndarray, "f 3 3"]
+    corner_uvs: Float[np.ndarray, "f 3 2"]
+    part: Int[np.ndarray, " f"]
+    parts: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Welded:
+    """The mesh as renderers and glTF want it: one index per distinct (position, normal, uv); `vertex` points back."""
+
+    positions: Float[np.ndarray, "w 3"]
+    normals: Float[np.ndarray, "w 3"]
+    uvs: Float[np.ndarray, "w 2"]
+    faces: Int[np.ndarray, "f 3"]
+    vertex: Int[np.ndarray, " w"]
+
+
+def weld(mesh: Mesh, part: int | None = None) -> Welded:
+    """Merge equal corners of one part (or of all): bit-equal normals and uvs at the same position share an index."""
+    chosen = np.arange(len(mesh.faces)) if part is None else np.flatnonzero(mesh.part == part)
+    vertex = mesh.faces[chosen].reshape(-1)
+    normals = mesh.corner_normals[chosen].reshape(-1, 3).astype(np.float32)
+    uvs = mesh.corner_uvs[chosen].reshape(-1, 2).astype(np.float32)
+    # Adding 0 turns -0.0 into 0.0, which compare equal but differ in bytes.
+    keys = np.concatenate([vertex[:, None].astype(np.int64), (normals + 0.0).view(np.int32), (uvs + 0.0).view(np.int32)], axis=1)
+    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    return Welded(
+        positions=mesh.positions[vertex[first]].astype(np.float32),
+        normals=normals[first],
+        uvs=uvs[first],
+        faces=inverse.reshape(-1, 3).astype(np.int32),
+        vertex=vertex[first].astype(np.int32),
+    )
+
+
+def face_normals(mesh: Mesh) -> Float[np.ndarray, "f 3"]:
+    """Unit geometric normal of every face (counter-clockwise front); zero for degenerate faces."""
+    a, b, c = (mesh.positions[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    n = np.cross(b - a, c - a)
+    length = np.linalg.norm(n, axis=1, keepdims=True)
+    return n / np.where(length > 0, length, 1)
+
+
+def face_areas(mesh: Mesh) -> Float[np.ndarray, " f"]:
+    """Area of every face in working units."""
+    a, b, c = (mesh.positions[mesh.faces[:, k]].astype(np.float64) for k in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
