@@ -12,7 +12,11 @@ from mistyle.files.records import load_record, save_record
 
 
 def test_round_trip_keeps_values_types_and_bytes(tmp_path):
-    record = {"maps": (flat_maps(4), flat_maps(8, albedo=0.25)), "camera": look_at((1, 2, 3), fov=30, size=(4, 6)), "note": None}
+    record = {
+        "maps": (flat_maps(4), flat_maps(8, albedo=0.25)),
+        "camera": look_at((1, 2, 3), fov=30, size=(4, 6)),
+        "note": None,
+    }
     save_record(tmp_path / "r", record)
     back = load_record(tmp_path / "r")
     assert type(back["maps"]) is tuple and back["note"] is None

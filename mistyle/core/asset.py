@@ -5,6 +5,9 @@ islands by integers, so that they lie in the unit square; an island that fits th
 spot whose u runs from -0.05 to 0.99) keeps its place and its faces stay whole, so single coordinates may lie
 anywhere in [-1, 2]. What a rasteriser paints outside the square belongs to the texel on the other side, and a
 texture fetch wraps. A new unwrapping never leaves the square.
+
+Faces may share texels (stacked or mirrored shells, instances of one glTF mesh): the face that comes first in
+`Mesh.faces` is the one to paint and to measure from; the others show the same texels.
 """
 
 from dataclasses import dataclass
@@ -36,7 +39,7 @@ class Material:
 
     The maps are as stored, factors not yet applied: the surface's albedo is `albedo * albedo_factor`, its roughness
     `roughness * roughness_factor`, its metallic `metallic * metallic_factor`, with 1 where a map is None. They belong
-    to the file's own UVs (`Source.old_uvs`): when `Source.uv` is "new" they have to be carried over to the new ones.
+    to `Mesh.corner_uvs`: reading has carried them over where the mesh was unwrapped anew.
 
     albedo     linear Rec.709, 0..1
     normal     unit tangent-space normal, +Y, the file's normal scale applied
@@ -58,8 +61,10 @@ class Material:
 class Primitive:
     """Faces start:stop of `Mesh.faces` and the place in the file that they came from; -1 where there is no such thing.
 
-    `texcoord` is the index of the TEXCOORD set that the material's base colour uses (-1: none). `part` is the texture
-    set, or -1 when the faces land in several UDIM tiles and `Mesh.part` decides face by face.
+    `texcoord` is the index of the TEXCOORD set that `Source.old_uvs` were read from (-1: none). `part` is the texture
+    set, or -1 when the faces land in several UDIM tiles and `Mesh.part` decides face by face. On glTF
+    `Mesh.faces[start:stop] - first_vertex` index the vertices of the primitive's own accessors; the faces are in the
+    file's order (strips and fans spelled out), and where the node mirrors space their corners 1 and 2 are swapped.
     """
 
     node: int
@@ -70,6 +75,7 @@ class Primitive:
     material: int
     texcoord: int
     part: int
+    first_vertex: int = 0
 
 
 @dataclass(frozen=True)

@@ -67,7 +67,12 @@ class Camera:
 
 
 def look_at(
-    position: Sequence[float], target: Sequence[float] = (0, 0, 0), *, fov: float, size: tuple[int, int], name: str = "view"
+    position: Sequence[float],
+    target: Sequence[float] = (0, 0, 0),
+    *,
+    fov: float,
+    size: tuple[int, int],
+    name: str = "view",
 ) -> Camera:
     """A camera at `position` that looks at `target`, Y up; near the poles the up vector turns to the horizontal."""
     eye, aim = np.asarray(position, float), np.asarray(target, float)
@@ -107,7 +112,11 @@ def rig(settings: RigSettings) -> list[Camera]:
     if settings.kind == "file":
         raise ValueError("cameras from a file are read by mistyle.files.views.read_cameras")
     size = (settings.resolution, settings.resolution)
-    angles = PAPER_ANGLES if settings.kind == "paper" else [(360.0 * k / settings.views, 15.0) for k in range(settings.views)]
+    angles = (
+        PAPER_ANGLES
+        if settings.kind == "paper"
+        else [(360.0 * k / settings.views, 15.0) for k in range(settings.views)]
+    )
     cameras = [orbit(a, e, distance=settings.distance, fov=settings.fov, size=size) for a, e in angles]
     return visiting_order(cameras) if settings.kind == "paper" else cameras
 
@@ -117,7 +126,9 @@ def visiting_order(cameras: Sequence[Camera]) -> list[Camera]:
     return sorted(cameras, key=lambda c: abs(c.azimuth) + abs(c.elevation))
 
 
-def px_from_world(camera: Camera, points: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
+def px_from_world(
+    camera: Camera, points: Float[np.ndarray, "*n 3"]
+) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
     """Project world points: pixel coordinates (x, y) and metric z in the camera (negative: behind it)."""
     cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     z = cam[..., 2]
@@ -125,7 +136,9 @@ def px_from_world(camera: Camera, points: Float[np.ndarray, "*n 3"]) -> tuple[Fl
     return cam[..., :2] / safe[..., None] * camera.focal + np.asarray(camera.centre), z
 
 
-def world_from_px(camera: Camera, px: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
+def world_from_px(
+    camera: Camera, px: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]
+) -> Float[np.ndarray, "*n 3"]:
     """Lift pixel coordinates (x, y) at metric z `depth` to world points; the inverse of `px_from_world`."""
     xy = (px - np.asarray(camera.centre)) / camera.focal * depth[..., None]
     cam = np.concatenate([xy, depth[..., None]], axis=-1)

@@ -30,7 +30,9 @@ def load_record(folder: Path) -> Any:
     try:
         return _unpack(json.loads(path.read_text(encoding="utf-8")), folder)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise InputRefused(f"{path}: not a record of this version of mistyle ({error}); delete the folder and run again") from error
+        raise InputRefused(
+            f"{path}: not a record of this version of mistyle ({error}); delete the folder and run again"
+        ) from error
 
 
 def _pack(value: Any, arrays: dict[str, np.ndarray]) -> Any:

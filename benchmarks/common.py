@@ -1,0 +1,78 @@
+"""What the benchmarks share: clocks, the peak of memory, the machine, and the table and JSON they end with."""
+
+import argparse
+import json
+import os
+import platform
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, TypeVar
+
+T = TypeVar("T")
+
+
+def arguments(description: str, argv: list[str] | None = None) -> argparse.Namespace:
+    """The options that every benchmark has: --quick and --json FILE."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--quick", action="store_true", help="small sizes, only to see that it works")
+    parser.add_argument(
+        "--json", type=Path, metavar="FILE", help="also write the figures as JSON ('-': to stdout only)"
+    )
+    return parser.parse_args(argv)
+
+
+def timed(figures: dict[str, float], name: str, work: Callable[[], T]) -> T:
+    """Do the work; note its wall time as `name` and its processor time (all threads) as `name`.cpu."""
+    wall, cpu = time.perf_counter(), time.process_time()
+    result = work()
+    figures[name] = time.perf_counter() - wall
+    figures[f"{name}.cpu"] = time.process_time() - cpu
+    return result
+
+
+def peak_gb() -> float:
+    """The most memory this process has held so far, in GB (10^9 bytes); NaN on Windows."""
+    try:
+        import resource
+    except ImportError:
+        return float("nan")
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak * (1 if sys.platform == "darwin" else 1024) / 1e9
+
+
+def machine() -> dict[str, Any]:
+    """Where the figures were measured; `load` above `cores` means that others were working too."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    return {
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": cores,
+        "load": round(load, 1),
+        "python": platform.python_version(),
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or "unknown"
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
+
+
+def finish(figures: Mapping[str, float], json_file: Path | None) -> None:
+    """Print the table; write {"figures": …, "machine": …} where asked."""
+    result = {"figures": {k: round(float(v), 6) for k, v in figures.items()}, "machine": machine()}
+    text = json.dumps(result, indent=2, allow_nan=False) + "\n"
+    if str(json_file) == "-":
+        print(text, end="")
+        return
+    width = max(len(name) for name in figures)
+    for name, value in figures.items():
+        print(f"{name:<{width}}  {value:12.4f}")
+    print(", ".join(f"{k} {v}" for k, v in result["machine"].items()))
+    if json_file is not None:
+        json_file.write_text(text, encoding="utf-8")

@@ -1,0 +1,29 @@
+"""`python3 -m mistyle`, also from a bare Python. Older Pythons have to be able to read this file."""
+
+import os
+import shutil
+import subprocess
+import sys
+
+NEW_ENOUGH = "import sys; sys.exit(not (3, 11) <= sys.version_info[:2])"
+
+
+def main():
+    """Start with a Python that is new enough and leave the rest to the bootstrap; ends with the verb's exit code."""
+    if sys.version_info < (3, 11):
+        names = ("python3.13", "python3.12", "python3.11", "python3.14")
+        # A name on the PATH need not run: pyenv puts a script there for each version that it knows of.
+        there = [path for path in map(shutil.which, names) if path]
+        newer = next((path for path in there if subprocess.call([path, "-c", NEW_ENOUGH]) == 0), None)
+        if not newer:
+            found = "%d.%d" % sys.version_info[:2]
+            sys.stderr.write("mistyle: this is Python %s; 3.11 or newer is needed. Install one and use it.\n" % found)
+            sys.exit(4)
+        os.execv(newer, [newer, "-m", "mistyle"] + sys.argv[1:])
+    from mistyle.bootstrap import start
+
+    sys.exit(start(sys.argv[1:]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,69 @@
+"""The weight-free stylizer: paints the surface once and answers for any point of it. Needs no network, no weights."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.asset import Picture
+from mistyle.core.mesh import Mesh
+from mistyle.core.view import Prior, View
+from mistyle.surface.lookup import Solution
+from mistyle.surface.settings import SurfaceSettings
+
+
+def array_module() -> str:
+    """Dr.Jit's array module for the Mitsuba variant in use: "llvm", "cuda" or "metal"."""
+    from mistyle.render import device
+
+    return device.use().split("_")[0]
+
+
+def solve_surface(
+    mesh: Mesh,
+    style: Picture,
+    settings: SurfaceSettings,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Solution:
+    """Paint `mesh` in the style of a picture; see `mistyle.surface.synthesis.solve` for what it can and cannot do."""
+    from mistyle.render.draw import tracer
+    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.surface.synthesis import solve
+
+    module = array_module()
+    traced = tracer(mesh)
+
+    def occlusion(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        return ambient_occlusion(traced, positions, normals, seed=seed)
+
+    return solve(mesh, style.rgb, settings, seed, occlusion, progress, alpha=style.alpha, device=module)
+
+
+def surface_colour(
+    solution: Solution, positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], footprint: float = 0.0
+) -> Float[np.ndarray, "n 3"]:
+    """Encoded sRGB of surface points; `footprint` is the distance of neighbours, over which colour is averaged."""
+    from mistyle.surface.lookup import colour
+
+    return colour(solution, positions, normals, footprint=footprint, device=array_module())
+
+
+@dataclass(frozen=True)
+class SurfaceStylizer:
+    """A solution behind the signature of stylizers that work view by view; the prior agrees by construction."""
+
+    solution: Solution
+    mesh: Mesh
+
+    def __call__(self, view: View, prior: Prior | None, rng: np.random.Generator) -> Float[np.ndarray, "h w 3"]:
+        """Linear rgb of the view, black off the mesh."""
+        from mistyle.core.image import linear_from_srgb
+        from mistyle.render.draw import gbuffer
+
+        hits = gbuffer(self.mesh, view.camera)
+        rgb = np.zeros((*hits.mask.shape, 3), np.float32)
+        at = hits.mask
+        rgb[at] = linear_from_srgb(surface_colour(self.solution, hits.position[at], hits.normal[at]))
+        return rgb

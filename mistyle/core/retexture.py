@@ -1,0 +1,112 @@
+"""Carry a texture from one set of UVs to another."""
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.core.normals import area_vectors
+from mistyle.core.raster import fragments
+from mistyle.core.uvs import signed_areas
+
+
+def carry(
+    values: np.ndarray, lookup: Float[np.ndarray, "f 3 2"], uvs: Float[np.ndarray, "f 3 2"], size: int
+) -> tuple[np.ndarray, Int[np.ndarray, "h w"]]:
+    """A texture of size² for `uvs` that shows on every face what `values` shows at `lookup`, and each texel's face.
+
+    Both UVs are v up, row 0 is v = 1, both repeat. Sampled bilinearly at texel centres; where faces share a texel the
+    first in face order counts; texels without a face (face -1) take their nearest covered neighbour.
+    """
+    channels = values if values.ndim == 3 else values[..., None]
+    spot = uvs.astype(np.float64) * [size, -size] + [0, size]  # y grows with the row
+    face, texel = fragments(spot, size)
+    owner = np.full(size * size, -1, np.int64)
+    # Written backwards, so that the first face stays.
+    owner[texel[::-1]] = np.arange(len(texel))[::-1]
+    pieces = np.flatnonzero(owner >= 0)
+    chosen = owner[pieces]
+    weights = _weights(spot[face[chosen]], pieces, size)
+    at = np.einsum("nk,nkc->nc", weights, lookup[face[chosen]].astype(np.float64))
+    result = np.zeros((size * size, channels.shape[2]), np.float32)
+    result[pieces] = fetch(channels, at)
+    faces = np.full(size * size, -1, np.int64)
+    faces[pieces] = face[chosen]
+    result = _spread(result.reshape(size, size, -1), faces.reshape(size, size) >= 0)
+    return (result if values.ndim == 3 else result[..., 0]), faces.reshape(size, size)
+
+
+def _weights(spot: Float[np.ndarray, "n 3 2"], texel: Int[np.ndarray, " n"], size: int) -> Float[np.ndarray, "n 3"]:
+    """Barycentric coordinates of a texel's centre in the triangle that covers it, whatever tile that lies in."""
+    centre = np.stack([texel % size, texel // size], axis=1) + 0.5
+    middle = spot.mean(axis=1)
+    centre += np.round((middle - centre) / size) * size
+    a, b, c = spot[:, 0], spot[:, 1], spot[:, 2]
+    area = _cross(b - a, c - a)
+    area = np.where(area == 0, 1, area)
+    w0, w1 = _cross(b - centre, c - centre) / area, _cross(c - centre, a - centre) / area
+    return np.clip(np.stack([w0, w1, 1 - w0 - w1], axis=1), 0, 1)
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+
+def fetch(values: Float[np.ndarray, "h w c"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n c"]:
+    """Bilinear lookup, v up, repeating."""
+    h, w = values.shape[:2]
+    x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
+    left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
+    s, t = (x - left)[:, None].astype(np.float32), (y - top)[:, None].astype(np.float32)
+    x0, x1, y0, y1 = left % w, (left + 1) % w, top % h, (top + 1) % h
+    upper = values[y0, x0] * (1 - s) + values[y0, x1] * s
+    lower = values[y1, x0] * (1 - s) + values[y1, x1] * s
+    return upper * (1 - t) + lower * t
+
+
+def _spread(values: Float[np.ndarray, "h w c"], covered: np.ndarray) -> Float[np.ndarray, "h w c"]:
+    from scipy.ndimage import distance_transform_edt
+
+    if covered.all() or not covered.any():
+        return values
+    row, column = np.asarray(distance_transform_edt(~covered, return_distances=False, return_indices=True))
+    return values[row, column]
+
+
+def turn_normals(
+    normal: Float[np.ndarray, "h w 3"],
+    face: Int[np.ndarray, "h w"],
+    positions: Float[np.ndarray, "v 3"],
+    faces: Int[np.ndarray, "f 3"],
+    old: Float[np.ndarray, "f 3 2"],
+    new: Float[np.ndarray, "f 3 2"],
+) -> Float[np.ndarray, "h w 3"]:
+    """Tangent-space normals that stand in the frame of the old UVs, in the frame of the new ones.
+
+    Frames are taken per face (exact where UVs are conformal, which MikkTSpace's averages also assume); texels without
+    a face are left as they are, and so are faces without area in either set.
+    """
+    tangent_old, bitangent_old = _frames(positions, faces, old)
+    tangent_new, bitangent_new = _frames(positions, faces, new)
+    rows = [[(n * o).sum(axis=1) for o in (tangent_old, bitangent_old)] for n in (tangent_new, bitangent_new)]
+    turn = np.moveaxis(np.array(rows), 2, 0)
+    lost = ~np.isfinite(turn).all(axis=(1, 2)) | (np.abs(np.linalg.det(np.nan_to_num(turn))) < 0.5)
+    turn[lost] = np.eye(2)
+    result = normal.copy()
+    covered = face >= 0
+    result[covered, :2] = np.einsum("nij,nj->ni", turn[face[covered]], normal[covered][:, :2])
+    return (result / np.linalg.norm(result, axis=2, keepdims=True)).astype(np.float32)
+
+
+def _frames(
+    positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"], uvs: Float[np.ndarray, "f 3 2"]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Unit tangent (along u) of every face and the bitangent, which the sign of the UV area turns over."""
+    corners, uv = positions[faces].astype(np.float64), uvs.astype(np.float64)
+    e1, e2 = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    v1, v2 = uv[:, 1, 1] - uv[:, 0, 1], uv[:, 2, 1] - uv[:, 0, 1]
+    sign = np.sign(signed_areas(uvs))[:, None]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        tangent = (e1 * v2[:, None] - e2 * v1[:, None]) * sign
+        tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
+        normal = area_vectors(positions, faces)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        return tangent, np.cross(normal, tangent) * sign

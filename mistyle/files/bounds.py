@@ -1,0 +1,60 @@
+"""How much a stranger's file may ask for, and from where."""
+
+import re
+from pathlib import Path
+from urllib.parse import unquote
+
+from mistyle.core.errors import InputRefused
+
+MAX_FILE_BYTES = 2 << 30
+MAX_JSON_BYTES = 64 << 20
+MAX_DEPTH = 128  # of nested JSON and of the node graph
+MAX_NODES = 200_000
+MAX_PIXELS = 1 << 26  # of one picture: 8192 x 8192
+MAX_TEXTURE_PIXELS = 1 << 27  # of all textures of one mesh
+WORK_TEXTURE = 4096  # a mesh's own textures are halved until no side is longer
+
+
+def refuse(path: Path | str, found: str, expected: str, fix: str) -> InputRefused:
+    """The sentence that every refusal has: which file, what was found, what was expected, what to do."""
+    return InputRefused(f"{path}: found {found}; expected {expected}. {fix}")
+
+
+def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
+    """The whole file, if it is one and not larger than `limit`."""
+    if not path.exists():
+        raise refuse(path, "nothing", "a file", "Check the path")
+    if not path.is_file():
+        raise refuse(path, "something that is not a plain file", "a file", "Check the path")
+    size = path.stat().st_size
+    if size > limit:
+        found, most = f"{size / 2**20:.0f} MiB", f"at most {limit / 2**20:.0f} MiB"
+        raise refuse(path, found, most, "Reduce the file (fewer faces, smaller textures)")
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise refuse(
+            path, f"a file that cannot be read ({error.strerror})", "a readable file", "Check its permissions"
+        ) from error
+
+
+def beside(path: Path, reference: str) -> Path:
+    """The file that `path` names, if it lies in the folder of `path` or below; links are resolved before the check.
+
+    Percent escapes are decoded as URIs have them. Raises InputRefused for network addresses, absolute paths and
+    everything that leads out of the folder.
+    """
+    name = unquote(reference).replace("\\", "/")
+    fix = "Copy the file into the mesh's folder and name it relative to the mesh"
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:", name) or name.startswith("//"):
+        raise refuse(path, f"a reference to {reference[:120]!r}", "a relative file name (nothing is fetched)", fix)
+    if "\0" in name or not name:
+        raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix)
+    root = path.parent.resolve()
+    try:
+        target = (root / name).resolve()
+    except (OSError, RuntimeError) as error:  # a loop of links
+        raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix) from error
+    if re.match(r"[A-Za-z]:", name) or not target.is_relative_to(root):
+        raise refuse(path, f"a reference to {reference[:120]!r}", "a file inside the mesh's own folder", fix)
+    return target

@@ -1,0 +1,265 @@
+"""glTF to triangles: node transforms, skins in their bind pose, strips and fans, materials with their textures."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.core.asset import Primitive
+from mistyle.core.normals import area_vectors
+from mistyle.files.bounds import refuse
+from mistyle.files.glb import values
+from mistyle.files.gltf_check import AGAIN, load_gltf
+from mistyle.files.gltf_materials import base_set, read_material, wanted_sets
+from mistyle.files.gltf_vertices import triangles
+from mistyle.files.pictures import Budget
+from mistyle.files.polygons import check_indices, too_many
+from mistyle.files.raw import Raw
+
+Tree = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One primitive under one node."""
+
+    node: int
+    mesh: int
+    primitive: int
+    material: int
+    texcoord: int
+    first_vertex: int
+    faces: np.ndarray
+    normals: np.ndarray
+    uvs: np.ndarray
+    other_uvs: dict[int, np.ndarray]
+
+
+def read_gltf(path: Path, max_faces: int) -> Raw:
+    """Triangles of the default scene (of all nodes where there is none), in node order and file order.
+
+    Positions are in world space, node transforms applied. A skinned mesh comes in its bind pose: its own node's
+    transform has no meaning (glTF 2.0, 3.7.3.3), it is placed as its skeleton's root places it. Morph targets stay
+    at their base shape. Primitives of points and lines are left out with a note. Where NORMAL is missing faces are
+    flat, as the specification demands.
+    """
+    tree, buffers = load_gltf(path)
+    notes: list[str] = []
+    pieces, positions = _pieces(tree, buffers, path, max_faces, notes)
+    if not pieces:
+        raise refuse(
+            path,
+            "no triangles in its scene",
+            "at least one triangle",
+            "Export the mesh itself, visible and as triangles",
+        )
+    used = sorted({p.material for p in pieces})
+    place = {m: i for i, m in enumerate(used)}
+    counts = [len(p.faces) for p in pieces]
+    material = np.repeat([place[p.material] for p in pieces], counts)
+    budget = Budget(path)
+    materials = tuple(read_material(tree, buffers, path, m, _other_sets(pieces, m), budget) for m in used)
+    starts = np.cumsum([0, *counts])
+    primitives = tuple(
+        Primitive(p.node, p.mesh, p.primitive, int(a), int(b), place[p.material], p.texcoord, -1, p.first_vertex)
+        for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)
+    )
+    uvs = np.concatenate([p.uvs for p in pieces])
+    return Raw(
+        kind="glb" if path.suffix.lower() == ".glb" else "gltf",
+        positions=np.concatenate(positions),
+        faces=np.concatenate([p.faces for p in pieces]),
+        normals=np.concatenate([p.normals for p in pieces]),
+        uvs=uvs if np.isfinite(uvs).any() else None,
+        material=material,
+        materials=materials,
+        primitives=primitives,
+        twin=_twins(pieces, starts),
+        notes=tuple(dict.fromkeys(notes)),
+    )
+
+
+def _pieces(
+    tree: Tree, buffers: list[bytes], path: Path, max_faces: int, notes: list[str]
+) -> tuple[list[_Piece], list[np.ndarray]]:
+    pieces: list[_Piece] = []
+    positions: list[np.ndarray] = []
+    vertices = faces = 0
+    world = world_matrices(tree)
+    first: dict[tuple[int, int], int] = {}
+    for node in _scene_nodes(tree):
+        entry = tree["nodes"][node]
+        if "mesh" not in entry:
+            continue
+        matrix = world[node]
+        if "skin" in entry:
+            matrix = _bind_pose(tree, buffers, entry["skin"], world, path)
+            notes.append("A skinned mesh was read in its bind pose; skin and animations stay as they are.")
+        if not np.isfinite(matrix).all():
+            raise refuse(path, f"node {node} with a transform that is not finite", "finite numbers", AGAIN)
+        if "EXT_mesh_gpu_instancing" in entry.get("extensions", {}):
+            notes.append("Instances (EXT_mesh_gpu_instancing) were read once; all of them show the same texels.")
+        for number, primitive in enumerate(tree["meshes"][entry["mesh"]]["primitives"]):
+            index = _indices(tree, buffers, primitive, path)
+            if index is None or "POSITION" not in primitive["attributes"] or len(index) == 0:
+                notes.append("Points and lines were left out.")
+                continue
+            faces += len(index)
+            too_many(faces, max_faces, path)
+            accessor = primitive["attributes"]["POSITION"]
+            if (node, accessor) not in first:
+                first[node, accessor] = vertices
+                local = _vectors(tree, buffers, accessor, 3, path).astype(np.float64)
+                positions.append(local @ matrix[:3, :3].T + matrix[:3, 3])
+                vertices += len(local)
+                too_many(vertices, 3 * max_faces, path, "vertices")
+            pieces.append(
+                _piece(tree, buffers, path, (node, entry["mesh"], number), primitive, index, matrix, first, notes)
+            )
+    return pieces, positions
+
+
+def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -> _Piece:
+    """One primitive's corners in world space, v up; the winding is turned where the node mirrors space."""
+    attributes = primitive["attributes"]
+    count = tree["accessors"][attributes["POSITION"]]["count"]
+    check_indices(index, count, path, "vertex")
+    if np.linalg.det(matrix[:3, :3]) < 0:
+        index = index[:, [0, 2, 1]]
+    if "COLOR_0" in attributes:
+        notes.append("Vertex colours were not read.")
+    local = _vectors(tree, buffers, attributes["POSITION"], 3, path).astype(np.float64)
+    if "NORMAL" in attributes:
+        vectors = _vectors(tree, buffers, attributes["NORMAL"], 3, path).astype(np.float64)
+        normals = (vectors @ np.linalg.pinv(matrix[:3, :3]))[index]  # the inverse transpose, for row vectors
+    else:
+        notes.append("A primitive has no normals: its faces are shaded flat, as glTF demands.")
+        flat = area_vectors(local @ matrix[:3, :3].T, index)
+        normals = np.repeat(flat[:, None], 3, axis=1)
+    length = np.linalg.norm(normals, axis=2, keepdims=True)
+    normals = normals / np.where(length > 0, length, 1)
+    sets = {
+        n: _texcoords(tree, buffers, attributes[f"TEXCOORD_{n}"], path)[index]
+        for n in wanted_sets(tree, primitive.get("material"))
+        if f"TEXCOORD_{n}" in attributes
+    }
+    base = base_set(tree, primitive.get("material"))
+    nothing = np.full((len(index), 3, 2), np.nan, np.float32)
+    start = first[where[0], attributes["POSITION"]]
+    return _Piece(
+        node=where[0],
+        mesh=where[1],
+        primitive=where[2],
+        material=primitive.get("material", -1),
+        texcoord=base if base in sets else -1,
+        first_vertex=start,
+        faces=index + start,
+        normals=normals.astype(np.float32),
+        uvs=sets.get(base, nothing),
+        other_uvs={n: uvs for n, uvs in sets.items() if n != base},
+    )
+
+
+def _indices(tree: Tree, buffers: list[bytes], primitive: Tree, path: Path) -> Int[np.ndarray, "f 3"] | None:
+    if "indices" in primitive:
+        accessor = tree["accessors"][primitive["indices"]]
+        if accessor["type"] != "SCALAR" or accessor["componentType"] not in (5121, 5123, 5125):
+            raise refuse(path, "indices that are no unsigned integers", "unsigned scalars", AGAIN)
+    return triangles(tree, buffers, primitive)
+
+
+def _vectors(tree: Tree, buffers: list[bytes], accessor: int, width: int, path: Path) -> np.ndarray:
+    """A float (or quantised) vector attribute as numbers."""
+    if tree["accessors"][accessor]["type"] != f"VEC{width}":
+        raise refuse(path, f"accessor {accessor} of {tree['accessors'][accessor]['type']}", f"VEC{width}", AGAIN)
+    return values(tree, buffers, accessor)
+
+
+def _texcoords(tree: Tree, buffers: list[bytes], accessor: int, path: Path) -> Float[np.ndarray, "n 2"]:
+    uv = _vectors(tree, buffers, accessor, 2, path).astype(np.float32)
+    return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
+
+
+def _scene_nodes(tree: Tree) -> list[int]:
+    """Nodes of the default scene, parents before children; without scenes all nodes."""
+    nodes = tree.get("nodes", [])
+    if tree.get("scenes"):
+        roots = tree["scenes"][tree.get("scene", 0)].get("nodes", [])
+    else:
+        children = {c for n in nodes for c in n.get("children", [])}
+        roots = [i for i in range(len(nodes)) if i not in children]
+    order, stack, seen = [], list(reversed(roots)), set()
+    while stack:
+        node = stack.pop()
+        if node in seen:
+            continue
+        seen.add(node)
+        order.append(node)
+        stack.extend(reversed(nodes[node].get("children", [])))
+    return order
+
+
+def world_matrices(tree: Tree) -> list[Float[np.ndarray, "4 4"]]:
+    """world_from_node for every node (glTF 2.0, 3.5.3: matrix, or translation * rotation * scale)."""
+    from scipy.spatial.transform import Rotation
+
+    nodes = tree.get("nodes", [])
+    local = []
+    for node in nodes:
+        if "matrix" in node:
+            local.append(np.array(node["matrix"], np.float64).reshape(4, 4).T)
+            continue
+        matrix = np.eye(4)
+        quaternion = np.array(node.get("rotation", [0, 0, 0, 1]), np.float64)
+        turn = Rotation.from_quat(quaternion).as_matrix() if np.linalg.norm(quaternion) > 0 else np.eye(3)
+        matrix[:3, :3] = turn * np.array(node.get("scale", [1, 1, 1]), np.float64)
+        matrix[:3, 3] = node.get("translation", [0, 0, 0])
+        local.append(matrix)
+    world: list[np.ndarray] = [np.eye(4)] * len(nodes)
+    children = {c for n in nodes for c in n.get("children", [])}
+    stack = [i for i in range(len(nodes)) if i not in children]
+    for i in stack:
+        world[i] = local[i]
+    while stack:
+        i = stack.pop()
+        for child in nodes[i].get("children", []):
+            world[child] = world[i] @ local[child]
+            stack.append(child)
+    return world
+
+
+def _bind_pose(
+    tree: Tree, buffers: list[bytes], skin: int, world: list[np.ndarray], path: Path
+) -> Float[np.ndarray, "4 4"]:
+    """Where the root joint puts the mesh: its world matrix times its inverse bind matrix. The same as skinning where
+    the file's rest pose is the bind pose; else the bind pose, upright and at the right size all the same."""
+    joints = tree["skins"][skin]["joints"]
+    below = {c for j in joints for c in tree["nodes"][j].get("children", [])}
+    root = next((k for k, j in enumerate(joints) if j not in below), 0)
+    inverse = np.eye(4)
+    if "inverseBindMatrices" in tree["skins"][skin]:
+        accessor = tree["skins"][skin]["inverseBindMatrices"]
+        entry = tree["accessors"][accessor]
+        if entry["type"] != "MAT4" or entry["componentType"] != 5126 or entry["count"] < len(joints):
+            raise refuse(path, "inverse bind matrices of another kind", "one float MAT4 per joint", AGAIN)
+        inverse = values(tree, buffers, accessor)[root].astype(np.float64).reshape(4, 4).T
+    return world[joints[root]] @ inverse
+
+
+def _other_sets(pieces: list[_Piece], material: int) -> dict[int, Float[np.ndarray, "f 3 2"]]:
+    """The UV sets besides the base that a material's textures use, for all faces; NaN where a face has none."""
+    numbers = {n for p in pieces if p.material == material for n in p.other_uvs}
+    nothing = [np.full((len(p.faces), 3, 2), np.nan, np.float32) for p in pieces]
+    return {n: np.concatenate([p.other_uvs.get(n, no) for p, no in zip(pieces, nothing, strict=True)]) for n in numbers}
+
+
+def _twins(pieces: list[_Piece], starts: Int[np.ndarray, " n"]) -> Int[np.ndarray, " f"]:
+    """For each face the first face that the file's same primitive gave; instances share the file's UVs."""
+    twin = np.arange(starts[-1])
+    first: dict[tuple[int, int], int] = {}
+    for piece, a, b in zip(pieces, starts[:-1], starts[1:], strict=True):
+        start = first.setdefault((piece.mesh, piece.primitive), int(a))
+        twin[a:b] = np.arange(start, start + (b - a))
+    return twin

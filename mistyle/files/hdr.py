@@ -1,0 +1,108 @@
+"""OpenEXR and Radiance files, header first."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.files.bounds import MAX_PIXELS, read_bytes, refuse
+
+MAX_CHANNELS = 256
+MAX_SAMPLES = 1 << 29  # texels times channels: 2 GiB of float32
+AGAIN = "Write or copy it again"
+
+
+def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
+    """See files/read.py."""
+    import OpenEXR
+
+    if read_bytes(path)[:4] != b"\x76\x2f\x31\x01":
+        raise refuse(path, "no OpenEXR header", "an .exr file", "Check that it is the right file")
+    try:
+        headers = [part.header for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts]
+    except (RuntimeError, ValueError, TypeError, KeyError) as error:
+        raise refuse(path, f"a header that cannot be read ({str(error)[:120]})", "an OpenEXR file", AGAIN) from error
+    _check(headers, path)
+    try:
+        parts = OpenEXR.File(str(path), separate_channels=True).parts
+    except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
+        raise refuse(
+            path, f"pixels that cannot be read ({str(error)[:120]})", "a complete OpenEXR file", AGAIN
+        ) from error
+    # Where decoding fails the library drops the part and prints a warning instead of raising.
+    if len(parts) != len(headers):
+        raise refuse(path, f"{len(parts)} of {len(headers)} parts whose pixels can be read", "a complete file", AGAIN)
+    planes: dict[str, np.ndarray] = {}
+    for part in parts:
+        prefix = f"{part.header['name']}." if len(parts) > 1 and part.header.get("name") else ""
+        for name, channel in part.channels.items():
+            planes[prefix + name] = _shown(np.asarray(channel.pixels, np.float32), part.header, path)
+    if len({plane.shape for plane in planes.values()}) > 1:
+        raise refuse(path, "parts of different sizes", "one size", "Save the parts as files of their own")
+    return planes
+
+
+def _window(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
+    """x0, y0, width and height."""
+    low, high = header[name]
+    return int(low[0]), int(low[1]), int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1
+
+
+def _check(headers: list[dict[str, Any]], path: Path) -> None:
+    samples = 0
+    if not headers:
+        raise refuse(path, "no image", "an OpenEXR image", AGAIN)
+    for header in headers:
+        kind = str(header.get("type", "scanlineimage"))
+        if "deep" in kind:
+            raise refuse(path, f"a deep image ({kind})", "a flat one", "Flatten it")
+        channels = header["channels"]
+        if not 0 < len(channels) <= MAX_CHANNELS:
+            raise refuse(path, f"{len(channels)} channels", f"1 to {MAX_CHANNELS}", "Leave channels out")
+        if any(c.xSampling != 1 or c.ySampling != 1 for c in channels):
+            raise refuse(path, "subsampled channels", "all channels at full resolution", "Convert it to RGB")
+        for name in ("dataWindow", "displayWindow"):
+            width, height = _window(header, name)[2:]
+            if width < 1 or height < 1 or width * height > MAX_PIXELS:
+                found, most = f"a {name} of {width} x {height}", f"1 to {MAX_PIXELS / 1e6:.0f} million texels"
+                raise refuse(path, found, most, "Scale it down, or write it again if it is damaged")
+            samples += width * height * len(channels)
+    if samples > 2 * MAX_SAMPLES:
+        raise refuse(path, f"{samples} samples", f"at most {2 * MAX_SAMPLES}", "Scale it down or leave channels out")
+
+
+def _shown(pixels: Float[np.ndarray, "h w"], header: dict[str, Any], path: Path) -> Float[np.ndarray, "h2 w2"]:
+    """The display window: zero where there are no data."""
+    x, y, width, height = _window(header, "dataWindow")
+    sx, sy, shown_width, shown_height = _window(header, "displayWindow")
+    if pixels.shape != (height, width):
+        raise refuse(path, f"{pixels.shape} texels", f"{(height, width)} as its header says", AGAIN)
+    if (x, y, width, height) == (sx, sy, shown_width, shown_height):
+        return pixels
+    result = np.zeros((shown_height, shown_width), np.float32)
+    x0, y0 = max(x, sx), max(y, sy)
+    x1, y1 = min(x + width, sx + shown_width), min(y + height, sy + shown_height)
+    if x1 > x0 and y1 > y0:
+        result[y0 - sy : y1 - sy, x0 - sx : x1 - sx] = pixels[y0 - y : y1 - y, x0 - x : x1 - x]
+    return result
+
+
+def read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """See files/read.py."""
+    import cv2
+
+    data = read_bytes(path, 512 << 20)
+    size = re.search(rb"\n\n-Y (\d{1,6}) \+X (\d{1,6})\n", data[: 1 << 16])
+    if not data.startswith(b"#?") or size is None:
+        raise refuse(
+            path, "no Radiance header (-Y height +X width)", "an .hdr file, upright", "Write it again, or as .exr"
+        )
+    height, width = int(size[1]), int(size[2])
+    if not 0 < height * width <= MAX_PIXELS:
+        raise refuse(path, f"{width} x {height} pixels", f"1 to {MAX_PIXELS / 1e6:.0f} million", "Scale it down")
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    if pixels is None or pixels.shape != (height, width, 3) or pixels.dtype != np.float32:
+        raise refuse(path, "pixels that cannot be decoded", f"{width} x {height} RGBE pixels", AGAIN)
+    return np.ascontiguousarray(pixels[..., ::-1])

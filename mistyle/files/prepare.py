@@ -1,0 +1,278 @@
+"""From what a file says to an asset: working space, normals, one usable set of UVs for every material."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.core.asset import Asset, Material, Source
+from mistyle.core.mesh import Mesh
+from mistyle.core.normals import area_vectors, crease_normals, same_points, usable_normals
+from mistyle.core.retexture import carry, turn_normals
+from mistyle.core.unwrap import unwrap
+from mistyle.core.uvs import Layout, Verdict, arrange
+from mistyle.files.bounds import refuse
+from mistyle.files.raw import Raw, RawMap
+
+MAX_COORDINATE = 1e18
+# Faces below this area in the unit sphere have none that anything could be computed from (float32 positions).
+NO_AREA = 1e-13
+Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
+UnwrapMode = Literal["keep", "new", "auto"]
+
+
+@dataclass(frozen=True)
+class _Plan:
+    """What becomes of one material's UVs: rows of its faces, kept layout (None: unwrap), the reason for unwrapping."""
+
+    rows: Int[np.ndarray, " n"]
+    layout: Layout | None
+    reason: str
+
+
+def prepare(
+    raw: Raw, path: Path, uv: UnwrapMode, up: Literal["y", "z"], size: int, progress: Callable[[float], None]
+) -> Asset:
+    """Decide, unwrap where needed, and put everything into the working space. `size` is the atlas that padding is
+    meant for."""
+    work_from_user = _work_matrix(raw, path, up)
+    work = raw.positions @ work_from_user[:3, :3].T + work_from_user[:3, 3]
+    area = np.linalg.norm(area_vectors(work, raw.faces), axis=1)
+    if not (area > NO_AREA).any():
+        raise refuse(
+            path, f"{len(area)} faces, all without area", "at least one triangle with an area", "Export the mesh again"
+        )
+    points = same_points(raw.positions)
+    notes = list(raw.notes)
+    normals = _normals(raw, work, points, work_from_user, notes)
+    plans = [_plan(raw, m, points, area, uv, path, notes) for m in range(len(raw.materials))]
+    progress(0.1)
+    fresh = _unwrap(raw, work, plans, size, lambda done: progress(0.1 + 0.8 * done))
+    corner_uvs, part, names, owners = _lay_out(raw, plans, fresh)
+    mesh = Mesh(
+        positions=work.astype(np.float32),
+        faces=raw.faces.astype(np.int32),
+        corner_normals=normals,
+        corner_uvs=corner_uvs,
+        part=part.astype(np.int32),
+        parts=names,
+    )
+    materials = tuple(
+        _material(raw, mesh, p, material, tile, plans[material].layout is None, size, notes)
+        for p, (material, tile) in enumerate(owners)
+    )
+    progress(1.0)
+    kept = raw.uvs is not None and np.array_equal(corner_uvs, raw.uvs)
+    how = "new" if any(p.layout is None for p in plans) else "kept" if kept else "shifted"
+    source = Source(
+        path=path,
+        kind=raw.kind,
+        primitives=tuple(_with_part(p, part) for p in raw.primitives),
+        user_positions=raw.positions,
+        work_from_user=work_from_user,
+        old_uvs=None if raw.uvs is None else np.nan_to_num(raw.uvs).astype(np.float32),
+        uv=how,
+        notes=tuple(dict.fromkeys(notes)),
+    )
+    return Asset(name=path.stem, mesh=mesh, materials=materials, source=source)
+
+
+def _work_matrix(raw: Raw, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
+    """Turns Z up to Y up where asked, and brings the sphere around the used vertices' box to the unit sphere."""
+    if not np.isfinite(raw.positions).all():
+        first = int(np.flatnonzero(~np.isfinite(raw.positions).all(axis=1))[0])
+        raise refuse(
+            path, f"a position that is not finite (vertex {first})", "finite numbers", "Repair or export the mesh again"
+        )
+    if np.abs(raw.positions).max() > MAX_COORDINATE:
+        raise refuse(
+            path,
+            f"coordinates up to {np.abs(raw.positions).max():.1e}",
+            f"at most {MAX_COORDINATE:.0e}",
+            "Scale the mesh",
+        )
+    turn = Y_FROM_Z if up == "z" else np.eye(3)
+    used = raw.positions[np.unique(raw.faces)] @ turn.T
+    centre = (used.min(axis=0) + used.max(axis=0)) / 2
+    radius = float(np.linalg.norm(used - centre, axis=1).max())
+    if radius <= 0:
+        raise refuse(path, "vertices that are all at one point", "a shape", "Export the mesh again")
+    matrix = np.eye(4)
+    matrix[:3, :3] = turn / radius
+    matrix[:3, 3] = -centre / radius
+    return matrix
+
+
+def _normals(
+    raw: Raw, work: np.ndarray, points: np.ndarray, work_from_user: np.ndarray, notes: list[str]
+) -> Float[np.ndarray, "f 3 3"]:
+    """The file's corner normals, unit, in working axes; smooth ones within a crease where it has none."""
+    if raw.normals is None:
+        notes.append("The mesh has no normals: smooth ones were computed, with creases at 50 degrees.")
+        return crease_normals(work, raw.faces, points)
+    fine = usable_normals(raw.normals)
+    given = np.where(fine[..., None], raw.normals, 1).astype(np.float64)
+    turn = work_from_user[:3, :3] / np.linalg.norm(work_from_user[0, :3])
+    given = (given / np.linalg.norm(given, axis=2, keepdims=True)) @ turn.T
+    if not fine.all():
+        bad = int((~fine).sum())
+        notes.append(
+            f"{bad} of {fine.size} corner normals are missing, zero or not finite: computed ones took their place."
+        )
+        given = np.where(fine[..., None], given, crease_normals(work, raw.faces, points))
+    return given.astype(np.float32)
+
+
+def _plan(
+    raw: Raw, material: int, points: np.ndarray, area: np.ndarray, uv: UnwrapMode, path: Path, notes: list[str]
+) -> _Plan:
+    """Keep a material's UVs or unwrap it; says so in `notes`, refuses where `keep` cannot be."""
+    rows = np.flatnonzero(raw.material == material)
+    name = raw.materials[material].name
+    own = rows if raw.twin is None else rows[raw.twin[rows] == rows]
+    if uv == "new":
+        return _Plan(rows, None, "asked for")
+    layout = None
+    if raw.uvs is not None and np.isfinite(raw.uvs[rows]).any():
+        layout = arrange(points[raw.faces[own]], raw.uvs[own], area[own], raw.materials[material].udim)
+    if layout is not None and layout.usable:
+        _say(name, layout.verdicts, len(own) < len(rows), notes)
+        return _Plan(rows, layout, "")
+    reason = (
+        "it has no UVs"
+        if layout is None
+        else "its UVs cannot be painted: " + next(v.reason for v in layout.verdicts if not v.usable)
+    )
+    if uv == "keep":
+        found = f"material '{name}' whose UVs cannot be kept ({reason})"
+        raise refuse(path, found, "UVs that cover the surface without overlaps", "Use --uv auto or --uv new")
+    notes.append(f"Material '{name}' was unwrapped anew, since {reason}.")
+    return _Plan(rows, None, reason)
+
+
+def _say(name: str, verdicts: tuple[Verdict, ...], instances: bool, notes: list[str]) -> None:
+    shared, mirrored = max(v.shared for v in verdicts), max(v.mirrored for v in verdicts)
+    if instances:
+        notes.append(
+            f"Material '{name}' is on several instances of a mesh, which share their texels; the first is painted."
+        )
+    if shared > 0.005:
+        notes.append(
+            f"Shells of material '{name}' lie on top of each other in UV space and share {shared:.0%} of its texels; "
+            "of each the one that comes first in the file is painted."
+        )
+    if mirrored > 0.005:
+        notes.append(f"{mirrored:.0%} of the UV area of material '{name}' is mirrored; it was kept as authored.")
+
+
+def _unwrap(
+    raw: Raw, work: np.ndarray, plans: list[_Plan], size: int, progress: Callable[[float], None]
+) -> dict[int, Float[np.ndarray, "n 3 2"]]:
+    """New UVs for the materials that need them, by material, for their own (not instanced) faces."""
+    needed = [m for m, plan in enumerate(plans) if plan.layout is None]
+    if not needed:
+        return {}
+    meshes = [(work, raw.faces[_own(raw, plans[m].rows)]) for m in needed]
+    return dict(zip(needed, unwrap(meshes, size=size, progress=progress), strict=True))
+
+
+def _own(raw: Raw, rows: Int[np.ndarray, " n"]) -> Int[np.ndarray, " k"]:
+    return rows if raw.twin is None else rows[raw.twin[rows] == rows]
+
+
+def _lay_out(
+    raw: Raw, plans: list[_Plan], fresh: dict[int, np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, tuple[str, ...], list[tuple[int, int]]]:
+    """Corner UVs, part of every face, part names, and the (material, tile) of every part."""
+    count = len(raw.faces)
+    uvs, part = np.zeros((count, 3, 2), np.float32), np.zeros(count, np.int64)
+    names: list[str] = []
+    owners: list[tuple[int, int]] = []
+    for m, plan in enumerate(plans):
+        own = _own(raw, plan.rows)
+        tile = np.full(len(own), 1001) if plan.layout is None else plan.layout.tile
+        uvs[own] = fresh[m] if plan.layout is None else plan.layout.uvs
+        numbers = np.unique(tile)
+        part[own] = len(names) + np.searchsorted(numbers, tile)
+        for n in numbers:
+            names.append(raw.materials[m].name if len(numbers) == 1 else f"{raw.materials[m].name}.{n}")
+            owners.append((m, int(n)))
+    if raw.twin is not None:
+        uvs, part = _copy_to_instances(raw, uvs), part[raw.twin]
+    return uvs, part, _distinct(names), owners
+
+
+def _copy_to_instances(raw: Raw, uvs: Float[np.ndarray, "f 3 2"]) -> Float[np.ndarray, "f 3 2"]:
+    """Instances take their first instance's UVs; where one of the two is mirrored its corners are in another order."""
+    assert raw.twin is not None
+    first = np.zeros(len(raw.faces), np.int64)
+    for p in raw.primitives:
+        first[p.start : p.stop] = p.first_vertex
+    local = raw.faces - first[:, None]
+    turned = (local[raw.twin] != local).any(axis=1)
+    copied = uvs[raw.twin]
+    copied[turned] = copied[turned][:, [0, 2, 1]]
+    return copied
+
+
+def _distinct(names: list[str]) -> tuple[str, ...]:
+    seen: dict[str, int] = {}
+    result = []
+    for name in names:
+        seen[name] = seen.get(name, 0) + 1
+        result.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
+    return tuple(result)
+
+
+def _with_part(primitive, part: Int[np.ndarray, " f"]):
+    parts = np.unique(part[primitive.start : primitive.stop])
+    return replace(primitive, part=int(parts[0]) if len(parts) == 1 else -1)
+
+
+def _material(
+    raw: Raw, mesh: Mesh, part: int, material: int, tile: int, new: bool, size: int, notes: list[str]
+) -> Material:
+    """The part's maps in its working UVs, carried over where the file's lookup differs from them."""
+    source = raw.materials[material]
+    maps, said = source.load(tile)
+    notes.extend(said)
+    rows = np.flatnonzero(mesh.part == part)
+    old = None if raw.uvs is None else raw.uvs[rows]
+    done = {name: _placed(name, entry, mesh, rows, old, new, size) for name, entry in maps.items()}
+    for name in [n for n, values in done.items() if values is None]:
+        notes.append(
+            f"The {name} map of material '{source.name}' was left out: its faces have no UVs to look it up at."
+        )
+    return Material(
+        name=mesh.parts[part],
+        albedo=done.get("albedo"),
+        normal=done.get("normal"),
+        roughness=done.get("roughness"),
+        metallic=done.get("metallic"),
+        albedo_factor=np.array(source.albedo_factor, np.float32),
+        roughness_factor=float(source.roughness_factor),
+        metallic_factor=float(source.metallic_factor),
+    )
+
+
+def _placed(
+    name: str, entry: RawMap, mesh: Mesh, rows: np.ndarray, old: np.ndarray | None, new: bool, size: int
+) -> np.ndarray | None:
+    """One map in the part's working UVs; None where there is nothing to look it up by."""
+    lookup = old if entry.uvs is None else entry.uvs[rows]
+    if not new and entry.uvs is None and entry.transform is None:
+        return entry.values
+    if lookup is None or not np.isfinite(lookup).any():
+        return None
+    lookup = np.nan_to_num(lookup).astype(np.float64)
+    frame = lookup
+    if entry.transform is not None:
+        lookup = lookup @ entry.transform[:2, :2].T + entry.transform[:2, 2]
+    side = min(size, max(entry.values.shape[:2]))
+    values, face = carry(entry.values, lookup, mesh.corner_uvs[rows], side)
+    if name == "normal":
+        values = turn_normals(values, face, mesh.positions, mesh.faces[rows], frame, mesh.corner_uvs[rows])
+    return values

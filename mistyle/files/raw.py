@@ -1,0 +1,66 @@
+"""What a mesh file says, before anything is decided about it."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.core.asset import Primitive
+
+
+@dataclass(frozen=True)
+class RawMap:
+    """One texture: values as `Material` has them (row 0 is v = 1) and how to look them up.
+
+    The lookup is at `uvs` where the map uses another UV set than the material's base, else at the mesh's UVs; then
+    `transform` (v up, homogeneous rows) is applied to it.
+    """
+
+    values: np.ndarray
+    uvs: Float[np.ndarray, "f 3 2"] | None = None
+    transform: Float[np.ndarray, "3 3"] | None = None
+
+
+Maps = Mapping[str, RawMap]  # keys: albedo, normal, roughness, metallic
+
+
+@dataclass(frozen=True)
+class RawMaterial:
+    """A material of the file. `load` decodes its textures for a UDIM tile (1001 where there are none) and returns them
+    with sentences about what could not be read. `udim`: True when textures are named as tiles, False when a texture
+    repeats over all of them, None when there is none."""
+
+    name: str
+    load: Callable[[int], tuple[Maps, tuple[str, ...]]]
+    udim: bool | None = None
+    albedo_factor: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    roughness_factor: float = 1.0
+    metallic_factor: float = 0.0
+
+
+@dataclass(frozen=True)
+class Raw:
+    """Triangles in file order, positions in the file's units and axes (glTF: world space).
+
+    normals   per corner, zero or NaN where the file gives none; None where it gives none at all
+    uvs       per corner, v up, NaN where a face has none; None where no face has any
+    material  index into `materials` per face
+    twin      the face whose UVs each face shares because the file stores them once (glTF instances), itself otherwise
+    """
+
+    kind: str
+    positions: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+    normals: Float[np.ndarray, "f 3 3"] | None
+    uvs: Float[np.ndarray, "f 3 2"] | None
+    material: Int[np.ndarray, " f"]
+    materials: tuple[RawMaterial, ...]
+    primitives: tuple[Primitive, ...]
+    twin: Int[np.ndarray, " f"] | None = None
+    notes: tuple[str, ...] = field(default=())
+
+
+def no_textures(tile: int) -> tuple[Maps, tuple[str, ...]]:
+    """The `load` of a material without textures."""
+    return {}, ()

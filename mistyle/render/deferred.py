@@ -1,0 +1,268 @@
+"""A Mitsuba integrator that shades known surface points under known lights, without noise.
+
+Geometry, cameras and lights stand still while materials are fitted, so rays are traced once (`trace`), and what a
+BSDF needs of a pixel is kept: the direction to the camera and to each light in the pixel's own tangent frame. The
+integrator `mistyle_deferred` then sums BSDF times irradiance over all lights exactly, one sample per pixel. Each
+pixel reads its own texel of textures as large as the film, so that the gradient of a texture has one summand per
+texel and the same bytes in every run and at any number of threads.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.camera import Camera, pixel_centres
+from mistyle.core.light import Ambient, Directional, Lights, direction_in_world
+from mistyle.render import device
+from mistyle.render.draw import Tracer
+
+INTEGRATOR = "mistyle_deferred"
+# Directions in which ambient light is sampled: half follow the cosine, half a lobe about the mirror direction.
+AMBIENT_DIRECTIONS = 16
+# GGX alpha of that lobe. Measured against 200,000 samples: roughness 0.3 and more stays within 0.015 of the mean
+# radiance of a dielectric, 0.15 within 0.03; a wider lobe misses glossy surfaces, a narrower one rough ones.
+LOBE_ALPHA = 0.12
+
+_registered: set[str] = set()
+
+
+@dataclass(frozen=True)
+class Surface:
+    """What the pixels of several equal cameras see, camera after camera, row by row (n = cameras · h · w).
+
+    uv is v up (meant modulo 1), part is -1 and facing 0 off the mesh; facing is the cosine between the direction to the
+    camera and the shading normal, negative where the surface's back is seen. `frame` and `towards` (Dr.Jit, world) are the
+    tangent frame and the direction to the camera; `point` is Mitsuba's surface interaction, for shadow rays.
+    """
+
+    cameras: tuple[Camera, ...]
+    uv: Float[np.ndarray, "n 2"]
+    part: Int[np.ndarray, " n"]
+    mask: Bool[np.ndarray, " n"]
+    facing: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    frame: Any
+    towards: Any
+    point: Any
+
+
+@dataclass(frozen=True)
+class Lit:
+    """A film's pixels with their lights, in their tangent frames: what the integrator sums over.
+
+    `size` is (rows, columns) of the film; `directional` holds (direction, irradiance as seen from the pixel) pairs,
+    `ambient` one radiance or None.
+    """
+
+    size: tuple[int, int]
+    wi: Any
+    mask: Any
+    directional: tuple[tuple[Any, Any], ...]
+    ambient: tuple[float, float, float] | None
+
+
+def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray, "f 3 4"] | None = None) -> Surface:
+    """One exact ray through every pixel centre of every camera (all of one size).
+
+    `tangents` (per face corner, xyz and handedness, as MikkTSpace makes them) give the frame of the normal map that
+    glTF viewers use. Without them it is Mitsuba's own: dp/du of each face, made perpendicular to the shading normal.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    device.use()
+    if len({camera.size for camera in cameras}) != 1:
+        raise ValueError(f"cameras of one size are needed, not {sorted({camera.size for camera in cameras})}")
+    rays = [_directions(camera) for camera in cameras]
+    origins = np.repeat(np.stack([camera.position for camera in cameras]), [len(r) for r in rays], axis=0)
+    ray = mi.Ray3f(_points(mi.Point3f, origins), _points(mi.Vector3f, np.concatenate(rays)))
+    first = traced.scene.ray_intersect_preliminary(ray, coherent=True)
+    point = first.compute_surface_interaction(ray, mi.RayFlags.All)
+    valid = point.is_valid()
+    frame = point.sh_frame if tangents is None else _tangent_frame(point, first.prim_uv, tangents)
+    towards = -ray.d
+    u, v = dr.select(valid, point.uv.x, 0), dr.select(valid, 1 - point.uv.y, 0)
+    face = dr.select(valid, mi.Int32(point.prim_index), -1)
+    facing = dr.select(valid, dr.dot(frame.n, towards), 0)
+    position, normal = point.p & valid, frame.n & valid
+    dr.eval(point, frame, towards, u, v, face, facing, position, normal)
+    faces = np.array(face)
+    return Surface(
+        cameras=tuple(cameras),
+        uv=np.stack([np.array(u), np.array(v)], axis=1),
+        part=np.where(faces >= 0, traced.mesh.part[np.maximum(faces, 0)], -1).astype(np.int32),
+        mask=faces >= 0,
+        facing=np.array(facing),
+        position=np.ascontiguousarray(np.array(position).T),
+        normal=np.ascontiguousarray(np.array(normal).T),
+        frame=frame,
+        towards=towards,
+        point=point,
+    )
+
+
+def light(traced: Tracer, surface: Surface, lights: Lights, *, shadows: bool = True) -> Lit:
+    """Light that all cameras share: directional lights, one shadow ray each (`shadows`), and unoccluded ambient light.
+
+    Ambient light knows no occlusion, so that an albedo fitted under it does not turn bright in cavities; its radiance
+    is summed over AMBIENT_DIRECTIONS fixed directions per pixel. Other kinds of light raise ValueError.
+    """
+    beams, ambient = [], np.zeros(3)
+    for source in lights:
+        if isinstance(source, Directional):
+            beams.append([source] * len(surface.cameras))
+        elif isinstance(source, Ambient):
+            ambient += source.radiance
+        else:
+            raise ValueError(f"{type(source).__name__} cannot be summed exactly; give directional or ambient light")
+    glow = (float(ambient[0]), float(ambient[1]), float(ambient[2])) if ambient.any() else None
+    return _lit(traced, surface, beams, glow, shadows)
+
+
+def light_each(traced: Tracer, surface: Surface, beams: Sequence[Directional], *, shadows: bool = True) -> Lit:
+    """One directional light for each camera, alone."""
+    return _lit(traced, surface, [list(beams)], None, shadows)
+
+
+def _lit(
+    traced: Tracer,
+    surface: Surface,
+    beams: Sequence[Sequence[Directional]],
+    ambient: tuple[float, float, float] | None,
+    shadows: bool,
+) -> Lit:
+    """`beams` holds rows of one light per camera."""
+    import drjit as dr
+    import mitsuba as mi
+
+    height, width = surface.cameras[0].size
+    valid = surface.point.is_valid()
+    wi = surface.frame.to_local(surface.towards)
+    directional = []
+    for row in beams:
+        towards = [direction_in_world(beam, camera) for beam, camera in zip(row, surface.cameras, strict=True)]
+        world = _points(mi.Vector3f, np.repeat(np.stack(towards), height * width, axis=0))
+        strength = np.repeat(np.array([beam.irradiance for beam in row]), height * width, axis=0)
+        seen = mi.Bool(valid)
+        if shadows:
+            seen &= ~traced.scene.ray_test(surface.point.spawn_ray(world), active=valid)
+        directional.append((surface.frame.to_local(world), dr.select(seen, _points(mi.Color3f, strength), 0)))
+    dr.eval(wi, directional, valid)
+    return Lit((height * len(surface.cameras), width), wi, valid, tuple(directional), ambient)
+
+
+def ambient_directions(wi: Any, count: int = AMBIENT_DIRECTIONS) -> list[tuple[Any, Any]]:
+    """Directions and weights with which a constant radiance sums to the light scattered towards `wi` (tangent frame).
+
+    Spherical Fibonacci points: half of them follow the cosine about the shading normal, half a GGX lobe of
+    LOBE_ALPHA about the mirror direction; each is weighted by one over the density of both together (the balance
+    heuristic). The same at every call, so the sum has an error but no noise.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    side = dr.mulsign(mi.Float(1), wi.z)
+    wi = mi.Vector3f(wi.x, wi.y, wi.z * side)
+    lobes, cosines = count // 2, count - count // 2
+    golden, a2 = np.pi * (3 - np.sqrt(5)), LOBE_ALPHA**2
+    directions = []
+    for k in range(cosines):
+        radius = np.sqrt((k + 0.5) / cosines)
+        x, y = radius * np.cos(golden * k), radius * np.sin(golden * k)
+        directions.append(mi.Vector3f(float(x), float(y), float(np.sqrt(1 - radius**2))))
+    for k in range(lobes):
+        u = (k + 0.5) / lobes
+        cosine = np.sqrt((1 - u) / (1 + (a2 - 1) * u))
+        sine = np.sqrt(1 - cosine**2)
+        half = mi.Vector3f(float(sine * np.cos(golden * k + 1)), float(sine * np.sin(golden * k + 1)), float(cosine))
+        directions.append(2 * dr.dot(wi, half) * half - wi)
+    result = []
+    for wo in directions:
+        half = dr.normalize(wi + wo)
+        spread = a2 / (dr.pi * dr.square(dr.square(half.z) * (a2 - 1) + 1))
+        lobe = spread * half.z / (4 * dr.maximum(dr.dot(wi, half), 1e-4))
+        density = (cosines * dr.maximum(wo.z, 0) / dr.pi + lobes * lobe) / count
+        weight = dr.select((wo.z > 1e-4) & (density > 1e-6), 1 / (count * dr.maximum(density, 1e-6)), 0)
+        result.append((mi.Vector3f(wo.x, wo.y, wo.z * side), weight))
+    return result
+
+
+def register() -> None:
+    """Make the plugin `mistyle_deferred` known to the current variant of Mitsuba."""
+    import mitsuba as mi
+
+    if mi.variant() not in _registered:
+        mi.register_integrator(INTEGRATOR, _integrator_class())
+        _registered.add(mi.variant())
+
+
+def _integrator_class() -> type:
+    """The integrator, as a class of the current variant's base."""
+    import drjit as dr
+    import mitsuba as mi
+
+    class Deferred(mi.SamplingIntegrator):
+        """Sums BSDF times irradiance at the points of `lit` (set before rendering) for the film's only shape."""
+
+        lit: Lit | None = None
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            """Radiance of the film's pixels in order; the ray is not looked at. Needs one sample per pixel."""
+            lit = self.lit
+            if lit is None:
+                raise RuntimeError(f"{INTEGRATOR}: set `lit` before rendering")
+            rows, columns = lit.size
+            if dr.width(ray.d) != rows * columns:
+                raise RuntimeError(f"{INTEGRATOR}: a film of {columns}x{rows} pixels at 1 spp is needed")
+            pixel = dr.arange(mi.UInt32, rows * columns)
+            point = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
+            point.wi = lit.wi
+            point.uv = mi.Point2f((pixel % columns + 0.5) / columns, (pixel // columns + 0.5) / rows)
+            bsdf = scene.shapes()[0].bsdf()
+            terms = list(lit.directional)
+            if lit.ambient is not None:
+                radiance = mi.Color3f(*lit.ambient)
+                terms += [(wo, radiance * weight) for wo, weight in ambient_directions(lit.wi)]
+            total = mi.Color3f(0)
+            for wo, irradiance in terms:
+                total += bsdf.eval(mi.BSDFContext(), point, wo, lit.mask) * irradiance
+            return total, lit.mask, []
+
+    return Deferred
+
+
+def _directions(camera: Camera) -> Float[np.ndarray, "n 3"]:
+    """Unit world directions through the pixel centres, row by row."""
+    xy = (pixel_centres(camera.size).reshape(-1, 2) - np.asarray(camera.centre)) / camera.focal
+    right, down, forward = camera.world_from_cam[:3, :3].T
+    world = xy[:, :1] * right + xy[:, 1:] * down + forward
+    return world / np.sqrt((world * world) @ np.ones((3, 1)))
+
+
+def _points(kind: Any, values: Float[np.ndarray, "n 3"]) -> Any:
+    return kind(np.ascontiguousarray(values.T, np.float32))
+
+
+def _tangent_frame(point: Any, barycentric: Any, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
+    """Interpolated tangent, made perpendicular to the shading normal; bitangent = handedness · (normal x tangent)."""
+    import drjit as dr
+    import mitsuba as mi
+
+    corners = mi.Float(np.ascontiguousarray(tangents, np.float32).ravel())
+    valid = point.is_valid()
+    tangent, hand = mi.Vector3f(0), mi.Float(1)
+    weights = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)
+    for k, weight in enumerate(weights):
+        corner = dr.gather(mi.Vector4f, corners, point.prim_index * 3 + k, valid)
+        tangent += weight * mi.Vector3f(corner.x, corner.y, corner.z)
+        hand = dr.mulsign(mi.Float(1), corner.w)
+    normal = point.sh_frame.n
+    s = tangent - normal * dr.dot(normal, tangent)
+    usable = valid & (dr.squared_norm(s) > 1e-12)
+    s = dr.select(usable, dr.normalize(s), point.sh_frame.s)
+    t = dr.select(usable, dr.cross(normal, s) * hand, point.sh_frame.t)
+    return mi.Frame3f(s, t, normal)

@@ -1,0 +1,67 @@
+"""Which Mitsuba variant draws, and on how many threads. Chosen at run time, never by an import."""
+
+from mistyle.core.errors import EnvironmentMissing
+
+# The first that answers is taken; a GPU needs no LLVM.
+VARIANTS = {"cuda_ad_rgb": "CUDA", "metal_ad_rgb": "Metal", "llvm_ad_rgb": "LLVM"}
+
+# Dr.Jit 1.5 refuses LLVM 14 itself; 15 and 16 end the whole process when the first kernel is compiled.
+OLDEST_LLVM = 17
+
+LLVM_HELP = (
+    "Run `python3 -m mistyle doctor`: it fetches an LLVM that works or prints the command for this system "
+    "(on Debian 12: apt-get install libllvm19 libatomic1; then DRJIT_LIBLLVM_PATH may name the libLLVM file)."
+)
+
+
+def use(variant: str | None = None, threads: int | None = None) -> str:
+    """Make a differentiable RGB variant of Mitsuba current and return its name.
+
+    `variant` None keeps the variant that is current already, or else takes the first of VARIANTS that answers.
+    `threads` sets Dr.Jit's thread count (CPU only; None leaves it): results are bit-identical only at the same count.
+    Cheap to call again; every function of `render/` calls it. Raises EnvironmentMissing when nothing answers.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    current = mi.variant()
+    if variant is None:
+        variant = current if current in VARIANTS else _first_that_answers(mi.variants())
+    elif variant not in VARIANTS:
+        raise EnvironmentMissing(f"Mitsuba variant '{variant}' cannot be used; expected one of {', '.join(VARIANTS)}.")
+    if variant != current:
+        if not _answers(variant, mi.variants()):
+            raise EnvironmentMissing(_missing(variant))
+        mi.set_variant(variant)
+    if threads is not None and threads != dr.thread_count():
+        if threads < 1:
+            raise ValueError(f"threads is {threads}; expected 1 or more")
+        dr.set_thread_count(threads)
+    return variant
+
+
+def _first_that_answers(built: list[str]) -> str:
+    for variant in VARIANTS:
+        if _answers(variant, built):
+            return variant
+    raise EnvironmentMissing(_missing("llvm_ad_rgb"))
+
+
+def _answers(variant: str, built: list[str]) -> bool:
+    import drjit as dr
+
+    backend = getattr(dr.JitBackend, VARIANTS[variant], None)
+    if variant not in built or backend is None or not dr.has_backend(backend):
+        return False
+    return VARIANTS[variant] != "LLVM" or dr.detail.llvm_version()[0] >= OLDEST_LLVM
+
+
+def _missing(variant: str) -> str:
+    import drjit as dr
+
+    if VARIANTS[variant] != "LLVM":
+        return f"Mitsuba's {variant} does not answer on this machine (no device or no driver). Use llvm_ad_rgb instead."
+    if not dr.has_backend(dr.JitBackend.LLVM):
+        return f"No LLVM library that Dr.Jit can load was found, and no GPU answers. {LLVM_HELP}"
+    found = ".".join(str(n) for n in dr.detail.llvm_version())
+    return f"LLVM {found} was found; Dr.Jit needs {OLDEST_LLVM} or newer (older ones abort while compiling). {LLVM_HELP}"

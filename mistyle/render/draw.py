@@ -1,0 +1,184 @@
+"""Drawing: exact surface hits through pixel centres, the views of a job, and pictures for reports."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.camera import Camera, pixel_centres
+from mistyle.core.maps import Maps
+from mistyle.core.mesh import Mesh
+from mistyle.core.view import View
+from mistyle.render import device
+from mistyle.render import scene as scenery
+
+
+@dataclass(frozen=True)
+class Hits:
+    """What the rays through the pixel centres meet first; zero, -1 or infinity where they meet nothing.
+
+    position  world
+    normal    interpolated shading normal, world, unit, without normal map; it belongs to the surface's front and is
+              not turned towards the camera
+    uv        v up, as in `Mesh.corner_uvs` (meant modulo 1)
+    part      texture set of the face
+    face      index into `Mesh.faces`
+    depth     metric z in the camera
+    """
+
+    position: Float[np.ndarray, "h w 3"]
+    normal: Float[np.ndarray, "h w 3"]
+    uv: Float[np.ndarray, "h w 2"]
+    part: Int[np.ndarray, "h w"]
+    face: Int[np.ndarray, "h w"]
+    depth: Float[np.ndarray, "h w"]
+    mask: Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class Tracer:
+    """A mesh ready for tracing; build once, use for any number of cameras."""
+
+    mesh: Mesh
+    scene: Any
+
+
+def tracer(mesh: Mesh) -> Tracer:
+    """Build the ray tracing structure of a mesh (all texture sets in one shape)."""
+    import mitsuba as mi
+
+    device.use()
+    return Tracer(mesh, mi.load_dict({"type": "scene", "object": scenery.mitsuba_mesh(mesh, None)}))
+
+
+def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
+    """One exact ray through each pixel centre of `camera`; a Tracer saves building the structure again."""
+    import drjit as dr
+    import mitsuba as mi
+
+    device.use()
+    traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
+    height, width = camera.size
+    directions, cosines = _directions(camera)
+    ray = mi.Ray3f(mi.Point3f(*camera.position.tolist()), mi.Vector3f(np.ascontiguousarray(directions.T)))
+    hit = traced.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
+    valid = hit.is_valid()
+    face = dr.select(valid, mi.Int32(hit.prim_index), -1)
+    position, normal, uv = hit.p & valid, hit.sh_frame.n & valid, hit.uv
+    v = dr.select(valid, 1 - uv.y, 0)
+    u = dr.select(valid, uv.x, 0)
+    distance = dr.select(valid, hit.t, dr.inf)
+    dr.eval(face, position, normal, u, v, distance)
+
+    def image(*channels) -> np.ndarray:
+        return np.stack([np.array(c) for c in channels], axis=-1).reshape(height, width, -1)
+
+    faces = image(face)[..., 0].astype(np.int32)
+    return Hits(
+        position=image(position.x, position.y, position.z),
+        normal=image(normal.x, normal.y, normal.z),
+        uv=image(u, v),
+        part=np.where(faces >= 0, traced.mesh.part[np.maximum(faces, 0)], -1).astype(np.int32),
+        face=faces,
+        depth=(image(distance)[..., 0] * cosines.reshape(height, width)).astype(np.float32),
+        mask=faces >= 0,
+    )
+
+
+def _directions(camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Unit world directions through the pixel centres, row by row, and their cosine with the optical axis."""
+    px = pixel_centres(camera.size).reshape(-1, 2)
+    xy = (px - np.asarray(camera.centre)) / camera.focal
+    cosines = 1 / np.sqrt(1 + (xy**2).sum(axis=1))
+    local = np.concatenate([xy * cosines[:, None], cosines[:, None]], axis=1)
+    return (local @ camera.world_from_cam[:3, :3].T).astype(np.float32), cosines.astype(np.float32)
+
+
+def draw_views(
+    mesh: Mesh,
+    maps: Sequence[Maps] | None,
+    cameras: Sequence[Camera],
+    template: str | Path = "paper_views",
+    spp: int = 8,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda done: None,
+    *,
+    hdri: Path | None = None,
+) -> list[View]:
+    """Render the mesh with its maps (None: neutral grey) from every camera (paper 4.1.1).
+
+    `rgb` is linear and premultiplied by `coverage`, the share of the `spp` samples of a pixel that met the object;
+    the environment is not seen. Depth, normal, uv, part and mask belong to the ray through the pixel centre. The same
+    seed and thread count give the same bytes. `spp` is rounded up to a power of two.
+    """
+    traced = tracer(mesh)
+    pictures = _pictures(mesh, maps, cameras, template, spp, seed, hdri=hdri, backdrop=False)
+    views = []
+    for k, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
+        hits = gbuffer(traced, camera)
+        views.append(
+            View(
+                camera=camera,
+                rgb=np.ascontiguousarray(picture[..., :3]),
+                depth=hits.depth,
+                normal=hits.normal,
+                uv=hits.uv,
+                part=hits.part,
+                mask=hits.mask,
+                coverage=np.ascontiguousarray(picture[..., 3]),
+            )
+        )
+        progress((k + 1) / len(cameras))
+    return views
+
+
+def picture(
+    mesh: Mesh,
+    maps: Sequence[Maps] | None,
+    camera: Camera,
+    template: str | Path = "studio",
+    spp: int = 64,
+    seed: int = 0,
+    *,
+    hdri: Path | None = None,
+    backdrop: bool = True,
+) -> Float[np.ndarray, "h w 4"]:
+    """One picture for a report: linear rgb (premultiplied) and alpha; with a backdrop alpha is 1 nearly everywhere."""
+    return next(iter(_pictures(mesh, maps, [camera], template, spp, seed, hdri=hdri, backdrop=backdrop)))
+
+
+def pictures(
+    mesh: Mesh,
+    maps: Sequence[Maps] | None,
+    cameras: Sequence[Camera],
+    template: str | Path = "studio",
+    spp: int = 64,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda done: None,
+    *,
+    hdri: Path | None = None,
+    backdrop: bool = True,
+) -> list[Float[np.ndarray, "h w 4"]]:
+    """`picture` for several cameras; the object and its textures are loaded once."""
+    result = []
+    for image in _pictures(mesh, maps, cameras, template, spp, seed, hdri=hdri, backdrop=backdrop):
+        result.append(image)
+        progress(len(result) / len(cameras))
+    return result
+
+
+def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
+    """Render camera after camera; the object is loaded once, the template around it is placed anew for each."""
+    import mitsuba as mi
+
+    device.use()
+    shapes = scenery.object_shapes(mesh, maps)
+    for camera in cameras:
+        described = scenery.scene_dict(
+            mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes
+        )
+        scene = mi.load_dict(described, optimize=False)
+        yield np.array(mi.render(scene, spp=scenery.samples(spp), seed=seed), dtype=np.float32)

@@ -1,0 +1,270 @@
+"""Mesh + maps + camera + lights → a Mitsuba scene dictionary. Every plugin and parameter name of Mitsuba lives here.
+
+A template is a Mitsuba scene file with a slot for the object: a shape whose id is "object". `scene_dict` takes the
+template's integrator, emitters and other shapes and puts one shape per texture set, each with a `principled` BSDF
+and its texture parameters, in place of the slot. The object is in the working space (bounding sphere of radius 1
+about the origin, Y up), whatever transform the slot's own shape has. The same works for a user's scene file.
+
+What a template may ask for besides:
+- an emitter whose id starts with "camera_" turns with the camera (its place in the file belongs to the file's sensor);
+- `<default name="turn" .../>`: the parameter $turn receives the camera's heading, degrees about +Y, 0 looking along -Z;
+- `<default name="floor" .../>`: $floor receives the object's lowest y; shapes whose id starts with "floor" are left
+  out for cameras below it and where no backdrop is wanted;
+- `<default name="hdri" .../>`: $hdri receives the environment map that the caller names.
+"""
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
+from mistyle.core.errors import InputRefused
+from mistyle.core.maps import Maps, flat_maps
+from mistyle.core.mesh import Mesh, weld
+from mistyle.core.paths import scenes
+from mistyle.render import device
+
+TEMPLATES = ("paper_views", "phase1_directional", "phase2_ambient", "studio", "hdri")
+
+# `mi.traverse` names of the textures that an optimiser moves, for texture set {p}.
+PARAMETERS = {
+    "albedo": "part{p}.bsdf.brdf_0.nested_bsdf.base_color.data",
+    "normal": "part{p}.bsdf.brdf_0.normalmap.data",
+    "roughness": "part{p}.bsdf.brdf_0.nested_bsdf.roughness.data",
+    "metallic": "part{p}.bsdf.brdf_0.nested_bsdf.metallic.data",
+}
+
+NEUTRAL_GREY = 0.5
+
+
+def parameters(part: int) -> dict[str, str]:
+    """The traverse names of the four maps of texture set `part`: albedo, normal (encoded 0..1), roughness, metallic."""
+    return {name: pattern.format(p=part) for name, pattern in PARAMETERS.items()}
+
+
+def mitsuba_mesh(mesh: Mesh, part: int | None, bsdf: Any = None, name: str = "object") -> Any:
+    """A Mitsuba mesh of one texture set (None: of all faces), faces in the order of `Mesh.faces`.
+
+    v is flipped here and nowhere else: Mitsuba's texture row 0 is v = 0, ours is v = 1. `bsdf` is a loaded BSDF.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    device.use()
+    welded = weld(mesh, part)
+    props = mi.Properties()
+    if bsdf is not None:
+        props["mesh_bsdf"] = bsdf
+    shape = mi.Mesh(
+        name, len(welded.positions), len(welded.faces), props=props, has_vertex_normals=True, has_vertex_texcoords=True
+    )
+    uvs = np.stack([welded.uvs[:, 0], 1 - welded.uvs[:, 1]], axis=1)
+    values = mi.traverse(shape)
+    # One update for all: an update that names only the positions recomputes the normals.
+    values["vertex_positions"] = mi.Float(np.ascontiguousarray(welded.positions.ravel(), np.float32))
+    values["vertex_normals"] = mi.Float(np.ascontiguousarray(welded.normals.ravel(), np.float32))
+    values["vertex_texcoords"] = mi.Float(np.ascontiguousarray(uvs.ravel(), np.float32))
+    values["faces"] = mi.UInt32(np.ascontiguousarray(welded.faces.ravel(), np.uint32))
+    values.update()
+    dr.eval(values["vertex_positions"], values["vertex_normals"], values["vertex_texcoords"])
+    return shape
+
+
+def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
+    """A float texture (so that it can be differentiated; 8-bit ones cannot), never colour-converted.
+
+    It repeats, as `Mesh.corner_uvs` are meant modulo 1: an island may cross the border of the unit square.
+    """
+    import mitsuba as mi
+
+    data = mi.TensorXf(np.ascontiguousarray(values, np.float32))
+    return {"type": "bitmap", "data": data, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
+
+
+def bsdf_dict(maps: Maps) -> dict:
+    """twosided(normalmap(principled)) with four textures; the normal texture holds (n + 1) / 2.
+
+    Shadowing correction and flipping of perturbed normals are off, as glTF viewers have neither. Dielectric index 1.5.
+    """
+    principled = {
+        "type": "principled",
+        "base_color": texture_dict(maps.albedo),
+        "roughness": texture_dict(maps.roughness[..., None]),
+        "metallic": texture_dict(maps.metallic[..., None]),
+        "specular": 0.5,
+    }
+    normal = {
+        "type": "normalmap",
+        "normalmap": texture_dict(maps.normal * 0.5 + 0.5),
+        "flip_invalid_normals": False,
+        "use_shadowing_function": False,
+        "bsdf": principled,
+    }
+    return {"type": "twosided", "bsdf": normal}
+
+
+def object_shapes(mesh: Mesh, maps: Sequence[Maps] | None) -> dict[str, Any]:
+    """One loaded shape per texture set, by name; `maps` None means neutral grey. Reusable in many scenes."""
+    import mitsuba as mi
+
+    device.use()
+    chosen = list(maps) if maps is not None else [flat_maps(2, NEUTRAL_GREY)] * len(mesh.parts)
+    if len(chosen) != len(mesh.parts):
+        raise ValueError(f"{len(chosen)} maps came for {len(mesh.parts)} texture sets ({', '.join(mesh.parts)})")
+    shapes = {}
+    for p in range(len(mesh.parts)):
+        if (mesh.part == p).any():
+            shapes[f"part{p}"] = mitsuba_mesh(mesh, p, mi.load_dict(bsdf_dict(chosen[p])), f"part{p}")
+    return shapes
+
+
+def samples(spp: int) -> int:
+    """The power of two at or above `spp`: then no two threads share a pixel, and its sum is the same in every run."""
+    if spp < 1:
+        raise ValueError(f"spp is {spp}; expected 1 or more")
+    return 1 << (spp - 1).bit_length()
+
+
+def sensor_dict(camera: Camera, spp: int = 8, seed: int = 0) -> dict:
+    """A perspective sensor that sees exactly what `core/camera.py` describes; box filter: pixels are independent.
+
+    Correlated multi-jittered samples: at 16 per pixel the error of the views is that of 44 independent ones. `spp`
+    is rounded up by `samples`; give `mi.render` the same number.
+    """
+    import mitsuba as mi
+
+    height, width = camera.size
+    return {
+        "type": "perspective",
+        "fov_axis": "x",
+        "fov": camera.fov,
+        "near_clip": 0.01,
+        "far_clip": 1e4,
+        "principal_point_offset_x": camera.centre[0] / width - 0.5,
+        "principal_point_offset_y": camera.centre[1] / height - 0.5,
+        "to_world": mi.ScalarTransform4f(camera.world_from_cam @ MITSUBA_FROM_OPENCV),
+        "sampler": {"type": "multijitter", "sample_count": samples(spp), "seed": seed},
+        "film": {
+            "type": "hdrfilm",
+            "width": width,
+            "height": height,
+            "pixel_format": "rgba",
+            "component_format": "float32",
+            "rfilter": {"type": "box"},
+        },
+    }
+
+
+def template_path(template: str | Path) -> Path:
+    """The scene file of a template's name, or the user's own file."""
+    if isinstance(template, str) and template in TEMPLATES:
+        return scenes() / f"{template}.xml"
+    path = Path(template)
+    if not path.is_file():
+        raise InputRefused(f"no scene '{template}': expected one of {', '.join(TEMPLATES)} or a Mitsuba scene file.")
+    return path
+
+
+def read_template(template: str | Path, *, hdri: Path | None = None, **wanted: float) -> Any:
+    """Load a template; of `hdri` and `wanted` (turn, floor) only what the file declares as `<default>` is passed on.
+
+    Raises InputRefused when the file cannot be read as a scene, has no shape "object", or does not take an `hdri`.
+    """
+    import mitsuba as mi
+
+    device.use()
+    path = template_path(template)
+    declared = set(re.findall(r'<default\s+name="(\w+)"', path.read_text(encoding="utf-8", errors="replace")))
+    given = {name: repr(float(value)) for name, value in wanted.items() if name in declared}
+    if hdri is not None:
+        if "hdri" not in declared:
+            raise InputRefused(f'{path}: takes no environment map; it needs <default name="hdri" value="..."/>.')
+        given["hdri"] = str(hdri.resolve())
+    try:
+        # Merging meshes, an optimisation of the loader, would lose their ids.
+        scene = mi.load_file(str(path), optimize=False, **given)
+    except RuntimeError as error:
+        raise InputRefused(f"{path}: Mitsuba cannot load this scene. {error}") from error
+    if not isinstance(scene, mi.Scene) or all(shape.id() != "object" for shape in scene.shapes()):
+        ids = ", ".join(shape.id() for shape in scene.shapes()) if isinstance(scene, mi.Scene) else "not a scene"
+        raise InputRefused(f'{path}: needs a shape with id="object", the slot for the mesh. Found: {ids or "no shapes"}.')
+    return scene
+
+
+def scene_dict(
+    mesh: Mesh,
+    maps: Sequence[Maps] | None,
+    camera: Camera | None = None,
+    template: str | Path = "paper_views",
+    *,
+    spp: int = 8,
+    seed: int = 0,
+    hdri: Path | None = None,
+    backdrop: bool = True,
+    integrator: dict | None = None,
+    shapes: dict[str, Any] | None = None,
+) -> dict:
+    """The scene as a dictionary for `mi.load_dict`, with a sensor when a camera is given.
+
+    `maps` None: neutral grey. `shapes` (of `object_shapes`) saves building the object again; mesh and maps are then
+    not looked at, except for the floor's height. `integrator` replaces the template's. Emitters with ids "camera_…"
+    are placed for `camera` (without one they keep the file's places).
+    """
+    import mitsuba as mi
+
+    device.use()
+    floor = float(mesh.positions[:, 1].min()) if len(mesh.positions) else -1.0
+    heading = _heading(camera) if camera is not None else 0.0
+    loaded = read_template(template, hdri=hdri, turn=heading, floor=floor)
+    result: dict[str, Any] = {"type": "scene", "integrator": integrator or loaded.integrator()}
+    below = camera is not None and camera.position[1] < floor
+    for k, shape in enumerate(loaded.shapes()):
+        if shape.id() == "object" or (shape.id().startswith("floor") and (below or not backdrop)):
+            continue
+        result[_key(shape.id(), f"shape{k}")] = shape
+    for k, emitter in enumerate(loaded.emitters()):
+        # An emitter that belongs to a shape comes with it.
+        if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
+            result[_key(emitter.id(), f"emitter{k}")] = emitter
+    if camera is not None:
+        sensors = loaded.sensors()
+        for key, to_world in camera_emitters(result, sensors[0] if sensors else None, camera).items():
+            values = mi.traverse(result[key])
+            values["to_world"] = to_world
+            values.update()
+        result["sensor"] = sensor_dict(camera, spp, seed)
+    result.update(shapes if shapes is not None else object_shapes(mesh, maps))
+    return result
+
+
+def camera_emitters(emitters: dict[str, Any], sensor: Any, camera: Camera) -> dict[str, Any]:
+    """Where the emitters with ids "camera_…" go for `camera`: their transforms, moved rigidly from the file's sensor."""
+    import mitsuba as mi
+
+    result: dict[str, Any] = {}
+    if sensor is None:
+        return result
+    old = np.asarray(mi.traverse(sensor)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    moved = camera.world_from_cam @ MITSUBA_FROM_OPENCV @ np.linalg.inv(old)
+    for key, emitter in emitters.items():
+        if key.startswith("camera_"):
+            here = np.asarray(mi.traverse(emitter)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+            result[key] = mi.AffineTransform4f(moved @ here)
+    return result
+
+
+def _heading(camera: Camera) -> float:
+    """Degrees about +Y from a camera on the +Z axis; for cameras looking straight up or down their up vector decides."""
+    x, z = camera.position[0], camera.position[2]
+    if np.hypot(x, z) < 1e-6:
+        x, z = camera.world_from_cam[0, 1], camera.world_from_cam[2, 1]
+    return float(np.degrees(np.arctan2(x, z)))
+
+
+def _key(name: str, otherwise: str) -> str:
+    """A usable dictionary key: ids that Mitsuba made up start with an underscore."""
+    return name if re.fullmatch(r"[A-Za-z]\w*", name) else otherwise

@@ -1,0 +1,180 @@
+"""Where torch's gradients meet Mitsuba's: maps (torch) ⇄ image (torch), through `mi.render` and one `dr.wrap`.
+
+Torch owns the maps of every texture set, as one table of texels. A picture is made in two steps, each with a
+gradient whose bytes are the same in every run at any thread count:
+
+1. `taps` finds, once per traced surface, the four texels and weights of every pixel's bilinear fetch; `fetch` is a
+   sparse matrix product, its gradient the product with the transpose, summed in a fixed order.
+2. A `Shader` renders the pixels' own materials: textures as large as the film, one texel per pixel, on the BSDF of
+   `render/scene.py`, by the integrator of `render/deferred.py`.
+
+Mitsuba's own gradient of a shared texture adds up with atomics, in another order each run.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Float, Int
+
+from mistyle.core.maps import flat_maps
+from mistyle.render import deferred, device
+from mistyle.render import scene as scenery
+
+CHANNELS = {"albedo": 3, "normal": 3, "roughness": 1, "metallic": 1}
+
+
+@dataclass(frozen=True)
+class Taps:
+    """A bilinear fetch by n pixels from a table of texels (all texture sets one after the other, row by row).
+
+    `texels` (sorted, each once) are the rows of the table that are touched at all; `matrix` (n, texels) holds the
+    weights, at most four per row, none for pixels off the mesh.
+    """
+
+    texels: Int[np.ndarray, " t"]
+    matrix: Any
+
+
+def taps(surface: deferred.Surface, sizes: Sequence[tuple[int, int]]) -> Taps:
+    """The bilinear fetch of every pixel of `surface` from texture sets of `sizes` (rows, columns).
+
+    Texel centres at +0.5, row 0 is v = 1, textures repeat: exactly what Mitsuba's bitmap texture does.
+    """
+    offsets = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in sizes])])
+    on = np.flatnonzero(surface.mask)
+    part = surface.part[on]
+    rows, columns = np.asarray(sizes, np.int64)[part].T
+    x = surface.uv[on, 0].astype(np.float64) * columns - 0.5
+    y = (1 - surface.uv[on, 1].astype(np.float64)) * rows - 0.5
+    x0, y0 = np.floor(x), np.floor(y)
+    fx, fy = x - x0, y - y0
+    left, top = x0.astype(np.int64) % columns, y0.astype(np.int64) % rows
+    right, bottom = (left + 1) % columns, (top + 1) % rows
+    start = offsets[part]
+    index = np.stack([start + r * columns + c for r in (top, bottom) for c in (left, right)], axis=1)
+    weight = np.stack([a * b for a in (1 - fy, fy) for b in (1 - fx, fx)], axis=1).astype(np.float32)
+    touched = np.zeros(offsets[-1], bool)
+    touched[index] = True
+    texels = np.flatnonzero(touched)
+    local = np.zeros(offsets[-1], np.int32)
+    local[texels] = np.arange(len(texels), dtype=np.int32)
+    pointer = np.concatenate([[0], np.cumsum(np.where(surface.mask, 4, 0))])
+    shape = (len(surface.mask), len(texels))
+    return Taps(texels, sparse.csr_matrix((weight.ravel(), local[index].ravel(), pointer), shape=shape))
+
+
+def fetch(values: Any, where: Taps) -> Any:
+    """Texel values (t, c), in the order of `where.texels`, to pixel values (n, c), torch to torch with a gradient."""
+    return _sparse_product().apply(values, where.matrix)
+
+
+class Shader:
+    """A Mitsuba scene that shades a film of `size` pixels; reused, because building one costs more than rendering it.
+
+    One picture at a time: its gradient must be taken before the next call.
+    """
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        device.use()
+        deferred.register()
+        bsdf = scenery.bsdf_dict(flat_maps(2))
+        _each_texture(bsdf, {"filter_type": "nearest"})
+        film = {"type": "hdrfilm", "width": size[1], "height": size[0], "pixel_format": "rgb"}
+        film |= {"component_format": "float32", "rfilter": {"type": "box"}}
+        self.size = size
+        self.scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": deferred.INTEGRATOR},
+                "sensor": {"type": "perspective", "film": film, "sampler": {"type": "independent", "sample_count": 1}},
+                "part0": {"type": "rectangle", "bsdf": bsdf},
+            }
+        )
+        self.integrator = self.scene.integrator()
+        self.names = scenery.parameters(0)
+        self.parameters = mi.traverse(self.scene)
+        self.parameters.keep(list(self.names.values()))
+        self._render = dr.wrap(source="torch", target="drjit")(self._draw)
+
+    def __call__(self, lit: deferred.Lit, materials: Mapping[str, Any]) -> Any:
+        """Linear radiance (rows, columns, 3) of the lit film, a torch tensor with a gradient.
+
+        `materials` holds a tensor (n, c) per name of CHANNELS: albedo and metallic linear 0..1, normal a tangent-space
+        vector of any length, roughness. Gradients flow to those that ask for them.
+        """
+        import mitsuba as mi
+
+        if lit.size != self.size:
+            raise ValueError(f"the film has {self.size} pixels, the lit surface {lit.size}")
+        self.integrator.lit = lit
+        moving = {}
+        for name, channels in CHANNELS.items():
+            image = materials[name].reshape(*self.size, channels)
+            if name == "normal":
+                image = image * 0.5 + 0.5
+            if image.requires_grad:
+                # A fresh tensor: Dr.Jit works on torch's memory, and does not recognise nn.Parameter.
+                moving[name] = image.clone()
+            else:
+                self.parameters[self.names[name]] = mi.TensorXf(image.detach().contiguous().numpy())
+        if not moving:
+            return self._still()
+        # Dr.Jit's wrapper makes every float argument ask for gradients, so only those that move are arguments.
+        return self._render(moving).clone()
+
+    def _draw(self, moving: dict[str, Any]) -> Any:
+        import mitsuba as mi
+
+        for name, values in moving.items():
+            self.parameters[self.names[name]] = mi.TensorXf(values)
+        self.parameters.update()
+        return mi.render(self.scene, self.parameters, spp=1, seed=0)
+
+    def _still(self) -> Any:
+        import mitsuba as mi
+        import torch
+
+        self.parameters.update()
+        return torch.from_numpy(np.array(mi.render(self.scene, spp=1, seed=0)))
+
+
+def bilinear(maps: Float[np.ndarray, "t c"], where: Taps) -> Float[np.ndarray, "n c"]:
+    """`fetch` without gradient, from the whole table."""
+    return where.matrix @ maps[where.texels]
+
+
+def _each_texture(description: Any, changes: Mapping[str, Any]) -> None:
+    if isinstance(description, dict):
+        if description.get("type") == "bitmap":
+            description.update(changes)
+        for value in description.values():
+            _each_texture(value, changes)
+
+
+def _sparse_product() -> Any:
+    """torch's Function for `matrix @ values`; built at the first use, because importing torch takes seconds."""
+    global _product
+    if _product is None:
+        import torch
+
+        class SparseProduct(torch.autograd.Function):
+            @staticmethod
+            def forward(ctx: Any, values: Any, matrix: Any) -> Any:
+                ctx.matrix = matrix
+                return torch.from_numpy(matrix @ values.detach().numpy())
+
+            @staticmethod
+            def backward(ctx: Any, *grads: Any) -> Any:
+                return torch.from_numpy(ctx.matrix.T @ grads[0].numpy()), None
+
+        _product = SparseProduct
+    return _product
+
+
+_product: Any = None

@@ -1,0 +1,349 @@
+"""The command line. Nothing heavy is imported before a command runs, so that --help answers at once.
+
+Exit codes: 0 done, 1 a job failed, 2 usage or settings, 3 input refused, 4 environment missing, 5 a quality gate
+failed, 75 stopped and resumable, 130 interrupted.
+"""
+
+import argparse
+import json
+import signal
+import sys
+import textwrap
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from mistyle import __version__
+from mistyle.core.errors import MistyleError, Stopped, UsageError
+
+Command = Callable[[argparse.Namespace], int]
+
+
+def _examples(text: str) -> dict[str, Any]:
+    return {
+        "epilog": "examples:\n" + textwrap.indent(textwrap.dedent(text).strip(), "  "),
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
+
+
+def parser() -> argparse.ArgumentParser:
+    """Every verb with its options and examples."""
+    top = argparse.ArgumentParser(
+        prog="mistyle",
+        description="A mesh and one style picture in; the same mesh with stylized, physically based textures out.",
+        **_examples(
+            """
+            python3 -m mistyle demo                                 see it work: mesh, style and report made here
+            mistyle stylize bunny.obj starry_night.jpg -o out/      the main job
+            mistyle stylize chair.glb wave.jpg -o out/ --preset draft
+            mistyle render bunny.obj -o views/                      the 16 views of the paper, with depth and normals
+            mistyle bake bunny.obj views/ -o baked/                 edited views back onto the texture
+            mistyle doctor                                          what this machine has, what is missing
+            """
+        ),
+    )
+    top.add_argument("--version", action="version", version=f"mistyle {__version__}")
+    verbs = top.add_subparsers(dest="verb", metavar="COMMAND", required=True)
+    _add_stylize(verbs)
+    _add_demo(verbs)
+    _add_render(verbs)
+    _add_bake(verbs)
+    doctor = verbs.add_parser(
+        "doctor", help="what was found on this machine, what is missing, and the command that fixes it"
+    )
+    doctor.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    doctor.set_defaults(command=_doctor)
+    test = verbs.add_parser("test", help="set everything up and run the whole test suite (arguments go to pytest)")
+    test.add_argument("arguments", nargs="*", help="passed on to pytest")
+    test.set_defaults(command=_test)
+    return top
+
+
+def _add_job_options(verb: argparse.ArgumentParser) -> None:
+    """Options that every job has; None means: not said here."""
+    verb.add_argument(
+        "--preset",
+        choices=["draft", "standard", "paper"],
+        help="draft: about a minute; standard (default); paper: the paper's own counts",
+    )
+    verb.add_argument(
+        "--config", type=Path, metavar="JOB.toml", help="settings from a file, as --print-config prints them"
+    )
+    verb.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="KEY=VALUE",
+        help="any setting by its dotted name, e.g. --set fit.refine=off",
+    )
+    verb.add_argument("--seed", type=int, help="every random choice follows from it (default 0)")
+    verb.add_argument("--threads", type=int, help="threads to use; the result depends on it (default: all cores)")
+    verb.add_argument("--json", action="store_true", help="one JSON object on stdout, logs on stderr")
+    verb.add_argument("--print-config", action="store_true", help="print every setting as TOML and stop")
+
+
+def _add_mesh_options(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--uv",
+        choices=["auto", "keep", "new"],
+        help="authored UVs: keep, replace, or (auto) replace only where unusable",
+    )
+    verb.add_argument("--up", choices=["y", "z"], help="the axis of the mesh file that points up (default y)")
+
+
+def _add_view_options(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--rig", help="paper (16 views), turntable, or a camera.json / transforms.json")
+    verb.add_argument("--resolution", type=int, metavar="N", help="pixels along each side of a view")
+    verb.add_argument("--spp", type=int, metavar="N", help="samples per pixel of the rendered views")
+    verb.add_argument(
+        "--scene", type=Path, help="a Mitsuba scene whose shape 'object' gives way to the mesh (trusted like code)"
+    )
+    verb.add_argument(
+        "--paper-files", action="store_true", default=None, help="also write 8-bit depth maps and Canny edges"
+    )
+
+
+def _add_style_options(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--name", help="name of the asset (default MESH_STYLE)")
+    verb.add_argument("--atlas", type=int, metavar="N", help="texture size")
+    verb.add_argument(
+        "--samples", type=int, metavar="N", help="surface samples of the stylizer: more means finer strokes"
+    )
+    verb.add_argument(
+        "--stroke-scale", type=float, metavar="X", help="size of the strokes on the surface, 1 is the default"
+    )
+    verb.add_argument(
+        "--refine", choices=["off", "normal-roughness", "all"], help="which maps the differentiable fit may change"
+    )
+    verb.add_argument("--metallic", choices=["keep", "zero", "fit"], help="what becomes of the asset's own metalness")
+    verb.add_argument(
+        "--vgg", type=Path, metavar="FILE", help="VGG-19 weights (.safetensors or .pth) for the style loss"
+    )
+    verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
+    verb.add_argument("--dry-run", action="store_true", help="print the plan with estimated time and disk, and stop")
+
+
+def _add_stylize(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "stylize",
+        help="mesh + style picture -> stylized asset, textures and report",
+        **_examples(
+            """
+            mistyle stylize bunny.obj starry_night.jpg -o out/
+            mistyle stylize chair.glb great_wave.jpg -o out/ --preset draft --atlas 1024
+            mistyle stylize helmet.glb woodcut.jpg -o out/ --uv keep --metallic keep --refine normal-roughness
+            mistyle stylize bunny.obj starry_night.jpg -o out/ --from fit --set fit.iterations2=100
+            mistyle stylize --preset paper --print-config > job.toml
+            """
+        ),
+    )
+    verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help=".obj .ply .stl .off .glb .gltf")
+    verb.add_argument("style", type=Path, nargs="?", metavar="STYLE", help="any picture")
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; the same command again goes on there")
+    _add_job_options(verb)
+    _add_mesh_options(verb)
+    _add_view_options(verb)
+    _add_style_options(verb)
+    verb.set_defaults(command=_stylize)
+
+
+def _add_demo(verbs: Any) -> None:
+    verb = verbs.add_parser("demo", help="run the main job on a mesh and a painting that come with mistyle")
+    verb.add_argument("-o", "--out", type=Path, default=Path("mistyle-demo"), help="run folder (default mistyle-demo)")
+    _add_job_options(verb)
+    _add_mesh_options(verb)
+    _add_view_options(verb)
+    _add_style_options(verb)
+    verb.set_defaults(command=_demo)
+
+
+def _add_render(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "render",
+        help="render a mesh from a rig of cameras: EXR layers, PNG, camera and light files",
+        **_examples(
+            """
+            mistyle render bunny.obj -o views/
+            mistyle render bunny.obj -o turn/ --rig turntable --resolution 512 --spp 64
+            mistyle render chair.glb -o views/ --rig transforms.json --paper-files
+            """
+        ),
+    )
+    verb.add_argument("mesh", type=Path, metavar="MESH")
+    verb.add_argument("-o", "--out", type=Path, required=True, metavar="DIR")
+    _add_job_options(verb)
+    _add_mesh_options(verb)
+    _add_view_options(verb)
+    verb.set_defaults(command=_render)
+
+
+def _add_bake(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "bake",
+        help="project pictures of known cameras onto the mesh's texture",
+        **_examples(
+            """
+            mistyle bake bunny.obj views/ -o baked/
+            mistyle bake bunny.obj edited_views/ -o baked/ --atlas 4096
+            """
+        ),
+    )
+    verb.add_argument("mesh", type=Path, metavar="MESH")
+    verb.add_argument("views", type=Path, metavar="VIEWS_DIR", help="camera.json and one picture per view")
+    verb.add_argument("-o", "--out", type=Path, required=True, metavar="OUT")
+    verb.add_argument("--atlas", type=int, metavar="N", help="texture size")
+    verb.add_argument("--name", help="name of the asset (default: the mesh's)")
+    _add_job_options(verb)
+    _add_mesh_options(verb)
+    verb.set_defaults(command=_bake)
+
+
+# Option of the command line -> dotted setting.
+OPTIONS = {
+    "seed": "seed",
+    "threads": "threads",
+    "uv": "read.uv",
+    "up": "read.up",
+    "resolution": "rig.resolution",
+    "spp": "draw.spp",
+    "scene": "draw.scene",
+    "paper_files": "draw.paper_files",
+    "atlas": "atlas.size",
+    "samples": "surface.samples",
+    "stroke_scale": "surface.style_scale",
+    "refine": "fit.refine",
+    "metallic": "fit.metallic",
+    "vgg": "fit.vgg",
+}
+
+
+def _settings(options: argparse.Namespace, preset: str | None = None) -> Any:
+    """The resolved settings of a command."""
+    from mistyle.run.settings import assignments, merge, resolve
+
+    said: dict[str, Any] = {}
+    for option, key in OPTIONS.items():
+        value = getattr(options, option, None)
+        if value is not None:
+            leaf: Any = str(value) if isinstance(value, Path) else value
+            for name in reversed(key.split(".")):
+                leaf = {name: leaf}
+            said = merge(said, leaf)
+    said = merge(said, _rig(options))
+    said = merge(said, assignments(options.set, "--set"))
+    return resolve(options.preset or preset, options.config, said)
+
+
+def _rig(options: argparse.Namespace) -> dict[str, Any]:
+    rig = getattr(options, "rig", None)
+    if rig is None:
+        return {}
+    if rig in ("paper", "turntable"):
+        return {"rig": {"kind": rig}}
+    return {"rig": {"kind": "file", "file": rig}}
+
+
+def _stylize(options: argparse.Namespace) -> int:
+    if options.print_config:
+        return _print_config(options)
+    missing = [name for name in ("mesh", "style", "out") if getattr(options, name) is None]
+    if missing:
+        raise UsageError(
+            f"stylize needs {', '.join('-o OUT' if m == 'out' else m.upper() for m in missing)}; see mistyle stylize --help"
+        )
+    return _run_job(options, options.mesh, options.style, None)
+
+
+def _demo(options: argparse.Namespace) -> int:
+    from mistyle.core.paths import scenes
+
+    if options.print_config:
+        return _print_config(options)
+    return _run_job(options, scenes() / "demo.obj", scenes() / "demo_style.png", "draft", options.name or "demo")
+
+
+def _print_config(options: argparse.Namespace) -> int:
+    from mistyle.run.settings import as_toml
+
+    sys.stdout.write(as_toml(_settings(options)))
+    return 0
+
+
+def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
+    settings = _settings(options, preset)
+    name = name or options.name or f"{mesh.stem}_{style.stem}"
+    from mistyle.run.plan import describe_plan, plan
+    from mistyle.run.pipeline import stylize
+    from mistyle.run.progress import Progress
+    from mistyle.run.stages import Job
+
+    job = Job(mesh, style, options.out, settings, name, options.redo_from)
+    if options.dry_run:
+        estimate = plan(job)
+        print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
+        return 0
+    summary = stylize(job, Progress())
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        for label in ("asset", "textures", "report", "views", "stylized"):
+            print(f"{label:<9} {summary[label]}", file=sys.stderr)
+    return 0
+
+
+def _render(options: argparse.Namespace) -> int:
+    if options.print_config:
+        return _print_config(options)
+    settings = _settings(options)
+    from mistyle.run.pipeline import render_views
+    from mistyle.run.progress import Progress
+
+    written = render_views(options.mesh, options.out, settings, Progress())
+    print(json.dumps({"views": [str(p) for p in written]}) if options.json else f"views     {options.out}")
+    return 0
+
+
+def _bake(options: argparse.Namespace) -> int:
+    if options.print_config:
+        return _print_config(options)
+    settings = _settings(options)
+    from mistyle.run.pipeline import bake_views
+    from mistyle.run.progress import Progress
+
+    summary = bake_views(
+        options.mesh, options.views, options.out, settings, options.name or options.mesh.stem, Progress()
+    )
+    print(json.dumps(summary) if options.json else f"asset     {summary['asset']}")
+    return 0
+
+
+def _doctor(options: argparse.Namespace) -> int:
+    from mistyle.run import doctor
+
+    return doctor.main(json=options.json)
+
+
+def _test(options: argparse.Namespace) -> int:
+    raise UsageError("run the tests as `python3 -m mistyle test` from a clone of the repository")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command and return its exit code; every expected failure becomes one sentence on stderr."""
+    options = parser().parse_args(arguments)
+
+    def stop(signum: int, frame: Any) -> None:
+        raise Stopped("stopped on request; the same command again goes on from the last finished stage")
+
+    signal.signal(signal.SIGTERM, stop)
+    try:
+        return options.command(options)
+    except MistyleError as error:
+        if getattr(options, "json", False):
+            print(json.dumps({"error": str(error), "exit_code": error.exit_code}))
+        print(f"mistyle: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("mistyle: interrupted; the same command again goes on from the last finished stage", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        return 1

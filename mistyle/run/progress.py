@@ -1,0 +1,71 @@
+"""What a person sees while a job runs: bars with the time left on a terminal, plain lines elsewhere, always on stderr."""
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+Report = Callable[[float], None]
+
+
+class Progress:
+    """Names the stage that runs and times it; `seconds` holds the finished ones."""
+
+    def __init__(self, quiet: bool = False) -> None:
+        self.quiet = quiet
+        self.seconds: dict[str, float] = {}
+        self.reused: list[str] = []
+
+    def say(self, text: str) -> None:
+        if not self.quiet:
+            print(text, file=sys.stderr, flush=True)
+
+    @contextmanager
+    def stage(self, name: str, what: str) -> Iterator[Report]:
+        """Runs a stage: yields the function that takes the share done, 0..1."""
+        start = time.perf_counter()
+        if sys.stderr.isatty() and not self.quiet:
+            with _bar(what) as report:
+                yield report
+        else:
+            self.say(f"{what} ...")
+            yield _lines(what, self.say)
+        self.seconds[name] = time.perf_counter() - start
+        self.say(f"{what}: {self.seconds[name]:.1f} s")
+
+    def skip(self, name: str, what: str) -> None:
+        """Says that a stage is taken over from an earlier run."""
+        self.reused.append(name)
+        self.seconds[name] = 0.0
+        self.say(f"{what}: done before, taken over")
+
+
+@contextmanager
+def _bar(what: str) -> Iterator[Report]:
+    from rich.console import Console
+    from rich.progress import BarColumn, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = [
+        TextColumn("{task.description:<42}"),
+        BarColumn(),
+        TimeElapsedColumn(),
+        TimeRemainingColumn(compact=True),
+    ]
+    with Bars(*columns, console=Console(stderr=True), transient=True) as bars:
+        task = bars.add_task(what, total=1.0)
+        yield lambda done: bars.update(task, completed=min(max(done, 0.0), 1.0))
+
+
+def _lines(what: str, say: Callable[[str], None], every: float = 20.0) -> Report:
+    """A line when a stage is still running after every so many seconds: logs of a farm stay short."""
+    start = last = time.perf_counter()
+
+    def report(done: float) -> None:
+        nonlocal last
+        now = time.perf_counter()
+        if now - last >= every and 0 < done < 1:
+            last = now
+            say(f"  {what}: {100 * done:.0f} %, about {(now - start) / done * (1 - done):.0f} s left")
+
+    return report

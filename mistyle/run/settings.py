@@ -1,0 +1,204 @@
+"""All settings of a job in one place: the root record only lists one record per stage, and the presets.
+
+Precedence, lowest first: defaults, preset, `--config FILE`, the environment variable MISTYLE_SET, the command line.
+"""
+
+import difflib
+import os
+import tomllib
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from mistyle.core.camera import RigSettings
+from mistyle.core.errors import UsageError
+from mistyle.stages.backproject import BakeSettings
+from mistyle.stages.fit import FitSettings
+from mistyle.stages.inpaint import RepairSettings
+from mistyle.stages.texels import AtlasSettings
+from mistyle.surface.settings import SurfaceSettings
+
+
+class ReadSettings(BaseModel):
+    """How the mesh is read."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    uv: Literal["keep", "new", "auto"] = Field(
+        "auto", description="authored UVs: keep, replace, or replace where unusable"
+    )
+    up: Literal["y", "z"] = Field("y", description="the axis of the user's file that points up")
+    max_faces: int = Field(5_000_000, ge=1, description="meshes with more faces are refused")
+
+
+class DrawSettings(BaseModel):
+    """How the views of the mesh are rendered (paper 4.1.1)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    spp: int = Field(16, ge=1, le=65536, description="samples per pixel of the rendered views")
+    scene: Path | None = Field(
+        None, description="a Mitsuba scene with a shape called 'object' in place of scenes/paper_views.xml"
+    )
+    paper_files: bool = Field(False, description="also write the 8-bit depth maps and Canny edges of the paper")
+
+
+class ReportSettings(BaseModel):
+    """The pictures of the report."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    frames: int = Field(24, ge=4, le=240, description="turntable frames")
+    resolution: int = Field(480, ge=64, le=4096, description="pixels of a turntable frame")
+    spp: int = Field(24, ge=1, le=4096, description="samples per pixel of a turntable frame")
+
+
+class Settings(BaseModel):
+    """One job: a mesh, a style, and how."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seed: int = Field(0, ge=0, lt=2**31, description="every random choice follows from it")
+    threads: int = Field(0, ge=0, le=1024, description="threads of the renderer and of torch; 0 takes all cores")
+    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
+    stylizer: Literal["embedded"] = "embedded"
+    read: ReadSettings = ReadSettings()
+    rig: RigSettings = RigSettings()
+    draw: DrawSettings = DrawSettings()
+    surface: SurfaceSettings = SurfaceSettings()
+    atlas: AtlasSettings = AtlasSettings()
+    bake: BakeSettings = BakeSettings()
+    fit: FitSettings = FitSettings()
+    repair: RepairSettings = RepairSettings()
+    report: ReportSettings = ReportSettings()
+
+
+# The three ways to run a job; the defaults of the records are the standard ones.
+PRESETS: dict[str, dict[str, Any]] = {"draft": {}, "standard": {}, "paper": {}}
+
+
+def thread_count(settings: Settings) -> int:
+    """The threads a job uses: as set, else the cores that this process may run on."""
+    if settings.threads:
+        return settings.threads
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
+    """`over` laid upon `base`, record by record."""
+    result = dict(base)
+    for key, value in over.items():
+        inner = result.get(key)
+        result[key] = merge(inner, value) if isinstance(value, Mapping) and isinstance(inner, Mapping) else value
+    return result
+
+
+def assignments(pairs: Iterable[str], origin: str) -> dict[str, Any]:
+    """'fit.phase1=200' lines as a nested dict; values are TOML where they parse as TOML, else text."""
+    result: dict[str, Any] = {}
+    for pair in pairs:
+        key, equals, text = pair.partition("=")
+        if not equals or not key.strip():
+            raise UsageError(f"{origin}: '{pair}' is not of the form KEY=VALUE, for example fit.iterations1=100")
+        try:
+            value: Any = tomllib.loads(f"value = {text.strip()}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text.strip()
+        for name in reversed(key.strip().split(".")):
+            value = {name: value}
+        result = merge(result, value)
+    return result
+
+
+def known_keys(model: type[BaseModel] = Settings, prefix: str = "") -> list[str]:
+    """Every dotted setting, leaves only."""
+    keys: list[str] = []
+    for name, field in model.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            keys += known_keys(inner, f"{prefix}{name}.")
+        else:
+            keys.append(prefix + name)
+    return keys
+
+
+def validate(values: Mapping[str, Any], origin: str) -> Settings:
+    """Settings from nested values; an unknown key is refused with the nearest known one, a wrong value with its path."""
+    try:
+        return Settings.model_validate(dict(values))
+    except ValidationError as error:
+        first = error.errors()[0]
+        path = ".".join(str(part) for part in first["loc"])
+        if first["type"] == "extra_forbidden":
+            near = difflib.get_close_matches(path, known_keys(), n=1, cutoff=0.5)
+            hint = f"; did you mean '{near[0]}'?" if near else ""
+            raise UsageError(
+                f"{origin}: there is no setting '{path}'{hint} (mistyle stylize --print-config lists all)"
+            ) from None
+        raise UsageError(f"{origin}: {path} = {first['input']!r}: {first['msg'].lower()}") from None
+
+
+def read_config(path: Path) -> dict[str, Any]:
+    """A job file in TOML; its keys are those that `--print-config` prints."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise UsageError(f"{path}: no such file; --config wants a TOML file") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise UsageError(f"{path}: not a TOML file: {error}") from None
+
+
+def resolve(
+    preset: str | None,
+    config: Path | None,
+    command_line: Mapping[str, Any],
+    environment: Mapping[str, str] = os.environ,
+) -> Settings:
+    """The settings of a job after every layer; each layer is checked alone so that the message names the guilty one."""
+    layers: list[tuple[str, Mapping[str, Any]]] = []
+    if config is not None:
+        values = read_config(config)
+        preset = preset or values.pop("preset", None)
+        values.pop("preset", None)
+        layers.append((str(config), values))
+    preset = preset or "standard"
+    if preset not in PRESETS:
+        raise UsageError(f"there is no preset '{preset}'; choose one of {', '.join(PRESETS)}")
+    variable = environment.get("MISTYLE_SET", "")
+    layers.append(("MISTYLE_SET", assignments(filter(None, map(str.strip, variable.split(";"))), "MISTYLE_SET")))
+    layers.append(("command line", command_line))
+    values: Mapping[str, Any] = PRESETS[preset]
+    for origin, layer in layers:
+        values = merge(values, layer)
+        validate(values, origin)
+    return validate(values, "settings")
+
+
+def as_toml(settings: Settings) -> str:
+    """The settings as a TOML file that `--config` reads back."""
+    lines: list[str] = []
+
+    def table(values: Mapping[str, Any], prefix: str) -> None:
+        leaves = {k: v for k, v in values.items() if not isinstance(v, dict) and v is not None}
+        if prefix:
+            lines.extend(["", f"[{prefix}]"])
+        lines.extend(f"{key} = {_toml_value(value)}" for key, value in leaves.items())
+        for key, value in values.items():
+            if isinstance(value, dict):
+                table(value, f"{prefix}.{key}" if prefix else key)
+
+    table(settings.model_dump(mode="json"), "")
+    return "\n".join(lines) + "\n"
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    return repr(value)

@@ -1,0 +1,90 @@
+"""The stages of a run and how each is kept: under a key made of everything it depends on."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import UsageError
+from mistyle.core.paths import PACKAGE
+from mistyle.files.records import load_record, save_record
+from mistyle.files.store import Keeper, digest
+from mistyle.run.progress import Progress, Report
+from mistyle.run.settings import Settings, thread_count
+
+STAGES = {
+    "mesh": "read the mesh",
+    "texels": "lay out the texture",
+    "views": "render the views",
+    "surface": "paint the surface",
+    "bake": "bake the texture",
+    "stylized": "draw the stylized views",
+    "fit": "fit normal, roughness and albedo",
+    "repair": "repair what the fit left open",
+    "asset": "write the asset",
+    "report": "write the report",
+}
+# These stand in the run folder itself, for people; the others in work/.
+VISIBLE = ("views", "stylized", "asset", "report")
+
+
+@dataclass(frozen=True)
+class Job:
+    """What to do and where: one mesh, one style picture, one run folder."""
+
+    mesh: Path
+    style: Path
+    out: Path
+    settings: Settings
+    name: str
+    redo_from: str | None = None
+
+
+class Run:
+    """Keeps the stages of one run folder; a class because it holds the folder's locks until it is closed."""
+
+    def __init__(self, job: Job, progress: Progress) -> None:
+        if job.redo_from is not None and job.redo_from not in STAGES:
+            raise UsageError(f"--from {job.redo_from}: there is no such stage; choose one of {', '.join(STAGES)}")
+        self.job, self.progress = job, progress
+        self.redoing = False
+        self.keys: dict[str, str] = {}
+        # A changed program or thread count may change bytes: both belong to every key.
+        code = {str(p.relative_to(PACKAGE)): p.read_bytes() for p in sorted(PACKAGE.rglob("*.py"))}
+        self.base = digest([code, thread_count(job.settings), job.settings.variant])
+        self.visible = Keeper(job.out)
+        self.hidden = Keeper(job.out / "work")
+
+    def __enter__(self) -> "Run":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.visible.close()
+        self.hidden.close()
+
+    def stage(self, name: str, after: Sequence[str], inputs: Any, write: Callable[[Path, Report], object]) -> Path:
+        """The folder of stage `name`, taken over or made; `inputs` are what it depends on besides the stages `after`."""
+        key = self.keys[name] = digest([self.base, name, inputs, [self.keys[a] for a in after]])
+        keeper = self.visible if name in VISIBLE else self.hidden
+        self.redoing = self.redoing or name == self.job.redo_from
+        found = None if self.redoing else keeper.get(name, key)
+        if found is not None:
+            self.progress.skip(name, STAGES[name])
+            return found
+
+        def fill(folder: Path) -> None:
+            write(folder, report)
+
+        with self.progress.stage(name, STAGES[name]) as report:
+            return keeper.put(name, key, fill)
+
+    def record(self, name: str, after: Sequence[str], inputs: Any, make: Callable[[Report], Any]) -> Any:
+        """Like `stage`, for a stage whose result is a record."""
+        made: list[Any] = []
+
+        def write(folder: Path, report: Report) -> None:
+            made.append(make(report))
+            save_record(folder / "record", made[0])
+
+        folder = self.stage(name, after, inputs, write)
+        return made[0] if made else load_record(folder / "record")

@@ -1,0 +1,86 @@
+"""`run.json`: what a job was told, what it stood on, how long it took, and how good it is."""
+
+import json
+import platform
+import resource
+import sys
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any
+
+from mistyle import __version__
+from mistyle.files.store import atomic_write
+from mistyle.run.stages import Run
+
+PACKAGES = (
+    "mitsuba",
+    "drjit",
+    "torch",
+    "numpy",
+    "scipy",
+    "trimesh",
+    "xatlas",
+    "OpenEXR",
+    "opencv-contrib-python-headless",
+    "pillow",
+)
+
+
+def write_summary(made: Any, run: Run) -> dict[str, Any]:
+    """Write `run.json` and return what the caller wants to know: paths, figures, timings."""
+    job = run.job
+    path = job.out / "run.json"
+    seconds = merged_seconds(path, run)
+    summary = {
+        "name": job.name,
+        "asset": str(job.out / "asset" / f"{job.name}.glb"),
+        "textures": str(job.out / "asset" / "textures"),
+        "report": str(job.out / "report" / "index.html"),
+        "views": str(job.out / "views"),
+        "stylized": str(job.out / "stylized"),
+        "seconds": seconds,
+        "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
+        "figures": figures(made),
+        "notes": list(made.asset.source.notes),
+    }
+    record = summary | {
+        "inputs": {"mesh": job.mesh.name, "style": job.style.name},
+        "seed": job.settings.seed,
+        "settings": job.settings.model_dump(mode="json"),
+        "versions": versions(),
+    }
+    atomic_write(path, (json.dumps(record, indent=1) + "\n").encode())
+    return summary
+
+
+def earlier(path: Any) -> dict[str, Any]:
+    """The `run.json` of the run before, or nothing."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def merged_seconds(path: Any, run: Run) -> dict[str, float]:
+    """The time of every stage; a stage that was taken over keeps the time that it took when it was made."""
+    before = earlier(path).get("seconds", {})
+    now = run.progress.seconds
+    return {name: round(before.get(name, 0.0) if name in run.progress.reused else now[name], 3) for name in now}
+
+
+def peak_gb() -> float:
+    """Peak resident memory of this process or of its largest child, GB."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    return (
+        max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) * unit / 1e9
+    )
+
+
+def versions() -> dict[str, str]:
+    """What the result was made with."""
+    found = {"mistyle": __version__, "python": platform.python_version(), "system": platform.platform()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "missing"
+    return found

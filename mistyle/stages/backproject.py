@@ -1,0 +1,322 @@
+"""From views to the atlas (paper 4.1.4): which view sees a texel best, and which colour it shows there."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from pydantic import BaseModel, ConfigDict, Field
+
+from mistyle.core.camera import Camera
+from mistyle.core.maps import Texels
+from mistyle.core.mesh import Mesh
+from mistyle.core.normals import area_vectors
+from mistyle.core.view import View
+from mistyle.stages.gaps import fill_in_place
+from mistyle.stages.texels import pad_in_place, threaded
+
+DEPTH_NOISE = 0.0005  # what depth maps may be off by: float32 through a file and another projection
+STEEP = 4.0  # depth per width of a surface seen at 76 degrees
+ROWS = 2**16  # texels handled at a time; their intermediate arrays then stay in the cache
+
+
+class BakeSettings(BaseModel):
+    """When a view may paint a texel (paper 4.1.4)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    depth_tolerance: float = Field(
+        default=0.05, gt=0, le=1, description="largest difference between a texel's and the view's depth"
+    )
+    window: int = Field(
+        default=5, ge=1, le=31, description="pixels across in which a silhouette pixel looks for its pure colour"
+    )
+
+
+@dataclass(frozen=True)
+class Baked:
+    """What the views say about the atlas; zero, False, -1 and 0 where they say nothing.
+
+    albedo  linear Rec.709, as the views have it
+    known   whether a view painted the texel
+    view    the index of that view
+    seen    how many views could have painted it
+    """
+
+    albedo: Float[np.ndarray, "h w 3"]
+    known: Bool[np.ndarray, "h w"]
+    view: Int[np.ndarray, "h w"]
+    seen: Int[np.ndarray, "h w"]
+
+
+def backproject(
+    views: Sequence[View],
+    texels: Texels,
+    settings: BakeSettings,
+    progress: Callable[[float], None] = lambda done: None,
+    *,
+    mesh: Mesh | None = None,
+) -> Baked:
+    """Paint every texel from the accepted view that faces it most: w = max(0, n . (c - P) / |c - P|), first of equals.
+
+    The paper accepts a view when the projection is in bounds with z > 0, when the depth map max-pooled over 5x5 "to
+    handle silhouette boundaries" matches z within 0.05, and when the mask holds. Taken literally the pooled test lets a
+    texel hidden up to two pixels behind a silhouette take the colour of what hides it, and refuses a texel in front
+    when something farther begins beside it. Our reading keeps the number and the purpose apart:
+
+    - visibility: z agrees with the depth of the very pixel within 0.05, and more closely with the plane that continues
+      what the pixel sees (so that one of two sheets 0.01 apart does not paint the other), and the mask holds;
+    - silhouettes: pixels whose colour is a mixture (coverage below 1, or a depth step beside them) take the colour of
+      the nearest pure pixel of their own surface in the 5x5 window before anything is sampled;
+    - colour: bilinear over those of the four pixels that the mask holds and whose depth matches, weights renormalised.
+
+    A texel whose normal, or (with `mesh`) whose face, turns away from a camera is never painted by it; the face counts
+    as turned where its corner normals point. Views may differ in size. The result does not depend on the thread count.
+    """
+    if not views:
+        raise ValueError("there are no views to paint the atlas from; pass at least one")
+    towards = None if mesh is None else _faces_towards(mesh, [view.camera for view in views])
+    tables = _depth_tables(views, settings)
+    height, width = texels.covered.shape
+    chosen, seen = np.full(height * width, -1, np.int16), np.zeros(height * width, np.int16)
+    covered = texels.covered.reshape(-1)
+    position, normal = texels.position.reshape(-1, 3), texels.normal.reshape(-1, 3)
+    face = texels.face.reshape(-1)
+    chunks = -(-covered.size // ROWS)
+
+    def work(chunk: int) -> None:
+        inside = chunk * ROWS + np.flatnonzero(covered[chunk * ROWS : (chunk + 1) * ROWS])
+        if len(inside):
+            own = None if towards is None else face.take(inside)
+            points, normals = position.take(inside, axis=0), normal.take(inside, axis=0)
+            chosen[inside], seen[inside] = _best(views, tables, points, normals, towards, own)
+
+    threaded(work, chunks, lambda done: progress(0.7 * done))
+    tables.clear()
+    albedo = np.zeros((height * width, 3), np.float32)
+    for k, view in enumerate(views):
+        _paint(albedo, view, np.flatnonzero(chosen == k), position, settings)
+        progress(0.7 + 0.3 * (k + 1) / len(views))
+    shape = texels.covered.shape
+    return Baked(albedo.reshape(*shape, 3), (chosen >= 0).reshape(shape), chosen.reshape(shape), seen.reshape(shape))
+
+
+def bake(
+    views: Sequence[View],
+    texels: Texels,
+    settings: BakeSettings,
+    padding: int = 16,
+    progress: Callable[[float], None] = lambda done: None,
+    *,
+    mesh: Mesh | None = None,
+) -> Baked:
+    """`backproject`, `fill` and `stages.texels.pad` in one array: the whole of section 4.1.4 after the rasterisation.
+
+    albedo is complete inside the islands and `padding` texels around them; known, view and seen are those of
+    `backproject`.
+    """
+    baked = backproject(views, texels, settings, lambda done: progress(0.9 * done), mesh=mesh)
+    fill_in_place(baked.albedo, baked.known, texels)
+    pad_in_place([baked.albedo], texels, padding)
+    progress(1.0)
+    return baked
+
+
+def _faces_towards(mesh: Mesh, cameras: Sequence[Camera]) -> Bool[np.ndarray, "c f"]:
+    """Which faces show each camera their front; the front is the side of the corner normals."""
+    n = area_vectors(mesh.positions, mesh.faces)
+    side = np.sign(np.einsum("fi,fki->f", n, mesh.corner_normals, optimize=True))
+    n *= side[:, None]
+    origin = np.einsum("fi,fi->f", n, mesh.positions[mesh.faces[:, 0]])
+    return np.stack([n @ camera.position > origin for camera in cameras])
+
+
+def _depth_tables(views: Sequence[View], settings: BakeSettings) -> list[Float[np.ndarray, "_ 4"]]:
+    """`_depth_table` of every view, with a frame of one pixel around it in which nothing is seen, row after row."""
+    sizes = [(view.camera.size[0] + 2, view.camera.size[1] + 2) for view in views]
+    starts = np.cumsum([0] + [h * w for h, w in sizes])
+    # One array for all: freed memory of this size goes back to the system, small pieces may not.
+    together = np.full((starts[-1], 4), -1, np.float32)
+    tables = [together[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
+
+    def work(k: int) -> None:
+        tables[k].reshape(*sizes[k], 4)[1:-1, 1:-1] = _depth_table(views[k], settings)
+
+    threaded(work, len(views))
+    return tables
+
+
+def _depth_table(view: View, settings: BakeSettings) -> Float[np.ndarray, "h w 4"]:
+    """The plane z = a + b x + c y (x, y in pixels) that continues what each pixel sees, and how far a texel's depth may
+    be from it: a, b, c, allowance. Where the mask does not hold the allowance is -1.
+
+    Of the steps to the two neighbours the smaller one is the surface's own, unless it is large too: then something else
+    lies on both sides. The plane leaves out curvature, hence a quarter of its steps is allowed, and a tenth of a pixel's
+    width. Steps and allowance together stay within the depth tolerance, or within what a surface seen at 76 degrees
+    does across a pixel where pixels are so coarse (below about 256²) that this is more; half the depth bounds the
+    allowance, so that nothing behind the camera agrees.
+    """
+    tolerance = settings.depth_tolerance
+    seen = view.mask & np.isfinite(view.depth) & (view.depth > 0)
+    depth = np.where(seen, view.depth, np.inf).astype(np.float32)
+    footprint = depth / view.camera.focal
+    limit = np.maximum(0.7 * tolerance, STEEP * footprint)
+    with np.errstate(invalid="ignore"):
+        across, down = (np.diff(depth, axis=k, prepend=np.inf, append=np.inf) for k in (1, 0))
+        dx = _smaller(across[:, :-1], across[:, 1:], limit)
+        dy = _smaller(down[:-1], down[1:], limit)
+    allowance = 0.25 * (np.abs(dx) + np.abs(dy)) + 0.1 * footprint + DEPTH_NOISE
+    allowance = np.minimum(np.minimum(allowance, 0.3 * tolerance), depth / 2)
+    x, y = np.arange(depth.shape[1], dtype=np.float32) + 0.5, np.arange(depth.shape[0], dtype=np.float32) + 0.5
+    table = np.empty((*depth.shape, 4), np.float32)
+    table[..., 0] = np.where(seen, depth, 0) - dx * x - dy * y[:, None]
+    table[..., 1], table[..., 2], table[..., 3] = dx, dy, np.where(seen, allowance, -1)
+    return table
+
+
+def _smaller(a: np.ndarray, b: np.ndarray, limit: np.ndarray) -> np.ndarray:
+    """Of two steps the one of smaller size; 0 where it exceeds the limit or is not a number."""
+    step = np.where(np.abs(a) < np.abs(b), a, b)
+    step = np.where(np.isfinite(step), step, a)
+    return np.where(np.abs(step) <= limit, step, 0)
+
+
+def _best(
+    views: Sequence[View],
+    tables: Sequence[np.ndarray],
+    position: Float[np.ndarray, "n 3"],
+    normal: Float[np.ndarray, "n 3"],
+    towards: Bool[np.ndarray, "v f"] | None,
+    face: Int[np.ndarray, " n"] | None,
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """For each texel the accepted view with the largest face-on weight (-1: none) and the number of accepted ones."""
+    points, normals = np.ascontiguousarray(position.T), np.ascontiguousarray(normal.T)
+    plane = (points * normals).sum(axis=0)
+    best = np.zeros(len(position), np.float32)
+    chosen, seen = np.full(len(position), -1, np.int16), np.zeros(len(position), np.int16)
+    for k, (view, table) in enumerate(zip(views, tables, strict=True)):
+        eye = view.camera.position.astype(np.float32)
+        height = normals[0] * eye[0] + normals[1] * eye[1] + normals[2] * eye[2] - plane
+        facing = height > 0
+        if towards is not None and face is not None:
+            facing &= towards[k].take(face)
+        near = np.flatnonzero(facing)
+        p = points.take(near, axis=1)
+        x, y, z = _project(view.camera, p)
+        width = view.camera.size[1] + 2
+        column = np.clip(x + 1, 0, width - 1).astype(np.int32)
+        row = np.clip(y + 1, 0, view.camera.size[0] + 1).astype(np.int32)
+        a, b, c, allowance = table.take(row * width + column, axis=0).T
+        accepted = np.abs(a + b * x + c * y - z) <= allowance
+        seen[near] += accepted
+        distance = np.sqrt((eye[0] - p[0]) ** 2 + (eye[1] - p[1]) ** 2 + (eye[2] - p[2]) ** 2)
+        weight = height.take(near) * accepted / distance
+        better = np.flatnonzero(weight > best.take(near))
+        winners = near.take(better)
+        best[winners], chosen[winners] = weight.take(better), k
+    return chosen, seen
+
+
+def _project(camera: Camera, points: Float[np.ndarray, "3 n"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """`px_from_world` in float32 on coordinate rows: pixel x, y (meaningless for z <= 0) and metric z."""
+    k = np.array([[camera.focal, 0, camera.centre[0]], [0, camera.focal, camera.centre[1]], [0, 0, 1]])
+    m = (k @ camera.cam_from_world[:3]).astype(np.float32)
+    x, y, z = (m[r, 0] * points[0] + m[r, 1] * points[1] + m[r, 2] * points[2] + m[r, 3] for r in range(3))
+    scale = 1 / np.maximum(z, np.float32(1e-6))
+    return x * scale, y * scale, z
+
+
+def _paint(
+    albedo: Float[np.ndarray, "t 3"],
+    view: View,
+    texel: Int[np.ndarray, " n"],
+    position: Float[np.ndarray, "t 3"],
+    settings: BakeSettings,
+) -> None:
+    """Write the view's colours into the texels that chose it."""
+    if len(texel) == 0:
+        return
+    height, width = view.camera.size
+    pixels = np.full((height + 2, width + 2, 4), (0, 0, 0, np.inf), np.float32)
+    pixels[1:-1, 1:-1, :3] = pure_colours(view, settings)
+    pixels[1:-1, 1:-1, 3] = np.where(view.mask, view.depth, np.inf)
+    pixels = pixels.reshape(-1, 4)
+
+    def work(chunk: int) -> None:
+        part = texel[chunk * ROWS : (chunk + 1) * ROWS]
+        x, y, z = _project(view.camera, np.ascontiguousarray(position.take(part, axis=0).T))
+        # What `_depth_table` may bridge between a pixel's centre and a texel in it.
+        tolerance = np.maximum(1.001 * settings.depth_tolerance, 1.5 * STEEP / view.camera.focal * z)
+        albedo[part] = _fetch(pixels, width + 2, x + 1, y + 1, z, tolerance)
+
+    threaded(work, -(-len(texel) // ROWS))
+
+
+def _fetch(pixels: Float[np.ndarray, "p 4"], width: int, x, y, z, tolerance) -> Float[np.ndarray, "n 3"]:
+    """Bilinear colour over the pixels (rgb and depth, rows of `width`) whose depth matches.
+
+    The pixel that holds the projection weighs at least 1/4 and matches, since its view was accepted.
+    """
+    low_x, low_y = np.floor(x - 0.5), np.floor(y - 0.5)
+    tx, ty = x - 0.5 - low_x, y - 0.5 - low_y
+    first = low_y.astype(np.int32) * width + low_x.astype(np.int32)
+    total, colour = np.zeros(len(x), np.float32), np.zeros((3, len(x)), np.float32)
+    for step, weight in (
+        (0, (1 - tx) * (1 - ty)),
+        (1, tx * (1 - ty)),
+        (width, (1 - tx) * ty),
+        (width + 1, tx * ty),
+    ):
+        r, g, b, depth = pixels.take(first + step, axis=0).T
+        weight = weight * (np.abs(depth - z) <= tolerance)
+        total += weight
+        for channel, value in enumerate((r, g, b)):
+            colour[channel] += value * weight
+    colour /= total
+    return np.ascontiguousarray(colour.T)
+
+
+def pure_colours(view: View, settings: BakeSettings) -> Float[np.ndarray, "h w 3"]:
+    """The view's rgb with mixed pixels replaced by the nearest pure one of their own surface within the window.
+
+    Mixed is a masked pixel that the mesh covers in part, or whose depth lies off the line between its neighbours' by
+    more than the tolerance: one of them is another surface's. Where the window has no pure pixel of matching depth
+    (thin things) the colour stays, divided by coverage.
+    """
+    depth = np.where(view.mask, view.depth, np.nan).astype(np.float32)
+    bend = np.zeros(depth.shape, bool)
+    for part, values in ((bend, depth), (bend.T, depth.T)):
+        part[1:-1] |= np.abs(values[2:] - 2 * values[1:-1] + values[:-2]) > settings.depth_tolerance
+    mixed = view.mask & (bend | (view.coverage < 0.995))
+    pure = view.mask & ~mixed
+    rgb = view.rgb.copy()
+    rows, columns = np.nonzero(mixed)
+    left = np.arange(len(rows))
+    for dy, dx in _offsets(settings.window):
+        r, c = rows[left] + dy, columns[left] + dx
+        inside = (r >= 0) & (c >= 0) & (r < depth.shape[0]) & (c < depth.shape[1])
+        r, c = np.where(inside, r, 0), np.where(inside, c, 0)
+        here = depth[rows[left], columns[left]]
+        good = inside & pure[r, c] & (np.abs(depth[r, c] - here) <= settings.depth_tolerance)
+        rgb[rows[left[good]], columns[left[good]]] = view.rgb[r[good], c[good]]
+        left = left[~good]
+    rgb[rows[left], columns[left]] /= np.clip(view.coverage[rows[left], columns[left]], 0.1, 1)[:, None]
+    return rgb
+
+
+def _offsets(window: int) -> list[tuple[int, int]]:
+    """The offsets of a window around its middle, nearest first, the middle left out."""
+    reach = range(-(window // 2), window // 2 + 1)
+    return sorted(((y, x) for y in reach for x in reach if (y, x) != (0, 0)), key=lambda o: (o[0] ** 2 + o[1] ** 2, o))
+
+
+def fill(baked: Baked, texels: Texels) -> Float[np.ndarray, "h w 3"]:
+    """Albedo with every covered texel coloured: unpainted ones take the nearest painted texel's colour, in the atlas
+    and inside their own island; where an island has none, the nearest on the surface (3-D distance).
+
+    The paper's distance transform leaks colours between islands that lie side by side in the atlas. Texels outside the
+    islands are not touched (`stages.texels.pad`). Nothing is filled where no view painted anything at all.
+    """
+    albedo = baked.albedo.copy()
+    fill_in_place(albedo, baked.known, texels)
+    return albedo

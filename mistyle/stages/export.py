@@ -1,0 +1,190 @@
+"""The last stage: everything another program needs, in one folder.
+
+    <name>.glb                                       the asset with its textures inside
+    textures/<name>_{albedo,normal,roughness,orm}.png   8 bits: albedo sRGB, the others linear
+    textures/<name>_{albedo,normal,roughness,orm}.exr   16-bit float: albedo linear Rec.709, the others data
+    <name>.json                                      every file with its sha256, size, colour space and meaning
+
+With several parts (texture sets) the textures are called <name>_<part>_<map>.
+"""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle import __version__
+from mistyle.core.asset import Asset
+from mistyle.core.errors import UsageError
+from mistyle.core.image import bilinear, nearest_fill
+from mistyle.core.maps import Maps, Texels
+from mistyle.files.gltf import patch_glb, write_glb
+from mistyle.files.gltf_alpha import Cutout, cutouts
+from mistyle.files.images import write_exr, write_png
+from mistyle.files.store import atomic_folder, atomic_write, carry_over, sha256_file
+from mistyle.files.textures import Pictures, encode_pictures, normal_colours, orm_colours, part_stems, safe_name
+
+NORMAL_CONVENTION = {
+    "space": "tangent",
+    "frame": "MikkTSpace",
+    "green": "+Y (OpenGL)",
+    "encoding": "n = 2 c - 1",
+}
+COLOUR_SPACES = {
+    ("albedo", "png"): "sRGB (IEC 61966-2-1), Rec.709 primaries",
+    ("albedo", "exr"): "linear Rec.709 (lin_rec709_scene)",
+}
+CHANNELS = {
+    "albedo": "base colour",
+    "normal": "tangent-space normal",
+    "roughness": "perceptual roughness (GGX alpha = roughness squared)",
+    "orm": "R ambient occlusion (1 is open), G roughness, B metallic",
+}
+
+
+def write_asset(
+    folder: Path,
+    name: str,
+    asset: Asset,
+    maps: Sequence[Maps],
+    occlusion: Sequence[Float[np.ndarray, "h w"]],
+    texels: Sequence[Texels],
+    *,
+    provenance: dict[str, Any],
+) -> dict[str, Any]:
+    """Write GLB, textures and the list of files into `folder`; returns the list (the content of <name>.json).
+
+    `maps`, `occlusion` (1 is open) and `texels` have one entry per part of the mesh; the maps arrive padded around
+    their islands. glTF sources are patched, all others written anew. `provenance` must hold JSON values and nothing
+    that differs from run to run (no times): it goes into the GLB and the list, and equal inputs give equal bytes.
+
+    The folder is filled beside its place and swapped in when complete; what an earlier export of the same name wrote
+    there goes, all other files stay. Raises UsageError for a name that is no file name.
+    """
+    if not name or safe_name(name) != name:
+        raise UsageError(f"--name {name!r}: found characters that do not suit file names; try {safe_name(name)!r}")
+    result: dict[str, Any] = {}
+
+    def fill(new: Path) -> None:
+        result.update(_write(new, name, asset, maps, occlusion, texels, provenance))
+        if folder.exists():
+            carry_over(folder, new, without=_earlier(folder, name))
+
+    atomic_folder(folder, fill)
+    return result
+
+
+def _write(new: Path, name: str, asset: Asset, maps, occlusion, texels, provenance: dict[str, Any]) -> dict[str, Any]:
+    stems = part_stems(name, asset.mesh.parts)
+    alphas = _alphas(asset, texels)
+    pictures: list[Pictures] = []
+    files: list[dict[str, Any]] = []
+    for part, stem in enumerate(stems):
+        pictures.append(encode_pictures(maps[part], occlusion[part], alphas[part]))
+        written = _write_textures(new / "textures", stem, maps[part], occlusion[part], alphas[part], pictures[part])
+        files += [_entry(new, path, part=asset.mesh.parts[part], **about) for path, about in written]
+    write = patch_glb if asset.source.kind in ("glb", "gltf") else write_glb
+    glb = new / f"{name}.glb"
+    write(glb, asset, maps, occlusion, name=name, provenance=provenance, pictures=pictures)
+    manifest = {
+        "generator": f"mistyle {__version__}",
+        "name": name,
+        "source": asset.source.path.name,
+        "uv": asset.source.uv,
+        "parts": [
+            {"name": p, "material": m.name, "textures": s}
+            for p, m, s in zip(asset.mesh.parts, asset.materials, stems, strict=True)
+        ],
+        "normal_map": NORMAL_CONVENTION,
+        "notes": list(asset.source.notes),
+        "provenance": provenance,
+        "files": [_entry(new, glb, what="glTF 2.0, textures inside"), *files],
+    }
+    atomic_write(new / f"{name}.json", (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode())
+    return manifest
+
+
+def _write_textures(
+    folder: Path, stem: str, maps: Maps, occlusion: np.ndarray, alpha: np.ndarray | None, pictures: Pictures
+) -> list[tuple[Path, dict[str, Any]]]:
+    """The eight texture files of one part, and what to say about each."""
+    arrays = {
+        "albedo": maps.albedo if alpha is None else np.concatenate([maps.albedo, alpha[..., None]], axis=-1),
+        "normal": normal_colours(maps.normal),
+        "roughness": maps.roughness,
+        "orm": orm_colours(maps, occlusion),
+    }
+    result = []
+    for kind, array in arrays.items():
+        png, exr = folder / f"{stem}_{kind}.png", folder / f"{stem}_{kind}.exr"
+        if kind == "roughness":
+            write_png(png, array)
+        else:
+            atomic_write(png, getattr(pictures, kind))
+        names = "Y" if array.ndim == 2 else "RGBA"[: array.shape[2]]
+        channels = {c: array if array.ndim == 2 else array[..., k] for k, c in enumerate(names)}
+        tags = {"mistyle:map": kind} | ({} if kind == "albedo" else {"colorInteropID": "data"})
+        write_exr(exr, channels, half=True, attributes=tags)
+        about = {"map": kind, "what": CHANNELS[kind], "size": [array.shape[1], array.shape[0]]}
+        about |= {"alpha": True} if kind == "albedo" and alpha is not None else {}
+        result.append((png, about | {"bits": 8}))
+        result.append((exr, about | {"bits": 16}))
+    return result
+
+
+def _entry(folder: Path, path: Path, **about: Any) -> dict[str, Any]:
+    entry = {"file": path.relative_to(folder).as_posix(), "sha256": sha256_file(path), "bytes": path.stat().st_size}
+    if "map" in about:
+        entry["colour_space"] = COLOUR_SPACES.get((about["map"], path.suffix[1:]), "none (linear data)")
+    if about.get("map") == "normal":
+        entry["normal_map"] = NORMAL_CONVENTION
+    return entry | about
+
+
+def _earlier(folder: Path, name: str) -> set[str]:
+    """What an earlier export of this name wrote, by its list."""
+    own = f"{name}.json"
+    try:
+        listed = json.loads((folder / own).read_text(encoding="utf-8"))["files"]
+        return {own, *(str(entry["file"]) for entry in listed)}
+    except (OSError, ValueError, LookupError, TypeError):
+        return {own}
+
+
+def _alphas(asset: Asset, texels: Sequence[Texels]) -> list[Float[np.ndarray, "h w"] | None]:
+    """The opacity of cut-out and blended glTF materials, carried over to the texels; None for opaque parts."""
+    found = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
+    return [_carried(asset, found[p], texels[p]) if p in found else None for p in range(len(texels))]
+
+
+def _carried(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, "h w"]:
+    """Sample the file's alpha at every covered texel's place in the file's own UVs; around islands the nearest one."""
+    rows, columns = np.nonzero(texels.covered)
+    face = texels.face[rows, columns]
+    height, width = texels.covered.shape
+    point = np.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], axis=1)
+    uvs = asset.mesh.corner_uvs[face].astype(np.float64)
+    # UVs count modulo 1: a face that crosses the border paints texels on the other side of the square.
+    point += np.rint(uvs.mean(axis=1) - point)
+    weights = _barycentric(uvs, point)
+    place = (weights[..., None] * cutout.uvs[face]).sum(axis=1)
+    size = np.array(cutout.alpha.shape[::-1])
+    px = np.stack([place[:, 0], 1 - place[:, 1]], axis=1) * size
+    alpha = np.ones((height, width), np.float32)
+    alpha[rows, columns] = bilinear(cutout.alpha, px, edge="repeat")
+    return nearest_fill(alpha, texels.covered)
+
+
+def _barycentric(uvs: Float[np.ndarray, "n 3 2"], point: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Weights of the corners, clipped to the face (a texel at its rim lies outside by less than its own size)."""
+    a, b, c = uvs[:, 0], uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
+    p = point - a
+    area = b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]
+    safe = np.where(area == 0, 1, area)
+    s = (p[:, 0] * c[:, 1] - p[:, 1] * c[:, 0]) / safe
+    t = (b[:, 0] * p[:, 1] - b[:, 1] * p[:, 0]) / safe
+    weights = np.clip(np.stack([1 - s - t, s, t], axis=1), 0, 1)
+    return weights / weights.sum(axis=1, keepdims=True)

@@ -1,0 +1,234 @@
+"""Fitting normal, roughness and albedo to the stylized views (paper 4.2), by Adam through Mitsuba's gradients.
+
+Phase 1 moves normal and roughness under the directional lights of `scenes/phase1_directional.xml`, in grey. Phase 2
+moves the albedo under the ambient light of `scenes/phase2_ambient.xml`, normal and roughness at a reduced rate. The
+target of both is the stylized view of the same camera, compared on random jittered crops.
+
+What phase 1 aims at depends on how the stylizer painted (`painted`):
+
+- "with-light": the view shows a lit object. Render with the baked albedo and view are compared as they are, feature
+  by feature (the paper's style loss).
+- "without-light": the view is as flat as an albedo. Compared as they are, the normals would learn to cancel the
+  light. The object is rendered as clay instead, and both pictures lose their mean and the view its contrast: what is
+  left of the view is the course of its strokes, and phase 1 looks for the relief that the lights would show like
+  that, with a contrast of `relief`. Where a stroke is bright the surface turns to the light; with the light on the
+  other side the relief is the opposite one.
+
+Both phases are judged afterwards (`fit_judge.py`), and undone where they made the pictures worse.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.image import erode, srgb_from_linear
+from mistyle.core.light import Lights, lights
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import Mesh, face_areas, weld
+from mistyle.core.tangents import mikktspace
+from mistyle.core.view import View
+from mistyle.stages import fit_table
+from mistyle.stages.fit_run import Loss, Phase, Run, Shot, World
+from mistyle.stages.fit_settings import FitSettings
+
+__all__ = ["Fit", "FitSettings", "two_phase"]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What the fit made.
+
+    maps      the fitted maps, one per texture set
+    struggle  sum over the last steps of phase 2 of |d loss / d albedo| (mean over rgb); zero where phase 2 did not run
+    touched   number of those steps in which a texel had a gradient
+    trace     losses per step, by name ("phase1.style", …)
+    kept      whether each phase that ran was kept
+    figures   by "phase.figure": (before, after)
+    notes     sentences for the report
+    """
+
+    maps: tuple[Maps, ...]
+    struggle: tuple[Float[np.ndarray, "h w"], ...]
+    touched: tuple[Float[np.ndarray, "h w"], ...]
+    trace: dict[str, list[float]]
+    kept: dict[str, bool]
+    figures: dict[str, tuple[float, float]]
+    notes: tuple[str, ...]
+
+
+def two_phase(
+    mesh: Mesh,
+    maps: Sequence[Maps],
+    targets: Sequence[View],
+    texels: Sequence[Texels],
+    settings: FitSettings,
+    seed: int,
+    progress: Callable[[float], None] = lambda done: None,
+    *,
+    phase1_lights: Lights | None = None,
+) -> Fit:
+    """Fit `maps` (one per texture set, as baked) so that renders look like `targets` (linear rgb, stylized).
+
+    `phase1_lights` replaces those of `scenes/phase1_directional.xml`. The same inputs, settings, seed and thread count
+    give the same bytes. A gradient that is not a number ends its phase at the last good state, and a note says where.
+    """
+    maps = [replace(m, metallic=np.zeros_like(m.metallic)) for m in maps] if settings.metallic == "zero" else list(maps)
+    nothing = tuple(np.zeros(m.roughness.shape, np.float32) for m in maps)
+    if settings.refine == "off":
+        return Fit(tuple(maps), nothing, nothing, {}, {}, {}, ())
+    world = _world(mesh, targets, settings)
+    table = fit_table.build(maps, texels, shrinkage(mesh, texels, targets, settings.texels_per_pixel))
+    phases = _phases(settings, phase1_lights or lights("phase1"), targets)
+    total, done = max(sum(phase.iterations for phase in phases), 1), 0
+    trace, notes = {}, []
+    struggle, touched = np.zeros((2, table.offsets[-1]), np.float32)
+    for phase, rng in zip(phases, np.random.default_rng(seed).spawn(len(phases)), strict=True):
+        run = Run(world, table, phase, settings, rng)
+        for iteration in range(phase.iterations):
+            note = run.step(iteration)
+            if note:
+                notes.append(note)
+                break
+            done += 1
+            progress(done / total)
+        trace |= {f"{phase.name}.{name}": values for name, values in run.trace.items()}
+        struggle, touched = run.struggle, run.touched
+    names = sorted({name for phase in phases for name in phase.rates})
+    return Fit(
+        maps=tuple(fit_table.finished(table, maps, names)),
+        struggle=tuple(fit_table.spread(table, maps, struggle)),
+        touched=tuple(fit_table.spread(table, maps, touched)),
+        trace=trace,
+        kept={},
+        figures={},
+        notes=tuple(notes),
+    )
+
+
+def shrinkage(mesh: Mesh, texels: Sequence[Texels], views: Sequence[View], texels_per_pixel: float) -> int:
+    """The power of two by which the atlas is shrunk for the fit: as fine as the views can tell texels apart.
+
+    Compares texels per unit of surface (covered texels over area) with pixels per unit of surface that faces a camera.
+    """
+    covered = sum(int(where.covered.sum()) for where in texels)
+    area = float(face_areas(mesh).sum())
+    closest = max(view.camera.focal / float(view.depth[view.mask].mean()) for view in views if view.mask.any())
+    ratio = np.sqrt(covered / max(area, 1e-12)) / closest
+    return 2 ** max(int(np.ceil(np.log2(ratio / texels_per_pixel))), 0)
+
+
+def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
+    import torch
+
+    from mistyle.measure.features import load_features
+    from mistyle.render.draw import tracer
+    from mistyle.render.seam import Shader
+
+    welded = weld(mesh)
+    pictures, masks = [], []
+    for view in targets:
+        inside = erode(view.mask & (view.coverage > 0.999), 1)
+        stacked = np.concatenate([srgb_from_linear(view.rgb), inside[..., None].astype(np.float32)], axis=-1)
+        pictures.append(torch.from_numpy(np.ascontiguousarray(stacked.transpose(2, 0, 1))))
+        masks.append(inside)
+    return World(
+        traced=tracer(mesh),
+        tangents=mikktspace(welded.positions, welded.normals, welded.uvs, welded.faces),
+        cameras=tuple(view.camera for view in targets),
+        targets=tuple(pictures),
+        masks=tuple(masks),
+        features=load_features(settings.features),
+        shader=Shader((settings.crops * settings.crop_size, settings.crop_size)),
+    )
+
+
+def _phases(settings: FitSettings, directional: Lights, targets: Sequence[View]) -> list[Phase]:
+    """Phase 1, and with refine = all phase 2."""
+    flat = settings.painted == "without-light"
+    moving = {"tilt": settings.rate_normal, "roughness": settings.rate_roughness}
+    first = Phase(
+        name="phase1",
+        lights=directional,
+        one_by_one=flat,
+        clay=flat,
+        rates=moving | ({"metallic": settings.rate_roughness} if settings.metallic == "fit" else {}),
+        variation={"tilt": settings.tv_normal, "roughness": settings.tv_roughness},
+        iterations=settings.iterations1,
+        loss=_relief_loss(settings) if flat else _lit_loss(settings),
+    )
+    if settings.refine != "all":
+        return [first]
+    second = Phase(
+        name="phase2",
+        lights=lights("phase2"),
+        one_by_one=False,
+        clay=False,
+        rates={"albedo": settings.rate_albedo} | {name: rate * settings.reduced for name, rate in moving.items()},
+        variation={"albedo": _albedo_variation(settings, targets)},
+        iterations=settings.iterations2,
+        loss=_colour_loss(settings),
+    )
+    return [first, second]
+
+
+def _albedo_variation(settings: FitSettings, targets: Sequence[View]) -> float:
+    from mistyle.measure.losses import adaptive_tv_weight, mean_gradient
+
+    gradients = [mean_gradient(srgb_from_linear(view.rgb), view.coverage > 0.999) for view in targets]
+    return adaptive_tv_weight(float(np.mean(gradients)), settings.tv_albedo)
+
+
+def _relief_loss(settings: FitSettings) -> Loss:
+    """Phase 1 for targets painted without light."""
+    from mistyle.measure import losses
+
+    def loss(shot: Shot, features, rng):
+        radius = settings.radius * shot.zoomed
+        grey = losses.srgb_from_linear(losses.luminance(losses.linear_from_srgb(shot.target)))
+        strokes = losses.without_light(grey, shot.mask, radius, standard=True)
+        smooth = losses.blur(strokes, settings.smooth * shot.zoomed)
+        expected, mask = losses.stroke_shading(
+            smooth, shot.position, shot.normal, shot.light, shot.mask, settings.relief
+        )
+        expected = expected + settings.sheen * strokes * mask
+        shading = losses.without_light(losses.luminance(shot.render), mask, radius)
+        maps, wanted = losses.masked_features(features, shading, expected, mask, mask)
+        result = {"style": settings.style1 * losses.style_aligned(maps, wanted, mask)}
+        if settings.statistics:
+            result["statistics"] = settings.statistics * losses.style_statistics(maps, wanted, mask, mask)
+        return result
+
+    return loss
+
+
+def _lit_loss(settings: FitSettings) -> Loss:
+    """Phase 1 for targets that show light: grey render and grey target as they are."""
+    from mistyle.measure import losses
+
+    def loss(shot: Shot, features, rng):
+        grey = losses.srgb_from_linear(losses.luminance(shot.render))
+        target = losses.srgb_from_linear(losses.luminance(losses.linear_from_srgb(shot.target)))
+        maps, wanted = losses.masked_features(features, grey, target, shot.mask, shot.mask)
+        return {"style": settings.style1 * losses.style_aligned(maps, wanted, shot.mask)}
+
+    return loss
+
+
+def _colour_loss(settings: FitSettings) -> Loss:
+    """Phase 2: 15 style + 5 sliced Wasserstein in RGB (total variation is added by the table)."""
+    from mistyle.measure import losses
+
+    def loss(shot: Shot, features, rng):
+        colour = losses.srgb_from_linear(shot.render)
+        chosen = shot.mask[:, 0] > 0
+        mine, theirs = colour.permute(0, 2, 3, 1)[chosen], shot.target.permute(0, 2, 3, 1)[chosen]
+        distance = losses.sliced_wasserstein(mine, theirs, rng, settings.projections, settings.colour_samples)
+        maps, wanted = losses.masked_features(features, colour, shot.target, shot.mask, shot.mask)
+        return {
+            "style": settings.style2 * losses.style_aligned(maps, wanted, shot.mask),
+            "colour": settings.colour2 * distance,
+        }
+
+    return loss

@@ -1,0 +1,202 @@
+"""One phase of the fit under way: crops, render, loss, gradient, step."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.camera import Camera, zoom
+from mistyle.core.light import Lights, direction_in_world
+from mistyle.stages import fit_table
+from mistyle.stages.fit_settings import FitSettings
+from mistyle.stages.fit_table import Table
+
+if TYPE_CHECKING:
+    import torch
+
+    from mistyle.measure.losses import Crop
+
+CLAY = 0.25  # albedo of the clay of phase 1: dark enough for highlights to count
+GRAZING = 0.2  # pixels whose surface is seen at a smaller cosine are left out
+LAST_RATE = 0.1  # share of the learning rate at the end of a phase; a cosine leads there
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One step's crops, rendered, beside their targets: n crops of s x s pixels (torch).
+
+    render linear, target sRGB (n, 3, s, s); mask (n, 1, s, s) 0 or 1; position and normal (n, 3, s, s) world; `light`
+    (n, 3) the direction to the only light of each crop, where each has its own; `zoomed` crop pixels per pixel of the
+    view.
+    """
+
+    render: Any
+    target: Any
+    mask: Any
+    position: Any
+    normal: Any
+    light: Any
+    zoomed: float
+
+
+# (shot, features, generator) -> weighted losses by name
+Loss = Callable[[Shot, Callable[[Any], list[Any]], np.random.Generator], "dict[str, torch.Tensor]"]
+
+
+@dataclass(frozen=True)
+class World:
+    """What stands still during the fit; `targets` are (4, h, w): sRGB and the mask of pixels that are wholly inside."""
+
+    traced: Any
+    tangents: Float[np.ndarray, "f 3 4"]
+    cameras: tuple[Camera, ...]
+    targets: tuple[Any, ...]
+    masks: tuple[Bool[np.ndarray, "h w"], ...]
+    features: Callable[[Any], list[Any]]
+    shader: Any
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One of the two optimisations: under which lights, what moves how fast, and what is minimised."""
+
+    name: str
+    lights: Lights
+    one_by_one: bool  # each crop under one of the lights alone, in turn, and without shadows
+    clay: bool
+    rates: Mapping[str, float]
+    variation: Mapping[str, float]
+    iterations: int
+    loss: Loss
+
+
+class Run:
+    """A phase under way: its trace, and what the last steps say about where the albedo struggles."""
+
+    def __init__(
+        self, world: World, table: Table, phase: Phase, settings: FitSettings, rng: np.random.Generator
+    ) -> None:
+        self.world, self.table, self.phase, self.settings, self.rng = world, table, phase, settings, rng
+        self.trace: dict[str, list[float]] = {}
+        self.order: list[int] = []
+        self.beam = 0
+        self.struggle = np.zeros(table.offsets[-1], np.float32)
+        self.touched = np.zeros(table.offsets[-1], np.float32)
+        table.forget()
+
+    def step(self, iteration: int) -> str:
+        """One step of Adam; where a gradient is not a number nothing moves, and the note says which texel."""
+        crops = self._crops()
+        texels, gradients, view_of = self._gradients(crops)
+        for name, gradient in gradients.items():
+            bad = ~np.isfinite(gradient).all(axis=1)
+            if bad.any():
+                row = int(np.flatnonzero(bad)[0])
+                return self._not_a_number(iteration, name, int(texels[row]), crops[view_of(row)])
+        share = iteration / max(self.phase.iterations, 1)
+        decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * share))
+        if "albedo" in gradients and self.phase.iterations - iteration <= self.settings.struggle_window:
+            size = np.abs(gradients["albedo"]).mean(axis=1)
+            self.struggle[texels] += size
+            self.touched[texels] += size > 0
+        for name, gradient in gradients.items():
+            weight = self.phase.variation.get(name, 0.0)
+            if weight:
+                value, slope = fit_table.variation(self.table, name, texels)
+                self._note(f"tv_{name}", weight * value)
+                gradient = gradient + np.float32(weight) * slope * gradient.any(axis=1, keepdims=True)
+            fit_table.step(self.table, name, texels, gradient, self.phase.rates[name] * decay)
+        return ""
+
+    def _crops(self) -> "list[Crop]":
+        """Views in turn, in an order drawn anew after each round."""
+        from mistyle.measure.losses import sample_crops
+
+        settings = self.settings
+        while len(self.order) < settings.crops:
+            self.order += self.rng.permutation(len(self.world.cameras)).tolist()
+        views, self.order = self.order[: settings.crops], self.order[settings.crops :]
+        return sample_crops(
+            self.rng, self.world.masks, settings.crops, settings.crop_size, settings.crop_scale, views=views
+        )
+
+    def _gradients(
+        self, crops: "Sequence[Crop]"
+    ) -> tuple[Int[np.ndarray, " t"], dict[str, Float[np.ndarray, "t c"]], Callable[[int], int]]:
+        """Touched texels, the gradient of the loss for each map that moves, and which crop a texel was seen in."""
+        import torch
+
+        from mistyle.measure.losses import crop_picture
+        from mistyle.render import deferred, seam
+
+        size, count = self.settings.crop_size, self.settings.crops
+        cameras = [zoom(self.world.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in crops]
+        surface = deferred.trace(self.world.traced, cameras, self.world.tangents)
+        lit, towards = self._light(surface)
+        where = seam.taps(surface, self.table.sizes)
+        leaves = {
+            name: torch.from_numpy(values[where.texels]).requires_grad_(name in self.phase.rates)
+            for name, values in self.table.values.items()
+        }
+        pixels = {name: seam.fetch(v, where) for name, v in materials(leaves, self.phase.clay).items()}
+        render = self.world.shader(lit, pixels).reshape(count, size, size, 3).permute(0, 3, 1, 2)
+        wanted = torch.stack([crop_picture(self.world.targets[c.view], c, size) for c in crops])
+        def image(values: np.ndarray) -> "torch.Tensor":
+            return torch.from_numpy(values).reshape(count, size, size, -1).permute(0, 3, 1, 2)
+
+        mask = (image(np.abs(surface.facing) > GRAZING) & (wanted[:, 3:] > 0.999)).float()
+        position, normal = image(surface.position), image(surface.normal)
+        shot = Shot(render, wanted[:, :3], mask, position, normal, towards, size / crops[0].width)
+        losses = self.phase.loss(shot, self.world.features, self.rng)
+        for name, value in losses.items():
+            self._note(name, float(value.detach()))
+        torch.stack(list(losses.values())).sum().backward()
+        gradients = {}
+        for name in self.phase.rates:
+            grad = leaves[name].grad
+            gradients[name] = np.zeros(leaves[name].shape, np.float32) if grad is None else grad.numpy()
+        return where.texels, gradients, lambda row: int(where.matrix[:, [row]].indices[0]) // (size * size)
+
+    def _light(self, surface: Any) -> "tuple[Any, torch.Tensor | None]":
+        import torch
+
+        from mistyle.render import deferred
+
+        if not self.phase.one_by_one:
+            return deferred.light(self.world.traced, surface, self.phase.lights), None
+        beams = []
+        for _ in surface.cameras:
+            beams.append(self.phase.lights[self.beam % len(self.phase.lights)])
+            self.beam += 1
+        towards = [direction_in_world(beam, camera) for beam, camera in zip(beams, surface.cameras, strict=True)]
+        lit = deferred.light_each(self.world.traced, surface, beams, shadows=False)
+        return lit, torch.from_numpy(np.stack(towards).astype(np.float32))
+
+    def _note(self, name: str, value: float) -> None:
+        self.trace.setdefault(name, []).append(value)
+
+    def _not_a_number(self, iteration: int, name: str, texel: int, crop: "Crop") -> str:
+        part = int(np.searchsorted(self.table.offsets, texel, side="right")) - 1
+        row, column = divmod(texel - self.table.offsets[part], self.table.sizes[part][1])
+        return (
+            f"{self.phase.name} stopped before step {iteration + 1}: the gradient of {name} is not a number at texel (row "
+            f"{row}, column {column} of {self.table.sizes[part][0]}x{self.table.sizes[part][1]}) of texture set {part}, seen "
+            f"in view {self.world.cameras[crop.view].name}; the maps are those of the last good step."
+        )
+
+
+def materials(leaves: "Mapping[str, torch.Tensor]", clay: bool = False) -> "dict[str, torch.Tensor]":
+    """Texel values as the shader wants them: tilt becomes a unit normal, clay a constant albedo."""
+    import torch
+
+    tilt = leaves["tilt"]
+    z = (1 - tilt.square().sum(dim=1, keepdim=True)).clamp_min(1e-4).sqrt()
+    albedo = torch.full_like(leaves["albedo"], CLAY) if clay else leaves["albedo"]
+    return {
+        "albedo": albedo,
+        "normal": torch.cat([tilt, z], dim=1),
+        "roughness": leaves["roughness"],
+        "metallic": leaves["metallic"],
+    }

@@ -1,0 +1,47 @@
+"""What a user may choose about the fit."""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class FitSettings(BaseModel):
+    """The fit's choices; the paper's numbers where it gives some (4.2), else what measuring on real data suggested."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    refine: Literal["off", "normal-roughness", "all"] = Field("all", description="which maps may change")
+    painted: Literal["without-light", "with-light"] = Field(
+        "without-light", description="whether the stylized views show lit objects"
+    )
+    metallic: Literal["keep", "zero", "fit"] = Field(
+        "keep", description="the asset's own metallic map (0 without one), 0, or moved by phase 1"
+    )
+    features: Path | None = Field(None, description="weights of VGG-19; none: the embedded filter bank")
+    iterations1: int = Field(200, ge=0, le=100_000, description="steps of phase 1: normal and roughness")
+    iterations2: int = Field(300, ge=0, le=100_000, description="steps of phase 2: albedo")
+    crops: int = Field(4, ge=1, le=64, description="crops per step")
+    crop_size: int = Field(256, ge=32, le=1024, description="pixels along a crop's side (the paper's 256)")
+    crop_scale: tuple[float, float] = Field((0.5, 1.0), description="range of a crop's side in pixels of the view / crop_size")
+    texels_per_pixel: float = Field(
+        1.25, gt=0, description="the fit works on the finest mip level with at most so many texels along a pixel's side"
+    )
+    style1: float = Field(1.0, ge=0, description="weight of the style loss in phase 1")
+    statistics: float = Field(0.02, ge=0, description="weight of the features' Gram matrices beside it, without light")
+    relief: float = Field(0.15, ge=0, le=1, description="slope of the strokes' flanks (root mean square), without light")
+    smooth: float = Field(1.0, gt=0, description="pixels of a view by which strokes are smoothed before they have flanks")
+    sheen: float = Field(0.05, ge=0, le=1, description="share of the strokes' own contrast that roughness may explain")
+    radius: float = Field(12.0, gt=0, description="pixels of a view over which mean and contrast are taken")
+    tv_normal: float = Field(0.002, ge=0, description="weight of the normal's total variation")
+    tv_roughness: float = Field(0.002, ge=0, description="weight of the roughness's total variation")
+    style2: float = Field(15.0, ge=0, description="weight of the style loss in phase 2 (the paper's)")
+    tv_albedo: float = Field(0.5, ge=0, description="largest weight of the albedo's total variation, for a flat style")
+    colour2: float = Field(5.0, ge=0, description="weight of the sliced Wasserstein distance in phase 2 (the paper's)")
+    projections: int = Field(32, ge=1, le=1024, description="directions of the sliced Wasserstein distance")
+    colour_samples: int = Field(8192, ge=16, description="pixels of the sliced Wasserstein distance")
+    rate_normal: float = Field(0.02, gt=0, description="Adam's rate for the normal's tilt")
+    rate_roughness: float = Field(0.02, gt=0, description="Adam's rate for the roughness")
+    rate_albedo: float = Field(0.005, gt=0, description="Adam's rate for the albedo")
+    reduced: float = Field(0.05, ge=0, le=1, description="share of their rates that normal and roughness keep in phase 2")
+    struggle_window: int = Field(100, ge=1, description="last steps whose albedo gradient is accumulated (the paper's 100)")

@@ -1,0 +1,183 @@
+"""The fit's texels: every texture set in one table, at the resolution that the views can tell apart, moved by Adam.
+
+An atlas is usually finer than the views: neighbouring texels then fall into one pixel, and fitted one by one they
+turn to noise. The fit therefore moves the maps of a coarser mip level, about one texel per pixel, and what it changed
+is laid, interpolated, upon the maps as they came; their own finer detail stays.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.image import nearest, resize
+from mistyle.core.maps import Maps, Texels
+
+CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}
+TILT_LIMIT = 0.95  # a normal more than 72 degrees off faces away from most views, where its gradient is zero
+ROUGHNESS_FLOOR = 0.05  # below 0.0316 Mitsuba's roughness has no gradient
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-8  # with 0.999 texels that few views see keep stale second moments
+FILL = 6  # texels of the table by which a change is continued beyond the last texel that was seen
+
+
+@dataclass
+class Table:
+    """All texels (t) of all texture sets at the fit's resolution, row by row, set after set; changes as the fit goes.
+
+    tilt is the tangent-space normal's x and y. `start` keeps the values before the fit. `right` and `below` say
+    whether a texel's neighbour in the same set belongs to the same UV island. `steps` counts Adam's steps per texel.
+    """
+
+    sizes: tuple[tuple[int, int], ...]
+    values: dict[str, Float[np.ndarray, "t c"]]
+    start: dict[str, Float[np.ndarray, "t c"]]
+    right: Bool[np.ndarray, " t"]
+    below: Bool[np.ndarray, " t"]
+    columns: Int[np.ndarray, " t"]
+    first: dict[str, Float[np.ndarray, "t c"]] = field(default_factory=dict)
+    second: dict[str, Float[np.ndarray, "t c"]] = field(default_factory=dict)
+    steps: dict[str, Int[np.ndarray, " t"]] = field(default_factory=dict)
+
+    @property
+    def offsets(self) -> list[int]:
+        """Where each set begins, and the end."""
+        return [0, *np.cumsum([rows * columns for rows, columns in self.sizes]).tolist()]
+
+    def forget(self) -> None:
+        """Drop Adam's moments: the next phase minimises something else."""
+        self.first, self.second, self.steps = {}, {}, {}
+
+
+def build(maps: Sequence[Maps], texels: Sequence[Texels], shrink: int) -> Table:
+    """A table of `maps` shrunk by the whole factor `shrink`: means over covered texels; uncovered ones take the nearest."""
+    sizes, rows = [], []
+    right, below, columns = [], [], []
+    for material, where in zip(maps, texels, strict=True):
+        height, width = where.covered.shape
+        by = shrink if height % shrink == 0 and width % shrink == 0 else 1
+        island = where.island.reshape(height // by, by, width // by, by).max(axis=(1, 3))
+        tilt = material.normal[..., :2] / np.maximum(np.linalg.norm(material.normal, axis=-1, keepdims=True), 1e-6)
+        channels = {"tilt": tilt, "roughness": material.roughness[..., None]}
+        channels |= {"albedo": material.albedo, "metallic": material.metallic[..., None]}
+        rows.append({name: _shrink(v, where.covered, by).reshape(-1, v.shape[-1]) for name, v in channels.items()})
+        same = np.zeros((2, *island.shape), bool)
+        same[0, :, :-1] = (island[:, :-1] == island[:, 1:]) & (island[:, :-1] >= 0)
+        same[1, :-1] = (island[:-1] == island[1:]) & (island[:-1] >= 0)
+        right.append(same[0].ravel())
+        below.append(same[1].ravel())
+        sizes.append(island.shape)
+        columns.append(np.full(island.size, island.shape[1], np.int64))
+    values = {name: np.concatenate([r[name] for r in rows]) for name in CHANNELS}
+    values = {name: project(name, table) for name, table in values.items()}
+    start = {name: table.copy() for name, table in values.items()}
+    return Table(tuple(sizes), values, start, np.concatenate(right), np.concatenate(below), np.concatenate(columns))
+
+
+def project(name: str, values: Float[np.ndarray, "t c"]) -> Float[np.ndarray, "t c"]:
+    """The nearest allowed values: tilt inside the disk of TILT_LIMIT, roughness from ROUGHNESS_FLOOR to 1, else 0..1."""
+    if name == "tilt":
+        length = np.sqrt((values**2).sum(axis=-1, keepdims=True))
+        return (values * np.minimum(1, TILT_LIMIT / np.maximum(length, 1e-6))).astype(np.float32)
+    return np.clip(values, ROUGHNESS_FLOOR if name == "roughness" else 0, 1)
+
+
+def step(table: Table, name: str, texels: Int[np.ndarray, " n"], gradient: Float[np.ndarray, "n c"], rate: float) -> None:
+    """One step of Adam for the given texels; those whose gradient is zero neither move nor forget (`mask_updates`)."""
+    if name not in table.first:
+        shape = table.values[name].shape
+        table.first[name], table.second[name] = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
+        table.steps[name] = np.zeros(shape[0], np.int32)
+    moving = gradient.any(axis=1)
+    rows, g = texels[moving], gradient[moving]
+    table.steps[name][rows] += 1
+    age = table.steps[name][rows, None].astype(np.float32)
+    first = BETA1 * table.first[name][rows] + (1 - BETA1) * g
+    second = BETA2 * table.second[name][rows] + (1 - BETA2) * g * g
+    table.first[name][rows], table.second[name][rows] = first, second
+    size = first / (1 - BETA1**age) / (np.sqrt(second / (1 - BETA2**age)) + EPSILON)
+    table.values[name][rows] = project(name, table.values[name][rows] - rate * size)
+
+
+def variation(table: Table, name: str, texels: Int[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, "n c"]]:
+    """Total variation among the given texels (sorted) and its gradient: means of |difference| to the right and below.
+
+    Only neighbours in the same island count. Written out instead of differentiated by torch, whose gradient of an
+    indexed read adds up in any order.
+    """
+    local = np.full(len(table.right), -1, np.int32)
+    local[texels] = np.arange(len(texels), dtype=np.int32)
+    values = table.values[name][texels]
+    gradient, total = np.zeros_like(values), 0.0
+    for joined, distance in ((table.right, np.ones_like(table.columns)), (table.below, table.columns)):
+        here = np.flatnonzero(joined[texels])
+        there = local[texels[here] + distance[texels[here]]]
+        here, there = here[there >= 0], there[there >= 0]
+        if len(here) == 0:
+            continue
+        difference = values[there] - values[here]
+        total += float(np.abs(difference).mean(dtype=np.float64))
+        share = np.sign(difference) / np.float32(difference.size)
+        # In each direction a texel is at most once the first and at most once the second of a pair.
+        gradient[here] -= share
+        gradient[there] += share
+    return total, gradient
+
+
+def finished(table: Table, maps: Sequence[Maps], names: Sequence[str]) -> list[Maps]:
+    """The maps as they came with what the fit changed in `names` laid upon them, at their own resolution."""
+    result = []
+    for k, material in enumerate(maps):
+        changed = {name: _change(table, k, name, material.roughness.shape) for name in names}
+        result.append(_apply(material, {name: change for name, change in changed.items() if change is not None}))
+    return result
+
+
+def spread(table: Table, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) -> list[Float[np.ndarray, "h w"]]:
+    """A figure per texel of the table at the maps' resolution (each texel takes that of the cell it lies in)."""
+    result = []
+    for k, material in enumerate(maps):
+        rows, columns = material.roughness.shape
+        cells = values[table.offsets[k] : table.offsets[k + 1]].reshape(table.sizes[k]).astype(np.float32)
+        by = rows // table.sizes[k][0]
+        result.append(np.repeat(np.repeat(cells, by, axis=0), by, axis=1)[:rows, :columns])
+    return result
+
+
+def _change(table: Table, k: int, name: str, shape: tuple[int, int]) -> Float[np.ndarray, "h w c"] | None:
+    part = slice(table.offsets[k], table.offsets[k + 1])
+    size = table.sizes[k]
+    change = (table.values[name][part] - table.start[name][part]).reshape(*size, -1)
+    moved = change.any(axis=-1)
+    if not moved.any():
+        return None
+    index, distance = nearest(moved)
+    filled = change.reshape(-1, change.shape[-1])[index.ravel()].reshape(change.shape)
+    return resize(np.where((distance <= FILL)[..., None], filled, 0).astype(np.float32), shape, "repeat")
+
+
+def _apply(material: Maps, changes: Mapping[str, Float[np.ndarray, "h w c"]]) -> Maps:
+    fields = {}
+    for name, change in changes.items():
+        if name == "tilt":
+            length = np.maximum(np.linalg.norm(material.normal, axis=-1, keepdims=True), 1e-6)
+            xy = project("tilt", material.normal[..., :2] / length + change)
+            z = np.sqrt(np.maximum(1 - (xy**2).sum(axis=-1, keepdims=True), 0))
+            fields["normal"] = np.concatenate([xy, z], axis=-1).astype(np.float32)
+        elif name == "albedo":
+            fields[name] = project(name, material.albedo + change).astype(np.float32)
+        else:
+            fields[name] = project(name, getattr(material, name) + change[..., 0]).astype(np.float32)
+    return replace(material, **fields)
+
+
+def _shrink(values: Float[np.ndarray, "h w c"], covered: Bool[np.ndarray, "h w"], by: int) -> Float[np.ndarray, "H W c"]:
+    height, width, channels = values.shape
+    cells = (height // by, by, width // by, by)
+    weight = covered.reshape(cells).sum(axis=(1, 3), dtype=np.float32)
+    total = (values * covered[..., None]).reshape(*cells, channels).sum(axis=(1, 3), dtype=np.float32)
+    mean = total / np.maximum(weight, 1)[..., None]
+    if not (weight > 0).any():
+        return np.ascontiguousarray(values.reshape(*cells, channels).mean(axis=(1, 3), dtype=np.float32))
+    index, _ = nearest(weight > 0)
+    return np.ascontiguousarray(mean.reshape(-1, channels)[index.ravel()].reshape(*weight.shape, channels))

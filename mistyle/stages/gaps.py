@@ -1,0 +1,62 @@
+"""Filling what is missing: the nearest texel of the same island, else the nearest on the surface."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.image import nearest
+from mistyle.core.maps import Texels
+from mistyle.stages.texels import threaded
+
+NEIGHBOURS_3D = 1_000_000  # known texels that a search across islands looks through at most
+
+
+def fill_in_place(albedo: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], texels: Texels) -> None:
+    """Give every covered texel that is not known the value of the nearest known one of its island, or, where the island
+    has none, of the nearest on the surface. Nothing is filled where nothing is known.
+    """
+    hole = texels.covered & ~known
+    known = known & texels.covered
+    if not hole.any() or not known.any():
+        return
+    boxes = island_boxes(texels.island, np.unique(texels.island[hole]))
+    lost: list[np.ndarray] = []
+
+    def work(k: int) -> None:
+        island, box = boxes[k]
+        own = texels.island[box] == island
+        wanted, offered = own & hole[box], own & known[box]
+        if offered.any():
+            index, part = nearest(offered)[0][wanted], albedo[box]
+            part[wanted] = part[np.unravel_index(index, own.shape)]
+        else:
+            rows, columns = np.nonzero(wanted)
+            lost.append((rows + box[0].start) * hole.shape[1] + columns + box[1].start)
+
+    threaded(work, len(boxes))
+    if lost:
+        wanted = np.concatenate(lost)
+        source = nearest_in_space(known.reshape(-1), texels.position.reshape(-1, 3), wanted)
+        flat = albedo.reshape(-1, 3)
+        flat[wanted] = flat[source]
+
+
+def nearest_in_space(
+    known: Bool[np.ndarray, " t"], position: Float[np.ndarray, "t 3"], wanted: Int[np.ndarray, " n"]
+) -> Int[np.ndarray, " n"]:
+    """The known texel nearest in space; with more than NEIGHBOURS_3D of them every k-th is looked at."""
+    from scipy.spatial import KDTree
+
+    seeds = np.flatnonzero(known)
+    seeds = seeds[:: -(-len(seeds) // NEIGHBOURS_3D)]
+    tree = KDTree(position[seeds], balanced_tree=False, compact_nodes=False)
+    return seeds[tree.query(position[wanted])[1]]
+
+
+def island_boxes(
+    island: Int[np.ndarray, "h w"], wanted: Int[np.ndarray, " n"]
+) -> list[tuple[int, tuple[slice, slice]]]:
+    """The wanted islands that have texels, each with the rectangle of the atlas that holds it."""
+    from scipy.ndimage import find_objects
+
+    found = find_objects(island + 1)
+    return [(int(k), found[k]) for k in wanted if k < len(found) and found[k] is not None]

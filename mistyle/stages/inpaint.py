@@ -1,0 +1,106 @@
+"""Repair (paper 4.3): where the fit could not settle, what to put there, and how to join it to what was there.
+
+The paper gives no sizes for its dilations and its blending boundary; here they are shares of the atlas's side. It fills
+with a diffusion model; any function of the Inpainter signature does, and `backends/fill.py` needs no weights.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from pydantic import BaseModel, ConfigDict, Field
+
+from mistyle.core.image import dilate_within, distance_to
+from mistyle.core.maps import Maps, Texels
+
+# (albedo (h w 3) linear, hole (h w), texels, generator) -> albedo (h w 3); only what it answers inside the hole counts.
+Inpainter = Callable[[np.ndarray, np.ndarray, Texels, np.random.Generator], np.ndarray]
+
+
+class RepairSettings(BaseModel):
+    """Which texels are painted again and how they are joined (paper 4.3)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    deviations: float = Field(
+        default=0.5,
+        ge=0,
+        le=10,
+        description="a texel struggles above mean + this many standard deviations (the paper's 0.5)",
+    )
+    dilation: float = Field(
+        default=0.004, ge=0, le=0.1, description="radius of the mask's max-pooling as a share of the atlas's side"
+    )
+    blend: float = Field(
+        default=0.003, ge=0, le=0.1, description="half the width of the blended boundary as a share of the atlas's side"
+    )
+
+
+def radius(share: float, size: int) -> int:
+    """A share of the atlas's side in texels: 0 for 0, else at least 1."""
+    return max(1, round(share * size)) if share > 0 else 0
+
+
+def struggle_mask(
+    accumulated: Float[np.ndarray, "h w"], seen: Int[np.ndarray, "h w"], texels: Texels, settings: RepairSettings
+) -> Bool[np.ndarray, "h w"]:
+    """The texels to paint again: those whose accumulated |gradient| per sighting exceeds mean + 0.5 std over the
+    covered texels that were seen, and those never seen; dilated by max-pooling inside their islands.
+
+    `accumulated` is the sum of absolute albedo gradients over the last steps of phase 2, `seen` how many views see a
+    texel. The paper thresholds the sum; without the division the mask would show how often a texel was looked at.
+    """
+    looked = texels.covered & (seen > 0)
+    struggling = texels.covered & ~looked
+    if looked.any():
+        average = accumulated[looked].astype(np.float64) / seen[looked]
+        struggling[looked] = average > average.mean() + settings.deviations * average.std()
+    return dilate_within(struggling, texels.island, radius(settings.dilation, texels.covered.shape[1]))
+
+
+def blend_weights(
+    mask: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], texels: Texels, settings: RepairSettings
+) -> Float[np.ndarray, "h w"]:
+    """How much of the new colour each texel takes: 1 inside the eroded mask, 0 outside the dilated one, a smooth step
+    over the difference of the two. Both stay inside islands, and an island's own border does not erode the mask: there
+    is nothing behind it to blend with. A masked texel that nobody saw has nothing worth keeping and takes all.
+    """
+    side = radius(settings.blend, mask.shape[1])
+    mask = mask & texels.covered
+    outer = dilate_within(mask, texels.island, side)
+    rest = texels.covered & ~mask
+    inner = mask & ~dilate_within(rest, texels.island, side)
+    # Signed distance to the mask's boundary, which runs half way between texel centres.
+    signed = np.where(mask, distance_to(rest) - 0.5, 0.5 - distance_to(mask))
+    t = np.clip((signed + side) / max(2 * side, 1), 0, 1)
+    weights = np.where(outer, t * t * (3 - 2 * t), 0)
+    return np.where(inner | (mask & ~known), 1, weights).astype(np.float32)
+
+
+def repair(
+    maps: Maps,
+    mask: Bool[np.ndarray, "h w"],
+    texels: Texels,
+    inpainter: Inpainter,
+    settings: RepairSettings,
+    rng: np.random.Generator | None = None,
+) -> Maps:
+    """The maps with the albedo under `mask` painted anew and joined by `blend_weights`; the rest stays as it is.
+
+    Texels outside the dilated mask (by `settings.blend`) keep their bits. Normal, roughness, metallic and `known` are
+    not touched: they follow by a short fit against renders of the repaired albedo. Padding is not redone.
+    """
+    weights = blend_weights(mask, maps.known, texels, settings)
+    hole = weights > 0
+    if not hole.any():
+        return maps
+    painted = inpainter(maps.albedo, hole, texels, np.random.default_rng(0) if rng is None else rng)
+    if painted.shape != maps.albedo.shape:
+        raise ValueError(f"the inpainter returned {painted.shape}, not the albedo's {maps.albedo.shape}")
+    if not np.isfinite(painted[hole]).all():
+        raise ValueError("the inpainter returned numbers that are not finite; it must answer every texel of the hole")
+    albedo = maps.albedo.copy()
+    w = weights[hole][:, None]
+    albedo[hole] = np.where(w == 1, painted[hole], albedo[hole] + w * (painted[hole] - albedo[hole]))
+    return replace(maps, albedo=albedo)

@@ -1,0 +1,228 @@
+"""The atlas (paper 4.1.4): where on the surface every texel lies, the maps to start from, and padding around islands.
+
+A texel (row r, column c) of a `size` x `size` map has its centre at u = (c + 0.5) / size, v = 1 - (r + 0.5) / size.
+The paper maps rows as r = (1 - v) H and says that glTF puts (0, 0) at the bottom left; v points up here in memory and
+the row formula holds, but glTF files have their origin at the top left (glTF 2.0, 3.8.4): the writers turn it.
+"""
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Float, Int
+from pydantic import BaseModel, ConfigDict, Field
+
+from mistyle.core.asset import Material
+from mistyle.core.errors import InputRefused
+from mistyle.core.image import nearest, resize
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import Mesh
+from mistyle.core.normals import same_points
+from mistyle.core.raster import fragments
+from mistyle.core.uvs import islands
+
+ROWS = 2**17  # texels handled at a time; the intermediate arrays then stay in the cache
+
+
+class AtlasSettings(BaseModel):
+    """The texture sets that are painted (paper 4.1.4 uses 4096)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    size: int = Field(default=2048, ge=16, le=16384, description="texels along each side of every texture set")
+    padding: int = Field(default=16, ge=0, le=1024, description="texels by which islands are continued outwards")
+
+
+def threaded(work: Callable[[int], None], count: int, progress: Callable[[float], None] = lambda done: None) -> None:
+    """Call work(0) … work(count - 1), each writing its own part of a result, on all cores, in any order."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    with ThreadPoolExecutor(max_workers=max(1, min(cores, 8))) as pool:
+        for k, _ in enumerate(pool.map(work, range(count))):
+            progress((k + 1) / count)
+
+
+def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
+    """Position, normal, island and face of every texel of texture set `part` whose centre a UV triangle covers.
+
+    P = sum l_i v_i and n = normalised sum l_i n_i with the barycentric coordinates l of the texel's centre. A centre on
+    an edge belongs to exactly one of the two triangles; where several faces cover a centre the first one in order
+    has it; UVs outside the unit square wrap (see core/asset.py). An island is a set of faces joined by points with
+    equal position and UV; islands are numbered in face order. An island too thin to cover any centre takes the free
+    texels that its corners and face middles fall into, each with the surface point found there, so that it never has
+    to show the colours of a neighbour.
+
+    Raises InputRefused for UVs that are not finite or farther than one tile outside the square.
+    """
+    chosen = np.flatnonzero(mesh.part == part)
+    uv = mesh.corner_uvs[chosen].astype(np.float64)
+    if not np.isfinite(uv).all() or (uv.size and (uv.min() < -1 or uv.max() > 2)):
+        raise InputRefused(
+            f"texture set '{mesh.parts[part]}': its UVs reach from {uv.min():.3g} to {uv.max():.3g}, they must"
+            " lie within one tile of the unit square; unwrap the mesh anew with --uv new"
+        )
+    corners = np.stack([uv[..., 0] * size, (1 - uv[..., 1]) * size], axis=-1)
+    local = np.full(size * size, -1, np.int32)
+    face, texel = fragments(corners, size)
+    # Where faces share a texel the last one written stays: writing backwards leaves it to the first.
+    local[texel[::-1]] = face[::-1]
+    del face, texel
+    island = islands(same_points(mesh.positions)[mesh.faces[chosen]], mesh.corner_uvs[chosen])
+    _claim_slivers(local, corners, island, size)
+    return _interpolate(mesh, chosen, corners, local, island, size)
+
+
+def _claim_slivers(
+    local: Int[np.ndarray, " t"], corners: Float[np.ndarray, "f 3 2"], island: Int[np.ndarray, " f"], size: int
+) -> None:
+    """Give islands without a texel the free texels under their corners and face middles."""
+    if len(island) == 0:
+        return
+    has = np.zeros(int(island.max()) + 1, bool)
+    has[island[np.unique(local[local >= 0])]] = True
+    faces = np.flatnonzero(~has[island])[::-1]
+    points = np.concatenate([corners[faces], corners[faces].mean(axis=1, keepdims=True)], axis=1)
+    column, row = np.moveaxis(np.floor(points).astype(np.int64) % size, -1, 0)
+    texel = (row * size + column).ravel()
+    free = local[texel] < 0
+    local[texel[free]] = np.repeat(faces, 4)[free]
+
+
+def _interpolate(
+    mesh: Mesh,
+    chosen: Int[np.ndarray, " f"],
+    corners: Float[np.ndarray, "f 3 2"],
+    local: Int[np.ndarray, " t"],
+    island: Int[np.ndarray, " f"],
+    size: int,
+) -> Texels:
+    """The barycentric interpolation, rows after rows; `local` holds indices into `chosen`."""
+    frame = _frames(corners)
+    vertices = np.concatenate(
+        [mesh.positions[mesh.faces[chosen]], mesh.corner_normals[chosen]], axis=-1, dtype=np.float32
+    )
+    columns = np.ascontiguousarray(vertices.reshape(len(chosen), 18).T)  # numpy gathers from rows of one number fastest
+    wraps = (corners.min(axis=(1, 2)) < 0) | (corners.max(axis=(1, 2)) > size)
+    position, normal = np.zeros((size * size, 3), np.float32), np.zeros((size * size, 3), np.float32)
+    face, islanded = np.full(size * size, -1, np.int32), np.full(size * size, -1, np.int32)
+    rows = max(1, ROWS // size)
+
+    def work(chunk: int) -> None:
+        start, stop = chunk * rows * size, min((chunk + 1) * rows, size) * size
+        inside = start + np.flatnonzero(local[start:stop] >= 0)
+        if len(inside) == 0:
+            return
+        f = local[inside]
+        face[inside], islanded[inside] = chosen[f], island[f]
+        weights = _weights(frame, f, (inside % size) + 0.5, (inside // size) + 0.5, wraps, size)
+        values = columns.take(f, axis=1)
+        mixed = values[:6] * weights[0] + values[6:12] * weights[1] + values[12:] * weights[2]
+        n = mixed[3:]
+        length = np.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+        n /= np.where(length > 0, length, 1)
+        position[inside], normal[inside] = mixed[:3].T, n.T
+
+    threaded(work, -(-size // rows))
+    return Texels(
+        position=position.reshape(size, size, 3),
+        normal=normal.reshape(size, size, 3),
+        covered=face.reshape(size, size) >= 0,
+        island=islanded.reshape(size, size),
+        face=face.reshape(size, size),
+    )
+
+
+def _frames(corners: Float[np.ndarray, "f 3 2"]) -> Float[np.ndarray, "f 6"]:
+    """First corner and the inverse of the edge matrix: (l1, l2) = M (x - x0, y - y0); zero for degenerate triangles."""
+    a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    area = e1[:, 0] * e2[:, 1] - e1[:, 1] * e2[:, 0]
+    inverse = np.where(area != 0, 1, 0) / np.where(area != 0, area, 1)
+    rows = [e2[:, 1] * inverse, -e2[:, 0] * inverse, -e1[:, 1] * inverse, e1[:, 0] * inverse]
+    return np.concatenate([a, np.stack(rows, axis=1)], axis=1)
+
+
+def _weights(frame, face, x, y, wraps, size) -> list[Float[np.ndarray, " n"]]:
+    """Barycentric coordinates of the points (x, y) in their faces, clamped to the triangle (which only matters for
+    slivers); a face that reaches outside the square is tried in the nine tiles around it."""
+    m = frame.take(face, axis=0)
+    dx, dy = x - m[:, 0], y - m[:, 1]
+    l1, l2 = m[:, 2] * dx + m[:, 3] * dy, m[:, 4] * dx + m[:, 5] * dy
+    if wraps.any():
+        again = np.flatnonzero(wraps[face])
+        best = np.full(len(again), -np.inf)
+        g, chosen = m[again], np.zeros((2, len(again)))
+        for du in (0, -size, size):
+            for dv in (0, -size, size):
+                sx, sy = dx[again] + du, dy[again] + dv
+                t1, t2 = g[:, 2] * sx + g[:, 3] * sy, g[:, 4] * sx + g[:, 5] * sy
+                inside = np.minimum(np.minimum(t1, t2), 1 - t1 - t2)
+                better = inside > best
+                best = np.where(better, inside, best)
+                chosen = np.where(better, np.stack([t1, t2]), chosen)
+        l1[again], l2[again] = chosen
+    l1, l2 = np.clip(l1, 0, 1), np.clip(l2, 0, 1)
+    total = np.maximum(l1 + l2, 1)
+    l1, l2 = l1 / total, l2 / total
+    return [(1 - l1 - l2).astype(np.float32), l1.astype(np.float32), l2.astype(np.float32)]
+
+
+def start_maps(material: Material, texels: Texels, size: int, metallic: Literal["keep", "zero"] = "keep") -> Maps:
+    """The material's own maps at the atlas's size, factors applied; flat where it has none (paper 4.2 starts there).
+
+    Larger pictures are averaged over each texel's area, smaller ones interpolated, both as repeating textures; normals
+    are made unit length again. `known` is False everywhere: nothing has been painted yet. `texels` only ties the size.
+    """
+    if texels.covered.shape != (size, size):
+        raise ValueError(f"the atlas has {texels.covered.shape} texels, not {size} x {size}")
+    albedo = _resampled(material.albedo, material.albedo_factor, size)
+    normal = np.zeros((size, size, 3), np.float32)
+    normal[..., 2] = 1
+    if material.normal is not None:
+        mean = resize(material.normal, (size, size), "repeat")
+        length = np.linalg.norm(mean, axis=-1, keepdims=True)
+        normal = np.where(length > 1e-6, mean / np.maximum(length, 1e-6), normal)
+    metal = np.zeros((size, size), np.float32)
+    if metallic == "keep":
+        metal = _resampled(material.metallic, material.metallic_factor, size)
+    roughness = _resampled(material.roughness, material.roughness_factor, size)
+    return Maps(albedo, normal.astype(np.float32), roughness, metal, np.zeros((size, size), bool))
+
+
+def _resampled(picture: np.ndarray | None, factor: np.ndarray | float, size: int) -> np.ndarray:
+    scale = np.asarray(factor, np.float32)
+    if picture is None:
+        return np.broadcast_to(np.clip(scale, 0, 1), (size, size, *scale.shape)).copy()
+    return np.clip(resize(picture, (size, size), "repeat") * scale, 0, 1).astype(np.float32)
+
+
+def pad(values: Float[np.ndarray, "h w *c"], texels: Texels, padding: int) -> Float[np.ndarray, "h w *c"]:
+    """Continue islands outwards: every texel within `padding` texels of a covered one takes the nearest one's values.
+
+    Covered texels and those clearly farther away keep what they have (distances are those of `core.image.nearest`, and
+    the ring is never narrower than asked for). Filtered look-ups and mip levels near an island's border then do not
+    meet foreign colours (Blender's bake calls this its margin).
+    """
+    result = values.copy()
+    pad_in_place([result], texels, padding)
+    return result
+
+
+def pad_maps(maps: Maps, texels: Texels, padding: int) -> Maps:
+    """`pad` for albedo, normal, roughness and metallic, with one search for the nearest texels."""
+    arrays = {name: getattr(maps, name).copy() for name in ("albedo", "normal", "roughness", "metallic")}
+    pad_in_place(list(arrays.values()), texels, padding)
+    return replace(maps, **arrays)
+
+
+def pad_in_place(maps: Sequence[np.ndarray], texels: Texels, padding: int) -> None:
+    """`pad` for several maps of one atlas, written into them."""
+    if padding <= 0 or texels.covered.all() or not texels.covered.any():
+        return
+    index, distance = nearest(texels.covered)
+    ring = np.flatnonzero((distance > 0) & (distance <= 1.05 * padding))
+    source = index.reshape(-1)[ring]
+    for values in maps:
+        flat = values.reshape(texels.covered.size, -1)
+        flat[ring] = flat.take(source, axis=0)

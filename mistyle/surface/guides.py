@@ -1,0 +1,188 @@
+"""What every place of the surface asks of the painting: how light, which colour, and where dark and light must be.
+
+All of it comes from the shape alone and is the same from every side: light from above, openness (ambient occlusion),
+cavities and ridges. The painting answers with its own range of values.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.surface.linefield import KEY
+from mistyle.surface.samples import Level, Points, carry, drop, smooth, workers
+
+Occlusion = Callable[[np.ndarray, np.ndarray], np.ndarray]
+ROTATIONS = 30
+LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, while colours are transported
+UNDULATION = 0.02  # low waves added to the tone, so that flat areas of equal tone get areas of colour and not noise
+HIDDEN = 0.05  # share of open sky under which a place is taken for invisible
+STANDING = -0.85  # height of the normal under which a place is taken for what the thing stands on
+
+
+@dataclass(frozen=True)
+class Guide:
+    """Guides of one level: `colour` Lab/100 (large areas), `detail` -1.6 (dark) .. 1.6 (light), `directed` 0..1."""
+
+    colour: Float[np.ndarray, "n 3"]
+    detail: Float[np.ndarray, " n"]
+    directed: Float[np.ndarray, " n"]
+
+
+def guides(
+    levels: Sequence[Level],
+    palette: Float[np.ndarray, "m 3"],
+    occlusion: Occlusion,
+    bake_light: float,
+    rng: np.random.Generator,
+) -> list[Guide]:
+    """Guides of all levels, coarse to fine. `palette` is Lab/100 of the blurred painting, a few thousand colours."""
+    middle = max(len(levels) - 2, 0)
+    base = levels[middle].points
+    openness = smooth(levels[middle], occlusion(base.positions, base.normals).astype(np.float32), 1)
+    tone, cavity = tones(levels, openness, bake_light)
+    details = detail(levels, tone, cavity)
+    shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
+    colour = colour_field(base, tone[middle], shown, palette, rng)
+    return [
+        Guide(carry(base, colour, level.points), wanted, level.directed)
+        for level, wanted in zip(levels, details, strict=True)
+    ]
+
+
+def cavity_of(level: Level) -> Float[np.ndarray, " n"]:
+    """Mean height of the neighbourhood over the tangent plane, in spacings: positive in hollows."""
+    height = np.zeros(len(level.directed), np.float32)
+    positions, normals = level.points.positions, level.points.normals
+    own = (positions * normals).sum(axis=1)
+    for k in range(level.neighbours.shape[1]):
+        height += (positions[level.neighbours[:, k]] * normals).sum(axis=1) - own
+    return height / np.float32(level.neighbours.shape[1] * level.points.spacing)
+
+
+def bounded(values: Float[np.ndarray, " n"], share: float, least: float, limit: float) -> Float[np.ndarray, " n"]:
+    """Values divided by that percentile of their size (at least `least`), cut at +-limit."""
+    return np.clip(values / max(float(np.percentile(np.abs(values), share)), least), -limit, limit)
+
+
+def tones(
+    levels: Sequence[Level], openness: Float[np.ndarray, " m"], bake_light: float
+) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
+    """Tone (about 0..1) and cavity (-1..1, positive in hollows) of every level.
+
+    `openness` (ambient occlusion, 1 = open) and the cavity belong to the second finest level, where they are smooth;
+    each level has its own normals.
+    """
+    middle = levels[max(len(levels) - 2, 0)]
+    coarse = levels[max(len(levels) - 3, 0)]
+    fine_cavity = smooth(middle, cavity_of(middle), 1)
+    broad_cavity = carry(coarse.points, smooth(coarse, cavity_of(coarse), 1), middle.points)
+    hollow = (bounded(fine_cavity, 95, 0.02, 1) + bounded(broad_cavity, 95, 0.02, 1)) / 2
+    tone, cavity = [], []
+    for level in levels:
+        own = level is middle
+        open_here = openness if own else carry(middle.points, openness, level.points)
+        hollow_here = hollow if own else carry(middle.points, hollow, level.points)
+        normals = level.points.normals
+        sky = 0.5 + 0.5 * normals[:, 1]
+        shade = 0.35 + 0.65 * open_here
+        key = (0.75 * (0.5 + 0.5 * normals @ KEY.astype(np.float32)) ** 1.2 + 0.25 * sky) * shade - 0.16 * hollow_here
+        top = sky * shade - 0.2 * hollow_here
+        tone.append((bake_light * key + (1 - bake_light) * top).astype(np.float32))
+        cavity.append(hollow_here.astype(np.float32))
+    return tone, cavity
+
+
+def detail(
+    levels: Sequence[Level], tone: Sequence[Float[np.ndarray, " _"]], cavity: Sequence[Float[np.ndarray, " _"]]
+) -> list[Float[np.ndarray, " _"]]:
+    """Exaggerated tone of small forms: two bands between smoothings of tone and cavity, -1.6..1.6, for every level."""
+    fine, middle, coarse = levels[-1], levels[max(len(levels) - 2, 0)], levels[max(len(levels) - 3, 0)]
+    sharp = smooth(fine, tone[-1] - 0.25 * cavity[-1], 1)
+    medium = smooth(middle, drop(fine.points, smooth(fine, sharp, 2), middle.points), 2)
+    broad = smooth(coarse, drop(middle.points, smooth(middle, medium, 2), coarse.points), 2)
+    medium_here = carry(middle.points, medium, fine.points)
+    broad_here = carry(coarse.points, broad, fine.points)
+    small = bounded(sharp - medium_here, 92, 0.03, 1.5)
+    large = bounded(medium_here - broad_here, 92, 0.03, 1.5)
+    finest = np.clip(0.6 * small + 0.8 * large, -1.6, 1.6).astype(np.float32)
+    softened = smooth(fine, finest, 1)
+    return [drop(fine.points, softened, level.points) for level in levels[:-1]] + [finest]
+
+
+def solid_waves(
+    positions: Float[np.ndarray, "n 3"], frequency: float, rng: np.random.Generator
+) -> Float[np.ndarray, " n"]:
+    """A sum of six plane waves in random directions: smooth noise through space, standard deviation sqrt(3)."""
+    direction = rng.normal(size=(6, 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    phase = rng.random(6) * 2 * np.pi
+    return np.cos(positions.astype(np.float64) @ direction.T * frequency + phase).sum(axis=1)
+
+
+def normal_scores(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Values replaced by those a standard normal variable takes at the same ranks."""
+    from scipy.special import ndtri
+
+    rank = np.empty(len(values))
+    rank[np.argsort(values, kind="stable")] = (np.arange(len(values)) + 0.5) / len(values)
+    return ndtri(rank)
+
+
+def at_quantiles(values: Float[np.ndarray, " n"], of: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
+    """Values replaced, in their order, by the quantiles of another set (ties by position)."""
+    share = (np.arange(len(values)) + 0.5) / len(values)
+    result = np.empty(len(values))
+    result[np.argsort(values, kind="stable")] = np.interp(share, (np.arange(len(of)) + 0.5) / len(of), np.sort(of))
+    return result
+
+
+def colour_field(
+    points: Points,
+    tone: Float[np.ndarray, " n"],
+    shown: Bool[np.ndarray, " n"],
+    palette: Float[np.ndarray, "m 3"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "n 3"]:
+    """A smooth colour (Lab/100) at every point; over those `shown` the palette keeps its own proportions.
+
+    Optimal transport by iterated one-dimensional transport along rotated axes (Pitie, Kokaram and Dahyot 2007), from
+    a description of the place (tone, height, side) to the palette: light places get light colours, and what lies
+    together on the surface gets colours that lie together in the palette. The others (the inside of a
+    pot and what it stands on would take most of the dark colours) get the colour of the shown point most like them.
+    """
+    from scipy.spatial import KDTree
+
+    positions, normals = points.positions.astype(np.float64), points.normals.astype(np.float64)
+    seen = np.flatnonzero(shown) if shown.any() else np.arange(len(tone))
+    mean, spread = palette.mean(axis=0), palette.std(axis=0)
+    light = tone + UNDULATION * solid_waves(positions, 3.0, rng)
+    height = positions[:, 1] + 0.5 * normals[:, 1] + 0.12 * solid_waves(positions, 4.0, rng)
+    side = normals[:, 0] + 0.25 * solid_waves(positions, 5.0, rng)
+    place = np.stack(
+        [
+            at_quantiles(light[seen], palette[:, 0]),
+            normal_scores(height[seen]) * spread[1] + mean[1],
+            normal_scores(side[seen]) * spread[2] + mean[2],
+        ],
+        axis=1,
+    )
+    scale = np.array([np.clip(LIGHTNESS_LEAD * spread[1:].mean() / max(spread[0], 1e-6), 0.25, 4.0), 1.0, 1.0])
+    colours = transport(place * scale, palette * scale, rng) / scale
+    features = np.stack([light, height, side], axis=1)
+    alike = KDTree(features[seen]).query(features, workers=workers())[1]
+    return colours[alike].astype(np.float32)
+
+
+def transport(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"], rng: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
+    """The source moved until its distribution is the target's; ends on the unrotated axes, exact in each of them."""
+    for step in range(ROTATIONS + 1):
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0] if step < ROTATIONS else np.eye(3)
+        turned, aim = source @ rotation, target @ rotation
+        for axis in range(3):
+            turned[:, axis] = at_quantiles(turned[:, axis], aim[:, axis])
+        source = turned @ rotation.T
+    return source

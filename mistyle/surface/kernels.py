@@ -1,0 +1,314 @@
+"""The inner loops, fused by Dr.Jit: choosing neighbours, describing patches, voting, searching, looking up.
+
+Every function takes the array module to run on as its first argument: `drjit.llvm` (CPU) or `drjit.cuda`. A thread
+reads what others wrote in the kernel before and writes only its own sample: nothing depends on the order of threads.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+TURNED = np.uint32(1 << 31)  # the bit of a table entry that says the neighbour's picture is upside down
+PAGES = 4  # the picture in its four quarter turns
+WIDTH = 24  # floats per style pixel: 16 patch components, 3 colour, 2 orientation, 1 band, 2 unused
+PATCH = 16
+LINEAR = 21  # how many of them enter the squared distance with weight one; the band follows at this index
+BORDER = 2  # half a patch: centres keep this far from a page's edge
+SIGMA = 1.6  # of the vote's Gaussian, in samples
+FOLLOW = (7, 11, 13, 17, 2, 10, 14, 22)  # table entries at distance 1 and 2 along the axes, whose place is continued
+PROBES = np.array(
+    [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1), (0, 3), (0, -3), (3, 0), (-3, 0)], np.float32
+)
+
+
+@dataclass(frozen=True)
+class Tables:
+    """A level's neighbourhoods on the device: index (with the TURNED bit), offsets (x, y) and voting weight."""
+
+    count: int
+    neighbour: Any
+    offset: Any
+    weight: Any
+
+
+@dataclass(frozen=True)
+class Book:
+    """The four pages on the device: sizes, first pixel, colour, descriptor, pixel of the unturned picture."""
+
+    height: Any
+    width: Any
+    start: Any
+    colour: Any
+    descriptor: Any
+    origin: Any
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where each sample's centre lies in the book: page, column and row in pixels (index coordinates)."""
+
+    page: Any
+    x: Any
+    y: Any
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What each sample looks for: its descriptor (as wide as a style pixel's) and how much the band matters to it."""
+
+    descriptor: Any
+    band_weight: Any
+
+
+def module(name: str) -> ModuleType:
+    """Dr.Jit's array module of that name: "llvm", "cuda" or "metal"."""
+    import importlib
+
+    return importlib.import_module(f"drjit.{name}")
+
+
+def floats(dj: ModuleType, values: np.ndarray) -> Any:
+    """A flat device array of float32."""
+    return dj.Float(np.ascontiguousarray(values, np.float32).reshape(-1))
+
+
+def whole(dj: ModuleType, values: np.ndarray) -> Any:
+    """A flat device array of uint32."""
+    return dj.UInt(np.ascontiguousarray(values).astype(np.uint32).reshape(-1))
+
+
+def tables(
+    dj: ModuleType,
+    neighbours: Int[np.ndarray, "n 25"],
+    turned: Bool[np.ndarray, "n 25"],
+    offsets: Float[np.ndarray, "n 25 2"],
+) -> Tables:
+    """Neighbourhoods moved to the device."""
+    index = neighbours.astype(np.uint32) | np.where(turned, TURNED, np.uint32(0))
+    weight = np.exp(-(offsets**2).sum(axis=2) / np.float32(2 * SIGMA**2))
+    return Tables(len(neighbours), whole(dj, index), floats(dj, offsets), floats(dj, weight))
+
+
+def choose_neighbours(
+    dj: ModuleType,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    tangent: Float[np.ndarray, "n 3"],
+    across: Float[np.ndarray, "n 3"],
+    spacing: float,
+    near: Int[np.ndarray, "n k"],
+) -> Int[np.ndarray, "n 25"]:
+    """For every grid position (row by row, x fastest) the sample of `near` that lies nearest to it.
+
+    Nearest means smallest |p_j - p_i - h (dx t + dy s)|^2 + (3 h)^2 |n_j - n_i|^2; the first of equals is taken.
+    """
+    import drjit as dr
+
+    count, reach = near.shape
+    at, nrm = floats(dj, positions), floats(dj, normals)
+    candidates = whole(dj, near)
+    i = dr.arange(dj.UInt, count)
+    own_p, own_n = dr.gather(dj.Array3f, at, i), dr.gather(dj.Array3f, nrm, i)
+    # Opaque: a literal would be compiled in, one kernel for every mesh.
+    scale = dr.opaque(dj.Float, 1 / spacing)
+    x_axis = dr.gather(dj.Array3f, floats(dj, tangent), i) * scale
+    y_axis = dr.gather(dj.Array3f, floats(dj, across), i) * scale
+    grid = [(dx, dy) for dy in range(-2, 3) for dx in range(-2, 3)]
+
+    def body(k: Any, *state: Any) -> tuple[Any, ...]:
+        best, which = state[:25], state[25:]
+        j = dr.gather(dj.UInt, candidates, i * reach + k)
+        step = dr.gather(dj.Array3f, at, j) - own_p
+        u, v = dr.dot(step, x_axis), dr.dot(step, y_axis)
+        turn = dr.squared_norm(dr.gather(dj.Array3f, nrm, j) - own_n)
+        # |step|^2 - u^2 - v^2 is the squared height over the tangent plane.
+        rest = dr.squared_norm(step * scale) - u * u - v * v + 9 * turn
+        new_best, new_which = [], []
+        for slot, (dx, dy) in enumerate(grid):
+            distance = rest + dr.square(u - dx) + dr.square(v - dy)
+            closer = distance < best[slot]
+            new_best.append(dr.select(closer, distance, best[slot]))
+            new_which.append(dr.select(closer, j, which[slot]))
+        return (k + 1, *new_best, *new_which)
+
+    start = (dj.UInt(0), *[dr.full(dj.Float, np.inf, count)] * 25, *[i] * 25)
+    state = dr.while_loop(start, lambda k, *rest: k < reach, body)
+    chosen = dr.empty(dj.UInt, count * 25)
+    for slot in range(25):
+        dr.scatter(chosen, state[26 + slot], i * 25 + slot)
+    result = chosen.numpy().reshape(count, 25).astype(np.int32)
+    result[:, 12] = np.arange(count)
+    return result
+
+
+def describe(dj: ModuleType, table: Tables, colour: Any, basis: Any, mean: Any) -> Any:
+    """Patch components of every sample: (colours of its 25 neighbours - mean) . basis; flat (n 16).
+
+    `colour` flat (n 3); `basis` flat (25 3 16) and `mean` flat (25 3): grid position, channel, component.
+    """
+    import drjit as dr
+
+    i = dr.arange(dj.UInt, table.count)
+    return _components(
+        dj, table.count, lambda k: dr.gather(dj.UInt, table.neighbour, i * 25 + k) & ~TURNED, colour, basis, mean
+    )
+
+
+def describe_pixels(dj: ModuleType, colour: Any, shapes: Int[np.ndarray, "4 2"], basis: Any, mean: Any) -> Any:
+    """Patch components of every pixel of the four pages (each height x width = `shapes`); wrong at a page's border."""
+    import drjit as dr
+
+    area = int(shapes[0].prod())
+    count = PAGES * area
+    i = dr.arange(dj.Int, count)
+    width = dr.gather(dj.Int, dj.Int(shapes[:, 1].astype(np.int32)), i // dr.opaque(dj.Int, area))
+    last = dr.opaque(dj.Int, count - 1)
+
+    def pixel(k: Any) -> Any:
+        return dj.UInt(dr.clip(i + (dj.Int(k) // 5 - 2) * width + dj.Int(k) % 5 - 2, 0, last))
+
+    return _components(dj, count, pixel, colour, basis, mean)
+
+
+def _components(dj: ModuleType, count: int, member: Callable[[Any], Any], colour: Any, basis: Any, mean: Any) -> Any:
+    """Sum over grid positions k and channels of (colour[member(k)] - mean[k]) basis[k], flat (count 16)."""
+    import drjit as dr
+
+    def body(k: Any, *parts: Any) -> tuple[Any, ...]:
+        c = dr.gather(dj.Array3f, colour, member(k)) - dr.gather(dj.Array3f, mean, k)
+        out = list(parts)
+        for channel in range(3):
+            for component in range(PATCH):
+                weight = dr.gather(dj.Float, basis, (k * 3 + channel) * PATCH + component)
+                out[component] = dr.fma(c[channel], weight, out[component])
+        return (k + 1, *out)
+
+    zero = dr.zeros(dj.Float, count)
+    state = dr.while_loop((dj.UInt(0), *[zero] * PATCH), lambda k, *parts: k < 25, body)
+    result = dr.empty(dj.Float, count * PATCH)
+    i = dr.arange(dj.UInt, count)
+    for component in range(PATCH):
+        dr.scatter(result, state[1 + component], i * PATCH + component)
+    dr.eval(result)
+    return result
+
+
+def vote(dj: ModuleType, table: Tables, book: Book, place: Place) -> Any:
+    """The colour of every sample, flat (n 3): what the patches of its 25 neighbours show where it lies, averaged."""
+    import drjit as dr
+
+    i = dr.arange(dj.UInt, table.count)
+
+    def body(k: Any, total: Any, weights: Any) -> tuple[Any, ...]:
+        slot = i * 25 + k
+        j = dr.gather(dj.UInt, table.neighbour, slot) & ~TURNED
+        page = dr.gather(dj.UInt, place.page, j)
+        step = dr.gather(dj.Array2f, table.offset, slot)
+        height, width = dr.gather(dj.Float, book.height, page), dr.gather(dj.Float, book.width, page)
+        x = dr.clip(dr.gather(dj.Float, place.x, j) + step[0], 0, width - 1.001)
+        y = dr.clip(dr.gather(dj.Float, place.y, j) + step[1], 0, height - 1.001)
+        left, top = dr.floor(x), dr.floor(y)
+        right, down = x - left, y - top
+        row = dj.UInt(width)
+        pixel = dr.gather(dj.UInt, book.start, page) + dj.UInt(top) * row + dj.UInt(left)
+
+        def colour(index: Any) -> Any:
+            return dr.gather(dj.Array3f, book.colour, index)
+
+        upper = dr.lerp(colour(pixel), colour(pixel + 1), right)
+        lower = dr.lerp(colour(pixel + row), colour(pixel + row + 1), right)
+        weight = dr.gather(dj.Float, table.weight, slot)
+        return k + 1, total + dr.lerp(upper, lower, down) * weight, weights + weight
+
+    start = (dj.UInt(0), dj.Array3f(0), dr.zeros(dj.Float, table.count))
+    _, total, weights = dr.while_loop(start, lambda k, *rest: k < 25, body)
+    result = dr.ravel(total / weights)
+    dr.eval(result)
+    return result
+
+
+def continued(dj: ModuleType, table: Tables, book: Book, place: Place, slot: Any) -> tuple[Any, Any, Any]:
+    """Where a sample would lie if it went on with the picture of the neighbour in table entry `slot`: page, x, y."""
+    import drjit as dr
+
+    entry = dr.gather(dj.UInt, table.neighbour, slot)
+    j, turned = entry & ~TURNED, entry >= TURNED
+    step = dr.gather(dj.Array2f, table.offset, slot)
+    page = dr.gather(dj.UInt, place.page, j)
+    x, y = dr.gather(dj.Float, place.x, j) + step[0], dr.gather(dj.Float, place.y, j) + step[1]
+    x = dr.select(turned, dr.gather(dj.Float, book.width, page) - 1 - x, x)
+    y = dr.select(turned, dr.gather(dj.Float, book.height, page) - 1 - y, y)
+    return dr.select(turned, (page + 2) % PAGES, page), x, y
+
+
+def search(
+    dj: ModuleType,
+    table: Tables,
+    book: Book,
+    place: Place,
+    wanted: Wanted,
+    use: Any,
+    prices: Any,
+    also: Place | None,
+) -> tuple[Any, Place]:
+    """One round: every sample takes the best of its own place, those its neighbours suggest, and fixed steps about it.
+
+    `use` says per pixel of the unturned picture how often it is taken (1 = average). `prices` is flat
+    (coherence, variety). `also` offers one more place per sample (from `exhaustive`). Returns costs and places.
+    """
+    import drjit as dr
+
+    i = dr.arange(dj.UInt, table.count)
+    target = [dr.gather(dj.Array4f, wanted.descriptor, i * (WIDTH // 4) + k) for k in range(WIDTH // 4)]
+    band_weight = dr.gather(dj.Float, wanted.band_weight, i)
+    coherence, variety = dr.gather(dj.Float, prices, dj.UInt(0)), dr.gather(dj.Float, prices, dj.UInt(1))
+    beside = [continued(dj, table, book, place, i * 25 + slot) for slot in (7, 11, 13, 17)]
+
+    def inside(page: Any, x: Any, y: Any) -> tuple[Any, Any]:
+        width, height = dr.gather(dj.Float, book.width, page), dr.gather(dj.Float, book.height, page)
+        return dr.clip(x, BORDER, width - 1 - BORDER), dr.clip(y, BORDER, height - 1 - BORDER)
+
+    def cost(page: Any, x: Any, y: Any) -> Any:
+        row = dj.UInt(dr.gather(dj.Float, book.width, page))
+        pixel = dr.gather(dj.UInt, book.start, page) + dj.UInt(dr.round(y)) * row + dj.UInt(dr.round(x))
+        total = variety * dr.gather(dj.Float, use, dr.gather(dj.UInt, book.origin, pixel))
+        for k in range(WIDTH // 4):
+            gap = target[k] - dr.gather(dj.Array4f, book.descriptor, pixel * (WIDTH // 4) + k)
+            if k < LINEAR // 4:
+                total += dr.squared_norm(gap)
+            else:
+                total += dr.square(gap[0]) + band_weight * dr.square(gap[1])
+        for other, u, v in beside:
+            jump = dr.minimum(dr.square(u - x) + dr.square(v - y), 4) / 4
+            total += coherence * dr.select(other == page, jump, 1)
+        return total
+
+    def better(best: tuple[Any, ...], page: Any, x: Any, y: Any) -> tuple[Any, ...]:
+        x, y = inside(page, x, y)
+        price = cost(page, x, y)
+        take = price < best[0]
+        return tuple(dr.select(take, new, old) for new, old in zip((price, page, x, y), best, strict=True))
+
+    best: tuple[Any, ...] = (cost(place.page, place.x, place.y), place.page, place.x, place.y)
+    if also is not None:
+        best = better(best, also.page, also.x, also.y)
+    slots = whole(dj, np.array(FOLLOW))
+    probes = floats(dj, PROBES)
+
+    def follow(k: Any, *best: Any) -> tuple[Any, ...]:
+        page, x, y = continued(dj, table, book, place, i * 25 + dr.gather(dj.UInt, slots, k))
+        return (k + 1, *better(best, page, x, y))
+
+    def probe(k: Any, *best: Any) -> tuple[Any, ...]:
+        step = dr.gather(dj.Array2f, probes, k)
+        return (k + 1, *better(best, best[1], best[2] + step[0], best[3] + step[1]))
+
+    best = dr.while_loop((dj.UInt(0), *best), lambda k, *rest: k < len(FOLLOW), follow)[1:]
+    best = dr.while_loop((dj.UInt(0), *best), lambda k, *rest: k < len(PROBES), probe)[1:]
+    dr.eval(best)
+    price, page, x, y = best
+    return price, Place(page, x, y)

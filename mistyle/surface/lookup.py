@@ -1,0 +1,199 @@
+"""The painted surface: any point of it answers with a colour of the painting, at the painting's own resolution."""
+
+from dataclasses import dataclass, fields
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.surface import kernels, style
+from mistyle.surface.samples import Level, as_points, lifted, workers
+
+CHUNK = 1 << 19
+BLEND = 0.5  # of the Gaussian between the nearest samples, in spacings
+NEAREST = 3
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Where each sample of the surface lies in the painting.
+
+    positions, normals  of the samples, working space
+    tangent             unit, the picture's x at quarter turn 0; y is tangent x normal
+    turn                quarter turns (counter-clockwise) by which the painting is turned at this sample
+    centre              (x, y) in pixels of the unturned painting, pixel centres at +0.5
+    spacing             mean distance h of samples
+    scale               pixels of the painting per spacing, along its x and y
+    painting            encoded sRGB, 0..1
+    """
+
+    positions: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    tangent: Float[np.ndarray, "n 3"]
+    turn: Int[np.ndarray, " n"]
+    centre: Float[np.ndarray, "n 2"]
+    spacing: float
+    scale: tuple[float, float]
+    painting: Float[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class Canvas:
+    """A finished solution on the device, and the painting with its size."""
+
+    position: Any
+    tangent: Any
+    across: Any
+    turn: Any
+    centre: Any
+    scale: Any
+    painting: Any
+    height: Any
+    width: Any
+
+
+def solution(
+    level: Level,
+    page: Int[np.ndarray, " n"],
+    x: Float[np.ndarray, " n"],
+    y: Float[np.ndarray, " n"],
+    size: tuple[int, int],
+    painting: Float[np.ndarray, "h w 3"],
+) -> Solution:
+    """A solution from places on the turned pages of a smaller painting of `size` (height, width)."""
+    height, width = size
+    # Page k is np.rot90(picture, k): undo it for pixel corners, where page 1 has (x, y) at picture (width - y, x).
+    x, y = x + 0.5, y + 0.5
+    across = np.choose(page, [x, width - y, width - x, y])
+    down = np.choose(page, [y, x, height - y, height - x])
+    scale = (painting.shape[1] / width, painting.shape[0] / height)
+    return Solution(
+        positions=level.points.positions,
+        normals=level.points.normals,
+        tangent=level.tangent,
+        turn=page.astype(np.int32),
+        centre=np.stack([across * scale[0], down * scale[1]], axis=1).astype(np.float32),
+        spacing=level.points.spacing,
+        scale=scale,
+        painting=painting,
+    )
+
+
+def colour(
+    solution: Solution,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    *,
+    footprint: float = 0.0,
+    device: str = "llvm",
+) -> Float[np.ndarray, "n 3"]:
+    """Encoded sRGB (0..1) at surface points with unit normals.
+
+    The three samples nearest in [p, 3 h n] each continue their piece of the painting to the point; their colours are
+    blended by exp(-(d^2 - d0^2) / (2 (0.5 h)^2)). `footprint` is the distance between neighbouring queries (a texel, a
+    pixel) in working units: the painting is blurred to it, 0 leaves it sharp. A point off the surface gets the colour
+    of the nearest sample's tangent plane.
+    """
+    dj = kernels.module(device)
+    tree = as_points(solution.positions, solution.normals, solution.spacing).tree
+    pixel = solution.spacing / max(solution.scale)  # one pixel of the painting on the surface
+    painting = solution.painting
+    if footprint > pixel:
+        painting = style.blurred(painting, 0.4 * footprint / pixel)
+    across = np.cross(solution.tangent, solution.normals)
+    per_unit = np.array(solution.scale) / solution.spacing
+    canvas = on_canvas(
+        dj, solution.positions, solution.tangent, across, solution.turn, solution.centre, per_unit, painting
+    )
+    out = np.empty((len(positions), 3), np.float32)
+    for low in range(0, len(positions), CHUNK):
+        p, n = positions[low : low + CHUNK], normals[low : low + CHUNK]
+        count = min(NEAREST, len(solution.positions))
+        distance, index = tree.query(lifted(p, n, solution.spacing), k=np.arange(1, count + 1), workers=workers())
+        weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * (BLEND * solution.spacing) ** 2))
+        weight /= weight.sum(axis=1, keepdims=True)
+        out[low : low + CHUNK] = paint(dj, canvas, p, index, weight)
+    return out
+
+
+def on_canvas(
+    dj: ModuleType,
+    positions: Float[np.ndarray, "n 3"],
+    tangent: Float[np.ndarray, "n 3"],
+    across: Float[np.ndarray, "n 3"],
+    turn: Int[np.ndarray, " n"],
+    centre: Float[np.ndarray, "n 2"],
+    scale: Float[np.ndarray, " 2"],
+    painting: Float[np.ndarray, "h w 3"],
+) -> Canvas:
+    """A solution moved to the device; `scale` is pixels (x, y) per working unit."""
+    import drjit as dr
+
+    return Canvas(
+        position=kernels.floats(dj, positions),
+        tangent=kernels.floats(dj, tangent),
+        across=kernels.floats(dj, across),
+        turn=kernels.whole(dj, turn),
+        centre=kernels.floats(dj, centre),
+        scale=dj.Array2f(dr.opaque(dj.Float, float(scale[0])), dr.opaque(dj.Float, float(scale[1]))),
+        painting=kernels.floats(dj, painting),
+        height=dr.opaque(dj.Float, float(painting.shape[0])),
+        width=dr.opaque(dj.Float, float(painting.shape[1])),
+    )
+
+
+def paint(
+    dj: ModuleType,
+    canvas: Canvas,
+    positions: Float[np.ndarray, "n 3"],
+    index: Int[np.ndarray, "n k"],
+    weight: Float[np.ndarray, "n k"],
+) -> Float[np.ndarray, "n 3"]:
+    """Blend what the samples `index` show at `positions`: bilinear in the painting, coordinates kept inside it."""
+    import drjit as dr
+
+    count, reach = index.shape
+    samples, weights = kernels.whole(dj, index), kernels.floats(dj, weight)
+    i = dr.arange(dj.UInt, count)
+    point = dr.gather(dj.Array3f, kernels.floats(dj, positions), i)
+
+    def body(k: Any, total: Any) -> tuple[Any, ...]:
+        j = dr.gather(dj.UInt, samples, i * reach + k)
+        step = point - dr.gather(dj.Array3f, canvas.position, j)
+        u = dr.dot(step, dr.gather(dj.Array3f, canvas.tangent, j))
+        v = dr.dot(step, dr.gather(dj.Array3f, canvas.across, j))
+        turn = dr.gather(dj.UInt, canvas.turn, j)
+        # A step (u, v) on the page turned k times is this step in the picture itself.
+        right = dr.select(turn == 0, u, dr.select(turn == 1, -v, dr.select(turn == 2, -u, v)))
+        down = dr.select(turn == 0, v, dr.select(turn == 1, u, dr.select(turn == 2, -v, -u)))
+        centre = dr.gather(dj.Array2f, canvas.centre, j)
+        x = dr.clip(centre[0] + right * canvas.scale[0] - 0.5, 0, canvas.width - 1)
+        y = dr.clip(centre[1] + down * canvas.scale[1] - 0.5, 0, canvas.height - 1)
+        left, top = dr.floor(x), dr.floor(y)
+        row = dj.UInt(canvas.width)
+        next_x = dj.UInt(dr.minimum(left + 1, canvas.width - 1))
+        next_row = dj.UInt(dr.minimum(top + 1, canvas.height - 1)) * row
+        first, first_row = dj.UInt(left), dj.UInt(top) * row
+
+        def texel(offset: Any) -> Any:
+            return dr.gather(dj.Array3f, canvas.painting, offset)
+
+        upper = dr.lerp(texel(first_row + first), texel(first_row + next_x), x - left)
+        lower = dr.lerp(texel(next_row + first), texel(next_row + next_x), x - left)
+        return k + 1, total + dr.lerp(upper, lower, y - top) * dr.gather(dj.Float, weights, i * reach + k)
+
+    _, total = dr.while_loop((dj.UInt(0), dj.Array3f(0)), lambda k, *rest: k < reach, body)
+    return np.clip(np.array(dr.ravel(total)).reshape(count, 3), 0, 1)
+
+
+def to_arrays(solution: Solution) -> dict[str, np.ndarray]:
+    """The record as plain arrays, for saving without pickle."""
+    return {field.name: np.asarray(getattr(solution, field.name)) for field in fields(solution)}
+
+
+def from_arrays(arrays: dict[str, np.ndarray]) -> Solution:
+    """The inverse of `to_arrays`, bit for bit."""
+    x, y = arrays["scale"]
+    names = ("positions", "normals", "tangent", "turn", "centre", "painting")
+    return Solution(**{n: arrays[n] for n in names}, spacing=float(arrays["spacing"]), scale=(float(x), float(y)))

@@ -1,0 +1,58 @@
+"""What holds for every test: the LLVM that the set-up found, a seeded generator, and no silent skips in CI."""
+
+import os
+
+import numpy as np
+import pytest
+from helpers import NO_DATA
+from hypothesis import settings
+
+from mistyle import bootstrap
+
+# Skips that CI accepts, by the beginning of their reason, and why. Where the environment variable CI is set, any
+# other skip fails the run: a test that never runs proves nothing.
+ALLOWED_SKIPS = {
+    NO_DATA: "real meshes and paintings stand under other people's licences and are not in the repository",
+}
+skipped: list[tuple[str, str]] = []
+
+bootstrap.use_llvm()
+settings.register_profile("mistyle", deadline=None, derandomize=True, database=None)
+settings.load_profile("mistyle")
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """The same random numbers in every test and every run."""
+    return np.random.default_rng(0)
+
+
+def pytest_runtest_logreport(report: pytest.TestReport) -> None:
+    note(report)
+
+
+def pytest_collectreport(report: pytest.CollectReport) -> None:
+    note(report)
+
+
+def note(report: pytest.TestReport | pytest.CollectReport) -> None:
+    """Keep a skip's reason; an expected failure (xfail) is no skip."""
+    if report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        skipped.append((report.nodeid, reason.removeprefix("Skipped: ")))
+
+
+def refused() -> list[tuple[str, str]]:
+    """The skips that fail this run."""
+    in_ci = os.environ.get("CI", "").lower() not in ("", "0", "false")
+    return [s for s in skipped if in_ci and not s[1].startswith(tuple(ALLOWED_SKIPS))]
+
+
+def pytest_sessionfinish(session: pytest.Session, exitstatus: int) -> None:
+    if refused() and exitstatus == pytest.ExitCode.OK:
+        session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    for test, reason in refused():
+        terminalreporter.write_line(f"CI does not accept this skip: {test}: {reason}", red=True)

@@ -1,0 +1,73 @@
+"""The command line as a person meets it: quick help, one sentence for an error, the right exit code."""
+
+import json
+import subprocess
+import sys
+import time
+
+import pytest
+
+from mistyle.run.cli import main, parser
+
+
+def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run([sys.executable, "-m", "mistyle", *arguments], capture_output=True, text=True)
+
+
+def test_help_answers_at_once():
+    run("--help")
+    seconds = []
+    for _ in range(3):
+        start = time.perf_counter()
+        assert run("--help").returncode == 0
+        seconds.append(time.perf_counter() - start)
+    assert min(seconds) < 0.5
+
+
+@pytest.mark.parametrize("verb", ["stylize", "demo", "render", "bake"])
+def test_every_verb_explains_itself(verb, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main([verb, "--help"])
+    assert stopped.value.code == 0
+    assert "--preset" in capsys.readouterr().out
+
+
+def test_options_name_existing_settings():
+    from mistyle.run.cli import OPTIONS
+    from mistyle.run.settings import known_keys
+
+    assert set(OPTIONS.values()) <= set(known_keys())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "sentence"),
+    [
+        (["stylize"], 2, "stylize needs MESH, STYLE, -o OUT"),
+        (["stylize", "a.obj", "b.png", "-o", "x", "--set", "fit.crop=1"], 2, "did you mean 'fit.crops'"),
+        (["stylize", "absent.obj", "b.png", "-o", "OUT"], 3, "absent.obj"),
+        (["render", "absent.obj", "-o", "OUT"], 3, "absent.obj"),
+    ],
+)
+def test_trouble_is_one_sentence_and_a_code(arguments, code, sentence, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(arguments) == code
+    said = capsys.readouterr().err
+    assert sentence in said and "Traceback" not in said
+    assert not list(tmp_path.iterdir()), "a refused job leaves nothing behind"
+
+
+def test_errors_are_json_where_asked(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["stylize", "absent.obj", "b.png", "-o", "OUT", "--json"]) == 3
+    assert json.loads(capsys.readouterr().out)["exit_code"] == 3
+
+
+def test_print_config_reads_back(capsys):
+    assert main(["stylize", "--preset", "draft", "--seed", "7", "--print-config"]) == 0
+    assert "seed = 7" in capsys.readouterr().out
+
+
+def test_unknown_verbs_are_refused():
+    with pytest.raises(SystemExit) as stopped:
+        parser().parse_args(["stylise"])
+    assert stopped.value.code == 2

@@ -1,0 +1,67 @@
+"""Layers of settings: the later one wins, and the guilty one is named."""
+
+from pathlib import Path
+
+import pytest
+
+from mistyle.core.errors import UsageError
+from mistyle.run.settings import PRESETS, Settings, as_toml, assignments, known_keys, resolve
+
+
+def test_later_layers_win(tmp_path):
+    config = tmp_path / "job.toml"
+    config.write_text('preset = "draft"\nseed = 1\n[fit]\ncrops = 2\n[atlas]\nsize = 256\n')
+    settings = resolve(None, config, {"seed": 3}, {"MISTYLE_SET": "seed=2; fit.crops=3"})
+    assert (settings.seed, settings.fit.crops, settings.atlas.size) == (3, 3, 256)
+    assert settings.rig.resolution == resolve("draft", None, {}, {}).rig.resolution
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_printed_settings_read_back_equal(tmp_path, preset):
+    settings = resolve(preset, None, {}, {})
+    path = tmp_path / "printed.toml"
+    path.write_text(as_toml(settings))
+    assert resolve("standard", path, {}, {}) == settings
+
+
+@pytest.mark.parametrize(
+    ("said", "expected"),
+    [
+        (
+            {"fit": {"iteratons1": 3}},
+            r"command line: there is no setting 'fit.iteratons1'; did you mean 'fit.iterations1'\?",
+        ),
+        ({"atlas": {"size": "large"}}, r"command line: atlas.size = 'large'"),
+        ({"seed": -1}, r"command line: seed = -1"),
+    ],
+)
+def test_wrong_settings_are_refused_with_their_path(said, expected):
+    with pytest.raises(UsageError, match=expected):
+        resolve(None, None, said, {})
+
+
+def test_the_guilty_layer_is_named(tmp_path):
+    config = tmp_path / "job.toml"
+    config.write_text("sed = 1\n")
+    with pytest.raises(UsageError, match=r"job.toml: there is no setting 'sed'; did you mean 'seed'"):
+        resolve(None, config, {}, {})
+    with pytest.raises(UsageError, match="MISTYLE_SET"):
+        resolve(None, None, {}, {"MISTYLE_SET": "nonsense"})
+    config.write_text("seed = = 1\n")
+    with pytest.raises(UsageError, match="not a TOML file"):
+        resolve(None, config, {}, {})
+    with pytest.raises(UsageError, match="no such file"):
+        resolve(None, Path(tmp_path / "absent.toml"), {}, {})
+
+
+def test_assignments_nest_and_parse():
+    assert assignments(["fit.crops=3", "fit.refine=off", "name=x"], "--set") == {
+        "fit": {"crops": 3, "refine": "off"},
+        "name": "x",
+    }
+
+
+def test_every_known_key_can_be_printed():
+    assert {"seed", "fit.iterations1", "atlas.size"} <= set(known_keys())
+    assert len(known_keys()) == len(set(known_keys()))
+    assert Settings() == resolve("standard", None, {}, {}) or PRESETS["standard"]
