@@ -66,20 +66,25 @@ def draw(camera: Camera) -> View:
     return View(camera, rgb, depth.astype(np.float32), nothing, nothing[..., :2], part, mask, mask.astype(np.float32))
 
 
-def main(argv: list[str] | None = None) -> None:
-    options = arguments(__doc__ or "", argv)
-    size, resolution, cells = (512, 128, 12) if options.quick else (4096, 1024, 34)
-    figures: dict[str, float] = {}
+def measure(figures: dict[str, float], size: int, resolution: int, cells: int) -> None:
+    """Rasterise and bake once; what it needed is gone when it returns."""
     views = [draw(camera) for camera in rig(RigSettings(resolution=resolution))]
     mesh = spheres(cells)
     figures["bake.faces"] = len(mesh.faces)
     texels = timed(figures, "bake.rasterise_seconds", lambda: rasterise(mesh, 0, size))
     baked = timed(figures, "bake.seconds", lambda: bake(views, texels, BakeSettings(), 16, mesh=mesh))
     figures["bake.peak_gb"] = peak_gb()
-    figures["bake.covered_share"] = texels.covered.mean()
-    figures["bake.known_share"] = baked.known[texels.covered].mean()
-    figures["bake.error_mean"] = np.abs(baked.albedo[baked.known] - paint(texels.position[baked.known])).mean()
-    del baked, texels, views
+    figures["bake.covered_share"] = float(texels.covered.mean())
+    figures["bake.known_share"] = float(baked.known[texels.covered].mean())
+    wrong = np.abs(baked.albedo[baked.known] - paint(texels.position[baked.known]))
+    figures["bake.error_mean"] = float(wrong.mean())
+
+
+def main(argv: list[str] | None = None) -> None:
+    options = arguments(__doc__ or "", argv)
+    size, resolution, cells = (512, 128, 12) if options.quick else (4096, 1024, 34)
+    figures: dict[str, float] = {}
+    measure(figures, size, resolution, cells)
     dense = spheres(3 * cells)
     figures["bake.dense_faces"] = len(dense.faces)
     timed(figures, "bake.dense_rasterise_seconds", lambda: rasterise(dense, 0, size))

@@ -33,11 +33,11 @@ def timed(figures: dict[str, float], name: str, work: Callable[[], T]) -> T:
 
 
 def peak_gb() -> float:
-    """The most memory this process has held so far, in GB (10^9 bytes); NaN on Windows."""
+    """The most memory this process has held so far, in GB (10^9 bytes); 0 on Windows, where nothing tells."""
     try:
         import resource
     except ImportError:
-        return float("nan")
+        return 0.0
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak * (1 if sys.platform == "darwin" else 1024) / 1e9
 
@@ -45,7 +45,7 @@ def peak_gb() -> float:
 def machine() -> dict[str, Any]:
     """Where the figures were measured; `load` above `cores` means that others were working too."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),

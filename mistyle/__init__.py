@@ -1,5 +1,7 @@
 """mistyle: one mesh and one style image in, the same mesh with stylized, physically based textures out."""
 
+from __future__ import annotations
+
 from os import PathLike
 from typing import Any
 

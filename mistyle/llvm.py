@@ -23,6 +23,7 @@ Say = Callable[[str], None]
 
 # Newest tested first; a distribution offers one or two of them.
 PACKAGES = ("libllvm19", "libllvm20", "libllvm21", "libllvm22", "libllvm18", "libllvm17t64", "libllvm17")
+RETRIES = ("-o", "Acquire::Retries=3")
 PLACES = (
     "/usr/lib/*-linux-gnu/libLLVM*.so*",
     "/usr/lib/llvm-*/lib/libLLVM*.so*",
@@ -196,7 +197,7 @@ def _download(home: Path, package: str, options: list[str], say: Say) -> bool:
     say(f"fetching {' '.join(name for name, _, _ in files)} into {home / 'llvm'} (the system is not changed)")
     with tempfile.TemporaryDirectory(dir=home) as scratch:
         os.chmod(scratch, 0o755)  # apt-get downloads as its own user when root calls it
-        if _run(["apt-get", *options, "-q", "download", *wanted], cwd=scratch).returncode != 0:
+        if _run(["apt-get", *options, *RETRIES, "-q", "download", *wanted], cwd=scratch).returncode != 0:
             return False
         for deb in sorted(Path(scratch).glob("*.deb")):
             if _run(["dpkg-deb", "-x", str(deb), str(Path(scratch) / "llvm")]).returncode != 0:

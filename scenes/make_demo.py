@@ -39,7 +39,7 @@ def largest_part(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, n
 
 
 def is_closed(faces: np.ndarray) -> bool:
-    """Whether every edge has two faces that run along it in opposite directions, and the whole is a sphere's topology."""
+    """Whether every edge has two faces, run through in opposite directions, and the surface is a sphere with dents."""
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     once = len(np.unique(directed, axis=0)) == len(directed)
     edges = len(np.unique(np.sort(directed, axis=1), axis=0))
@@ -128,7 +128,8 @@ def obj_text(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, corne
     """Wavefront OBJ with shared positions and normals and one vt per distinct (vertex, uv)."""
     corners = np.concatenate([faces.reshape(-1, 1), np.round(corner_uvs.reshape(-1, 2) * 1e5).astype(np.int64)], axis=1)
     unique, index = np.unique(corners, axis=0, return_inverse=True)
-    lines = ["# mistyle demo: a young elephant with a bird on its back, by scenes/make_demo.py. CC0 1.0.", "o elephant"]
+    lines = ["# mistyle demo: a young elephant with a bird on its back, by scenes/make_demo.py. CC0 1.0."]
+    lines += ["mtllib demo.mtl", "o elephant", "usemtl elephant"]
     lines += [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices]
     lines += [f"vt {u / 1e5:.5f} {v / 1e5:.5f}" for _, u, v in unique]
     lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normals]
@@ -140,12 +141,13 @@ def obj_text(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, corne
 
 
 def make_mesh() -> None:
-    """Write demo.obj."""
+    """Write demo.obj and demo.mtl."""
     from mistyle.core.unwrap import unwrap
 
     vertices, faces, normals = sculpture()
     (uvs,) = unwrap([(vertices, faces)])
     (HERE / "demo.obj").write_text(obj_text(vertices, faces, normals, uvs), encoding="ascii", newline="\n")
+    (HERE / "demo.mtl").write_text("newmtl elephant\nKd 0.5 0.5 0.5\n", encoding="ascii", newline="\n")
 
 
 def make_style() -> None:

@@ -1,8 +1,8 @@
-"""Make the files that the scenes beside this one read: paper_views.exr, studio.exr, studio_backdrop.obj and .exr.
+"""Make the files that the scenes beside this one read: paper_lights.exr, studio_lights.exr, studio_backdrop.obj and .exr.
 
     python scenes/make_lights.py [--out FOLDER]
 
-The numbers of the paper's three lights stand in paper_views.json, those of the studio below.
+The numbers of the paper's three lights stand in paper_lights.json, those of the studio below.
 """
 
 import argparse
@@ -83,11 +83,12 @@ def write_backdrop(path: Path, steps: int = 24) -> None:
     angles = np.linspace(0, np.pi / 2, steps + 1)
     bend = [(BACK + BEND - BEND * np.sin(a), BEND - BEND * np.cos(a), np.sin(a), np.cos(a)) for a in angles]
     profile = [(FRONT, 0.0, 0.0, 1.0), *bend, (BACK, TOP, 1.0, 0.0)]
-    ways = np.concatenate([[0], np.cumsum([np.hypot(b[0] - a[0], b[1] - a[1]) for a, b in zip(profile, profile[1:])])])
+    steps_taken = np.hypot(*np.diff(np.array(profile)[:, :2], axis=0).T)
+    along = np.concatenate([[0], np.cumsum(steps_taken)])
     lines = ["# the studio's backdrop, made by make_lights.py"]
     for z, y, _, _ in profile:
         lines += [f"v {x:.4f} {y:.4f} {z:.4f}" for x in (-HALF_WIDTH, HALF_WIDTH)]
-    for way in ways / ways[-1]:
+    for way in along / along[-1]:
         lines += [f"vt {u} {way:.5f}" for u in (0, 1)]
     lines += [f"vn 0 {up:.5f} {front:.5f}" for _, _, front, up in profile]
     for k in range(len(profile) - 1):
@@ -107,8 +108,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--out", type=Path, default=HERE)
     out = parser.parse_args().out
-    write_exr(out / "paper_views.exr", channels(bake_environment(lights("paper"), PAPER_HEIGHT)), half=True)
-    write_exr(out / "studio.exr", channels(studio(STUDIO_HEIGHT)), half=True)
+    write_exr(out / "paper_lights.exr", channels(bake_environment(lights("paper"), PAPER_HEIGHT)), half=True)
+    write_exr(out / "studio_lights.exr", channels(studio(STUDIO_HEIGHT)), half=True)
     write_exr(out / "studio_backdrop.exr", channels(backdrop_colour(BACKDROP_TEXELS)), half=True)
     write_backdrop(out / "studio_backdrop.obj")
 

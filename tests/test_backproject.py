@@ -139,6 +139,18 @@ def test_a_plane_facing_the_camera_takes_its_colours_exactly():
     assert np.abs(baked.albedo - (texels.position @ slope + 0.5))[inner].max() < 1e-5
 
 
+def test_colours_are_bilinear_between_pixel_centres(rng):
+    mesh = quads(square(1.3, 0.0), uv_boxes=[(0, 0, 1, 1)])  # fills the frame
+    view = see(mesh, front(24), smooth)
+    noise = replace(view, rgb=rng.random((24, 24, 3)).astype(np.float32))
+    texels = rasterise(mesh, 0, 64)
+    baked = backproject([noise], texels, SETTINGS)
+    px, _ = px_from_world(noise.camera, texels.position[baked.known].astype(float))
+    inner = ((px > 0.5) & (px < 23.5)).all(axis=1)
+    assert inner.sum() > 1500
+    assert np.abs(baked.albedo[baked.known] - bilinear(noise.rgb, px))[inner].max() < 1e-4
+
+
 def test_a_tilted_plane_agrees_to_second_order():
     mesh = quads(square(0.9, 0.0) @ np.array([[0.6, 0, 0.8], [0, 1, 0], [-0.8, 0, 0.6]]), uv_boxes=[(0, 0, 1, 1)])
     texels = rasterise(mesh, 0, 48)
@@ -324,6 +336,23 @@ def texels_of(island: np.ndarray, position: np.ndarray) -> Texels:
 
 
 def test_holes_take_the_nearest_colour_of_their_own_island(rng):
+    # Islands above and below the diagonal, painted along the picture's border and along the diagonal: the nearest
+    # painted texel of many holes above is the neighbour's, and the rectangle around either island holds both.
+    rows, columns = np.indices((40, 40))
+    island = np.where(rows < columns - 1, 0, np.where(rows > columns + 1, 1, -1))
+    known = ((island == 0) & (rows == 0)) | ((island == 1) & (rows == columns + 2))
+    albedo = np.where(known[..., None], rng.random((40, 40, 3)), 0).astype(np.float32)
+    marks = np.where(known, 0, -1).astype(np.int16), known.astype(np.int16)
+    position = np.stack([rows, columns, 0 * rows], axis=-1)
+    filled = fill(Baked(albedo, known, *marks), texels_of(island, position))
+    for row, column in np.argwhere((island >= 0) & ~known)[::7]:
+        mine = np.argwhere(known & (island == island[row, column]))
+        distance = np.hypot(*(mine - [row, column]).T)
+        near = mine[distance <= 1.04 * distance.min() + 0.5]  # the chamfer's choice may be that much farther
+        assert (filled[row, column] == albedo[tuple(near.T)]).all(axis=-1).any()
+
+
+def test_holes_are_filled_along_rows(rng):
     # Two islands side by side, painted at their far ends; the nearest painted texel of some holes is the neighbour's.
     island = np.full((24, 40), -1, np.int32)
     island[:, :19], island[:, 20:] = 0, 1

@@ -17,6 +17,8 @@ from mistyle.stages.inpaint import Inpainter
 # Standard deviation, as a share of the atlas's side, that parts the colour which flows into a hole from the detail
 # which is mirrored into it: about the width of a brush stroke.
 DETAIL = 0.01
+# Where to look for detail, as factors of the step from a texel to the nearest rim, taken on from there.
+TURNS = (1, 0.7 + 0.7j, 0.7 - 0.7j, 1j, -1j, 0.5, 0.25, 0.125)
 SWEEPS = 12  # smoothing sweeps on every level of the pyramid; the coarse ones carry the colour across
 
 # positions (n 3), normals (n 3) in working space -> linear rgb (n 3); not finite where it has no answer
@@ -86,15 +88,16 @@ def _grow_island(
 
 
 def _mirrored(gap: Bool[np.ndarray, "h w"], rim: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
-    """For each gap texel the rim texel opposite to it across the nearest rim texel; closer to that one where the place
-    opposite is not part of the rim."""
+    """For each gap texel the rim texel opposite to it across the nearest rim texel; where the place opposite is no rim,
+    one beside it at the same distance, else one closer to the nearest. All of them meet the gap at its border."""
     rows, columns = np.nonzero(gap)
     near_row, near_column = np.unravel_index(nearest(rim)[0][gap], gap.shape)
     row, column = near_row.copy(), near_column.copy()
     left = np.arange(len(rows))
-    for reach in (1.0, 0.5, 0.25, 0.125):
-        r = near_row[left] + np.round((near_row[left] - rows[left]) * reach).astype(np.int64)
-        c = near_column[left] + np.round((near_column[left] - columns[left]) * reach).astype(np.int64)
+    for turn in TURNS:
+        step = ((near_column - columns)[left] + 1j * (near_row - rows)[left]) * turn
+        r = near_row[left] + np.round(step.imag).astype(np.int64)
+        c = near_column[left] + np.round(step.real).astype(np.int64)
         inside = (r >= 0) & (c >= 0) & (r < gap.shape[0]) & (c < gap.shape[1])
         good = inside & rim[np.where(inside, r, 0), np.where(inside, c, 0)]
         row[left[good]], column[left[good]] = r[good], c[good]

@@ -24,11 +24,13 @@ class RigSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     kind: Literal["paper", "turntable", "file"] = "paper"
-    file: Path | None = Field(None, description="for kind 'file': a camera.json or transforms.json in working units")
-    views: int = Field(16, ge=1, le=256, description="number of turntable views; the paper's rig always has 16")
-    distance: float = Field(4.0, gt=1.0, description="camera distance; the mesh has bounding-sphere radius 1")
-    fov: float = Field(30.0, gt=1.0, lt=120.0, description="vertical and horizontal field of view, degrees")
-    resolution: int = Field(1024, ge=16, le=8192, description="pixels along each side")
+    file: Path | None = Field(
+        default=None, description="for kind 'file': a camera.json or transforms.json in working units"
+    )
+    views: int = Field(default=16, ge=1, le=256, description="number of turntable views; the paper's rig always has 16")
+    distance: float = Field(default=4.0, gt=1.0, description="camera distance; the mesh has bounding-sphere radius 1")
+    fov: float = Field(default=30.0, gt=1.0, lt=120.0, description="vertical and horizontal field of view, degrees")
+    resolution: int = Field(default=1024, ge=16, le=8192, description="pixels along each side")
 
 
 @dataclass(frozen=True)

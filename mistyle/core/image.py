@@ -71,7 +71,11 @@ def _stretch(image: np.ndarray, axis: int, count: int, edge: str) -> np.ndarray:
     shape[axis] = count
     t = (x - low).astype(np.float32).reshape(shape)
     first, second = (k % have if edge == "repeat" else np.clip(k, 0, have - 1) for k in (low, low + 1))
-    return image.take(first, axis=axis) * (1 - t) + image.take(second, axis=axis) * t
+    result, rest = image.take(first, axis=axis), image.take(second, axis=axis)
+    result *= 1 - t
+    rest *= t
+    result += rest
+    return result
 
 
 def gaussian(image: Float[np.ndarray, "h w *c"], sigma: float) -> Float[np.ndarray, "h w *c"]:

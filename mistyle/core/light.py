@@ -20,7 +20,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 from xml.etree import ElementTree
 
 import numpy as np
@@ -70,16 +70,22 @@ class SceneLights:
 
 Light = Directional | Ambient | SphericalGaussian | SceneLights
 Lights = tuple[Light, ...]
+NAMES = {
+    Directional: "directional",
+    Ambient: "ambient",
+    SphericalGaussian: "spherical_gaussian",
+    SceneLights: "scene",
+}
 
 
 def lights(name: str) -> Lights:
     """The lights of a scene of ours: "paper", "phase1", "phase2", or any other template's name or scene file.
 
-    The numbers stand once: the paper's three spherical Gaussians in `scenes/paper_views.json`, the lights of both fit
+    The numbers stand once: the paper's three spherical Gaussians in `scenes/paper_lights.json`, the lights of both fit
     phases in their scene files. Every other scene is named by its file.
     """
     if name in ("paper", "paper_views"):
-        return from_json(json.loads((scenes() / "paper_views.json").read_text(encoding="utf-8")), "paper_views.json")
+        return from_json(json.loads((scenes() / "paper_lights.json").read_text(encoding="utf-8")), "paper_lights.json")
     if name in ("phase1", "phase1_directional"):
         return _lights_of_xml(scenes() / "phase1_directional.xml")
     if name in ("phase2", "phase2_ambient"):
@@ -100,11 +106,12 @@ def spherical_gaussian(light: SphericalGaussian, directions: Float[np.ndarray, "
 
 
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
-    """World direction of every pixel centre of a latitude-longitude map as Mitsuba's `envmap` reads it.
+    """World direction of every pixel of a latitude-longitude map as Mitsuba's `envmap` reads it.
 
-    Row 0 is up (+Y); the middle column looks along +Z, the columns to the right of it towards -X.
+    Row 0 is straight up (+Y), the last row straight down; the middle looks along +Z, the columns to the right of it
+    towards -X, each pixel's direction through the middle of its column.
     """
-    theta = (np.arange(height) + 0.5) / height * np.pi
+    theta = np.arange(height) / (height - 1) * np.pi
     phi = (np.arange(width) + 0.5) / width * 2 * np.pi
     sin, cos = np.sin(theta)[:, None], np.cos(theta)[:, None]
     return np.stack([np.sin(phi) * sin, np.broadcast_to(cos, (height, width)), -np.cos(phi) * sin], axis=-1)
@@ -126,8 +133,7 @@ def bake_environment(rig: Sequence[Light], height: int = 128) -> Float[np.ndarra
 
 def to_json(rig: Lights) -> dict[str, Any]:
     """The content of `lights.json`."""
-    names = {Directional: "directional", Ambient: "ambient", SphericalGaussian: "spherical_gaussian", SceneLights: "scene"}
-    return {"version": 1, "axes": AXES, "lights": [{"type": names[type(light)], **_plain(light)} for light in rig]}
+    return {"version": 1, "axes": AXES, "lights": [{"type": NAMES[type(light)], **_plain(light)} for light in rig]}
 
 
 def from_json(data: dict[str, Any], where: str = "lights.json") -> Lights:
@@ -153,7 +159,7 @@ def _light(entry: Any, where: str) -> Light:
         return Ambient(_triple(entry, "radiance", where, 0.0))
     if kind == "spherical_gaussian":
         sharpness = entry.get("sharpness")
-        if not isinstance(sharpness, (int, float)) or not 0 <= sharpness < 1e6:
+        if not _number(sharpness) or not 0 <= sharpness < 1e6:
             raise InputRefused(f"{where}: sharpness is {sharpness!r}; expected a number from 0 to a million.")
         axis, amplitude = _unit(entry, "axis", where), _triple(entry, "amplitude", where, 0.0)
         return SphericalGaussian(axis, float(sharpness), amplitude)
@@ -164,10 +170,14 @@ def _light(entry: Any, where: str) -> Light:
 
 def _triple(entry: dict, key: str, where: str, least: float = -math.inf) -> Vector:
     value = entry.get(key)
-    good = isinstance(value, list) and len(value) == 3 and all(isinstance(v, (int, float)) for v in value)
-    if not good or not all(math.isfinite(v) and v >= least for v in value):
-        raise InputRefused(f"{where}: {key} is {value!r}; expected three finite numbers{' >= 0' if least == 0 else ''}.")
+    if not isinstance(value, list) or len(value) != 3 or not all(_number(v) and v >= least for v in value):
+        expected = f"three finite numbers{' >= 0' if least == 0 else ''}"
+        raise InputRefused(f"{where}: {key} is {value!r}; expected {expected}.")
     return (float(value[0]), float(value[1]), float(value[2]))
+
+
+def _number(value: Any) -> TypeGuard[float]:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _unit(entry: dict, key: str, where: str) -> Vector:
@@ -175,7 +185,8 @@ def _unit(entry: dict, key: str, where: str) -> Vector:
     length = float(np.linalg.norm(vector))
     if length < 1e-9:
         raise InputRefused(f"{where}: {key} has no length.")
-    x, y, z = (vector / length).tolist()
+    # What is a unit vector already keeps its bits, so that writing and reading again changes nothing.
+    x, y, z = (vector if abs(length - 1) < 1e-12 else vector / length).tolist()
     return (x, y, z)
 
 

@@ -37,8 +37,7 @@ def carry(
 def _weights(spot: Float[np.ndarray, "n 3 2"], texel: Int[np.ndarray, " n"], size: int) -> Float[np.ndarray, "n 3"]:
     """Barycentric coordinates of a texel's centre in the triangle that covers it, whatever tile that lies in."""
     centre = np.stack([texel % size, texel // size], axis=1) + 0.5
-    middle = spot.mean(axis=1)
-    centre += np.round((middle - centre) / size) * size
+    centre += np.ceil((spot.min(axis=1) - centre) / size) * size  # the repetition inside the triangle's box
     a, b, c = spot[:, 0], spot[:, 1], spot[:, 2]
     area = _cross(b - a, c - a)
     area = np.where(area == 0, 1, area)

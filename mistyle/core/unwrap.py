@@ -32,12 +32,12 @@ def estimated_seconds(faces: int) -> float:
 
 
 def unwrap(
-    meshes: Sequence[tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]],
+    meshes: Sequence[tuple[Float[np.ndarray, "_ 3"], Int[np.ndarray, "_ 3"]]],
     *,
     size: int = 2048,
     padding: int | None = None,
     progress: Callable[[float], None] = lambda done: None,
-) -> list[Float[np.ndarray, "f 3 2"]]:
+) -> list[Float[np.ndarray, "_ 3 2"]]:
     """Corner UVs (v up) for each mesh, each in a unit square of its own.
 
     Charts lie at least `padding` texels apart in an atlas of size² (default: size / 256, at least 2; less where many

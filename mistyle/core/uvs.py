@@ -11,7 +11,7 @@ from mistyle.core.raster import fragments
 BORDER = 1e-5
 # Below this a UV triangle has no area in float32 (both coordinates near 1, spacing 6e-8).
 NO_AREA = 1e-13
-RASTER = 1024
+RASTER = 512
 MAX_DEGENERATE = 0.01  # share of the surface without UV area
 MAX_OVERLAP = 0.01  # share of covered texels that faces claim without sharing them
 MIN_COVERAGE = 0.002  # share of the square in use; colour-swatch UVs stay below it

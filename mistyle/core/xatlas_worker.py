@@ -22,6 +22,7 @@ MIN_PADDING = 2
 # Where padding would shrink the charts below this, it is halved.
 MAX_SHRINK = 0.7
 OVERLAP_TEXELS = 2_000_000
+CHART_TEXELS = 100_000
 
 
 def run(source: str, target: str) -> None:
@@ -39,7 +40,7 @@ def run(source: str, target: str) -> None:
             uvs, chart = charts(positions, faces)
         corners = positions[faces]
         uvs, chart = mend(uvs, chart, corners)
-        chart = cut_overlaps(uvs, chart, corners)
+        chart = cut_overlaps(uvs, chart)
         result[f"uvs_{i}"], result[f"chart_{i}"] = pack(landscape(uvs, chart), chart, resolution, padding), chart
     np.savez(target, **result)
 
@@ -135,25 +136,44 @@ def lay_flat(corners: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "n 3 2"]:
     return flat
 
 
-def cut_overlaps(
-    uvs: Float[np.ndarray, "f 3 2"], chart: Int[np.ndarray, " f"], corners: Float[np.ndarray, "f 3 3"]
-) -> Int[np.ndarray, " f"]:
-    """Cut charts that cover part of themselves twice in two, across their longest direction in space, until none does.
+def cut_overlaps(uvs: Float[np.ndarray, "f 3 2"], chart: Int[np.ndarray, " f"]) -> Int[np.ndarray, " f"]:
+    """Give the part of a chart that lies on an earlier part of it a chart of its own, until none lies on itself.
 
-    xatlas lets a chart through whose border crosses itself a little; two places would share texels.
+    xatlas lets a chart through whose border crosses itself a little; two places would share texels. "Earlier" counts
+    the steps from face to face across the chart, so that what is cut off hangs together.
     """
     chart = chart.copy()
-    middle = corners.mean(axis=1).astype(np.float64)
     for _ in range(12):
         folded = _folded_charts(uvs, chart)
         if len(folded) == 0:
             break
         for number in folded:
             faces = np.flatnonzero(chart == number)
-            spread = middle[faces] - middle[faces].mean(axis=0)
-            along = spread @ np.linalg.eigh(spread.T @ spread)[1][:, 2]
-            chart[faces[along > np.median(along)]] = chart.max() + 1
+            steps = _steps(uvs[faces])
+            flat = uvs[faces] - uvs[faces].min(axis=(0, 1))
+            scale = np.sqrt(CHART_TEXELS / np.abs(signed_areas(flat)).sum())
+            face, texel = fragments(flat * scale, 1 << 20, wrap=False)
+            order = np.lexsort((steps[face], texel))
+            again = np.concatenate([[False], texel[order][1:] == texel[order][:-1]])
+            chart[faces[np.unique(face[order][again])]] = chart.max() + 1
     return chart
+
+
+def _steps(uvs: Float[np.ndarray, "f 3 2"]) -> Int[np.ndarray, " f"]:
+    """How many faces lie between each face and the first, going over common UVs; unreachable faces come last."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import breadth_first_order
+
+    count = len(uvs)
+    _, node = np.unique(uvs.reshape(-1, 2), axis=0, return_inverse=True)
+    node = node.reshape(-1)
+    size = count + int(node.max()) + 1
+    face = np.repeat(np.arange(count), 3)
+    graph = coo_matrix((np.ones(len(face), np.int8), (face, count + node)), shape=(size, size)).tocsr()
+    reached = breadth_first_order(graph, 0, directed=False, return_predecessors=False)
+    rank = np.full(size, size)
+    rank[reached] = np.arange(len(reached))
+    return rank[:count]
 
 
 def _folded_charts(uvs: Float[np.ndarray, "f 3 2"], chart: Int[np.ndarray, " f"]) -> Int[np.ndarray, " c"]:
@@ -209,7 +229,6 @@ def _pack_to(
     each, which gives the scale for any area to aim at; the area is corrected by what the packer then needed.
     """
     boxes = _boxes(vertices[index], chart)
-    area = float(np.abs(signed_areas(vertices[index])).sum())
     aim = FULLNESS * resolution**2
     bare = _scale(boxes, MIN_PADDING, aim)
     while padding > MIN_PADDING and _scale(boxes, padding, aim) < MAX_SHRINK * bare:

@@ -20,8 +20,9 @@ def refuse(path: Path | str, found: str, expected: str, fix: str) -> InputRefuse
     return InputRefused(f"{path}: found {found}; expected {expected}. {fix}")
 
 
-def read_bytes(path: Path, limit: int = MAX_FILE_BYTES) -> bytes:
-    """The whole file, if it is one and not larger than `limit`."""
+def read_bytes(path: Path, limit: int | None = None) -> bytes:
+    """The whole file, if it is one and not larger than `limit` (MAX_FILE_BYTES)."""
+    limit = MAX_FILE_BYTES if limit is None else limit
     if not path.exists():
         raise refuse(path, "nothing", "a file", "Check the path")
     if not path.is_file():

@@ -15,7 +15,7 @@ from mistyle.files.gltf_check import AGAIN, load_gltf
 from mistyle.files.gltf_materials import base_set, read_material, wanted_sets
 from mistyle.files.gltf_vertices import triangles
 from mistyle.files.pictures import Budget
-from mistyle.files.polygons import check_indices, too_many
+from mistyle.files.polygons import check_indices, check_positions, too_many
 from mistyle.files.raw import Raw
 
 Tree = dict[str, Any]
@@ -47,7 +47,8 @@ def read_gltf(path: Path, max_faces: int) -> Raw:
     """
     tree, buffers = load_gltf(path)
     notes: list[str] = []
-    pieces, positions = _pieces(tree, buffers, path, max_faces, notes)
+    with np.errstate(over="ignore", invalid="ignore"):  # transforms may overflow; what comes of it is refused
+        pieces, positions = _pieces(tree, buffers, path, max_faces, notes)
     if not pieces:
         raise refuse(
             path,
@@ -63,7 +64,7 @@ def read_gltf(path: Path, max_faces: int) -> Raw:
     materials = tuple(read_material(tree, buffers, path, m, _other_sets(pieces, m), budget) for m in used)
     starts = np.cumsum([0, *counts])
     primitives = tuple(
-        Primitive(p.node, p.mesh, p.primitive, int(a), int(b), place[p.material], p.texcoord, -1, p.first_vertex)
+        Primitive(p.node, p.mesh, p.primitive, int(a), int(b), p.material, p.texcoord, -1, p.first_vertex)
         for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)
     )
     uvs = np.concatenate([p.uvs for p in pieces])
@@ -113,6 +114,7 @@ def _pieces(
                 first[node, accessor] = vertices
                 local = _vectors(tree, buffers, accessor, 3, path).astype(np.float64)
                 positions.append(local @ matrix[:3, :3].T + matrix[:3, 3])
+                check_positions(positions[-1], path)
                 vertices += len(local)
                 too_many(vertices, 3 * max_faces, path, "vertices")
             pieces.append(

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from mistyle.core.asset import Primitive
 from mistyle.core.normals import same_points
 from mistyle.files.bounds import read_bytes, refuse
-from mistyle.files.polygons import check_indices, parse_numbers, too_many, triangulate
+from mistyle.files.polygons import check_indices, check_positions, parse_numbers, too_many, triangulate
 from mistyle.files.raw import Raw, RawMaterial, no_textures
 
 AGAIN = "Export the mesh again"
@@ -60,7 +60,8 @@ def read_stl(path: Path, max_faces: int) -> Raw:
     if len(data) == 84 + 50 * count:
         too_many(count, max_faces, path)
         facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-        corners = np.frombuffer(data, facet, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
+        with np.errstate(invalid="ignore"):  # a signalling NaN in a damaged file
+            corners = np.frombuffer(data, facet, count, 84)["corners"].reshape(-1, 3).astype(np.float64)
     elif re.match(rb"\s*solid\b", data[:1024], re.IGNORECASE) and b"facet" in data:
         rows = re.findall(rb"\bvertex[ \t]+([^\r\n]+)", data, re.IGNORECASE)
         too_many(len(rows) // 3, max_faces, path)
@@ -74,8 +75,7 @@ def read_stl(path: Path, max_faces: int) -> Raw:
         size = f"{len(data)} bytes"
         expected = f"{84 + 50 * count} for the {count} faces its header names" if count >= 0 else "a header of 84 bytes"
         raise refuse(path, size, f"{expected}, or an ASCII STL", CUT_OFF)
-    if not np.isfinite(corners).all():
-        raise refuse(path, "vertices that are not finite", "finite numbers", AGAIN)
+    check_positions(corners, path)
     vertex = same_points(corners)
     first = np.unique(vertex, return_index=True)[1]
     joined = f"{len(corners)} corners at equal positions were joined to {len(first)} vertices."
@@ -113,6 +113,7 @@ def read_off(path: Path, max_faces: int) -> Raw:
     if (sizes < 0).any() or len(corners) != sizes.sum():
         raise refuse(path, "a face with fewer indices than it announces", "as many", CUT_OFF)
     check_indices(corners, vertices, path, "vertex")
+    check_positions(positions, path)
     triangles = corners[triangulate(sizes, positions[corners])]
     too_many(len(triangles), max_faces, path)
     return _plain("off", positions, triangles, notes=_small(sizes))
@@ -154,7 +155,8 @@ def read_ply(path: Path, max_faces: int) -> Raw:
     vertex, face = tables.get("vertex", {}), tables.get("face", {})
     if not {"x", "y", "z"} <= set(vertex):
         raise refuse(path, "no vertices with x, y and z", "a mesh", AGAIN)
-    positions = np.stack([vertex[k].astype(np.float64) for k in "xyz"], axis=1)
+    with np.errstate(invalid="ignore"):  # a signalling NaN in a damaged file
+        positions = np.stack([vertex[k].astype(np.float64) for k in "xyz"], axis=1)
     lists = face.get("vertex_indices", face.get("vertex_index"))
     if lists is None or len(lists[0]) == 0:
         raise refuse(
@@ -162,12 +164,14 @@ def read_ply(path: Path, max_faces: int) -> Raw:
         )
     sizes, corners = lists[0].astype(np.int64), lists[1].astype(np.int64)
     check_indices(corners, len(positions), path, "vertex")
+    check_positions(positions, path)
     pick = triangulate(sizes, positions[corners])
     triangles = corners[pick]
     too_many(len(triangles), max_faces, path)
     normals = None
     if {"nx", "ny", "nz"} <= set(vertex):
-        normals = np.stack([vertex[k].astype(np.float32) for k in ("nx", "ny", "nz")], axis=1)[triangles]
+        with np.errstate(invalid="ignore", over="ignore"):
+            normals = np.stack([vertex[k].astype(np.float32) for k in ("nx", "ny", "nz")], axis=1)[triangles]
     notes = _small(sizes)
     if "red" in vertex or "red" in face:
         notes.append("Vertex colours were not read.")
@@ -175,6 +179,11 @@ def read_ply(path: Path, max_faces: int) -> Raw:
 
 
 def _ply_uvs(vertex, face, sizes, triangles, pick) -> Float[np.ndarray, "f 3 2"] | None:
+    with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN in a damaged file; doubles beyond float32
+        return _uvs_of(vertex, face, sizes, triangles, pick)
+
+
+def _uvs_of(vertex, face, sizes, triangles, pick) -> Float[np.ndarray, "f 3 2"] | None:
     if "texcoord" in face:
         counts, values = face["texcoord"]
         whole = counts == 2 * sizes

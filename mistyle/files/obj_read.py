@@ -11,7 +11,7 @@ from mistyle.core.asset import Primitive
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import beside, read_bytes, refuse
 from mistyle.files.pictures import Budget, Kind, decode
-from mistyle.files.polygons import parse_numbers, too_many, triangulate
+from mistyle.files.polygons import check_positions, parse_numbers, too_many, triangulate
 from mistyle.files.raw import Maps, Raw, RawMap, RawMaterial, no_textures
 
 MAX_LIBRARY_BYTES = 16 << 20
@@ -29,7 +29,8 @@ OPTIONS |= {b"-clamp": 1, b"-bm": 1, b"-imfchan": 1, b"-type": 1, b"-cc": 1}
 
 def read_obj(path: Path, max_faces: int) -> Raw:
     """Polygons become fans around their first corner (concave ones are cut into ears), in file order. Lines, points and
-    free-form surfaces are left out; so are faces with fewer than three corners, with a note. Vertex colours are not read."""
+    free-form surfaces are left out; so are faces with fewer than three corners, with a note. Vertex colours are not
+    read."""
     data = re.sub(rb"\\\r?\n", b" ", read_bytes(path))
     lines, notes = _sorted_lines(data), []
     positions = _table(lines[b"v"], 3, path, "vertices")
@@ -43,6 +44,7 @@ def read_obj(path: Path, max_faces: int) -> Raw:
     small = int((sizes < 3).sum())
     if small:
         notes.append(f"{small} face(s) with fewer than three corners were left out.")
+    check_positions(positions, path)
     triangles = triangulate(sizes, positions[corners[:, 0]])
     too_many(len(triangles), max_faces, path)
     polygon = np.repeat(np.arange(len(sizes)), np.maximum(sizes - 2, 0))
@@ -188,7 +190,7 @@ def _runs(material: Int[np.ndarray, " f"]) -> tuple[Primitive, ...]:
 def _libraries(names: list[bytes], path: Path) -> tuple[dict, tuple[str, ...]]:
     """Material makers by name, from every library that can be read; notes about those that cannot."""
     found, notes = {}, []
-    for name in dict.fromkeys(n.decode("utf-8", "replace") for n in names):
+    for name in dict.fromkeys(single for n in names for single in _file_names(n.decode("utf-8", "replace"), path)):
         try:
             target = beside(path, name)
             if not target.is_file():
@@ -198,6 +200,13 @@ def _libraries(names: list[bytes], path: Path) -> tuple[dict, tuple[str, ...]]:
         except InputRefused as error:
             notes.append(f"Material library {name} was left out: {error}")
     return found, tuple(notes)
+
+
+def _file_names(statement: str, path: Path) -> list[str]:
+    """One statement may name several libraries; a single name may hold spaces."""
+    parts = statement.split()
+    several = len(parts) > 1 and all(part.lower().endswith(".mtl") for part in parts)
+    return parts if several and not (path.parent / statement).is_file() else [statement]
 
 
 def _library(data: bytes, path: Path) -> dict:

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from mistyle.files.bounds import refuse
 
 MAX_EARS = 500
+MAX_COORDINATE = 1e18
 
 
 def parse_numbers(text: bytes, path: Path, what: str) -> Float[np.ndarray, " n"]:
@@ -103,7 +104,7 @@ def _ears(points: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "t 3"] | None:
     return np.array([*found, tuple(rest)])
 
 
-def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray | np.float64:
     """Twice the signed area of a, b, c; c may be many points."""
     return (b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0])
 
@@ -115,8 +116,19 @@ def check_indices(index: Int[np.ndarray, "..."], count: int, path: Path, what: s
         raise refuse(path, f"a face that uses {what} {wrong}", f"0 to {count - 1}", "Export the mesh again")
 
 
+def check_positions(positions: Float[np.ndarray, "v 3"], path: Path) -> None:
+    """Refuse positions that are not finite or beyond MAX_COORDINATE."""
+    finite = np.isfinite(positions).all(axis=1)
+    if not finite.all():
+        found = f"a position that is not finite (vertex {int(np.flatnonzero(~finite)[0])})"
+        raise refuse(path, found, "finite numbers", "Repair the mesh or export it again")
+    if np.abs(positions).max(initial=0) > MAX_COORDINATE:
+        found = f"coordinates up to {np.abs(positions).max():.1e}"
+        raise refuse(path, found, f"at most {MAX_COORDINATE:.0e}", "Scale the mesh")
+
+
 def too_many(count: int, limit: int, path: Path, what: str = "faces") -> None:
     """Refuse more than `limit` of something."""
     if count > limit:
-        fix = "Simplify the mesh (Blender: Decimate), or raise --max-faces" if what == "faces" else "Simplify the mesh"
+        fix = "Simplify the mesh (Blender: Decimate), or raise --max-faces"
         raise refuse(path, f"{count} {what}", f"at most {limit}", fix)

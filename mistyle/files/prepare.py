@@ -15,9 +15,9 @@ from mistyle.core.retexture import carry, turn_normals
 from mistyle.core.unwrap import unwrap
 from mistyle.core.uvs import Layout, Verdict, arrange
 from mistyle.files.bounds import refuse
+from mistyle.files.polygons import check_positions
 from mistyle.files.raw import Raw, RawMap
 
-MAX_COORDINATE = 1e18
 # Faces below this area in the unit sphere have none that anything could be computed from (float32 positions).
 NO_AREA = 1e-13
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
@@ -38,6 +38,7 @@ def prepare(
 ) -> Asset:
     """Decide, unwrap where needed, and put everything into the working space. `size` is the atlas that padding is
     meant for."""
+    check_positions(raw.positions, path)
     work_from_user = _work_matrix(raw, path, up)
     work = raw.positions @ work_from_user[:3, :3].T + work_from_user[:3, 3]
     area = np.linalg.norm(area_vectors(work, raw.faces), axis=1)
@@ -82,18 +83,6 @@ def prepare(
 
 def _work_matrix(raw: Raw, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
     """Turns Z up to Y up where asked, and brings the sphere around the used vertices' box to the unit sphere."""
-    if not np.isfinite(raw.positions).all():
-        first = int(np.flatnonzero(~np.isfinite(raw.positions).all(axis=1))[0])
-        raise refuse(
-            path, f"a position that is not finite (vertex {first})", "finite numbers", "Repair or export the mesh again"
-        )
-    if np.abs(raw.positions).max() > MAX_COORDINATE:
-        raise refuse(
-            path,
-            f"coordinates up to {np.abs(raw.positions).max():.1e}",
-            f"at most {MAX_COORDINATE:.0e}",
-            "Scale the mesh",
-        )
     turn = Y_FROM_Z if up == "z" else np.eye(3)
     used = raw.positions[np.unique(raw.faces)] @ turn.T
     centre = (used.min(axis=0) + used.max(axis=0)) / 2

@@ -42,8 +42,8 @@ def read_mesh(
 
     OBJ, PLY, STL, OFF, GLB and glTF, each without merging or reordering vertices (STL, which repeats them, is joined
     and says so). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees (glTF:
-    flat, as it demands). One part per material and UDIM tile. Not read: vertex colours, morph targets (the base shape is),
-    animations (a skinned mesh comes in its bind pose), Draco and meshopt compression (refused).
+    flat, as it demands). One part per material and UDIM tile. Not read: vertex colours, morph targets (the base shape
+    is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression (refused).
     """
     path = Path(path)
     kind = path.suffix.lower()

@@ -64,4 +64,4 @@ def _missing(variant: str) -> str:
     if not dr.has_backend(dr.JitBackend.LLVM):
         return f"No LLVM library that Dr.Jit can load was found, and no GPU answers. {LLVM_HELP}"
     found = ".".join(str(n) for n in dr.detail.llvm_version())
-    return f"LLVM {found} was found; Dr.Jit needs {OLDEST_LLVM} or newer (older ones abort while compiling). {LLVM_HELP}"
+    return f"LLVM {found} was found; {OLDEST_LLVM} or newer is needed (older ones abort while compiling). {LLVM_HELP}"

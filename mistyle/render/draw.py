@@ -106,7 +106,7 @@ def draw_views(
     seed: int = 0,
     progress: Callable[[float], None] = lambda done: None,
     *,
-    hdri: Path | None = None,
+    hdri: Float[np.ndarray, "eh ew 3"] | None = None,
 ) -> list[View]:
     """Render the mesh with its maps (None: neutral grey) from every camera (paper 4.1.1).
 
@@ -143,7 +143,7 @@ def picture(
     spp: int = 64,
     seed: int = 0,
     *,
-    hdri: Path | None = None,
+    hdri: Float[np.ndarray, "eh ew 3"] | None = None,
     backdrop: bool = True,
 ) -> Float[np.ndarray, "h w 4"]:
     """One picture for a report: linear rgb (premultiplied) and alpha; with a backdrop alpha is 1 nearly everywhere."""
@@ -159,7 +159,7 @@ def pictures(
     seed: int = 0,
     progress: Callable[[float], None] = lambda done: None,
     *,
-    hdri: Path | None = None,
+    hdri: Float[np.ndarray, "eh ew 3"] | None = None,
     backdrop: bool = True,
 ) -> list[Float[np.ndarray, "h w 4"]]:
     """`picture` for several cameras; the object and its textures are loaded once."""
@@ -175,7 +175,7 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
     import mitsuba as mi
 
     device.use()
-    shapes = scenery.object_shapes(mesh, maps)
+    shapes = scenery.object_shapes(mesh, maps, flip_invalid=True)
     for camera in cameras:
         described = scenery.scene_dict(
             mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes

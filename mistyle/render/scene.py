@@ -16,6 +16,7 @@ What a template may ask for besides:
 import re
 from collections.abc import Sequence
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -85,10 +86,12 @@ def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
     return {"type": "bitmap", "data": data, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 
-def bsdf_dict(maps: Maps) -> dict:
+def bsdf_dict(maps: Maps, flip_invalid: bool = False) -> dict:
     """twosided(normalmap(principled)) with four textures; the normal texture holds (n + 1) / 2.
 
-    Shadowing correction and flipping of perturbed normals are off, as glTF viewers have neither. Dielectric index 1.5.
+    Shadowing correction is off, as glTF viewers have none. Dielectric index 1.5. A perturbed normal that faces away
+    from the camera is black, with no gradient; `flip_invalid` tilts it the other way instead, which pictures want and
+    gradients do not (it depends on the view and mirrors them).
     """
     principled = {
         "type": "principled",
@@ -100,14 +103,14 @@ def bsdf_dict(maps: Maps) -> dict:
     normal = {
         "type": "normalmap",
         "normalmap": texture_dict(maps.normal * 0.5 + 0.5),
-        "flip_invalid_normals": False,
+        "flip_invalid_normals": flip_invalid,
         "use_shadowing_function": False,
         "bsdf": principled,
     }
     return {"type": "twosided", "bsdf": normal}
 
 
-def object_shapes(mesh: Mesh, maps: Sequence[Maps] | None) -> dict[str, Any]:
+def object_shapes(mesh: Mesh, maps: Sequence[Maps] | None, flip_invalid: bool = False) -> dict[str, Any]:
     """One loaded shape per texture set, by name; `maps` None means neutral grey. Reusable in many scenes."""
     import mitsuba as mi
 
@@ -118,7 +121,7 @@ def object_shapes(mesh: Mesh, maps: Sequence[Maps] | None) -> dict[str, Any]:
     shapes = {}
     for p in range(len(mesh.parts)):
         if (mesh.part == p).any():
-            shapes[f"part{p}"] = mitsuba_mesh(mesh, p, mi.load_dict(bsdf_dict(chosen[p])), f"part{p}")
+            shapes[f"part{p}"] = mitsuba_mesh(mesh, p, mi.load_dict(bsdf_dict(chosen[p], flip_invalid)), f"part{p}")
     return shapes
 
 
@@ -144,8 +147,8 @@ def sensor_dict(camera: Camera, spp: int = 8, seed: int = 0) -> dict:
         "fov": camera.fov,
         "near_clip": 0.01,
         "far_clip": 1e4,
-        "principal_point_offset_x": camera.centre[0] / width - 0.5,
-        "principal_point_offset_y": camera.centre[1] / height - 0.5,
+        "principal_point_offset_x": 0.5 - camera.centre[0] / width,
+        "principal_point_offset_y": 0.5 - camera.centre[1] / height,
         "to_world": mi.ScalarTransform4f(camera.world_from_cam @ MITSUBA_FROM_OPENCV),
         "sampler": {"type": "multijitter", "sample_count": samples(spp), "seed": seed},
         "film": {
@@ -169,9 +172,10 @@ def template_path(template: str | Path) -> Path:
     return path
 
 
-def read_template(template: str | Path, *, hdri: Path | None = None, **wanted: float) -> Any:
+def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | None = None, **wanted: float) -> Any:
     """Load a template; of `hdri` and `wanted` (turn, floor) only what the file declares as `<default>` is passed on.
 
+    The file itself is trusted: Mitsuba opens whatever it names. `hdri` is linear radiance, latitude-longitude, +Y up.
     Raises InputRefused when the file cannot be read as a scene, has no shape "object", or does not take an `hdri`.
     """
     import mitsuba as mi
@@ -179,19 +183,23 @@ def read_template(template: str | Path, *, hdri: Path | None = None, **wanted: f
     device.use()
     path = template_path(template)
     declared = set(re.findall(r'<default\s+name="(\w+)"', path.read_text(encoding="utf-8", errors="replace")))
-    given = {name: repr(float(value)) for name, value in wanted.items() if name in declared}
-    if hdri is not None:
-        if "hdri" not in declared:
-            raise InputRefused(f'{path}: takes no environment map; it needs <default name="hdri" value="..."/>.')
-        given["hdri"] = str(hdri.resolve())
-    try:
-        # Merging meshes, an optimisation of the loader, would lose their ids.
-        scene = mi.load_file(str(path), optimize=False, **given)
-    except RuntimeError as error:
-        raise InputRefused(f"{path}: Mitsuba cannot load this scene. {error}") from error
+    given: dict[str, Any] = {name: repr(float(value)) for name, value in wanted.items() if name in declared}
+    if hdri is not None and "hdri" not in declared:
+        raise InputRefused(f'{path}: takes no environment map; it needs <default name="hdri" value="..."/>.')
+    with TemporaryDirectory() as folder:
+        if hdri is not None:
+            given["hdri"] = str(Path(folder, "hdri.exr"))
+            mi.Bitmap(np.ascontiguousarray(hdri, np.float32)).write(given["hdri"])
+        try:
+            # Merging meshes, an optimisation of the loader, would lose their ids.
+            scene = mi.load_file(str(path), optimize=False, **given)
+        except RuntimeError as error:
+            raise InputRefused(f"{path}: Mitsuba cannot load this scene. {error}") from error
     if not isinstance(scene, mi.Scene) or all(shape.id() != "object" for shape in scene.shapes()):
         ids = ", ".join(shape.id() for shape in scene.shapes()) if isinstance(scene, mi.Scene) else "not a scene"
-        raise InputRefused(f'{path}: needs a shape with id="object", the slot for the mesh. Found: {ids or "no shapes"}.')
+        raise InputRefused(
+            f'{path}: needs a shape with id="object", the slot for the mesh; found {ids or "no shapes"}.'
+        )
     return scene
 
 
@@ -203,7 +211,7 @@ def scene_dict(
     *,
     spp: int = 8,
     seed: int = 0,
-    hdri: Path | None = None,
+    hdri: Float[np.ndarray, "eh ew 3"] | None = None,
     backdrop: bool = True,
     integrator: dict | None = None,
     shapes: dict[str, Any] | None = None,
@@ -242,23 +250,29 @@ def scene_dict(
 
 
 def camera_emitters(emitters: dict[str, Any], sensor: Any, camera: Camera) -> dict[str, Any]:
-    """Where the emitters with ids "camera_…" go for `camera`: their transforms, moved rigidly from the file's sensor."""
+    """Where the emitters with ids "camera_…" go for `camera`: moved rigidly from the file's sensor."""
     import mitsuba as mi
 
     result: dict[str, Any] = {}
     if sensor is None:
         return result
-    old = np.asarray(mi.traverse(sensor)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+    old = _matrix(sensor)
     moved = camera.world_from_cam @ MITSUBA_FROM_OPENCV @ np.linalg.inv(old)
     for key, emitter in emitters.items():
         if key.startswith("camera_"):
-            here = np.asarray(mi.traverse(emitter)["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-            result[key] = mi.AffineTransform4f(moved @ here)
+            result[key] = mi.AffineTransform4f(mi.Matrix4f(moved @ _matrix(emitter)))
     return result
 
 
+def _matrix(plugin: Any) -> Float[np.ndarray, "4 4"]:
+    import mitsuba as mi
+
+    transform: Any = mi.traverse(plugin)["to_world"]
+    return np.asarray(transform.matrix, dtype=np.float64).reshape(4, 4)
+
+
 def _heading(camera: Camera) -> float:
-    """Degrees about +Y from a camera on the +Z axis; for cameras looking straight up or down their up vector decides."""
+    """Degrees about +Y from a camera on the +Z axis; straight above or below, the up vector decides."""
     x, z = camera.position[0], camera.position[2]
     if np.hypot(x, z) < 1e-6:
         x, z = camera.world_from_cam[0, 1], camera.world_from_cam[2, 1]

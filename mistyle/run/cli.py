@@ -213,7 +213,7 @@ OPTIONS = {
     "stroke_scale": "surface.style_scale",
     "refine": "fit.refine",
     "metallic": "fit.metallic",
-    "vgg": "fit.vgg",
+    "vgg": "fit.features",
 }
 
 

@@ -195,7 +195,7 @@ def _weights() -> Row:
     path = os.environ.get("MISTYLE_VGG", "")
     if path and Path(path).is_file():
         return Row("VGG-19 weights", path, "ok")
-    fix = "export MISTYLE_VGG=FILE (.safetensors or .pth)"
+    fix = "mistyle stylize … --vgg FILE (.safetensors or .pth)"
     if path:
         return Row("VGG-19 weights", f"MISTYLE_VGG names {path}, which is not there", "optional", fix)
     return Row("VGG-19 weights", "none; the embedded features are used, which need none", "optional", fix)

@@ -149,7 +149,7 @@ def cameras_of(settings: Settings) -> list[Camera]:
     """The rig in visiting order, from the settings or from a file."""
     if settings.rig.kind != "file":
         return rig(settings.rig)
-    from mistyle.files.views import read_cameras
+    from mistyle.files.cameras import read_cameras
 
     assert settings.rig.file is not None
     return read_cameras(settings.rig.file)

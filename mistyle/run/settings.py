@@ -1,6 +1,6 @@
 """All settings of a job in one place: the root record only lists one record per stage, and the presets.
 
-Precedence, lowest first: defaults, preset, `--config FILE`, the environment variable MISTYLE_SET, the command line.
+Precedence, lowest first: defaults, preset, `--config FILE`, the environment (MISTYLE_VGG, MISTYLE_SET), command line.
 """
 
 import difflib
@@ -27,10 +27,10 @@ class ReadSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     uv: Literal["keep", "new", "auto"] = Field(
-        "auto", description="authored UVs: keep, replace, or replace where unusable"
+        default="auto", description="authored UVs: keep, replace, or replace where unusable"
     )
-    up: Literal["y", "z"] = Field("y", description="the axis of the user's file that points up")
-    max_faces: int = Field(5_000_000, ge=1, description="meshes with more faces are refused")
+    up: Literal["y", "z"] = Field(default="y", description="the axis of the user's file that points up")
+    max_faces: int = Field(default=5_000_000, ge=1, description="meshes with more faces are refused")
 
 
 class DrawSettings(BaseModel):
@@ -38,11 +38,11 @@ class DrawSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    spp: int = Field(16, ge=1, le=65536, description="samples per pixel of the rendered views")
+    spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel of the rendered views")
     scene: Path | None = Field(
-        None, description="a Mitsuba scene with a shape called 'object' in place of scenes/paper_views.xml"
+        default=None, description="a Mitsuba scene with a shape called 'object' in place of scenes/paper_views.xml"
     )
-    paper_files: bool = Field(False, description="also write the 8-bit depth maps and Canny edges of the paper")
+    paper_files: bool = Field(default=False, description="also write the 8-bit depth maps and Canny edges of the paper")
 
 
 class ReportSettings(BaseModel):
@@ -50,9 +50,9 @@ class ReportSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    frames: int = Field(24, ge=4, le=240, description="turntable frames")
-    resolution: int = Field(480, ge=64, le=4096, description="pixels of a turntable frame")
-    spp: int = Field(24, ge=1, le=4096, description="samples per pixel of a turntable frame")
+    frames: int = Field(default=24, ge=4, le=240, description="turntable frames")
+    resolution: int = Field(default=480, ge=64, le=4096, description="pixels of a turntable frame")
+    spp: int = Field(default=24, ge=1, le=4096, description="samples per pixel of a turntable frame")
 
 
 class Settings(BaseModel):
@@ -60,8 +60,10 @@ class Settings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    seed: int = Field(0, ge=0, lt=2**31, description="every random choice follows from it")
-    threads: int = Field(0, ge=0, le=1024, description="threads of the renderer and of torch; 0 takes all cores")
+    seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
+    threads: int = Field(
+        default=0, ge=0, le=1024, description="threads of the renderer and of torch; 0 takes all cores"
+    )
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     stylizer: Literal["embedded"] = "embedded"
     read: ReadSettings = ReadSettings()
@@ -76,7 +78,23 @@ class Settings(BaseModel):
 
 
 # The three ways to run a job; the defaults of the records are the standard ones.
-PRESETS: dict[str, dict[str, Any]] = {"draft": {}, "standard": {}, "paper": {}}
+PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {
+        "rig": {"resolution": 512},
+        "draw": {"spp": 8},
+        "surface": {"samples": 80_000},
+        "atlas": {"size": 1024},
+        "fit": {"iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},
+        "report": {"frames": 12, "resolution": 384, "spp": 8},
+    },
+    "standard": {},
+    "paper": {
+        "draw": {"paper_files": True},
+        "surface": {"samples": 1_000_000},
+        "atlas": {"size": 4096},
+        "fit": {"iterations1": 400, "iterations2": 600, "crops": 8},
+    },
+}
 
 
 def thread_count(settings: Settings) -> int:
@@ -166,6 +184,8 @@ def resolve(
     preset = preset or "standard"
     if preset not in PRESETS:
         raise UsageError(f"there is no preset '{preset}'; choose one of {', '.join(PRESETS)}")
+    if environment.get("MISTYLE_VGG"):
+        layers.append(("MISTYLE_VGG", {"fit": {"features": environment["MISTYLE_VGG"]}}))
     variable = environment.get("MISTYLE_SET", "")
     layers.append(("MISTYLE_SET", assignments(filter(None, map(str.strip, variable.split(";"))), "MISTYLE_SET")))
     layers.append(("command line", command_line))

@@ -84,3 +84,26 @@ def versions() -> dict[str, str]:
         except PackageNotFoundError:
             found[name] = "missing"
     return found
+
+
+# What each figure of `figures` means, and which way is up.
+MEANINGS: dict[str, tuple[str, str]] = {
+    "painted_share": ("share of the covered texels whose albedo was painted", "higher"),
+    "seen_share": ("share of the covered texels that at least one view sees", "higher"),
+    "repaired_share": ("share of the covered texels that were painted again after the fit", ""),
+}
+
+
+def figures(made: Any) -> dict[str, float]:
+    """How good the result is, over all texture sets."""
+    covered = [t.covered for t in made.atlas.texels]
+    total = max(sum(int(c.sum()) for c in covered), 1)
+
+    def share(masks: Any) -> float:
+        return sum(int((m & c).sum()) for m, c in zip(masks, covered, strict=True)) / total
+
+    return {
+        "painted_share": share([m.known for m in made.repaired.maps]),
+        "seen_share": share([s > 0 for s in made.baked.seen]),
+        "repaired_share": share(made.repaired.mask),
+    }

@@ -17,6 +17,7 @@ from mistyle.stages.texels import pad_in_place, threaded
 
 DEPTH_NOISE = 0.0005  # what depth maps may be off by: float32 through a file and another projection
 STEEP = 4.0  # depth per width of a surface seen at 76 degrees
+BAND = 64  # rows of a view handled at a time
 ROWS = 2**16  # texels handled at a time; their intermediate arrays then stay in the cache
 
 
@@ -94,9 +95,11 @@ def backproject(
     threaded(work, chunks, lambda done: progress(0.7 * done))
     tables.clear()
     albedo = np.zeros((height * width, 3), np.float32)
-    for k, view in enumerate(views):
-        _paint(albedo, view, np.flatnonzero(chosen == k), position, settings)
-        progress(0.7 + 0.3 * (k + 1) / len(views))
+
+    def paint(k: int) -> None:
+        _paint(albedo, views[k], np.flatnonzero(chosen == k), position, settings)
+
+    threaded(paint, len(views), lambda done: progress(0.7 + 0.3 * done))
     shape = texels.covered.shape
     return Baked(albedo.reshape(*shape, 3), (chosen >= 0).reshape(shape), chosen.reshape(shape), seen.reshape(shape))
 
@@ -132,53 +135,61 @@ def _faces_towards(mesh: Mesh, cameras: Sequence[Camera]) -> Bool[np.ndarray, "c
 
 
 def _depth_tables(views: Sequence[View], settings: BakeSettings) -> list[Float[np.ndarray, "_ 4"]]:
-    """`_depth_table` of every view, with a frame of one pixel around it in which nothing is seen, row after row."""
+    """`_depth_band` over every view, with a frame of one pixel around it in which nothing is seen, row after row."""
     sizes = [(view.camera.size[0] + 2, view.camera.size[1] + 2) for view in views]
     starts = np.cumsum([0] + [h * w for h, w in sizes])
     # One array for all: freed memory of this size goes back to the system, small pieces may not.
     together = np.full((starts[-1], 4), -1, np.float32)
     tables = [together[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
 
-    def work(k: int) -> None:
-        tables[k].reshape(*sizes[k], 4)[1:-1, 1:-1] = _depth_table(views[k], settings)
+    bands = [(k, top) for k, (rows, _) in enumerate(sizes) for top in range(0, rows - 2, BAND)]
 
-    threaded(work, len(views))
+    def work(n: int) -> None:
+        k, top = bands[n]
+        band = _depth_band(views[k], top, min(top + BAND, sizes[k][0] - 2), settings.depth_tolerance)
+        tables[k].reshape(*sizes[k], 4)[top + 1 : top + 1 + len(band), 1:-1] = band
+
+    threaded(work, len(bands))
     return tables
 
 
-def _depth_table(view: View, settings: BakeSettings) -> Float[np.ndarray, "h w 4"]:
+def _depth_band(view: View, top: int, bottom: int, tolerance: float) -> Float[np.ndarray, "h w 4"]:
     """The plane z = a + b x + c y (x, y in pixels) that continues what each pixel sees, and how far a texel's depth may
-    be from it: a, b, c, allowance. Where the mask does not hold the allowance is -1.
+    be from it: a, b, c, allowance; for the rows from top to bottom. Where the mask does not hold the allowance is -1.
 
     Of the steps to the two neighbours the smaller one is the surface's own, unless it is large too: then something else
-    lies on both sides. The plane leaves out curvature, hence a quarter of its steps is allowed, and a tenth of a pixel's
-    width. Steps and allowance together stay within the depth tolerance, or within what a surface seen at 76 degrees
+    lies on both sides. The plane leaves out curvature, hence a quarter of its steps is allowed, and a tenth of a
+    pixel's width. Steps and allowance together stay within the depth tolerance, or within what a surface seen at 76°
     does across a pixel where pixels are so coarse (below about 256²) that this is more; half the depth bounds the
     allowance, so that nothing behind the camera agrees.
     """
-    tolerance = settings.depth_tolerance
-    seen = view.mask & np.isfinite(view.depth) & (view.depth > 0)
-    depth = np.where(seen, view.depth, np.inf).astype(np.float32)
-    footprint = depth / view.camera.focal
-    limit = np.maximum(0.7 * tolerance, STEEP * footprint)
+    first, last = max(top - 1, 0), min(bottom + 1, len(view.depth))
+    depth, mask = view.depth[first:last], view.mask[first:last]
+    depth = np.where(mask & np.isfinite(depth) & (depth > 0), depth, np.inf).astype(np.float32)
     with np.errstate(invalid="ignore"):
         across, down = (np.diff(depth, axis=k, prepend=np.inf, append=np.inf) for k in (1, 0))
-        dx = _smaller(across[:, :-1], across[:, 1:], limit)
-        dy = _smaller(down[:-1], down[1:], limit)
+    own = slice(top - first, bottom - first)
+    depth, across = depth[own], across[own]
+    down = down[top - first : bottom - first + 1]
+    footprint = depth * np.float32(1 / view.camera.focal)
+    limit = np.maximum(0.7 * tolerance, STEEP * footprint)
+    dx, dy = _smaller(across[:, :-1], across[:, 1:], limit), _smaller(down[:-1], down[1:], limit)
     allowance = 0.25 * (np.abs(dx) + np.abs(dy)) + 0.1 * footprint + DEPTH_NOISE
     allowance = np.minimum(np.minimum(allowance, 0.3 * tolerance), depth / 2)
-    x, y = np.arange(depth.shape[1], dtype=np.float32) + 0.5, np.arange(depth.shape[0], dtype=np.float32) + 0.5
+    seen = np.isfinite(depth)
+    x = np.arange(depth.shape[1], dtype=np.float32) + 0.5
+    y = np.arange(top, bottom, dtype=np.float32)[:, None] + 0.5
     table = np.empty((*depth.shape, 4), np.float32)
-    table[..., 0] = np.where(seen, depth, 0) - dx * x - dy * y[:, None]
+    table[..., 0] = np.where(seen, depth, 0) - dx * x - dy * y
     table[..., 1], table[..., 2], table[..., 3] = dx, dy, np.where(seen, allowance, -1)
     return table
 
 
 def _smaller(a: np.ndarray, b: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """Of two steps the one of smaller size; 0 where it exceeds the limit or is not a number."""
+    """Of two steps the one of smaller size; 0 where it reaches the limit or is not a number."""
     step = np.where(np.abs(a) < np.abs(b), a, b)
     step = np.where(np.isfinite(step), step, a)
-    return np.where(np.abs(step) <= limit, step, 0)
+    return np.where(np.abs(step) < limit, step, 0)
 
 
 def _best(
@@ -241,15 +252,12 @@ def _paint(
     pixels[1:-1, 1:-1, :3] = pure_colours(view, settings)
     pixels[1:-1, 1:-1, 3] = np.where(view.mask, view.depth, np.inf)
     pixels = pixels.reshape(-1, 4)
-
-    def work(chunk: int) -> None:
-        part = texel[chunk * ROWS : (chunk + 1) * ROWS]
+    for start in range(0, len(texel), ROWS):
+        part = texel[start : start + ROWS]
         x, y, z = _project(view.camera, np.ascontiguousarray(position.take(part, axis=0).T))
-        # What `_depth_table` may bridge between a pixel's centre and a texel in it.
+        # What `_depth_band` may bridge between a pixel's centre and a texel in it.
         tolerance = np.maximum(1.001 * settings.depth_tolerance, 1.5 * STEEP / view.camera.focal * z)
         albedo[part] = _fetch(pixels, width + 2, x + 1, y + 1, z, tolerance)
-
-    threaded(work, -(-len(texel) // ROWS))
 
 
 def _fetch(pixels: Float[np.ndarray, "p 4"], width: int, x, y, z, tolerance) -> Float[np.ndarray, "n 3"]:

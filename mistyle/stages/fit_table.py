@@ -11,13 +11,14 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.image import nearest, resize
+from mistyle.core.image import gaussian, nearest, resize
 from mistyle.core.maps import Maps, Texels
 
 CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}
 TILT_LIMIT = 0.95  # a normal more than 72 degrees off faces away from most views, where its gradient is zero
 ROUGHNESS_FLOOR = 0.05  # below 0.0316 Mitsuba's roughness has no gradient
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-8  # with 0.999 texels that few views see keep stale second moments
+SMOOTH = 0.7  # texels of the table; a change finer than that is the noise of single steps
 FILL = 6  # texels of the table by which a change is continued beyond the last texel that was seen
 
 
@@ -153,6 +154,7 @@ def _change(table: Table, k: int, name: str, shape: tuple[int, int]) -> Float[np
         return None
     index, distance = nearest(moved)
     filled = change.reshape(-1, change.shape[-1])[index.ravel()].reshape(change.shape)
+    filled = gaussian(filled, SMOOTH)
     return resize(np.where((distance <= FILL)[..., None], filled, 0).astype(np.float32), shape, "repeat")
 
 

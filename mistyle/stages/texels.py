@@ -12,7 +12,7 @@ from dataclasses import replace
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core.asset import Material
@@ -68,20 +68,24 @@ def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
     face, texel = fragments(corners, size)
     # Where faces share a texel the last one written stays: writing backwards leaves it to the first.
     local[texel[::-1]] = face[::-1]
+    drawn = np.zeros(len(chosen), bool)
+    drawn[face] = True
     del face, texel
     island = islands(same_points(mesh.positions)[mesh.faces[chosen]], mesh.corner_uvs[chosen])
-    _claim_slivers(local, corners, island, size)
+    _claim_slivers(local, corners, drawn, island, size)
     return _interpolate(mesh, chosen, corners, local, island, size)
 
 
 def _claim_slivers(
-    local: Int[np.ndarray, " t"], corners: Float[np.ndarray, "f 3 2"], island: Int[np.ndarray, " f"], size: int
+    local: Int[np.ndarray, " t"],
+    corners: Float[np.ndarray, "f 3 2"],
+    drawn: Bool[np.ndarray, " f"],
+    island: Int[np.ndarray, " f"],
+    size: int,
 ) -> None:
-    """Give islands without a texel the free texels under their corners and face middles."""
-    if len(island) == 0:
-        return
-    has = np.zeros(int(island.max()) + 1, bool)
-    has[island[np.unique(local[local >= 0])]] = True
+    """Give islands of which nothing was drawn the free texels under their corners and face middles."""
+    has = np.zeros(int(island.max(initial=-1)) + 1, bool)
+    has[island[drawn]] = True
     faces = np.flatnonzero(~has[island])[::-1]
     points = np.concatenate([corners[faces], corners[faces].mean(axis=1, keepdims=True)], axis=1)
     column, row = np.moveaxis(np.floor(points).astype(np.int64) % size, -1, 0)

@@ -17,6 +17,9 @@ Occlusion = Callable[[np.ndarray, np.ndarray], np.ndarray]
 ROTATIONS = 30
 LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, while colours are transported
 UNDULATION = 0.02  # low waves added to the tone, so that flat areas of equal tone get areas of colour and not noise
+LEAST_RELIEF = 0.03  # mean height of a 5x5 neighbourhood, in spacings, that counts as a full hollow or ridge
+LEAST_DETAIL = 0.05  # difference of tone between two smoothings that counts as full detail
+CONVEX = 0.4  # how much of a ridge or bulge counts, against a hollow
 HIDDEN = 0.05  # share of open sky under which a place is taken for invisible
 STANDING = -0.85  # height of the normal under which a place is taken for what the thing stands on
 
@@ -78,7 +81,9 @@ def tones(
     coarse = levels[max(len(levels) - 3, 0)]
     fine_cavity = smooth(middle, cavity_of(middle), 1)
     broad_cavity = carry(coarse.points, smooth(coarse, cavity_of(coarse), 1), middle.points)
-    hollow = (bounded(fine_cavity, 95, 0.02, 1) + bounded(broad_cavity, 95, 0.02, 1)) / 2
+    hollow = (bounded(fine_cavity, 95, LEAST_RELIEF, 1) + bounded(broad_cavity, 95, LEAST_RELIEF, 1)) / 2
+    # Round things are convex nearly everywhere: counted in full, flat places among them would look like hollows.
+    hollow = np.where(hollow < 0, CONVEX * hollow, hollow)
     tone, cavity = [], []
     for level in levels:
         own = level is middle
@@ -104,8 +109,8 @@ def detail(
     broad = smooth(coarse, drop(middle.points, smooth(middle, medium, 2), coarse.points), 2)
     medium_here = carry(middle.points, medium, fine.points)
     broad_here = carry(coarse.points, broad, fine.points)
-    small = bounded(sharp - medium_here, 92, 0.03, 1.5)
-    large = bounded(medium_here - broad_here, 92, 0.03, 1.5)
+    small = bounded(sharp - medium_here, 92, LEAST_DETAIL, 1.5)
+    large = bounded(medium_here - broad_here, 92, LEAST_DETAIL, 1.5)
     finest = np.clip(0.6 * small + 0.8 * large, -1.6, 1.6).astype(np.float32)
     softened = smooth(fine, finest, 1)
     return [drop(fine.points, softened, level.points) for level in levels[:-1]] + [finest]

@@ -1,0 +1,281 @@
+"""Figures for the report, the benchmarks and the fit's own judgement; every definition stands with its function.
+
+Pictures are float arrays (h, w, 3), sRGB-encoded 0..1 unless a name says linear; masks are bool. A figure over no
+pixels is NaN. Higher is better for psnr, ssim, detail_correlation, edge_recall and coverage; lower for the others.
+"""
+
+import warnings
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.core.camera import pixel_centres, px_from_world, world_from_px
+from mistyle.core.image import bilinear, dilate, erode, gaussian, linear_from_srgb, resize
+from mistyle.core.view import View
+
+XYZ_FROM_LINEAR = np.array(
+    [[0.4123908, 0.3575843, 0.1804808], [0.2126390, 0.7151687, 0.0721923], [0.0193308, 0.1191948, 0.9505322]]
+)
+D65 = XYZ_FROM_LINEAR.sum(axis=1)
+
+PATCH = 5
+SCALES = (1, 2, 4)
+QUANTILES = 256
+DEPTH_TOLERANCE = 0.01  # working units: two views see the same point
+SEAM_JUMP = 8.0  # times the usual uv step between neighbouring pixels
+
+
+def psnr(reference: Float[np.ndarray, "*n"], test: Float[np.ndarray, "*n"], mask: np.ndarray | None = None) -> float:
+    """10 log10(1 / mean squared error), in dB, over the mask; infinite for equal pictures."""
+    squares = (np.asarray(reference, np.float64) - test) ** 2
+    error = float(squares[mask].mean() if mask is not None else squares.mean())
+    return float("inf") if error == 0 else float(-10 * np.log10(error))
+
+
+def ssim(
+    reference: Float[np.ndarray, "h w 3"], test: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None
+) -> float:
+    """Structural similarity (Wang et al. 2004: Gaussian window of 1.5 px, K = 0.01, 0.03), mean over the mask."""
+    from skimage.metrics import structural_similarity
+
+    _, full = structural_similarity(
+        reference, test, data_range=1.0, channel_axis=-1, gaussian_weights=True, use_sample_covariance=False, full=True
+    )
+    return float(full[mask].mean() if mask is not None else full.mean())
+
+
+def flip(reference: Float[np.ndarray, "h w 3"], test: Float[np.ndarray, "h w 3"]) -> float:
+    """Mean LDR-FLIP error (Andersson et al. 2020) at 67 pixels per degree, 0..1."""
+    import flip_evaluator
+
+    arrays = [np.ascontiguousarray(np.clip(a, 0, 1), np.float32) for a in (reference, test)]
+    return float(flip_evaluator.evaluate(*arrays, "LDR", inputsRGB=True, applyMagma=False)[1])
+
+
+def ciede2000(
+    reference: Float[np.ndarray, "*n 3"], test: Float[np.ndarray, "*n 3"], mask: np.ndarray | None = None
+) -> float:
+    """Mean CIE Delta E 2000 (ISO/CIE 11664-6, all factors 1) over the mask, from CIELAB with the D65 white."""
+    difference = delta_e(lab(reference), lab(test))
+    return float(difference[mask].mean() if mask is not None else difference.mean())
+
+
+def delta_e(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
+    """CIE Delta E 2000 between CIELAB colours."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it announces at import that matplotlib is not there
+        from colour.difference import delta_E_CIE2000
+
+    return np.asarray(delta_E_CIE2000(a, b), dtype=np.float64)
+
+
+def lab(picture: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """CIELAB (L 0..100) of an sRGB picture, white D65."""
+    xyz = linear_from_srgb(picture) @ XYZ_FROM_LINEAR.T / D65
+    f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
+    return np.stack(
+        [116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1
+    ).astype(np.float32)
+
+
+def patch_distance(
+    pictures: Sequence[Float[np.ndarray, "h w 3"]],
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    style: Sequence[Float[np.ndarray, "i j 3"]],
+    style_masks: Sequence[Bool[np.ndarray, "i j"]] | None = None,
+    projections: int = 64,
+    samples: int = 20_000,
+    seed: int = 0,
+) -> float:
+    """Sliced Wasserstein-1 distance of 5x5 Lab patches (L / 100), mean over full, half and quarter scale; times 100.
+
+    Patches are pooled over all pictures and all style pictures; each random unit direction compares QUANTILES
+    quantiles. Only patches wholly inside a mask count. On its own it can be cheated by noise of the right histogram:
+    read it beside the detail correlation.
+    """
+    inside = style_masks or [np.ones(s.shape[:2], bool) for s in style]
+    total = []
+    for scale in SCALES:
+        rng = np.random.default_rng(seed)
+        axes = rng.normal(size=(PATCH * PATCH * 3, projections)).astype(np.float32)
+        axes /= np.linalg.norm(axes, axis=0)
+        mine, theirs = (_patches(p, m, scale, samples, rng) for p, m in ((pictures, masks), (style, inside)))
+        if len(mine) == 0 or len(theirs) == 0:
+            continue
+        levels = (np.arange(QUANTILES) + 0.5) / QUANTILES
+        a, b = np.quantile(mine @ axes, levels, axis=0), np.quantile(theirs @ axes, levels, axis=0)
+        total.append(float(np.abs(a - b).mean()))
+    return 100 * float(np.mean(total)) if total else float("nan")
+
+
+def _patches(pictures, masks, scale: int, samples: int, rng: np.random.Generator) -> Float[np.ndarray, "n k"]:
+    """About `samples` patches at one scale, rows of Lab / 100, drawn evenly from the pictures."""
+    found = []
+    for picture, mask in zip(pictures, masks, strict=True):
+        size = (picture.shape[0] // scale, picture.shape[1] // scale)
+        if min(size) < PATCH:
+            continue
+        small = lab(resize(picture, size)) / 100
+        whole = erode(resize(mask.astype(np.float32), size) > 0.999, PATCH // 2)
+        edge = PATCH // 2
+        whole[:edge], whole[-edge:], whole[:, :edge], whole[:, -edge:] = False, False, False, False
+        places = np.flatnonzero(whole)
+        if len(places) == 0:
+            continue
+        chosen = rng.choice(places, min(len(places), samples // len(pictures)), replace=False)
+        row, column = chosen // size[1], chosen % size[1]
+        offsets = np.arange(-edge, edge + 1)
+        window = small[row[:, None, None] + offsets[:, None], column[:, None, None] + offsets]
+        found.append(window.reshape(len(chosen), -1))
+    return np.concatenate(found) if found else np.zeros((0, PATCH * PATCH * 3), np.float32)
+
+
+def gram_distance(
+    pictures: Sequence[Float[np.ndarray, "h w 3"]],
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    style: Sequence[Float[np.ndarray, "i j 3"]],
+    style_masks: Sequence[Bool[np.ndarray, "i j"]] | None = None,
+) -> float:
+    """Relative distance |G - G_style| / |G_style| (Frobenius) of the filter bank's Gram matrices, mean over its levels.
+
+    Gram matrices are pooled over pictures by the pixels in their masks; the masked picture's outside is the mask's
+    mean colour, so that the silhouette adds little.
+    """
+    inside = style_masks or [np.ones(s.shape[:2], bool) for s in style]
+    mine, theirs = _pooled_gram(pictures, masks), _pooled_gram(style, inside)
+    ratios = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(mine, theirs, strict=True)]
+    return float(np.mean(ratios))
+
+
+def _pooled_gram(pictures, masks) -> list[np.ndarray]:
+    import torch
+
+    from mistyle.measure.features import filter_bank
+    from mistyle.measure.losses import gram
+
+    totals: list[np.ndarray] = []
+    weights = [float(mask.sum()) for mask in masks]
+    for picture, mask, weight in zip(pictures, masks, weights, strict=True):
+        if weight == 0:
+            continue
+        filled = np.where(mask[..., None], picture, picture[mask].mean(axis=0))
+        image = torch.from_numpy(np.ascontiguousarray(filled.transpose(2, 0, 1), np.float32))[None]
+        inside = torch.from_numpy(erode(mask, 3).astype(np.float32))[None, None]
+        with torch.no_grad():
+            grams = [gram(maps, inside)[0].numpy() * (weight / sum(weights)) for maps in filter_bank(image)]
+        totals = grams if not totals else [a + b for a, b in zip(totals, grams, strict=True)]
+    if not totals:
+        raise ValueError("no picture has a pixel in its mask")
+    return totals
+
+
+def style_distance(pictures, masks, style, style_masks=None, seed: int = 0) -> float:
+    """`patch_distance` plus ten times `gram_distance`: about equal shares for a painting's left half and its right."""
+    patches = patch_distance(pictures, masks, style, style_masks, seed=seed)
+    return patches + 10 * gram_distance(pictures, masks, style, style_masks)
+
+
+def detail(
+    picture: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], fine: float = 1.0, coarse: float = 8.0
+) -> Float[np.ndarray, "h w"]:
+    """Band-pass lightness: difference of Gaussians of `fine` and `coarse` pixels inside the mask, 0 outside."""
+    light = lab(picture)[..., 0]
+    weight = mask.astype(np.float32)
+
+    def smooth(sigma: float) -> np.ndarray:
+        return gaussian(light * weight, sigma) / np.maximum(gaussian(weight, sigma), 1e-3)
+
+    return (smooth(fine) - smooth(coarse)) * mask
+
+
+def detail_correlation(
+    picture: Float[np.ndarray, "h w 3"], reference: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
+) -> float:
+    """Correlation of the two pictures' `detail` over the mask, -1..1: whether strokes or shape stand where they should."""
+    inner = erode(mask, 2)
+    a, b = detail(picture, mask)[inner], detail(reference, mask)[inner]
+    scale = np.sqrt(float((a * a).sum()) * float((b * b).sum()))
+    return float((a * b).sum() / scale) if scale > 0 else float("nan")
+
+
+def edge_recall(
+    picture: Float[np.ndarray, "h w 3"],
+    reference: Float[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    thresholds: tuple[float, float] = (20, 60),
+) -> float:
+    """Share of the reference's Canny edges (8-bit lightness, 2 px blur) with an edge of the picture within one pixel,
+    minus the share that edges thrown at random would meet. Without the second, noise would score best."""
+    inner = erode(mask, 3)
+    mine, theirs = (_edges(p, mask, thresholds) & inner for p in (picture, reference))
+    if not theirs.any():
+        return float("nan")
+    near = dilate(mine, 1)
+    return float(near[theirs].mean() - near[inner].mean())
+
+
+def _edges(picture, mask, thresholds) -> Bool[np.ndarray, "h w"]:
+    light, weight = lab(picture)[..., 0], mask.astype(np.float32)
+    smooth = gaussian(light * weight, 2) / np.maximum(gaussian(weight, 2), 1e-3)
+    return cv2.Canny(np.clip(smooth * 2.55, 0, 255).astype(np.uint8), *thresholds) > 0
+
+
+def warp_error(
+    view: View, other: View, picture: Float[np.ndarray, "h w 3"], other_picture: Float[np.ndarray, "h w 3"]
+) -> float:
+    """View-to-view error: mean |Delta L| + |Delta a| + |Delta b| (Lab / 100, times 100) of points both views see.
+
+    Every pixel of `view` is lifted by its depth, looked up (bilinear) in `other`, and counted where the depths agree
+    and both are three pixels inside their masks. Bilinear lookups of fine strokes leave a few units.
+    """
+    chosen = erode(view.mask, 3)
+    px = pixel_centres(view.camera.size)[chosen]
+    points = world_from_px(view.camera, px, view.depth[chosen].astype(np.float64))
+    there, z = px_from_world(other.camera, points)
+    seen = _sees(other, there, z)
+    if not seen.any():
+        return float("nan")
+    a = lab(picture[chosen][seen])
+    b = lab(bilinear(other_picture.astype(np.float32), there[seen]))
+    return float(np.abs(a - b).sum(axis=1).mean())
+
+
+def _sees(view: View, px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    height, width = view.camera.size
+    inside = (z > 0) & (px >= 0).all(axis=1) & (px[:, 0] < width) & (px[:, 1] < height)
+    column, row = np.where(inside[:, None], px, 0).astype(np.int64).T
+    depth = np.where(np.isfinite(view.depth), view.depth, 1e9)[row, column]
+    return inside & erode(view.mask, 3)[row, column] & (np.abs(depth - z) < DEPTH_TOLERANCE)
+
+
+def seam_ratio(view: View, picture: Float[np.ndarray, "h w 3"]) -> float:
+    """How much more neighbouring pixels differ across UV seams than beside them: 1 where seams cannot be seen.
+
+    A pair of neighbours is a seam where both lie on the surface, their depths continue each other, and their uv jump
+    is over SEAM_JUMP times the view's median step, or their texture sets differ. Compared with the pairs within eight
+    pixels of a seam. NaN where the view shows no seam.
+    """
+    differences, steps, pairs = [], [], []
+    depth = np.where(view.mask, view.depth, 0)
+    for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        joined = view.mask[a] & view.mask[b] & (np.abs(depth[a] - depth[b]) < DEPTH_TOLERANCE)
+        jump = np.linalg.norm(view.uv[a] - view.uv[b], axis=-1)
+        steps.append(jump[joined])
+        pairs.append((joined, jump, view.part[a] != view.part[b]))
+        differences.append(np.abs(picture[a] - picture[b]).sum(axis=-1))
+    if not sum(map(len, steps)):
+        return float("nan")
+    usual = float(np.median(np.concatenate(steps)))
+    seams = [joined & ((jump > SEAM_JUMP * usual) | parts) for joined, jump, parts in pairs]
+    on = np.concatenate([d[s] for d, s in zip(differences, seams, strict=True)])
+    beside = [dilate(s, 8) & ~s & joined for s, (joined, _, _) in zip(seams, pairs, strict=True)]
+    off = np.concatenate([d[s] for d, s in zip(differences, beside, strict=True)])
+    return float(on.mean() / max(float(off.mean()), 1e-9)) if len(on) and len(off) else float("nan")
+
+
+def coverage(known: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> float:
+    """Share of the covered texels that were painted by something that saw them."""
+    return float(known[covered].mean()) if covered.any() else float("nan")
+

@@ -1,0 +1,230 @@
+"""What the report of a job shows: its pictures are drawn here, its page is made by `run/report.py`."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel
+
+from mistyle.core.asset import Asset
+from mistyle.core.camera import Camera, orbit
+from mistyle.core.image import srgb_from_linear
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.view import View
+from mistyle.run.progress import Progress
+from mistyle.run.report import File, Figure, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
+from mistyle.run.settings import Settings
+from mistyle.run.stages import STAGES
+from mistyle.run.summary import MEANINGS, figures, versions
+
+ELEVATION = 15.0
+
+
+def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
+    """Draw the pictures and write `index.html` and, for people and README files, `beauty.png` into `folder`."""
+    from mistyle.files.images import write_png
+
+    settings = made.job.settings
+    turntable = frames(made.asset, made.repaired.maps, settings, lambda done: report(0.4 * done))
+    plain = frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
+    close = close_up(settings)
+    beauty, before = (
+        shown(render(made.asset, maps, [close], settings, backdrop=True)[0])[..., :3]
+        for maps in (made.repaired.maps, made.baked.maps)
+    )
+    report(0.9)
+    write_png(folder / "beauty.png", beauty)
+    page = Report(
+        title=made.job.name,
+        mesh=made.job.mesh.name,
+        style=made.job.style.name,
+        painting=Shot(made.style.rgb, f"The style: {made.job.style.name}"),
+        turntable=tuple(turntable),
+        plain=tuple(plain),
+        made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
+        facts=facts(made),
+        notes=tuple(Note(text) for text in (*made.asset.source.notes, *made.style.notes, *made.fit.notes)),
+        steps=steps(made, Shot(before, "as baked"), Shot(beauty, "after fit and repair")),
+        maps=map_sets(made),
+        timings=tuple(Timing(STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
+        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS.get(k, ("", ""))) for k, v in figures(made).items()),
+        settings=setting_groups(settings),
+        versions=tuple(versions().items()),
+        files=files(made),
+    )
+    write_report(folder / "index.html", page)
+
+
+def frames(asset: Asset, maps: Sequence[Maps], settings: Settings, report: Callable[[float], None]) -> list[np.ndarray]:
+    """Pictures all round the asset, transparent where nothing is, sRGB."""
+    chosen, size = settings.report, (settings.report.resolution, settings.report.resolution)
+    cameras = [
+        orbit(30 + 360 * k / chosen.frames, ELEVATION, distance=4, fov=30, size=size) for k in range(chosen.frames)
+    ]
+    return [shown(picture) for picture in render(asset, maps, cameras, settings, report=report)]
+
+
+def close_up(settings: Settings) -> Camera:
+    """The camera of the picture that stands for the asset."""
+    size = (settings.report.resolution * 2, settings.report.resolution * 2)
+    return orbit(30, ELEVATION, distance=4, fov=30, size=size)
+
+
+def render(
+    asset: Asset,
+    maps: Sequence[Maps],
+    cameras: Sequence[Camera],
+    settings: Settings,
+    report: Callable[[float], None] = lambda done: None,
+    backdrop: bool = False,
+) -> list[np.ndarray]:
+    """Linear premultiplied rgb and alpha under the studio lights."""
+    from mistyle.render.draw import pictures
+
+    return pictures(asset.mesh, maps, cameras, "studio", settings.report.spp, settings.seed, report, backdrop=backdrop)
+
+
+def shown(picture: np.ndarray) -> np.ndarray:
+    """A rendered picture as people see it: straight sRGB and alpha."""
+    alpha = np.clip(picture[..., 3:], 0, 1)
+    return np.concatenate([srgb_from_linear(picture[..., :3] / np.maximum(alpha, 1e-4)), alpha], axis=-1)
+
+
+def facts(made: Any) -> tuple[tuple[str, str], ...]:
+    """What the mesh is, in a line of figures."""
+    mesh = made.asset.mesh
+    return (
+        ("faces", f"{len(mesh.faces):,}"),
+        ("texture sets", str(len(mesh.parts))),
+        ("texture size", f"{made.job.settings.atlas.size}²"),
+        ("UVs", {"kept": "the mesh's own", "shifted": "the mesh's own", "new": "new"}[made.asset.source.uv]),
+        ("views", str(len(made.views))),
+    )
+
+
+def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
+    """The stages in the order of the paper."""
+    views = Step(
+        "Views of the mesh",
+        "Every camera of the rig, with the mesh's own material.",
+        "4.1.1",
+        shots=tuple(Shot(view_picture(v), v.camera.name) for v in made.views),
+        columns=8,
+    )
+    stylized = Step(
+        "Stylized views",
+        "The surface is painted once, so the views agree by construction.",
+        "4.1.3",
+        shots=tuple(Shot(view_picture(v), v.camera.name) for v in made.stylized),
+        columns=8,
+    )
+    parts = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True))
+    baked = Step(
+        "Bake",
+        "How many views see each texel: dark blue none, yellow many.",
+        "4.1.4",
+        shots=tuple(
+            Shot(heat(made.baked.seen[k] / max(len(made.views), 1), t), f"{name}: seen by views", sharp=True)
+            for k, (name, t) in enumerate(parts)
+        ),
+        columns=3,
+    )
+    fit = Step(
+        "Differentiable fit",
+        "Normal and roughness under directional light, then albedo under ambient light. A phase is kept only where it "
+        "makes nothing worse.",
+        "4.2",
+        pairs=(Pair(before, after, "Under the same studio light"),),
+        facts=fit_facts(made.fit),
+    )
+    repair = Step(
+        "Repair",
+        "Texels that the fit could not settle or that no view saw, painted again from the surface.",
+        "4.3",
+        shots=tuple(
+            Shot(mask_over(made.repaired.mask[k], made.repaired.maps[k], t), f"{name}: repaired texels")
+            for k, (name, t) in enumerate(parts)
+        ),
+        columns=3,
+    )
+    return (views, stylized, baked, fit, repair)
+
+
+def view_picture(view: View) -> np.ndarray:
+    """A view as straight sRGB with coverage."""
+    return shown(np.concatenate([view.rgb, view.coverage[..., None]], axis=-1))
+
+
+def heat(share: np.ndarray, texels: Texels) -> np.ndarray:
+    """A share 0..1 of every covered texel as colour (viridis), white elsewhere."""
+    import cv2
+
+    levels = np.clip(np.sqrt(share) * 255, 0, 255).astype(np.uint8)
+    colours = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1]
+    return np.where(texels.covered[..., None], colours, np.uint8(255)).astype(np.uint8)
+
+
+def mask_over(mask: np.ndarray, maps: Maps, texels: Texels) -> np.ndarray:
+    """The albedo with the masked texels in magenta, white outside the islands."""
+    albedo = srgb_from_linear(maps.albedo)
+    tinted = np.where(mask[..., None], 0.35 * albedo + 0.65 * np.array([1.0, 0.0, 0.8], np.float32), albedo)
+    return np.where(texels.covered[..., None], tinted, 1.0).astype(np.float32)
+
+
+def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
+    """Each phase: kept or undone, and the figures that decided."""
+    kept = [(f"{phase}", "kept" if good else "undone: it made a figure worse") for phase, good in fit.kept.items()]
+    return (*kept, *((name, f"{a:.4g} → {b:.4g}") for name, (a, b) in fit.figures.items()))
+
+
+def map_sets(made: Any) -> tuple[MapSet, ...]:
+    """The maps of every texture set, as written beside the asset."""
+    sets = []
+    for name, maps in zip(made.asset.mesh.parts, made.repaired.maps, strict=True):
+        shots = (
+            Shot(srgb_from_linear(maps.albedo), "albedo", "sRGB"),
+            Shot(maps.normal * 0.5 + 0.5, "normal", "tangent space, +Y, MikkTSpace"),
+            Shot(maps.roughness, "roughness", "linear"),
+            Shot(maps.metallic, "metallic", "linear"),
+        )
+        sets.append(MapSet(name, shots))
+    return tuple(sets)
+
+
+def setting_groups(settings: Settings) -> dict[str, tuple[Setting, ...]]:
+    """Every setting with its meaning, by stage."""
+    groups: dict[str, tuple[Setting, ...]] = {}
+    alone: list[Setting] = []
+    default = Settings()
+    for name in Settings.model_fields:
+        value = getattr(settings, name)
+        if isinstance(value, BaseModel):
+            groups[name] = tuple(
+                Setting(
+                    k,
+                    str(getattr(value, k)),
+                    f.description or "",
+                    getattr(value, k) != getattr(getattr(default, name), k),
+                )
+                for k, f in type(value).model_fields.items()
+            )
+        else:
+            meaning = Settings.model_fields[name].description or ""
+            alone.append(Setting(name, str(value), meaning, value != getattr(default, name)))
+    return {"job": tuple(alone)} | groups
+
+
+def files(made: Any) -> tuple[File, ...]:
+    """The files of the asset as its own list names them."""
+    listed = json.loads((made.folder / f"{made.job.name}.json").read_text(encoding="utf-8"))["files"]
+    return tuple(
+        File(
+            f"asset/{entry['file']}",
+            entry["bytes"],
+            entry["sha256"],
+            entry.get("colour_space") or entry.get("what") or "",
+        )
+        for entry in listed
+    )

@@ -1,0 +1,223 @@
+"""The report: one HTML file with everything a job made, that opens from disk with no network.
+
+`Report` is pure data: pictures are arrays that are ready to look at (sRGB-encoded, 8 bit or float 0..1; grey, rgb or
+rgb with straight alpha), everything else is text and numbers. `write_report` inlines every picture as WebP, escapes
+every text (jinja2 autoescape) and forbids itself every connection by a content-security policy; the one script is
+allowed by its hash. The page works without scripts too, only the turntable then stands still.
+"""
+
+import base64
+import hashlib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, TypeAlias
+
+import numpy as np
+from jaxtyping import Bool, Float, UInt8
+
+from mistyle.files.store import atomic_write
+from mistyle.run.report_pictures import Sizes, accents, palette, webp
+
+Pixels: TypeAlias = (
+    UInt8[np.ndarray, "h w c"]
+    | UInt8[np.ndarray, "h w"]
+    | Float[np.ndarray, "h w c"]
+    | Float[np.ndarray, "h w"]
+    | Bool[np.ndarray, "h w"]
+)
+
+# The whole file stays below this; where the pictures of a job are more, all of them are made smaller.
+MOST_BYTES = 8_000_000
+SCALES = (1.0, 0.75, 0.55, 0.4, 0.25)
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One picture with what is said below it; `sharp` keeps its pixels as they are (masks, charts)."""
+
+    picture: Pixels
+    caption: str
+    detail: str = ""
+    sharp: bool = False
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two pictures of the same size in one frame with a handle between them."""
+
+    before: Shot
+    after: Shot
+    caption: str = ""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One stage of the job: a heading, a sentence or two, comparisons and pictures, and a few facts.
+
+    `section` names the paper's section; `columns` is how many pictures stand in a row on a wide screen.
+    """
+
+    title: str
+    text: str = ""
+    section: str = ""
+    pairs: tuple[Pair, ...] = ()
+    shots: tuple[Shot, ...] = ()
+    facts: tuple[tuple[str, str], ...] = ()
+    columns: int = 4
+
+
+@dataclass(frozen=True)
+class MapSet:
+    """The maps of one texture set."""
+
+    name: str
+    shots: tuple[Shot, ...]
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How long a stage took; `reused` where its result was taken over from an earlier run."""
+
+    name: str
+    seconds: float
+    reused: bool = False
+
+
+@dataclass(frozen=True)
+class Figure:
+    """A measured figure and what it means; `better` says which way is up."""
+
+    name: str
+    value: str
+    meaning: str
+    better: Literal["higher", "lower", ""] = ""
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One setting of the job; `chosen` where it is not the default."""
+
+    name: str
+    value: str
+    meaning: str = ""
+    chosen: bool = False
+
+
+@dataclass(frozen=True)
+class File:
+    """One file of the asset: path relative to the report's run folder, size in bytes, sha256."""
+
+    path: str
+    size: int
+    sha256: str
+    detail: str = ""
+
+
+@dataclass(frozen=True)
+class Note:
+    """A sentence that the reader should know; a warning is set apart."""
+
+    text: str
+    warning: bool = False
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything the page shows; empty tuples leave their part out.
+
+    `turntable` and `plain` are frames of equal size and number all round the stylized and the original asset, evenly
+    spaced, transparent where nothing is; the first is what is seen first. `made` says when and with what in one line.
+    """
+
+    title: str
+    mesh: str
+    style: str
+    painting: Shot
+    turntable: tuple[Pixels, ...]
+    plain: tuple[Pixels, ...] = ()
+    made: str = ""
+    facts: tuple[tuple[str, str], ...] = ()
+    notes: tuple[Note, ...] = ()
+    steps: tuple[Step, ...] = ()
+    maps: tuple[MapSet, ...] = ()
+    timings: tuple[Timing, ...] = ()
+    figures: tuple[Figure, ...] = ()
+    settings: Mapping[str, tuple[Setting, ...]] = field(default_factory=dict)
+    versions: tuple[tuple[str, str], ...] = ()
+    files: tuple[File, ...] = ()
+
+
+def write_report(path: Path, report: Report) -> None:
+    """Write the report to `path` as one HTML file.
+
+    It stays below MOST_BYTES unless even pictures of a quarter of the usual size are more.
+    Raises ValueError where the turntable has no frames, or where `plain` has another number of frames.
+    """
+    if not report.turntable:
+        raise ValueError("a report needs at least one turntable frame")
+    if report.plain and len(report.plain) != len(report.turntable):
+        raise ValueError(f"{len(report.plain)} frames of the original for {len(report.turntable)} of the turntable")
+    page = b""
+    for scale in SCALES:
+        page = render(report, scale).encode()
+        if len(page) <= MOST_BYTES:
+            break
+    atomic_write(path, page)
+
+
+def render(report: Report, scale: float = 1.0) -> str:
+    """The page as text, with every picture at `scale` of its usual size."""
+    import jinja2
+    from markupsafe import Markup
+
+    here = Path(__file__).parent
+    loader = jinja2.FileSystemLoader(here)
+    env = jinja2.Environment(
+        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    env.filters |= {"seconds": seconds, "size": size, "slug": slug}
+    script = (here / "report.js").read_text(encoding="utf-8")
+    swatches = palette(report.painting.picture)
+    return env.get_template("report.html.j2").render(
+        report=report,
+        total=sum(t.seconds for t in report.timings),
+        longest=max([t.seconds for t in report.timings], default=0.0) or 1.0,
+        sizes=Sizes(scale),
+        webp=webp,
+        palette=swatches,
+        accent=accents(swatches),
+        # Both files are ours and hold no text of others.
+        style=Markup((here / "report.css").read_text(encoding="utf-8")),
+        script=Markup(script),
+        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+    )
+
+
+def seconds(value: float) -> str:
+    """A duration as people say it: '0.4 s', '12 s', '3 min 05 s', '1 h 02 min'."""
+    if value < 9.95:
+        return f"{value:.1f} s"
+    whole = round(value)
+    if whole < 60:
+        return f"{whole} s"
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600} h {whole % 3600 // 60:02d} min"
+
+
+def size(count: int) -> str:
+    """A number of bytes as people say it, in powers of 1000."""
+    if count < 1000:
+        return f"{count} B"
+    power = 1
+    while power < 4 and count / 1000**power >= 999.5:
+        power += 1
+    value, unit = count / 1000**power, ("kB", "MB", "GB", "TB")[power - 1]
+    return f"{value:.1f} {unit}" if value < 99.95 else f"{value:.0f} {unit}"
+
+
+def slug(text: str) -> str:
+    """A text as an anchor: letters, digits and hyphens."""
+    kept = "".join(c if c.isascii() and c.isalnum() else " " for c in text.lower())
+    return "-".join(kept.split()) or "part"

@@ -1,0 +1,237 @@
+"""The struggle mask, the blend and the weight-free fill, against values worked out by hand."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import ndimage
+
+from mistyle.backends.fill import _harmonic, grow, inpainter
+from mistyle.core.maps import Maps, Texels, flat_maps
+from mistyle.stages.inpaint import RepairSettings, blend_weights, radius, repair, struggle_mask
+
+BARE = RepairSettings(dilation=0, blend=0)
+
+
+def texels_of(island: np.ndarray, position: np.ndarray | None = None) -> Texels:
+    """An atlas lying flat in space, one unit a texel, unless told otherwise."""
+    flat = np.stack([*np.indices(island.shape), np.zeros(island.shape)], axis=-1)
+    place = (flat if position is None else position).astype(np.float32)
+    normal = np.broadcast_to(np.float32([0, 0, 1]), place.shape).copy()
+    return Texels(place, normal, island >= 0, island.astype(np.int32), island.astype(np.int32))
+
+
+def one_island(size: int) -> Texels:
+    return texels_of(np.zeros((size, size), int))
+
+
+def two_islands(size: int) -> Texels:
+    """Left and right of a gap two texels wide."""
+    column = np.arange(size)[None, :] * np.ones((size, 1))
+    return texels_of(np.where(column < size // 2 - 1, 0, np.where(column > size // 2, 1, -1)))
+
+
+def disk(size: int, row: float, column: float, r: float) -> np.ndarray:
+    rows, columns = np.indices((size, size))
+    return np.hypot(rows - row, columns - column) < r
+
+
+def random_maps(rng: np.random.Generator, size: int) -> Maps:
+    maps = flat_maps(size)
+    return replace(maps, albedo=rng.random((size, size, 3)).astype(np.float32), known=np.ones((size, size), bool))
+
+
+def test_radius_is_a_share_of_the_atlas():
+    assert [radius(0.004, size) for size in (64, 1024, 4096)] == [1, 4, 16]
+    assert radius(0, 4096) == 0
+
+
+def test_the_threshold_is_mean_plus_half_a_deviation():
+    texels, seen = texels_of(np.array([[0, 0, 0, 0, -1]])), np.ones((1, 5), np.int32)
+
+    def masked(*values: float, choice: RepairSettings = BARE) -> list[bool]:
+        return struggle_mask(np.array([values], np.float32), seen, texels, choice)[0].tolist()
+
+    # Mean 3, std sqrt(11) = 3.317, threshold 4.658; what is not covered (1000) neither counts nor is masked.
+    assert masked(0, 0, 4, 8, 1000) == [False, False, False, True, False]
+    # Mean 3.25, std sqrt(11.6875) = 3.419, threshold 4.959.
+    assert masked(0, 0, 5, 8, 1000) == [False, False, True, True, False]
+    assert masked(0, 0, 4, 8, 0, choice=RepairSettings(deviations=0, dilation=0)) == [False, False, True, True, False]
+    assert masked(7, 7, 7, 7, 7) == [False] * 5
+
+
+def test_texels_seen_more_often_do_not_struggle_for_that():
+    seen = np.arange(1, 10).reshape(3, 3)
+    texels = one_island(3)
+    assert not struggle_mask(0.25 * seen.astype(np.float32), seen, texels, BARE).any()
+    gradient = 0.25 * seen.astype(np.float32)
+    gradient[0, 0] = 1.0
+    assert struggle_mask(gradient, seen, texels, BARE).tolist() == [[True, False, False]] + [[False] * 3] * 2
+
+
+def test_never_seen_texels_join_the_mask_and_stay_out_of_the_statistics():
+    gradient, seen = np.array([[1, 1, 1, 2, 0]], np.float32), np.array([[1, 1, 1, 1, 0]])
+    mask = struggle_mask(gradient, seen, texels_of(np.array([[0, 0, 0, 0, 0]])), BARE)
+    # Mean 1.25, std 0.433: 2 is above 1.47. With the unseen zero the mean would be 1, and 2 still above 1.32.
+    assert mask.tolist() == [[False, False, False, True, True]]
+    assert struggle_mask(gradient, 0 * seen, texels_of(np.array([[0, 0, 0, 0, -1]])), BARE).tolist() == [
+        [True] * 4 + [False]
+    ]
+
+
+def test_the_mask_grows_by_its_share_and_stays_in_its_island():
+    texels = two_islands(256)
+    gradient = np.zeros((256, 256), np.float32)
+    gradient[100, 124] = 1e4
+    mask = struggle_mask(gradient, np.ones((256, 256), int), texels, RepairSettings(dilation=3 / 256))
+    expected = np.zeros_like(mask)
+    expected[97:104, 121:127] = True  # a square of side 7, cut off where the island ends
+    assert np.array_equal(mask, expected)
+
+
+def test_blend_is_one_inside_zero_outside_and_falls_between():
+    size, side = 200, 4
+    texels, mask = one_island(size), disk(size, 100, 100, 40)
+    weights = blend_weights(mask, np.ones_like(mask), texels, RepairSettings(blend=side / size))
+    window = np.ones((2 * side + 1,) * 2, bool)
+    outer, inner = ndimage.binary_dilation(mask, window), ndimage.binary_erosion(mask, window)
+    assert (weights[inner] == 1).all() and (weights[~outer] == 0).all()
+    band = outer & ~inner
+    assert 0.3 < weights[band].mean() < 0.7
+    profile = weights[100, 100:]
+    assert (np.diff(profile) <= 0).all() and np.abs(np.diff(profile)).max() < 1.6 / (2 * side)
+
+
+def test_the_border_of_an_island_is_no_edge_of_the_mask():
+    texels = two_islands(100)
+    mask = (texels.island == 0) & (np.indices((100, 100))[1] > 30)
+    weights = blend_weights(mask, np.ones_like(mask), texels, RepairSettings(blend=0.03))
+    assert (weights[:, 35:49] == 1).all()  # up to the seam
+    assert not weights[texels.island == 1].any() and not weights[~texels.covered].any()
+    assert ((weights[:, 29:31] > 0) & (weights[:, 29:31] < 1)).all()
+
+
+def test_what_nobody_saw_is_replaced_whole():
+    mask = disk(100, 50, 50, 20)
+    known = ~disk(100, 50, 50, 20)
+    weights = blend_weights(mask, known, one_island(100), RepairSettings(blend=0.05))
+    assert (weights[mask] == 1).all() and 0 < weights[50, 71] < 1
+
+
+@given(seed=st.integers(0, 2**32 - 1))
+@settings(max_examples=10)
+def test_texels_outside_the_dilated_mask_keep_their_bits(seed):
+    generator = np.random.default_rng(seed)
+    texels, maps = two_islands(96), random_maps(generator, 96)
+    mask = disk(96, *generator.uniform(0, 96, 2), generator.uniform(1, 30)) & texels.covered
+    choice = RepairSettings(blend=0.03)
+    holes = []
+
+    def paint(albedo, hole, atlas, rng):
+        holes.append(hole)
+        return np.full_like(albedo, 2.0)  # writes everywhere, hole or not
+
+    fixed = repair(maps, mask, texels, paint, choice)
+    outside = ~ndimage.binary_dilation(mask, np.ones((7, 7)))
+    assert fixed.albedo[outside].tobytes() == maps.albedo[outside].tobytes()
+    assert fixed.normal is maps.normal and fixed.roughness is maps.roughness and fixed.known is maps.known
+    if mask.any():
+        assert (holes[0] >= mask).all() and not holes[0][outside].any()
+        assert (fixed.albedo[ndimage.binary_erosion(mask | ~texels.covered, np.ones((7, 7))) & mask] == 2).all()
+        other = texels.island == 1 - texels.island[mask][0]
+        if not (mask & other).any():
+            assert fixed.albedo[other].tobytes() == maps.albedo[other].tobytes()
+
+
+def test_an_empty_mask_changes_nothing(rng):
+    maps = random_maps(rng, 16)
+    assert repair(maps, np.zeros((16, 16), bool), one_island(16), inpainter(), RepairSettings()) is maps
+
+
+@pytest.mark.parametrize("answer", [np.zeros((8, 8, 3), np.float32), np.full((16, 16, 3), np.nan, np.float32)])
+def test_a_useless_inpainter_is_refused(rng, answer):
+    with pytest.raises(ValueError, match="inpainter"):
+        repair(random_maps(rng, 16), disk(16, 8, 8, 4), one_island(16), lambda *_: answer, RepairSettings())
+
+
+def test_the_surface_solution_is_asked_first(rng):
+    texels, hole = one_island(64), disk(64, 30, 30, 9)
+
+    def colours(positions, normals):
+        assert positions.shape == normals.shape == (hole.sum(), 3)
+        answer = positions / 100
+        answer[positions[:, 0] > 34] = np.nan  # no answer there
+        return answer
+
+    albedo = np.full((64, 64, 3), 0.5, np.float32)
+    painted = inpainter(colours)(albedo, hole, texels, rng)
+    asked = hole & (np.arange(64)[:, None] <= 34)
+    assert np.abs(painted[asked] - texels.position[asked] / 100).max() < 1e-6
+    assert np.array_equal(painted[~hole], albedo[~hole])
+    # The rest grows from between the answers (0.34 in red) and the untouched 0.5.
+    assert np.isfinite(painted).all() and abs(painted[hole & ~asked][:, 0].mean() - 0.42) < 0.08
+
+
+def test_a_linear_gradient_grows_on_through_a_hole():
+    # Linear functions solve Laplace's equation; the blur leaves them alone except within 3 sigma of a border.
+    rows, columns = np.indices((128, 128)) / 128
+    albedo = np.stack([0.2 + 0.6 * columns, 0.8 - 0.5 * rows, 0.3 + 0.2 * rows + 0.2 * columns], axis=-1).astype(
+        np.float32
+    )
+    hole = disk(128, 64, 60, 22)
+    painted = grow(np.where(hole[..., None], 9, albedo).astype(np.float32), hole, one_island(128))
+    assert np.abs(painted - albedo)[hole].max() < 0.05 and np.abs(painted - albedo)[hole].mean() < 0.01
+    assert painted[~hole].tobytes() == albedo[~hole].tobytes()
+
+
+def test_the_smooth_part_solves_laplace_s_equation():
+    # Three harmonic functions (real parts of analytic ones); only their values around the hole are given.
+    y, x = (np.indices((96, 96)) - 48) / 96
+    functions = [x * x - y * y, 2 * (3 * x * x * y - y**3), np.exp(2 * x) * np.sin(2 * y) / 4]
+    exact = np.stack(functions, axis=-1).astype(np.float32)
+    hole = np.hypot(x, y + 0.05) < 0.33
+    found = _harmonic(np.where(hole[..., None], 0, exact).astype(np.float32), ~hole, np.ones_like(hole))
+    # A mean between the rim's values alone (the pyramid without sweeps) errs three times as much.
+    assert np.abs(found - exact).max() < 0.015 and np.abs(found - exact)[hole].mean() < 0.005
+
+
+def test_detail_goes_on_into_the_hole(rng):
+    albedo = np.clip(0.5 + 0.15 * rng.normal(size=(128, 128, 1)) * np.ones(3), 0, 1).astype(np.float32)
+    hole = disk(128, 64, 64, 16)
+    painted = grow(albedo, hole, one_island(128))
+    assert 0.6 < painted[hole].std() / albedo[~hole].std() < 1.4
+    # And it joins the rim: no more of a step there than anywhere.
+    rim = hole & ~ndimage.binary_erosion(hole)
+    assert np.abs(painted[rim].mean(axis=0) - 0.5).max() < 0.06
+
+
+def test_no_colour_crosses_between_islands():
+    # Cut along the diagonal, so that the rectangle around either island holds the other one too.
+    rows, columns = np.indices((128, 128))
+    texels = texels_of(np.where(rows > columns + 1, 0, np.where(rows < columns - 1, 1, -1)))
+    albedo = np.where((texels.island == 0)[..., None], np.float32([1, 0, 0]), np.float32([0, 0, 1]))
+    hole = disk(128, 60, 63, 30) & texels.covered
+    painted = grow(np.where(hole[..., None], 0.5, albedo).astype(np.float32), hole, texels)
+    assert np.abs(painted - albedo)[texels.covered].max() < 1e-5
+
+
+def test_an_island_that_is_all_hole_takes_the_nearest_colour_in_space():
+    island = np.repeat([[0, 1, 2]], 4, axis=0).repeat(8, axis=1)
+    position = np.zeros((4, 24, 3))
+    position[..., 0] = np.repeat([0.0, 5.0, 4.5], 8)
+    albedo = (island[..., None] / 4 + 0.25).repeat(3, axis=-1).astype(np.float32)
+    painted = grow(albedo, island == 1, texels_of(island, position))
+    assert (painted[:, 8:16] == 0.75).all()
+    everything = island >= 0
+    assert np.array_equal(grow(albedo, everything, texels_of(island, position)), albedo)
+
+
+def test_growing_is_deterministic_and_ignores_what_lies_under_the_hole(rng):
+    texels, hole = two_islands(64), disk(64, 30, 20, 12)
+    albedo = rng.random((64, 64, 3)).astype(np.float32)
+    other = np.where(hole[..., None], 1 - albedo, albedo).astype(np.float32)
+    first, second = grow(albedo, hole, texels), grow(other, hole, texels)
+    assert first[hole & texels.covered].tobytes() == second[hole & texels.covered].tobytes()
+    assert (first >= 0).all() and (first <= 1).all()
