@@ -102,7 +102,8 @@ def mend(vertices: np.ndarray, faces: np.ndarray, clay: sculpt.Clay, rounds: int
         angles = np.degrees(np.arccos(np.clip(-(sides * np.roll(sides, 1, axis=1)).sum(2), -1, 1)))
         across = np.cross(sides[:, 0], sides[:, 1])
         normals = sculpt.gradient(clay, corners.mean(1), CELL / 2)
-        bad = (angles.min(1) < 5) | ((across * normals).sum(1) < 0)
+        lean = (across * normals).sum(1) / (np.linalg.norm(across, axis=1) * np.linalg.norm(normals, axis=1))
+        bad = (angles.min(1) < 5) | (lean < 0.3)
         ill = np.unique(faces[bad])
         total, weight = np.zeros_like(vertices), np.zeros(len(vertices))
         for k in range(3):

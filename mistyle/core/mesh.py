@@ -11,8 +11,9 @@ class Mesh:
     """Triangles in the working space: Y up, right-handed, bounding sphere of radius 1 about the origin.
 
     UVs and normals belong to face corners, so a UV seam never duplicates a position and the user's vertex order
-    survives. `part` says to which texture set a face belongs; `parts` names the sets. Inside one part every UV
-    lies in the unit square, v up.
+    survives. `part` says to which texture set a face belongs; `parts` names the sets. UVs are v up and taken modulo 1
+    (textures repeat): a kept island that crosses the square's border keeps its place, so single coordinates may lie in
+    [-1, 2]. Where faces share texels, the first in face order is the one painted.
     """
 
     positions: Float[np.ndarray, "v 3"]

@@ -123,6 +123,7 @@ def _plan(
     name = raw.materials[material].name
     own = rows if raw.twin is None else rows[raw.twin[rows] == rows]
     if uv == "new":
+        notes.append(f"Material '{name}' was unwrapped anew, as asked.")
         return _Plan(rows, None, "asked for")
     layout = None
     if raw.uvs is not None and np.isfinite(raw.uvs[rows]).any():

@@ -31,7 +31,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
     plain = frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
     close = close_up(settings)
     beauty, before = (
-        shown(render(made.asset, maps, [close], settings, backdrop=True)[0])[..., :3]
+        shown(render(made.asset, maps, [close], settings, backdrop=True, finer=4)[0])[..., :3]
         for maps in (made.repaired.maps, made.baked.maps)
     )
     report(0.9)
@@ -79,11 +79,14 @@ def render(
     settings: Settings,
     report: Callable[[float], None] = lambda done: None,
     backdrop: bool = False,
+    finer: int = 1,
 ) -> list[np.ndarray]:
     """Linear premultiplied rgb and alpha under the studio lights."""
     from mistyle.render.draw import pictures
 
-    return pictures(asset.mesh, maps, cameras, "studio", settings.report.spp, settings.seed, report, backdrop=backdrop)
+    return pictures(
+        asset.mesh, maps, cameras, "studio", settings.report.spp * finer, settings.seed, report, backdrop=backdrop
+    )
 
 
 def shown(picture: np.ndarray) -> np.ndarray:
@@ -110,14 +113,14 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         "Views of the mesh",
         "Every camera of the rig, with the mesh's own material.",
         "4.1.1",
-        shots=tuple(Shot(view_picture(v), v.camera.name) for v in made.views),
+        shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.views),
         columns=8,
     )
     stylized = Step(
         "Stylized views",
         "The surface is painted once, so the views agree by construction.",
         "4.1.3",
-        shots=tuple(Shot(view_picture(v), v.camera.name) for v in made.stylized),
+        shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.stylized),
         columns=8,
     )
     parts = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True))
@@ -150,6 +153,12 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         columns=3,
     )
     return (views, stylized, baked, fit, repair)
+
+
+def angle(camera: Camera) -> str:
+    """Where a view is taken from, in few characters."""
+    known = np.isfinite(camera.azimuth) and np.isfinite(camera.elevation)
+    return f"{camera.azimuth:.0f}° / {camera.elevation:+.0f}°" if known else camera.name
 
 
 def view_picture(view: View) -> np.ndarray:

@@ -75,7 +75,7 @@ def build(maps: Sequence[Maps], texels: Sequence[Texels], shrink: int) -> Table:
     return Table(tuple(sizes), values, start, np.concatenate(right), np.concatenate(below), np.concatenate(columns))
 
 
-def project(name: str, values: Float[np.ndarray, "t c"]) -> Float[np.ndarray, "t c"]:
+def project(name: str, values: Float[np.ndarray, "*t c"]) -> Float[np.ndarray, "*t c"]:
     """The nearest allowed values: tilt inside the disk of TILT_LIMIT, roughness from ROUGHNESS_FLOOR to 1, else 0..1."""
     if name == "tilt":
         length = np.sqrt((values**2).sum(axis=-1, keepdims=True))

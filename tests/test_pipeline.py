@@ -1,0 +1,130 @@
+"""The main job on a small mesh, end to end: what it writes, that a killed run ends as an uninterrupted one, and that
+nothing is redone without need."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from PIL import Image
+
+import mistyle
+from mistyle.core.errors import Stopped, UsageError
+from mistyle.run import pipeline
+from mistyle.run.progress import Progress
+from mistyle.run.settings import resolve
+from mistyle.run.stages import STAGES, Job
+
+TINY = {
+    "rig": {"resolution": 128},
+    "draw": {"spp": 2},
+    "surface": {"samples": 3000},
+    "atlas": {"size": 128, "padding": 4},
+    "fit": {"iterations1": 4, "iterations2": 4, "crops": 1, "crop_size": 64},
+    "report": {"frames": 4, "resolution": 64, "spp": 2},
+    "threads": 2,
+}
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory) -> tuple[Path, Path]:
+    """A dumb-bell without UVs and a painting of diagonal strokes."""
+    folder = tmp_path_factory.mktemp("inputs")
+    ball = trimesh.creation.icosphere(subdivisions=2)
+    ball.vertices *= 1 + 0.5 * np.cos(np.arctan2(ball.vertices[:, 1], 0.7) * 2)[:, None]
+    ball.export(folder / "bell.obj")
+    y, x = np.mgrid[:96, :128] / 16
+    stripes = np.stack([np.sin(x + y) * 0.4 + 0.5, np.sin(x + y + 1) * 0.3 + 0.4, np.cos(x - y) * 0.2 + 0.3], axis=-1)
+    Image.fromarray((stripes * 255).astype(np.uint8)).save(folder / "strokes.png")
+    return folder / "bell.obj", folder / "strokes.png"
+
+
+def job(inputs: tuple[Path, Path], out: Path, **more) -> Job:
+    return Job(inputs[0], inputs[1], out, resolve("draft", None, TINY, {}), "bell", **more)
+
+
+def hashes(out: Path) -> dict[str, str]:
+    """Every file of the asset and the stylized views, and the stored maps, but not the report, which holds times."""
+    found = [
+        p for part in ("asset", "stylized", "views", "work") for p in sorted((out / part).rglob("*")) if p.is_file()
+    ]
+    return {
+        str(p.relative_to(out)): hashlib.sha256(p.read_bytes()).hexdigest() for p in found if not p.name.startswith(".")
+    }
+
+
+@pytest.fixture(scope="module")
+def whole(inputs, tmp_path_factory) -> Path:
+    """An uninterrupted run."""
+    out = tmp_path_factory.mktemp("whole")
+    pipeline.stylize(job(inputs, out), Progress(quiet=True))
+    return out
+
+
+def test_everything_promised_is_there(whole):
+    names = {f"bell_{kind}.{ending}" for kind in ("albedo", "normal", "roughness", "orm") for ending in ("png", "exr")}
+    assert names == {p.name for p in (whole / "asset" / "textures").iterdir()}
+    assert len(list((whole / "views").glob("*.exr"))) == len(list((whole / "stylized").glob("*.png"))) == 16
+    assert (whole / "report" / "index.html").stat().st_size > 10_000
+    run = json.loads((whole / "run.json").read_text())
+    assert set(run["seconds"]) == set(STAGES) and run["peak_gb"] > 0
+    assert run["settings"]["surface"]["samples"] == 3000 and run["versions"]["mitsuba"].startswith("3.9")
+
+
+def test_an_independent_reader_opens_the_asset(whole, inputs):
+    ours = trimesh.load(whole / "asset" / "bell.glb", force="mesh", process=False)
+    theirs = trimesh.load(inputs[0], force="mesh", process=False)
+    np.testing.assert_allclose(ours.bounds, theirs.bounds, atol=1e-5)
+    assert len(ours.faces) == len(theirs.faces)
+    picture = np.asarray(ours.visual.material.baseColorTexture.convert("RGB"), float)
+    assert picture.std(axis=(0, 1)).min() > 5, "the albedo holds the painting, not a constant"
+
+
+def test_the_fit_moved_the_maps(whole):
+    from mistyle.files.records import load_record
+
+    start, final = (load_record(whole / "work" / name / "record").maps[0] for name in ("bake", "repair"))
+    assert not np.array_equal(start.normal, final.normal)
+    assert final.roughness.std() > 1e-5 and np.isfinite(final.normal).all()
+
+
+@pytest.mark.parametrize("stage", ["surface", "fit", "asset"])
+def test_a_stopped_run_resumes_to_the_same_bytes(inputs, whole, tmp_path, monkeypatch, stage):
+    """Stopped in the middle of a stage, then run again: asset, stylized views and maps have the same bytes."""
+    function = {"surface": "paint", "fit": "fit", "asset": "write_asset"}[stage]
+    with monkeypatch.context() as patch:
+
+        def stop(*arguments, **keywords):
+            raise Stopped("on request")
+
+        patch.setattr(pipeline, function, stop)
+        with pytest.raises(Stopped):
+            pipeline.stylize(job(inputs, tmp_path), Progress(quiet=True))
+    assert not (tmp_path / "asset").exists()
+    progress = Progress(quiet=True)
+    pipeline.stylize(job(inputs, tmp_path), progress)
+    assert progress.reused, "what was finished before is taken over"
+    assert hashes(tmp_path) == hashes(whole)
+
+
+def test_a_second_run_takes_everything_over_and_from_redoes(inputs, whole):
+    before = hashes(whole)
+    progress = Progress(quiet=True)
+    pipeline.stylize(job(inputs, whole), progress)
+    assert progress.reused == list(STAGES)
+    progress = Progress(quiet=True)
+    pipeline.stylize(job(inputs, whole, redo_from="repair"), progress)
+    assert "fit" in progress.reused and "repair" not in progress.reused and "asset" not in progress.reused
+    assert hashes(whole) == before
+
+
+def test_unknown_stages_and_busy_folders_are_refused(inputs, tmp_path):
+    with pytest.raises(UsageError, match="there is no such stage"):
+        pipeline.stylize(job(inputs, tmp_path / "a", redo_from="paint"), Progress(quiet=True))
+
+
+def test_the_python_call_does_the_same(inputs, whole):
+    summary = mistyle.stylize(*inputs, whole, preset="draft", name="bell", **TINY)
+    assert Path(summary["asset"]).is_file() and summary["figures"]["painted_share"] > 0.99
