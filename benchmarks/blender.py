@@ -102,7 +102,7 @@ def draw(asset: Asset, camera: Camera, samples: int) -> np.ndarray:
     import mitsuba as mi
 
     from mistyle.render import device
-    from mistyle.render.scene import object_shapes, sensor_dict
+    from mistyle.render.scene import object_shapes, samples as allowed, sensor_dict
 
     device.use()
     scene = {
@@ -113,7 +113,7 @@ def draw(asset: Asset, camera: Camera, samples: int) -> np.ndarray:
         "sun": {"type": "directional", "direction": [-x for x in SUN["direction"]], "irradiance": SUN["irradiance"]},
     }
     scene |= object_shapes(asset.mesh, [material_maps(m) for m in asset.materials])
-    return np.array(mi.render(mi.load_dict(scene), spp=samples), dtype=np.float32)
+    return np.array(mi.render(mi.load_dict(scene), spp=allowed(samples)), dtype=np.float32)
 
 
 def cycles(path: Path, asset: Asset, camera: Camera, samples: int, blender: str) -> np.ndarray:

@@ -330,7 +330,7 @@ def test_the_papers_environment_is_its_spherical_gaussians(rng: np.random.Genera
 
 def test_the_same_seed_gives_the_same_bytes() -> None:
     mesh, cameras = sphere(24), [camera_at(30, 0, 48), camera_at(30, 89, 48)]
-    first, again, other = (draw.draw_views(mesh, None, cameras, spp=6, seed=seed) for seed in (1, 1, 2))
+    first, again, other = (draw.draw_views(mesh, None, cameras, spp=17, seed=seed) for seed in (1, 1, 2))
     for a, b, c in zip(first, again, other, strict=True):
         assert a.rgb.tobytes() == b.rgb.tobytes() and a.coverage.tobytes() == b.coverage.tobytes()
         assert a.depth.tobytes() == b.depth.tobytes() == c.depth.tobytes()
@@ -367,10 +367,17 @@ def test_parameters_name_textures_that_can_be_optimised() -> None:
             assert dr.grad_enabled(values)
 
 
-def test_samples_are_powers_of_two() -> None:
-    assert [scene.samples(n) for n in (1, 2, 3, 8, 9, 64)] == [1, 2, 4, 8, 16, 64]
+def test_samples_come_in_passes_that_threads_do_not_share() -> None:
+    assert [scene.passes(n) for n in (1, 2, 3, 8, 9, 17, 64, 65)] == [
+        (1, 1), (1, 2), (1, 4), (1, 8), (1, 16), (2, 16), (1, 64), (2, 64),
+    ]  # fmt: skip
     with pytest.raises(ValueError, match="spp"):
-        scene.samples(0)
+        scene.passes(0)
+    ball, camera = sphere(16), camera_at(30, 15, 24)
+    few, many, reference = (draw.picture(ball, None, camera, "paper_views", spp=n) for n in (16, 128, 1024))
+    error = [float(np.sqrt(((image - reference) ** 2).mean())) for image in (few, many)]
+    # Eight times the samples halve the error at the very least, if the passes differ.
+    assert error[1] < 0.5 * error[0]
 
 
 def test_maps_must_match_the_parts() -> None:

@@ -181,4 +181,9 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
             mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes
         )
         scene = mi.load_dict(described, optimize=False)
-        yield np.array(mi.render(scene, spp=scenery.samples(spp), seed=seed), dtype=np.float32)
+        times, each = scenery.passes(spp)
+        total = np.zeros((*camera.size, 4), np.float32)
+        for k in range(times):
+            # Seeds of passes must not meet those of a neighbouring seed: an odd step visits every number once.
+            total += np.array(mi.render(scene, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32), dtype=np.float32)
+        yield total / np.float32(times)

@@ -125,18 +125,24 @@ def object_shapes(mesh: Mesh, maps: Sequence[Maps] | None, flip_invalid: bool = 
     return shapes
 
 
-def samples(spp: int) -> int:
-    """The power of two at or above `spp`: then no two threads share a pixel, and its sum is the same in every run."""
+def passes(spp: int) -> tuple[int, int]:
+    """How to take at least `spp` samples a pixel: so many passes of so many samples, which are then averaged.
+
+    In all a power of two: then no two threads share a pixel, and its sum is the same in every run. Of these the sampler
+    takes only 2, 8 and the powers of four as they are; a pass of 64 keeps the memory of large pictures small.
+    """
     if spp < 1:
         raise ValueError(f"spp is {spp}; expected 1 or more")
-    return 1 << (spp - 1).bit_length()
+    total = 1 << (spp - 1).bit_length()
+    each = 16 if total == 32 else min(total, 64)
+    return total // each, each
 
 
 def sensor_dict(camera: Camera, spp: int = 8, seed: int = 0) -> dict:
     """A perspective sensor that sees exactly what `core/camera.py` describes; box filter: pixels are independent.
 
-    Correlated multi-jittered samples: at 16 per pixel the error of the views is that of 44 independent ones. `spp`
-    is rounded up by `samples`; give `mi.render` the same number.
+    Correlated multi-jittered samples: at 16 per pixel the error of the views is that of 44 independent ones. The
+    sampler is set to what `passes` gives as the samples of one pass; give `mi.render` the same number.
     """
     import mitsuba as mi
 
@@ -150,7 +156,7 @@ def sensor_dict(camera: Camera, spp: int = 8, seed: int = 0) -> dict:
         "principal_point_offset_x": 0.5 - camera.centre[0] / width,
         "principal_point_offset_y": 0.5 - camera.centre[1] / height,
         "to_world": mi.ScalarTransform4f(camera.world_from_cam @ MITSUBA_FROM_OPENCV),
-        "sampler": {"type": "multijitter", "sample_count": samples(spp), "seed": seed},
+        "sampler": {"type": "multijitter", "sample_count": passes(spp)[1], "seed": seed},
         "film": {
             "type": "hdrfilm",
             "width": width,

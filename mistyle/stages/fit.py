@@ -21,7 +21,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.light import Lights, lights
@@ -29,7 +29,7 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas, weld
 from mistyle.core.tangents import mikktspace
 from mistyle.core.view import View
-from mistyle.stages import fit_table
+from mistyle.stages import fit_judge, fit_table
 from mistyle.stages.fit_run import Loss, Phase, Run, Shot, World
 from mistyle.stages.fit_settings import FitSettings
 
@@ -42,7 +42,8 @@ class Fit:
 
     maps      the fitted maps, one per texture set
     struggle  sum over the last steps of phase 2 of |d loss / d albedo| (mean over rgb); zero where phase 2 did not run
-    touched   number of those steps in which a texel had a gradient
+    touched   how often those steps looked at a texel: the sum of its bilinear weights over pixels and steps, at the
+              fit's resolution; struggle / touched is the gradient of one look
     trace     losses per step, by name ("phase1.style", …)
     kept      whether each phase that ran was kept
     figures   by "phase.figure": (before, after)
@@ -68,41 +69,60 @@ def two_phase(
     progress: Callable[[float], None] = lambda done: None,
     *,
     phase1_lights: Lights | None = None,
+    only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> Fit:
     """Fit `maps` (one per texture set, as baked) so that renders look like `targets` (linear rgb, stylized).
 
-    `phase1_lights` replaces those of `scenes/phase1_directional.xml`. The same inputs, settings, seed and thread count
-    give the same bytes. A gradient that is not a number ends its phase at the last good state, and a note says where.
+    `phase1_lights` replaces those of `scenes/phase1_directional.xml`; `only` names the texels that may change, all
+    others keep their bytes. The same inputs, settings, seed and thread count give the same bytes. A gradient that is
+    not a number ends its phase at the last good state, and a note says where.
     """
-    maps = [replace(m, metallic=np.zeros_like(m.metallic)) for m in maps] if settings.metallic == "zero" else list(maps)
+    if settings.metallic == "zero":
+        maps = [replace(m, metallic=np.zeros_like(m.metallic)) for m in maps]
     nothing = tuple(np.zeros(m.roughness.shape, np.float32) for m in maps)
-    if settings.refine == "off":
+    if settings.refine == "off" or not any(view.mask.any() for view in targets):
         return Fit(tuple(maps), nothing, nothing, {}, {}, {}, ())
     world = _world(mesh, targets, settings)
-    table = fit_table.build(maps, texels, shrinkage(mesh, texels, targets, settings.texels_per_pixel))
+    table = fit_table.build(maps, texels, shrinkage(mesh, texels, targets, settings.texels_per_pixel), only)
     phases = _phases(settings, phase1_lights or lights("phase1"), targets)
+    judge = fit_judge.bench(world.traced, world.tangents, targets) if settings.judge else None
     total, done = max(sum(phase.iterations for phase in phases), 1), 0
-    trace, notes = {}, []
-    struggle, touched = np.zeros((2, table.offsets[-1]), np.float32)
+    fit = Fit(tuple(maps), nothing, nothing, {}, {}, {}, ())
     for phase, rng in zip(phases, np.random.default_rng(seed).spawn(len(phases)), strict=True):
-        run = Run(world, table, phase, settings, rng)
-        for iteration in range(phase.iterations):
-            note = run.step(iteration)
-            if note:
-                notes.append(note)
-                break
-            done += 1
-            progress(done / total)
-        trace |= {f"{phase.name}.{name}": values for name, values in run.trace.items()}
-        struggle, touched = run.struggle, run.touched
-    names = sorted({name for phase in phases for name in phase.rates})
+        if phase.iterations:
+            share = (done / total, phase.iterations / total)
+            fit = _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress)
+            done += phase.iterations
+    return fit
+
+
+def _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress) -> Fit:
+    """Run a phase and keep its result unless a figure got worse; `share` is (begin, length) of the whole progress."""
+    saved = {name: table.values[name].copy() for name in phase.rates}
+    run, notes = Run(world, table, phase, settings, rng), list(fit.notes)
+    for iteration in range(phase.iterations):
+        note = run.step(iteration)
+        if note:
+            notes.append(note)
+            break
+        progress(share[0] + share[1] * (iteration + 1) / phase.iterations)
+    after = tuple(fit_table.finished(table, maps, only))
+    figures, kept = dict(fit.figures), True
+    if judge is not None:
+        old, new = (fit_judge.figures(judge, each, phase.lights) for each in (fit.maps, after))
+        figures |= {f"{phase.name}.{name}": (old[name], new[name]) for name in old}
+        worse = fit_judge.worse(old, new)
+        kept = not worse
+        if worse:
+            notes.append(f"{phase.name} was undone: {', '.join(worse)} got worse.")
+            table.values.update(saved)
     return Fit(
-        maps=tuple(fit_table.finished(table, maps, names)),
-        struggle=tuple(fit_table.spread(table, maps, struggle)),
-        touched=tuple(fit_table.spread(table, maps, touched)),
-        trace=trace,
-        kept={},
-        figures={},
+        maps=after if kept else fit.maps,
+        struggle=tuple(fit_table.spread(table, maps, run.struggle)),
+        touched=tuple(fit_table.spread(table, maps, run.touched)),
+        trace=fit.trace | {f"{phase.name}.{name}": values for name, values in run.trace.items()},
+        kept=fit.kept | {phase.name: kept},
+        figures=figures,
         notes=tuple(notes),
     )
 

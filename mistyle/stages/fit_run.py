@@ -89,24 +89,23 @@ class Run:
     def step(self, iteration: int) -> str:
         """One step of Adam; where a gradient is not a number nothing moves, and the note says which texel."""
         crops = self._crops()
-        texels, gradients, view_of = self._gradients(crops)
+        texels, gradients, looks, crop_of = self._gradients(crops)
         for name, gradient in gradients.items():
-            bad = ~np.isfinite(gradient).all(axis=1)
-            if bad.any():
-                row = int(np.flatnonzero(bad)[0])
-                return self._not_a_number(iteration, name, int(texels[row]), crops[view_of(row)])
+            if not np.isfinite(gradient.sum(dtype=np.float64)):
+                row = int(np.flatnonzero(~np.isfinite(gradient).all(axis=1))[0])
+                return self._not_a_number(iteration, name, int(texels[row]), crops[crop_of(row)])
         share = iteration / max(self.phase.iterations, 1)
         decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * share))
         if "albedo" in gradients and self.phase.iterations - iteration <= self.settings.struggle_window:
-            size = np.abs(gradients["albedo"]).mean(axis=1)
+            size = np.abs(gradients["albedo"]) @ np.full(3, 1 / 3, np.float32)
             self.struggle[texels] += size
-            self.touched[texels] += size > 0
+            self.touched[texels] += looks
         for name, gradient in gradients.items():
             weight = self.phase.variation.get(name, 0.0)
             if weight:
                 value, slope = fit_table.variation(self.table, name, texels)
                 self._note(f"tv_{name}", weight * value)
-                gradient = gradient + np.float32(weight) * slope * gradient.any(axis=1, keepdims=True)
+                gradient = gradient + np.float32(weight) * slope * fit_table.nonzero(gradient)[:, None]
             fit_table.step(self.table, name, texels, gradient, self.phase.rates[name] * decay)
         return ""
 
@@ -124,8 +123,9 @@ class Run:
 
     def _gradients(
         self, crops: "Sequence[Crop]"
-    ) -> tuple[Int[np.ndarray, " t"], dict[str, Float[np.ndarray, "t c"]], Callable[[int], int]]:
-        """Touched texels, the gradient of the loss for each map that moves, and which crop a texel was seen in."""
+    ) -> tuple[Int[np.ndarray, " t"], dict[str, np.ndarray], Float[np.ndarray, " t"], Callable[[int], int]]:
+        """Touched texels; the gradient of the loss for each map that moves; how often each texel was looked at (sum of
+        bilinear weights of the pixels that count); and a function that says in which crop a texel was seen."""
         import torch
 
         from mistyle.measure.losses import crop_picture
@@ -157,7 +157,8 @@ class Run:
         for name in self.phase.rates:
             grad = leaves[name].grad
             gradients[name] = np.zeros(leaves[name].shape, np.float32) if grad is None else grad.numpy()
-        return where.texels, gradients, lambda row: int(where.matrix[:, [row]].indices[0]) // (size * size)
+        looks = where.matrix.T @ mask.numpy().ravel()
+        return where.texels, gradients, looks, lambda row: int(where.matrix[:, [row]].nonzero()[0][0]) // (size * size)
 
     def _light(self, surface: Any) -> "tuple[Any, torch.Tensor | None]":
         import torch

@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.image import gaussian, nearest, resize
 from mistyle.core.maps import Maps, Texels
 
+MAPS = ("albedo", "normal", "roughness", "metallic")
 CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}
 TILT_LIMIT = 0.95  # a normal more than 72 degrees off faces away from most views, where its gradient is zero
 ROUGHNESS_FLOOR = 0.05  # below 0.0316 Mitsuba's roughness has no gradient
@@ -36,6 +37,7 @@ class Table:
     right: Bool[np.ndarray, " t"]
     below: Bool[np.ndarray, " t"]
     columns: Int[np.ndarray, " t"]
+    still: Bool[np.ndarray, " t"]
     first: dict[str, Float[np.ndarray, "t c"]] = field(default_factory=dict)
     second: dict[str, Float[np.ndarray, "t c"]] = field(default_factory=dict)
     steps: dict[str, Int[np.ndarray, " t"]] = field(default_factory=dict)
@@ -50,11 +52,19 @@ class Table:
         self.first, self.second, self.steps = {}, {}, {}
 
 
-def build(maps: Sequence[Maps], texels: Sequence[Texels], shrink: int) -> Table:
-    """A table of `maps` shrunk by the whole factor `shrink`: means over covered texels; uncovered ones take the nearest."""
+def build(
+    maps: Sequence[Maps],
+    texels: Sequence[Texels],
+    shrink: int,
+    only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+) -> Table:
+    """A table of `maps` shrunk by the whole factor `shrink`: means over covered texels; uncovered ones take the nearest.
+
+    With `only`, cells without a texel of these masks stand still.
+    """
     sizes, rows = [], []
-    right, below, columns = [], [], []
-    for material, where in zip(maps, texels, strict=True):
+    right, below, columns, still = [], [], [], []
+    for k, (material, where) in enumerate(zip(maps, texels, strict=True)):
         height, width = where.covered.shape
         by = shrink if height % shrink == 0 and width % shrink == 0 else 1
         island = where.island.reshape(height // by, by, width // by, by).max(axis=(1, 3))
@@ -68,17 +78,20 @@ def build(maps: Sequence[Maps], texels: Sequence[Texels], shrink: int) -> Table:
         right.append(same[0].ravel())
         below.append(same[1].ravel())
         sizes.append(island.shape)
+        free = only[k] if only is not None else np.ones_like(where.covered)
+        still.append(~free.reshape(height // by, by, width // by, by).any(axis=(1, 3)).ravel())
         columns.append(np.full(island.size, island.shape[1], np.int64))
     values = {name: np.concatenate([r[name] for r in rows]) for name in CHANNELS}
     values = {name: project(name, table) for name, table in values.items()}
     start = {name: table.copy() for name, table in values.items()}
-    return Table(tuple(sizes), values, start, np.concatenate(right), np.concatenate(below), np.concatenate(columns))
+    joined = (np.concatenate(each) for each in (right, below, columns, still))
+    return Table(tuple(sizes), values, start, *joined)
 
 
 def project(name: str, values: Float[np.ndarray, "*t c"]) -> Float[np.ndarray, "*t c"]:
     """The nearest allowed values: tilt inside the disk of TILT_LIMIT, roughness from ROUGHNESS_FLOOR to 1, else 0..1."""
     if name == "tilt":
-        length = np.sqrt((values**2).sum(axis=-1, keepdims=True))
+        length = np.sqrt(values[..., :1] ** 2 + values[..., 1:] ** 2)
         return (values * np.minimum(1, TILT_LIMIT / np.maximum(length, 1e-6))).astype(np.float32)
     return np.clip(values, ROUGHNESS_FLOOR if name == "roughness" else 0, 1)
 
@@ -89,15 +102,23 @@ def step(table: Table, name: str, texels: Int[np.ndarray, " n"], gradient: Float
         shape = table.values[name].shape
         table.first[name], table.second[name] = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         table.steps[name] = np.zeros(shape[0], np.int32)
-    moving = gradient.any(axis=1)
-    rows, g = texels[moving], gradient[moving]
+    moving = nonzero(gradient) & ~table.still[texels]
+    rows, g = (texels, gradient) if moving.all() else (texels[moving], gradient[moving])
     table.steps[name][rows] += 1
     age = table.steps[name][rows, None].astype(np.float32)
     first = BETA1 * table.first[name][rows] + (1 - BETA1) * g
     second = BETA2 * table.second[name][rows] + (1 - BETA2) * g * g
     table.first[name][rows], table.second[name][rows] = first, second
     size = first / (1 - BETA1**age) / (np.sqrt(second / (1 - BETA2**age)) + EPSILON)
-    table.values[name][rows] = project(name, table.values[name][rows] - rate * size)
+    table.values[name][rows] = project(name, table.values[name][rows] - np.float32(rate) * size)
+
+
+def nonzero(gradient: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " n"]:
+    """Rows that are not all zero; written out because reductions along a short axis are slow."""
+    result = gradient[:, 0] != 0
+    for channel in range(1, gradient.shape[1]):
+        result |= gradient[:, channel] != 0
+    return result
 
 
 def variation(table: Table, name: str, texels: Int[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, "n c"]]:
@@ -110,9 +131,10 @@ def variation(table: Table, name: str, texels: Int[np.ndarray, " n"]) -> tuple[f
     local[texels] = np.arange(len(texels), dtype=np.int32)
     values = table.values[name][texels]
     gradient, total = np.zeros_like(values), 0.0
-    for joined, distance in ((table.right, np.ones_like(table.columns)), (table.below, table.columns)):
+    for joined in (table.right, table.below):
         here = np.flatnonzero(joined[texels])
-        there = local[texels[here] + distance[texels[here]]]
+        at = texels[here]
+        there = local[at + (1 if joined is table.right else table.columns[at])]
         here, there = here[there >= 0], there[there >= 0]
         if len(here) == 0:
             continue
@@ -125,13 +147,23 @@ def variation(table: Table, name: str, texels: Int[np.ndarray, " n"]) -> tuple[f
     return total, gradient
 
 
-def finished(table: Table, maps: Sequence[Maps], names: Sequence[str]) -> list[Maps]:
-    """The maps as they came with what the fit changed in `names` laid upon them, at their own resolution."""
+def finished(
+    table: Table, maps: Sequence[Maps], only: Sequence[Bool[np.ndarray, "h w"]] | None = None
+) -> list[Maps]:
+    """The maps as they came with what the fit changed laid upon them, at their own resolution (inside `only`)."""
     result = []
     for k, material in enumerate(maps):
-        changed = {name: _change(table, k, name, material.roughness.shape) for name in names}
-        result.append(_apply(material, {name: change for name, change in changed.items() if change is not None}))
+        changes = {name: _change(table, k, name, material.roughness.shape) for name in CHANNELS}
+        made = _apply(material, {name: change for name, change in changes.items() if change is not None})
+        if only is not None:
+            fields = {n: _inside(only[k], getattr(made, n), getattr(material, n)) for n in MAPS}
+            made = replace(made, **fields)
+        result.append(made)
     return result
+
+
+def _inside(mask: Bool[np.ndarray, "h w"], inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
+    return np.where(mask.reshape(*mask.shape, *[1] * (inner.ndim - 2)), inner, outer)
 
 
 def spread(table: Table, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) -> list[Float[np.ndarray, "h w"]]:
