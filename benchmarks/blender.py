@@ -102,7 +102,8 @@ def draw(asset: Asset, camera: Camera, samples: int) -> np.ndarray:
     import mitsuba as mi
 
     from mistyle.render import device
-    from mistyle.render.scene import object_shapes, samples as allowed, sensor_dict
+    from mistyle.render.scene import object_shapes, sensor_dict
+    from mistyle.render.scene import samples as allowed
 
     device.use()
     scene = {

@@ -371,8 +371,9 @@ def test_samples_come_in_passes_that_threads_do_not_share() -> None:
     assert [scene.passes(n) for n in (1, 2, 3, 8, 9, 17, 64, 65)] == [
         (1, 1), (1, 2), (1, 4), (1, 8), (1, 16), (2, 16), (1, 64), (2, 64),
     ]  # fmt: skip
+    assert [scene.samples(n) for n in (1, 2, 3, 8, 9, 17, 65)] == [1, 2, 4, 8, 16, 64, 256]
     with pytest.raises(ValueError, match="spp"):
-        scene.passes(0)
+        scene.samples(0)
     ball, camera = sphere(16), camera_at(30, 15, 24)
     few, many, reference = (draw.picture(ball, None, camera, "paper_views", spp=n) for n in (16, 128, 1024))
     error = [float(np.sqrt(((image - reference) ** 2).mean())) for image in (few, many)]

@@ -105,7 +105,9 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
     except Image.DecompressionBombError as error:
         raise _too_large(where, "far too many pixels") from error
     except (OSError, ValueError, SyntaxError, EOFError, OverflowError, KeyError, TypeError) as error:
-        raise refuse(where, f"a file that no decoder takes ({_first(error)})", EXPECTED, CONVERT) from error
+        # Pillow's own words for an unknown format name only the buffer.
+        why = "" if isinstance(error, Image.UnidentifiedImageError) else f" ({_first(error)})"
+        raise refuse(where, f"a file that no decoder takes{why}", EXPECTED, CONVERT) from error
     if image.width < 1 or image.height < 1:
         raise refuse(where, f"{image.width} x {image.height} pixels", "at least one pixel", CONVERT)
     if image.width * image.height > MAX_PIXELS:

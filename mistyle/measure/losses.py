@@ -168,7 +168,7 @@ def stroke_shading(
     each crop is `slope` (faint crops less). The second result masks pixels whose neighbours lie on the surface too
     and that the light does not graze.
     """
-    inside = 1 - functional.max_pool2d(1 - mask.to(strokes), 3, stride=1, padding=1)
+    inside = 1 - functional.max_pool2d(functional.pad(1 - mask.to(strokes), (1, 1, 1, 1), value=1.0), 3, stride=1)
     across, down = _differences(position)
     s_across, s_down = _differences(strokes)
     xx, yy, xy = (across * across).sum(1, True), (down * down).sum(1, True), (across * down).sum(1, True)
@@ -185,7 +185,7 @@ def stroke_shading(
 
 
 def _differences(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Central differences to the right and downwards, per pixel; one-sided repeats at the border."""
+    """Central differences to the right and downwards, per pixel; only half of a difference at the border."""
     padded = _pad_edge(values)
     return (padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]) / 2, (padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]) / 2
 

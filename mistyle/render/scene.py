@@ -125,14 +125,21 @@ def object_shapes(mesh: Mesh, maps: Sequence[Maps] | None, flip_invalid: bool = 
     return shapes
 
 
-def passes(spp: int) -> tuple[int, int]:
-    """How to take at least `spp` samples a pixel: so many passes of so many samples, which are then averaged.
+def samples(spp: int) -> int:
+    """The number at or above `spp` to give to one `mi.render`: 2, 8 or a power of four.
 
-    In all a power of two: then no two threads share a pixel, and its sum is the same in every run. Of these the sampler
-    takes only 2, 8 and the powers of four as they are; a pass of 64 keeps the memory of large pictures small.
+    With a power of two no two threads share a pixel, and its sum is the same in every run; the sampler rounds others.
     """
     if spp < 1:
         raise ValueError(f"spp is {spp}; expected 1 or more")
+    return next(n for n in (1, 2, 4, 8, *(4**k for k in range(2, 17))) if n >= spp)
+
+
+def passes(spp: int) -> tuple[int, int]:
+    """How to take at least `spp` samples a pixel in smaller steps: so many passes of so many samples, to be averaged.
+
+    A power of two in all; a pass has at most 64 samples, which keeps the memory of large pictures small.
+    """
     total = 1 << (spp - 1).bit_length()
     each = 16 if total == 32 else min(total, 64)
     return total // each, each
@@ -141,8 +148,8 @@ def passes(spp: int) -> tuple[int, int]:
 def sensor_dict(camera: Camera, spp: int = 8, seed: int = 0) -> dict:
     """A perspective sensor that sees exactly what `core/camera.py` describes; box filter: pixels are independent.
 
-    Correlated multi-jittered samples: at 16 per pixel the error of the views is that of 44 independent ones. The
-    sampler is set to what `passes` gives as the samples of one pass; give `mi.render` the same number.
+    Correlated multi-jittered samples: at 16 per pixel the error of the views is that of 44 independent ones. Give
+    `mi.render` the number that `samples(spp)` gives.
     """
     import mitsuba as mi
 
@@ -156,7 +163,7 @@ def sensor_dict(camera: Camera, spp: int = 8, seed: int = 0) -> dict:
         "principal_point_offset_x": 0.5 - camera.centre[0] / width,
         "principal_point_offset_y": 0.5 - camera.centre[1] / height,
         "to_world": mi.ScalarTransform4f(camera.world_from_cam @ MITSUBA_FROM_OPENCV),
-        "sampler": {"type": "multijitter", "sample_count": passes(spp)[1], "seed": seed},
+        "sampler": {"type": "multijitter", "sample_count": samples(spp), "seed": seed},
         "film": {
             "type": "hdrfilm",
             "width": width,

@@ -248,9 +248,8 @@ def _stylize(options: argparse.Namespace) -> int:
         return _print_config(options)
     missing = [name for name in ("mesh", "style", "out") if getattr(options, name) is None]
     if missing:
-        raise UsageError(
-            f"stylize needs {', '.join('-o OUT' if m == 'out' else m.upper() for m in missing)}; see mistyle stylize --help"
-        )
+        wanted = ", ".join("-o OUT" if m == "out" else m.upper() for m in missing)
+        raise UsageError(f"stylize needs {wanted}; see mistyle stylize --help")
     return _run_job(options, options.mesh, options.style, None)
 
 
@@ -271,13 +270,13 @@ def _print_config(options: argparse.Namespace) -> int:
 
 def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
     settings = _settings(options, preset)
-    name = name or options.name or f"{mesh.stem}_{style.stem}"
-    from mistyle.run.plan import describe_plan, plan
+    called = name or options.name or f"{mesh.stem}_{style.stem}"
     from mistyle.run.pipeline import stylize
+    from mistyle.run.plan import describe_plan, plan
     from mistyle.run.progress import Progress
     from mistyle.run.stages import Job
 
-    job = Job(mesh, style, options.out, settings, name, options.redo_from)
+    job = Job(mesh, style, options.out, settings, called, options.redo_from)
     if options.dry_run:
         estimate = plan(job)
         print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))

@@ -14,7 +14,7 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.run.progress import Progress
-from mistyle.run.report import File, Figure, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
+from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import STAGES
 from mistyle.run.summary import MEANINGS, figures, versions
@@ -31,7 +31,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
     plain = frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
     close = close_up(settings)
     beauty, before = (
-        shown(render(made.asset, maps, [close], settings, backdrop=True, finer=4)[0])[..., :3]
+        shown(render(made.asset, maps, [close], settings, backdrop=True, finer=2)[0])[..., :3]
         for maps in (made.repaired.maps, made.baked.maps)
     )
     report(0.9)
@@ -49,7 +49,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         steps=steps(made, Shot(before, "as baked"), Shot(beauty, "after fit and repair")),
         maps=map_sets(made),
         timings=tuple(Timing(STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
-        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS.get(k, ("", ""))) for k, v in figures(made).items()),
+        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k]) for k, v in figures(made).items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),
         files=files(made),

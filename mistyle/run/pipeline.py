@@ -4,7 +4,7 @@ Each stage is kept in the run folder under a key made of its inputs, its setting
 so that a killed run goes on from the last finished stage and a changed setting redoes only what depends on it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -165,7 +165,7 @@ def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:
     return read_views(folder)
 
 
-def draw(folder: Path, asset: Asset, maps: Sequence[Maps], settings: Settings, report: Report) -> list[View]:
+def draw(folder: Path, asset: Asset, maps: Sequence[Maps], settings: Settings, report: Report) -> None:
     """Render the views and write them with their cameras and lights."""
     from mistyle.core.light import lights
     from mistyle.files.views import write_views
@@ -174,7 +174,6 @@ def draw(folder: Path, asset: Asset, maps: Sequence[Maps], settings: Settings, r
     template = settings.draw.scene or "paper_views"
     views = draw_views(asset.mesh, maps, cameras_of(settings), template, settings.draw.spp, settings.seed, report)
     write_views(folder, views, lights("phase1"), paper_files=settings.draw.paper_files)
-    return views
 
 
 def paint(asset: Asset, style: Picture, settings: Settings, report: Report) -> Any:
@@ -223,8 +222,8 @@ def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) 
 
 def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report, fine: int = 2) -> list[View]:
     """Each view with its rgb replaced by the albedo seen there, `fine` x `fine` samples a pixel, premultiplied."""
-    from mistyle.render.draw import gbuffer, tracer
     from mistyle.core.image import bilinear
+    from mistyle.render.draw import gbuffer, tracer
 
     traced = tracer(asset.mesh)
     result = []
@@ -331,7 +330,7 @@ def write_asset(folder: Path, job: Job, asset: Asset, atlas: Atlas, maps: Sequen
 
 
 def ambient(asset: Asset, part: int, settings: Settings, report: Report) -> np.ndarray:
-    """Ambient occlusion of one texture set, computed at a quarter of the atlas: it has no finer detail than the mesh."""
+    """Ambient occlusion of a texture set, computed at a quarter of the atlas: it has no finer detail than the mesh."""
     from mistyle.core.image import resize
     from mistyle.render.occlusion import ambient_occlusion
     from mistyle.stages.texels import pad, rasterise
@@ -355,7 +354,7 @@ def render_views(mesh: Path, out: Path, settings: Settings, progress: Progress) 
         asset = read(mesh, settings, report)
         atlas = lay_out(asset, settings, lambda done: None)
     with progress.stage("views", "render the views") as report:
-        atomic_folder(out, lambda folder: draw(folder, asset, atlas.start, settings, report) and None)
+        atomic_folder(out, lambda folder: draw(folder, asset, atlas.start, settings, report))
     return sorted(out.iterdir())
 
 

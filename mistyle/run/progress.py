@@ -1,4 +1,4 @@
-"""What a person sees while a job runs: bars with the time left on a terminal, plain lines elsewhere, always on stderr."""
+"""What a person sees while a job runs, on stderr: bars with the time left on a terminal, plain lines elsewhere."""
 
 import sys
 import time

@@ -143,7 +143,7 @@ def known_keys(model: type[BaseModel] = Settings, prefix: str = "") -> list[str]
 
 
 def validate(values: Mapping[str, Any], origin: str) -> Settings:
-    """Settings from nested values; an unknown key is refused with the nearest known one, a wrong value with its path."""
+    """Settings from nested values; refuses an unknown key with the nearest known one, a wrong value with its path."""
     try:
         return Settings.model_validate(dict(values))
     except ValidationError as error:

@@ -61,9 +61,13 @@ class Run:
     def __exit__(self, *_: object) -> None:
         self.visible.close()
         self.hidden.close()
+        for folder in (self.job.out / "work", self.job.out):
+            # A job that was refused before its first stage leaves no empty folders behind.
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
 
     def stage(self, name: str, after: Sequence[str], inputs: Any, write: Callable[[Path, Report], object]) -> Path:
-        """The folder of stage `name`, taken over or made; `inputs` are what it depends on besides the stages `after`."""
+        """The folder of stage `name`, taken over or made; it depends on `inputs` and on the stages `after`."""
         key = self.keys[name] = digest([self.base, name, inputs, [self.keys[a] for a in after]])
         keeper = self.visible if name in VISIBLE else self.hidden
         self.redoing = self.redoing or name == self.job.redo_from

@@ -5,7 +5,7 @@ import platform
 import resource
 import sys
 from importlib.metadata import PackageNotFoundError, version
-from typing import Any
+from typing import Any, Literal
 
 from mistyle import __version__
 from mistyle.files.store import atomic_write
@@ -87,7 +87,7 @@ def versions() -> dict[str, str]:
 
 
 # What each figure of `figures` means, and which way is up.
-MEANINGS: dict[str, tuple[str, str]] = {
+MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "painted_share": ("share of the covered texels whose albedo was painted", "higher"),
     "seen_share": ("share of the covered texels that at least one view sees", "higher"),
     "repaired_share": ("share of the covered texels that were painted again after the fit", ""),
