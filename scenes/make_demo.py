@@ -98,11 +98,12 @@ def mend(vertices: np.ndarray, faces: np.ndarray, clay: sculpt.Clay, rounds: int
     for _ in range(rounds):
         corners = vertices[faces]
         sides = np.roll(corners, -1, axis=1) - corners
-        sides /= np.linalg.norm(sides, axis=2, keepdims=True)
+        sides /= np.maximum(np.linalg.norm(sides, axis=2, keepdims=True), 1e-12)
         angles = np.degrees(np.arccos(np.clip(-(sides * np.roll(sides, 1, axis=1)).sum(2), -1, 1)))
         across = np.cross(sides[:, 0], sides[:, 1])
         normals = sculpt.gradient(clay, corners.mean(1), CELL / 2)
-        lean = (across * normals).sum(1) / (np.linalg.norm(across, axis=1) * np.linalg.norm(normals, axis=1))
+        lengths = np.linalg.norm(across, axis=1) * np.linalg.norm(normals, axis=1)
+        lean = (across * normals).sum(1) / np.maximum(lengths, 1e-12)
         bad = (angles.min(1) < 5) | (lean < 0.3)
         ill = np.unique(faces[bad])
         total, weight = np.zeros_like(vertices), np.zeros(len(vertices))

@@ -23,19 +23,20 @@ ELEVATION = 15.0
 
 
 def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html` and, for people and README files, `beauty.png` into `folder`."""
+    """Draw the pictures and write `index.html`, `beauty.png` and `overview.png` (mesh, style, result) into `folder`."""
     from mistyle.files.images import write_png
 
     settings = made.job.settings
     turntable = frames(made.asset, made.repaired.maps, settings, lambda done: report(0.4 * done))
     plain = frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
     close = close_up(settings)
-    beauty, before = (
+    beauty, before, bare = (
         shown(render(made.asset, maps, [close], settings, backdrop=True, finer=2)[0])[..., :3]
-        for maps in (made.repaired.maps, made.baked.maps)
+        for maps in (made.repaired.maps, made.baked.maps, made.atlas.start)
     )
     report(0.9)
     write_png(folder / "beauty.png", beauty)
+    write_png(folder / "overview.png", side_by_side([bare, made.style.rgb, beauty]))
     page = Report(
         title=made.job.name,
         mesh=made.job.mesh.name,
@@ -55,6 +56,19 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         files=files(made),
     )
     write_report(folder / "index.html", page)
+
+
+def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
+    """Pictures in a row at the height of the first, with a white gap between them."""
+    from mistyle.core.image import resize
+
+    height = pictures[0].shape[0]
+    gap = np.ones((height, height // 32, 3), np.float32)
+    row: list[np.ndarray] = []
+    for picture in pictures:
+        width = round(picture.shape[1] * height / picture.shape[0])
+        row += [resize(picture, (height, width)), gap]
+    return np.clip(np.concatenate(row[:-1], axis=1), 0, 1)
 
 
 def frames(asset: Asset, maps: Sequence[Maps], settings: Settings, report: Callable[[float], None]) -> list[np.ndarray]:

@@ -38,7 +38,7 @@ class DrawSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel of the rendered views")
+    spp: int = Field(default=8, ge=1, le=65536, description="samples per pixel of the rendered views")
     scene: Path | None = Field(
         default=None, description="a Mitsuba scene with a shape called 'object' in place of scenes/paper_views.xml"
     )
@@ -81,7 +81,7 @@ class Settings(BaseModel):
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "rig": {"resolution": 512},
-        "draw": {"spp": 8},
+        "draw": {"spp": 4},
         "surface": {"samples": 80_000},
         "atlas": {"size": 1024},
         "fit": {"iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},

@@ -50,7 +50,8 @@ class Run:
         self.redoing = False
         self.keys: dict[str, str] = {}
         # A changed program or thread count may change bytes: both belong to every key.
-        code = {str(p.relative_to(PACKAGE)): p.read_bytes() for p in sorted(PACKAGE.rglob("*.py"))}
+        program = sorted(p for p in PACKAGE.rglob("*") if p.suffix in (".py", ".j2", ".css", ".js"))
+        code = {str(p.relative_to(PACKAGE)): p.read_bytes() for p in program}
         self.base = digest([code, thread_count(job.settings), job.settings.variant])
         self.visible = Keeper(job.out)
         self.hidden = Keeper(job.out / "work")

@@ -139,6 +139,11 @@ def shrinkage(mesh: Mesh, texels: Sequence[Texels], views: Sequence[View], texel
     return 2 ** max(int(np.ceil(np.log2(ratio / texels_per_pixel))), 0)
 
 
+def view_mask(view: View) -> Bool[np.ndarray, "h w"]:
+    """Pixels wholly on the mesh whose colour is a number."""
+    return view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1)
+
+
 def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
     import torch
 
@@ -149,8 +154,8 @@ def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
     welded = weld(mesh)
     pictures, masks = [], []
     for view in targets:
-        inside = erode(view.mask & (view.coverage > 0.999), 1)
-        stacked = np.concatenate([srgb_from_linear(view.rgb), inside[..., None].astype(np.float32)], axis=-1)
+        rgb, inside = np.nan_to_num(view.rgb, posinf=1.0), erode(view_mask(view), 1)
+        stacked = np.concatenate([srgb_from_linear(rgb), inside[..., None].astype(np.float32)], axis=-1)
         pictures.append(torch.from_numpy(np.ascontiguousarray(stacked.transpose(2, 0, 1))))
         masks.append(inside)
     return World(
@@ -196,7 +201,7 @@ def _phases(settings: FitSettings, directional: Lights, targets: Sequence[View])
 def _albedo_variation(settings: FitSettings, targets: Sequence[View]) -> float:
     from mistyle.measure.losses import adaptive_tv_weight, mean_gradient
 
-    gradients = [mean_gradient(srgb_from_linear(view.rgb), view.coverage > 0.999) for view in targets]
+    gradients = [mean_gradient(srgb_from_linear(np.nan_to_num(view.rgb)), view_mask(view)) for view in targets]
     return adaptive_tv_weight(float(np.mean(gradients)), settings.tv_albedo)
 
 

@@ -73,8 +73,8 @@ def figures(where: Bench, maps: Sequence[Maps], lights: Lights) -> dict[str, flo
         contrast = float(np.abs(metrics.detail(mine, view.mask))[view.mask].mean())
         errors.append(metrics.warp_error(view, other, mine, theirs) / max(contrast, 1e-3))
         encoded.append(srgb_from_linear(_exposed(first, view)) if lit else mine)
-        targets.append(srgb_from_linear(view.rgb))
-        masks.append(view.mask & (view.coverage > 0.999))
+        targets.append(srgb_from_linear(np.nan_to_num(view.rgb)))
+        masks.append(view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1))
     details = [metrics.detail_correlation(*each) for each in zip(encoded, targets, masks, strict=True)]
     usable = [error for error in errors if np.isfinite(error)]
     return {
@@ -138,7 +138,7 @@ def _draw(where: Bench, table: tuple, camera: Camera, lights: Lights) -> Float[n
 def _exposed(picture: Float[np.ndarray, "h w 3"], view: View) -> Float[np.ndarray, "h w 3"]:
     """Scaled to the mean luminance of the target: its exposure is no fault of the maps."""
     mean = float(luminance(picture)[view.mask].mean())
-    return picture * np.float32(float(luminance(view.rgb)[view.mask].mean()) / max(mean, 1e-6))
+    return picture * np.float32(float(luminance(np.nan_to_num(view.rgb))[view.mask].mean()) / max(mean, 1e-6))
 
 
 def _fixed(lights: Lights, camera: Camera) -> Lights:

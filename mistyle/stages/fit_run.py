@@ -87,25 +87,24 @@ class Run:
         table.forget()
 
     def step(self, iteration: int) -> str:
-        """One step of Adam; where a gradient is not a number nothing moves, and the note says which texel."""
+        """One step of Adam; where something is not a number nothing moves, and the note says which texel."""
         crops = self._crops()
-        texels, gradients, looks, crop_of = self._gradients(crops)
-        for name, gradient in gradients.items():
-            if not np.isfinite(gradient.sum(dtype=np.float64)):
-                row = int(np.flatnonzero(~np.isfinite(gradient).all(axis=1))[0])
-                return self._not_a_number(iteration, name, int(texels[row]), crops[crop_of(row)])
+        texels, pure, looks, crop_of = self._gradients(crops)
+        gradients = dict(pure)
+        for name, weight in self.phase.variation.items():
+            value, slope = fit_table.variation(self.table, name, texels)
+            self._note(f"tv_{name}", weight * value)
+            gradients[name] = gradients[name] + np.float32(weight) * slope * fit_table.nonzero(gradients[name])[:, None]
+        bad = self._not_a_number(texels, gradients)
+        if bad:
+            name, row = bad
+            return self._stopped(iteration, name, int(texels[row]), crops[crop_of(row)])
+        if "albedo" in gradients and self.phase.iterations - iteration <= self.settings.struggle_window:
+            self.struggle[texels] += np.abs(pure["albedo"]) @ np.full(3, 1 / 3, np.float32)
+            self.touched[texels] += looks
         share = iteration / max(self.phase.iterations, 1)
         decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * share))
-        if "albedo" in gradients and self.phase.iterations - iteration <= self.settings.struggle_window:
-            size = np.abs(gradients["albedo"]) @ np.full(3, 1 / 3, np.float32)
-            self.struggle[texels] += size
-            self.touched[texels] += looks
         for name, gradient in gradients.items():
-            weight = self.phase.variation.get(name, 0.0)
-            if weight:
-                value, slope = fit_table.variation(self.table, name, texels)
-                self._note(f"tv_{name}", weight * value)
-                gradient = gradient + np.float32(weight) * slope * fit_table.nonzero(gradient)[:, None]
             fit_table.step(self.table, name, texels, gradient, self.phase.rates[name] * decay)
         return ""
 
@@ -178,13 +177,27 @@ class Run:
     def _note(self, name: str, value: float) -> None:
         self.trace.setdefault(name, []).append(value)
 
-    def _not_a_number(self, iteration: int, name: str, texel: int, crop: "Crop") -> str:
+    def _not_a_number(
+        self, texels: Int[np.ndarray, " t"], gradients: Mapping[str, np.ndarray]
+    ) -> tuple[str, int] | None:
+        """The map and the row of the first texel that is, or would become, no number; Mitsuba gives such a texel itself
+        a gradient of zero, so the values are looked at too where the loss is no number."""
+        broken = not all(np.isfinite(values[-1]) for values in self.trace.values())
+        looked_at = {name: self.table.values[name][texels] for name in self.table.values} if broken else {}
+        for found in (looked_at, gradients):
+            for name, values in found.items():
+                if not np.isfinite(values.sum(dtype=np.float64)):
+                    return name, int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+        return (next(iter(gradients)), 0) if broken else None
+
+    def _stopped(self, iteration: int, name: str, texel: int, crop: "Crop") -> str:
         part = int(np.searchsorted(self.table.offsets, texel, side="right")) - 1
         row, column = divmod(texel - self.table.offsets[part], self.table.sizes[part][1])
+        shape = "x".join(map(str, self.table.sizes[part]))
         return (
-            f"{self.phase.name} stopped before step {iteration + 1}: the gradient of {name} is not a number at texel (row "
-            f"{row}, column {column} of {self.table.sizes[part][0]}x{self.table.sizes[part][1]}) of texture set {part}, seen "
-            f"in view {self.world.cameras[crop.view].name}; the maps are those of the last good step."
+            f"{self.phase.name} stopped before step {iteration + 1}: {name} or its gradient is not a number at texel (row "
+            f"{row}, column {column} of {shape}) of texture set {part}, seen in view {self.world.cameras[crop.view].name}; "
+            "the maps are those of the last good step."
         )
 
 

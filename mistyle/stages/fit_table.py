@@ -181,6 +181,7 @@ def _change(table: Table, k: int, name: str, shape: tuple[int, int]) -> Float[np
     part = slice(table.offsets[k], table.offsets[k + 1])
     size = table.sizes[k]
     change = (table.values[name][part] - table.start[name][part]).reshape(*size, -1)
+    change = np.where(np.isfinite(change), change, 0)  # a texel that came as no number goes as it came
     moved = change.any(axis=-1)
     if not moved.any():
         return None
