@@ -50,7 +50,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         steps=steps(made, Shot(before, "as baked"), Shot(beauty, "after fit and repair")),
         maps=map_sets(made),
         timings=tuple(Timing(STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
-        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k]) for k, v in figures(made).items()),
+        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k.split(".")[-1]]) for k, v in figures(made).items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),
         files=files(made),

@@ -86,11 +86,14 @@ def versions() -> dict[str, str]:
     return found
 
 
-# What each figure of `figures` means, and which way is up.
+# What each figure of `figures` means, and which way is up; those of the fit are named <phase>.<figure>.
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "painted_share": ("share of the covered texels whose albedo was painted", "higher"),
     "seen_share": ("share of the covered texels that at least one view sees", "higher"),
     "repaired_share": ("share of the covered texels that were painted again after the fit", ""),
+    "detail": ("correlation of the render's fine lightness with the stylized views' after this phase", "higher"),
+    "style": ("patch and Gram distance of the render to the stylized views after this phase", "lower"),
+    "views": ("difference of a surface point between neighbouring views, over the picture's own detail", "lower"),
 }
 
 
@@ -106,4 +109,5 @@ def figures(made: Any) -> dict[str, float]:
         "painted_share": share([m.known for m in made.repaired.maps]),
         "seen_share": share([s > 0 for s in made.baked.seen]),
         "repaired_share": share(made.repaired.mask),
+        **{name: after for name, (_, after) in made.fit.figures.items()},
     }

@@ -9,10 +9,12 @@ What phase 1 aims at depends on how the stylizer painted (`painted`):
 - "with-light": the view shows a lit object. Render with the baked albedo and view are compared as they are, feature
   by feature (the paper's style loss).
 - "without-light": the view is as flat as an albedo. Compared as they are, the normals would learn to cancel the
-  light. The object is rendered as clay instead, and both pictures lose their mean and the view its contrast: what is
-  left of the view is the course of its strokes, and phase 1 looks for the relief that the lights would show like
-  that, with a contrast of `relief`. Where a stroke is bright the surface turns to the light; with the light on the
-  other side the relief is the opposite one.
+  light. So both lose what light does and what it does not: the object is rendered as clay and divided by its own
+  render without the fit (the shape's shading is gone), the view loses its mean and its contrast (the course of the
+  strokes is left). The strokes are taken to stand proud of the surface, bright ones most, with flanks of slope
+  `relief`; what that adds to the shading under the crop's light is what the clay is compared with, in features at
+  their places and in their statistics. Each crop has one light of the rig alone, in turn: only lights from several
+  sides tell a slope from a bright spot. With the key light on the other side the relief's shading turns around.
 
 Both phases are judged afterwards (`fit_judge.py`), and undone where they made the pictures worse.
 """
@@ -34,6 +36,8 @@ from mistyle.stages.fit_run import Loss, Phase, Run, Shot, World
 from mistyle.stages.fit_settings import FitSettings
 
 __all__ = ["Fit", "FitSettings", "two_phase"]
+
+DARK = 0.01  # radiance of the clay below which a ratio means nothing
 
 
 @dataclass(frozen=True)
@@ -218,7 +222,8 @@ def _relief_loss(settings: FitSettings) -> Loss:
             smooth, shot.position, shot.normal, shot.light, shot.mask, settings.relief
         )
         expected = expected + settings.sheen * strokes * mask
-        shading = losses.without_light(losses.luminance(shot.render), mask, radius)
+        before = losses.luminance(shot.plain).clamp_min(DARK)
+        shading = (losses.luminance(shot.render) / before - 1) * mask
         maps, wanted = losses.masked_features(features, shading, expected, mask, mask)
         result = {"style": settings.style1 * losses.style_aligned(maps, wanted, mask)}
         if settings.statistics:

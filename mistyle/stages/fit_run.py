@@ -27,12 +27,14 @@ LAST_RATE = 0.1  # share of the learning rate at the end of a phase; a cosine le
 class Shot:
     """One step's crops, rendered, beside their targets: n crops of s x s pixels (torch).
 
-    render linear, target sRGB (n, 3, s, s); mask (n, 1, s, s) 0 or 1; position and normal (n, 3, s, s) world; `light`
+    render linear, target sRGB (n, 3, s, s); `plain` the same render with the normals and roughness of before the fit,
+    where the phase asks for it; mask (n, 1, s, s) 0 or 1; position and normal (n, 3, s, s) world; `light`
     (n, 3) the direction to the only light of each crop, where each has its own; `zoomed` crop pixels per pixel of the
     view.
     """
 
     render: Any
+    plain: Any
     target: Any
     mask: Any
     position: Any
@@ -135,19 +137,20 @@ class Run:
         surface = deferred.trace(self.world.traced, cameras, self.world.tangents)
         lit, towards = self._light(surface)
         where = seam.taps(surface, self.table.sizes)
-        leaves = {
-            name: torch.from_numpy(values[where.texels]).requires_grad_(name in self.phase.rates)
-            for name, values in self.table.values.items()
-        }
-        pixels = {name: seam.fetch(v, where) for name, v in materials(leaves, self.phase.clay).items()}
-        render = self.world.shader(lit, pixels).reshape(count, size, size, 3).permute(0, 3, 1, 2)
+        def picture(values: Mapping[str, np.ndarray], moving: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
+            leaves = {n: torch.from_numpy(v[where.texels]).requires_grad_(n in moving) for n, v in values.items()}
+            pixels = {n: seam.fetch(v, where) for n, v in materials(leaves, self.phase.clay).items()}
+            return self.world.shader(lit, pixels).reshape(count, size, size, 3).permute(0, 3, 1, 2), leaves
+
+        plain = picture(self.table.start, {})[0] if self.phase.clay else None
+        render, leaves = picture(self.table.values, self.phase.rates)
         wanted = torch.stack([crop_picture(self.world.targets[c.view], c, size) for c in crops])
         def image(values: np.ndarray) -> "torch.Tensor":
             return torch.from_numpy(values).reshape(count, size, size, -1).permute(0, 3, 1, 2)
 
         mask = (image(np.abs(surface.facing) > GRAZING) & (wanted[:, 3:] > 0.999)).float()
         position, normal = image(surface.position), image(surface.normal)
-        shot = Shot(render, wanted[:, :3], mask, position, normal, towards, size / crops[0].width)
+        shot = Shot(render, plain, wanted[:, :3], mask, position, normal, towards, size / crops[0].width)
         losses = self.phase.loss(shot, self.world.features, self.rng)
         for name, value in losses.items():
             self._note(name, float(value.detach()))

@@ -44,5 +44,5 @@ class FitSettings(BaseModel):
     rate_roughness: float = Field(default=0.03, gt=0, description="Adam's rate for the roughness")
     rate_albedo: float = Field(default=0.005, gt=0, description="Adam's rate for the albedo")
     reduced: float = Field(default=0.05, ge=0, le=1, description="share of their rates that normal and roughness keep in phase 2")
-    judge: bool = Field(True, description="undo a phase that makes detail, style or view-to-view agreement worse")
+    judge: bool = Field(default=True, description="undo a phase that makes detail, style or view-to-view agreement worse")
     struggle_window: int = Field(default=100, ge=1, description="last steps whose albedo gradient is accumulated (the paper's 100)")
