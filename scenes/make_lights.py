@@ -1,4 +1,4 @@
-"""Make the files that the scenes beside this one read: paper_lights.exr, studio_lights.exr, studio_backdrop.obj and .exr.
+"""Make what the scenes beside this one read: paper_lights.exr, studio_lights.exr, studio_backdrop.obj and .exr.
 
     python scenes/make_lights.py [--out FOLDER]
 

@@ -62,7 +62,9 @@ def clay(scene, maps: Maps, direction) -> np.ndarray:
     traced, camera = draw.tracer(mesh), views[0].camera
     surface = deferred.trace(traced, [camera])
     vector = np.array(direction) / np.linalg.norm(direction)
-    lit = deferred.light(traced, surface, (Directional(tuple(vector.tolist()), (2.0, 2.0, 2.0), "camera"),), shadows=False)
+    lit = deferred.light(
+        traced, surface, (Directional(tuple(vector.tolist()), (2.0, 2.0, 2.0), "camera"),), shadows=False
+    )
     where = seam.taps(surface, [maps.roughness.shape])
     tables = {"albedo": np.full((SIZE * SIZE, 3), 0.25, np.float32), "normal": maps.normal.reshape(-1, 3)}
     tables |= {"roughness": maps.roughness.reshape(-1, 1), "metallic": maps.metallic.reshape(-1, 1)}

@@ -23,7 +23,9 @@ def torus(rings: int = 24, sides: int = 16, parts: int = 2, bumps: float = 0.1) 
     def surface(u, v):
         a, b = 2 * np.pi * u, 2 * np.pi * v
         small = 0.28 * (1 + bumps * np.sin(3 * a + 2 * b))
-        return np.stack([(0.7 + small * np.cos(b)) * np.cos(a), small * np.sin(b), -(0.7 + small * np.cos(b)) * np.sin(a)], -1)
+        return np.stack(
+            [(0.7 + small * np.cos(b)) * np.cos(a), small * np.sin(b), -(0.7 + small * np.cos(b)) * np.sin(a)], -1
+        )
 
     h = 1e-4
     normals = np.cross(surface(u + h, v) - surface(u - h, v), surface(u, v + h) - surface(u, v - h))
@@ -159,7 +161,9 @@ def slope(path, values, name, direction, adjoint, step):
 @pytest.mark.parametrize("name, step", [("albedo", 1e-2), ("normal", 2e-3), ("roughness", 2e-3), ("metallic", 1e-2)])
 def test_gradient_equals_central_differences(rng, name, step):
     device.use()
-    path = Path(torus(bumps=0), [crop(32), orbit(200, 10, distance=4, fov=30, size=(32, 32))], (KEY, Ambient((0.3, 0.3, 0.3))))
+    path = Path(
+        torus(bumps=0), [crop(32), orbit(200, 10, distance=4, fov=30, size=(32, 32))], (KEY, Ambient((0.3, 0.3, 0.3)))
+    )
     leaves = path.leaves(tables(random_maps(rng, SIZES, tilt=0.2)), (name,))
     adjoint = torch.from_numpy(rng.normal(size=(64, 32, 3)))
     (path.draw(leaves).double() * adjoint).sum().backward()
@@ -173,7 +177,7 @@ def test_gradient_equals_central_differences(rng, name, step):
 
 
 def test_roughness_has_no_gradient_below_its_floor_and_one_above(rng):
-    """Mitsuba clamps alpha = roughness² at 0.001, so a roughness below 0.0316 can never be moved again: the fit keeps it at 0.05."""
+    """Mitsuba clamps alpha = roughness² at 0.001, so a roughness below 0.0316 never moves; the fit stays at 0.05."""
     device.use()
     path = Path(torus(bumps=0), [crop(32)], (KEY,))
     sizes = {}
@@ -199,7 +203,9 @@ def test_same_bytes_at_any_thread_count(rng):
             leaves = path.leaves(tables(maps))
             picture = path.draw(leaves)
             picture.square().sum().backward()
-            made.append([picture.detach().numpy().tobytes()] + [leaves[k].grad.numpy().tobytes() for k in ("albedo", "normal")])
+            made.append(
+                [picture.detach().numpy().tobytes()] + [leaves[k].grad.numpy().tobytes() for k in ("albedo", "normal")]
+            )
     finally:
         device.use(threads=threads)
     assert made[0] == made[1] == made[2]
@@ -211,14 +217,18 @@ def test_ambient_light_is_the_mean_over_the_hemisphere(rng):
     import mitsuba as mi
 
     mesh, camera = sphere(), orbit(20, 10, distance=4, fov=30, size=(24, 24))
-    maps = [Maps(*[np.full((4, 4, *tail), value, np.float32) for tail, value in (((3,), 0.5), ((3,), 0), ((), 0.5), ((), 0))],
-                 known=np.ones((4, 4), bool))]  # fmt: skip
+    kinds = (((3,), 0.5), ((3,), 0), ((), 0.5), ((), 0))
+    values = [np.full((4, 4, *tail), value, np.float32) for tail, value in kinds]
+    maps = [Maps(*values, known=np.ones((4, 4), bool))]
     maps[0].normal[..., 2] = 1
     ours = Path(mesh, [camera], (Ambient((0.8, 0.8, 0.8)),), [(4, 4)])
     picture = ours.draw(ours.leaves(tables(maps), ())).numpy()
     sensor = scenery.sensor_dict(camera)
     scene = {"type": "scene", "integrator": {"type": "path", "max_depth": 2}, "sensor": sensor}
-    scene |= {"light": {"type": "constant", "radiance": {"type": "rgb", "value": [0.8] * 3}}, **scenery.object_shapes(mesh, maps)}
+    scene |= {
+        "light": {"type": "constant", "radiance": {"type": "rgb", "value": [0.8] * 3}},
+        **scenery.object_shapes(mesh, maps),
+    }
     reference = np.array(mi.render(mi.load_dict(scene), spp=512, seed=0))
     inside = draw.gbuffer(draw.tracer(mesh), camera)
     inner = inside.mask & (inside.normal @ camera.world_from_cam[:3, 2] < -0.6)
@@ -237,7 +247,9 @@ def sphere(rings: int = 48, sides: int = 24) -> Mesh:
     faces = np.concatenate([np.stack([a, b, c], -1).reshape(-1, 3), np.stack([a, c, d], -1).reshape(-1, 3)])
     uvs = np.stack([u, v], -1).reshape(-1, 2)[faces]
     p = points.astype(np.float32)
-    return Mesh(p, faces.astype(np.int32), p[faces], uvs.astype(np.float32), np.zeros(len(faces), np.int32), ("sphere",))
+    return Mesh(
+        p, faces.astype(np.int32), p[faces], uvs.astype(np.float32), np.zeros(len(faces), np.int32), ("sphere",)
+    )
 
 
 def test_tangents_give_the_frame_of_the_normal_map():
@@ -245,8 +257,9 @@ def test_tangents_give_the_frame_of_the_normal_map():
     device.use()
     mesh, camera = sphere(), orbit(0, 0, distance=4, fov=30, size=(33, 33))
     positions, corners = mesh.positions, mesh.faces
-    tangents = mikktspace(positions[corners.ravel()], mesh.corner_normals.reshape(-1, 3), mesh.corner_uvs.reshape(-1, 2),
-                          np.arange(corners.size).reshape(-1, 3).astype(np.int32))  # fmt: skip
+    separate = np.arange(corners.size).reshape(-1, 3).astype(np.int32)
+    normals, uvs = mesh.corner_normals.reshape(-1, 3), mesh.corner_uvs.reshape(-1, 2)
+    tangents = mikktspace(positions[corners.ravel()], normals, uvs, separate)
     for given in (None, tangents):
         surface = deferred.trace(draw.tracer(mesh), [camera], given)
         middle = 33 * 16 + 16
@@ -255,7 +268,9 @@ def test_tangents_give_the_frame_of_the_normal_map():
         np.testing.assert_allclose(frame["s"], [1, 0, 0], atol=0.02)
         np.testing.assert_allclose(frame["t"], [0, 1, 0], atol=0.02)
     # A mirrored chart: u runs west, so its sign is negative and the bitangent still points north.
-    mirrored = Mesh(mesh.positions, mesh.faces, mesh.corner_normals, mesh.corner_uvs * [-1, 1] + [1, 0], mesh.part, mesh.parts)
+    mirrored = Mesh(
+        mesh.positions, mesh.faces, mesh.corner_normals, mesh.corner_uvs * [-1, 1] + [1, 0], mesh.part, mesh.parts
+    )
     mirrored = Mesh(**{**vars(mirrored), "corner_uvs": mirrored.corner_uvs.astype(np.float32)})
     flipped = tangents * np.float32([-1, -1, -1, -1])
     surface = deferred.trace(draw.tracer(mirrored), [camera], flipped)

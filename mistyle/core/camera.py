@@ -154,14 +154,14 @@ def pixel_centres(size: tuple[int, int]) -> Float[np.ndarray, "h w 2"]:
 
 
 def zoom(camera: Camera, x: float, y: float, width: float, size: tuple[int, int]) -> Camera:
-    """The camera that sees the square window with top left corner (x, y) and side `width` pixels as an image of `size`."""
+    """The camera whose image of `size` is the square window with top left corner (x, y) and side `width` pixels."""
     scale = size[1] / width
     centre = ((camera.centre[0] - x) * scale, (camera.centre[1] - y) * scale)
     return replace(camera, focal=camera.focal * scale, centre=centre, size=size)
 
 
 def resized(camera: Camera, size: tuple[int, int]) -> Camera:
-    """The same camera with another number of pixels along each side (square pixels: the aspect ratio must not change)."""
+    """The same camera with another number of pixels along each side; the aspect ratio must not change."""
     if size[0] * camera.size[1] != size[1] * camera.size[0]:
         raise ValueError(f"cannot resize a camera of {camera.size} to {size}: the aspect ratio differs")
     return zoom(camera, 0.0, 0.0, float(camera.size[1]), size)

@@ -42,7 +42,9 @@ def weld(mesh: Mesh, part: int | None = None) -> Welded:
     normals = mesh.corner_normals[chosen].reshape(-1, 3).astype(np.float32)
     uvs = mesh.corner_uvs[chosen].reshape(-1, 2).astype(np.float32)
     # Adding 0 turns -0.0 into 0.0, which compare equal but differ in bytes.
-    keys = np.concatenate([vertex[:, None].astype(np.int64), (normals + 0.0).view(np.int32), (uvs + 0.0).view(np.int32)], axis=1)
+    keys = np.concatenate(
+        [vertex[:, None].astype(np.int64), (normals + 0.0).view(np.int32), (uvs + 0.0).view(np.int32)], axis=1
+    )
     _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     return Welded(
         positions=mesh.positions[vertex[first]].astype(np.float32),

@@ -187,7 +187,9 @@ def stroke_shading(
 def _differences(values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Central differences to the right and downwards, per pixel; only half of a difference at the border."""
     padded = _pad_edge(values)
-    return (padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]) / 2, (padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]) / 2
+    return (padded[:, :, 1:-1, 2:] - padded[:, :, 1:-1, :-2]) / 2, (
+        padded[:, :, 2:, 1:-1] - padded[:, :, :-2, 1:-1]
+    ) / 2
 
 
 def _pad_edge(values: torch.Tensor) -> torch.Tensor:
@@ -224,7 +226,7 @@ def sliced_wasserstein(
     projections: int = 32,
     samples: int | None = None,
 ) -> torch.Tensor:
-    """E over directions of mean (sort(R.d) - sort(T.d))², in RGB (paper 4.2, L_color); directions uniform on the sphere.
+    """E over directions of mean (sort(R.d) - sort(T.d))², in RGB (paper 4.2, L_color); directions uniform on a sphere.
 
     Both sides are drawn down to the same number of pixels (`samples`, or the smaller side), without replacement.
     """

@@ -6,6 +6,7 @@ pixels is NaN. Higher is better for psnr, ssim, detail_correlation, edge_recall 
 
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import cv2
 import numpy as np
@@ -40,9 +41,10 @@ def ssim(
     """Structural similarity (Wang et al. 2004: Gaussian window of 1.5 px, K = 0.01, 0.03), mean over the mask."""
     from skimage.metrics import structural_similarity
 
-    _, full = structural_similarity(
+    found: Any = structural_similarity(
         reference, test, data_range=1.0, channel_axis=-1, gaussian_weights=True, use_sample_covariance=False, full=True
     )
+    full = found[1]
     return float(full[mask].mean() if mask is not None else full.mean())
 
 
@@ -50,8 +52,8 @@ def flip(reference: Float[np.ndarray, "h w 3"], test: Float[np.ndarray, "h w 3"]
     """Mean LDR-FLIP error (Andersson et al. 2020) at 67 pixels per degree, 0..1."""
     import flip_evaluator
 
-    arrays = [np.ascontiguousarray(np.clip(a, 0, 1), np.float32) for a in (reference, test)]
-    return float(flip_evaluator.evaluate(*arrays, "LDR", inputsRGB=True, applyMagma=False)[1])
+    a, b = (np.ascontiguousarray(np.clip(picture, 0, 1), np.float32) for picture in (reference, test))
+    return float(flip_evaluator.evaluate(a, b, "LDR", inputsRGB=True, applyMagma=False)[1])
 
 
 def ciede2000(
@@ -193,7 +195,7 @@ def detail(
 def detail_correlation(
     picture: Float[np.ndarray, "h w 3"], reference: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 ) -> float:
-    """Correlation of the two pictures' `detail` over the mask, -1..1: whether strokes or shape stand where they should."""
+    """Correlation of the pictures' `detail` over the mask, -1..1: whether strokes or shape stand where they should."""
     inner = erode(mask, 2)
     a, b = detail(picture, mask)[inner], detail(reference, mask)[inner]
     scale = np.sqrt(float((a * a).sum()) * float((b * b).sum()))
@@ -278,4 +280,3 @@ def seam_ratio(view: View, picture: Float[np.ndarray, "h w 3"]) -> float:
 def coverage(known: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> float:
     """Share of the covered texels that were painted by something that saw them."""
     return float(known[covered].mean()) if covered.any() else float("nan")
-

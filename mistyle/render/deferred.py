@@ -34,8 +34,8 @@ class Surface:
     """What the pixels of several equal cameras see, camera after camera, row by row (n = cameras · h · w).
 
     uv is v up (meant modulo 1), part is -1 and facing 0 off the mesh; facing is the cosine between the direction to the
-    camera and the shading normal, negative where the surface's back is seen. `frame` and `towards` (Dr.Jit, world) are the
-    tangent frame and the direction to the camera; `point` is Mitsuba's surface interaction, for shadow rays.
+    camera and the shading normal, negative where the surface's back is seen. `frame` and `towards` (Dr.Jit, world) are
+    the tangent frame and the direction to the camera; `point` is Mitsuba's surface interaction, for shadow rays.
     """
 
     cameras: tuple[Camera, ...]
@@ -195,9 +195,10 @@ def register() -> None:
     """Make the plugin `mistyle_deferred` known to the current variant of Mitsuba."""
     import mitsuba as mi
 
-    if mi.variant() not in _registered:
+    variant = device.use()
+    if variant not in _registered:
         mi.register_integrator(INTEGRATOR, _integrator_class())
-        _registered.add(mi.variant())
+        _registered.add(variant)
 
 
 def _integrator_class() -> type:
@@ -221,7 +222,8 @@ def _integrator_class() -> type:
             pixel = dr.arange(mi.UInt32, rows * columns)
             point = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
             point.wi = lit.wi
-            point.uv = mi.Point2f((pixel % columns + 0.5) / columns, (pixel // columns + 0.5) / rows)
+            column, row = mi.Float(pixel % columns), mi.Float(pixel // columns)
+            point.uv = mi.Point2f((column + 0.5) / columns, (row + 0.5) / rows)
             bsdf = scene.shapes()[0].bsdf()
             terms = list(lit.directional)
             if lit.ambient is not None:

@@ -1,5 +1,8 @@
 """Which Mitsuba variant draws, and on how many threads. Chosen at run time, never by an import."""
 
+import sys
+
+from mistyle.bootstrap import use_llvm
 from mistyle.core.errors import EnvironmentMissing
 
 # The first that answers is taken; a GPU needs no LLVM.
@@ -21,6 +24,8 @@ def use(variant: str | None = None, threads: int | None = None) -> str:
     `threads` sets Dr.Jit's thread count (CPU only; None leaves it): results are bit-identical only at the same count.
     Cheap to call again; every function of `render/` calls it. Raises EnvironmentMissing when nothing answers.
     """
+    if "drjit" not in sys.modules:
+        use_llvm()
     import drjit as dr
     import mitsuba as mi
 

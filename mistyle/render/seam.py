@@ -77,14 +77,17 @@ class Shader:
     One picture at a time: its gradient must be taken before the next call.
     """
 
-    def __init__(self, size: tuple[int, int]) -> None:
+    def __init__(self, size: tuple[int, int], *, gloss: bool = True) -> None:
+        """`gloss` False leaves out the reflection at the surface of dielectrics: what remains is the paint's colour."""
         import drjit as dr
         import mitsuba as mi
 
         device.use()
         deferred.register()
         bsdf = scenery.bsdf_dict(flat_maps(2))
-        _each_texture(bsdf, {"filter_type": "nearest"})
+        _each(bsdf, "bitmap", {"filter_type": "nearest"})
+        if not gloss:
+            _each(bsdf, "principled", {"specular": 0.0})
         film = {"type": "hdrfilm", "width": size[1], "height": size[0], "pixel_format": "rgb"}
         film |= {"component_format": "float32", "rfilter": {"type": "box"}}
         self.size = size
@@ -134,14 +137,14 @@ class Shader:
         for name, values in moving.items():
             self.parameters[self.names[name]] = mi.TensorXf(values)
         self.parameters.update()
-        return mi.render(self.scene, self.parameters, spp=1, seed=0)
+        return mi.render(self.scene, self.parameters, spp=1, seed=mi.UInt32(0))
 
     def _still(self) -> Any:
         import mitsuba as mi
         import torch
 
         self.parameters.update()
-        return torch.from_numpy(np.array(mi.render(self.scene, spp=1, seed=0)))
+        return torch.from_numpy(np.array(mi.render(self.scene, spp=1, seed=mi.UInt32(0))))
 
 
 def bilinear(maps: Float[np.ndarray, "t c"], where: Taps) -> Float[np.ndarray, "n c"]:
@@ -149,12 +152,13 @@ def bilinear(maps: Float[np.ndarray, "t c"], where: Taps) -> Float[np.ndarray, "
     return where.matrix @ maps[where.texels]
 
 
-def _each_texture(description: Any, changes: Mapping[str, Any]) -> None:
+def _each(description: Any, plugin: str, changes: Mapping[str, Any]) -> None:
+    """Change every plugin of one type inside a nested scene description."""
     if isinstance(description, dict):
-        if description.get("type") == "bitmap":
+        if description.get("type") == plugin:
             description.update(changes)
         for value in description.values():
-            _each_texture(value, changes)
+            _each(value, plugin, changes)
 
 
 def _sparse_product() -> Any:

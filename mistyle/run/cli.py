@@ -258,7 +258,7 @@ def _demo(options: argparse.Namespace) -> int:
 
     if options.print_config:
         return _print_config(options)
-    return _run_job(options, scenes() / "demo.obj", scenes() / "demo_style.png", "draft", options.name or "demo")
+    return _run_job(options, scenes() / "demo.obj", scenes() / "demo_style.png", "demo", options.name or "demo")
 
 
 def _print_config(options: argparse.Namespace) -> int:
@@ -285,7 +285,7 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     if options.json:
         print(json.dumps(summary))
     else:
-        for label in ("asset", "textures", "report", "views", "stylized"):
+        for label in ("asset", "textures", "report", "picture", "views", "stylized"):
             print(f"{label:<9} {summary[label]}", file=sys.stderr)
     return 0
 

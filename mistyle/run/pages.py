@@ -31,7 +31,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
     plain = frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
     close = close_up(settings)
     beauty, before, bare = (
-        shown(render(made.asset, maps, [close], settings, backdrop=True, finer=2)[0])[..., :3]
+        shown(render(made.asset, maps, [close], settings, backdrop=True, finer=4)[0])[..., :3]
         for maps in (made.repaired.maps, made.baked.maps, made.atlas.start)
     )
     report(0.9)

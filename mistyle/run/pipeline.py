@@ -306,15 +306,10 @@ def settle_relief(
         return list(maps)
     short = settings.fit.model_copy(update={"refine": "normal-roughness", "iterations1": steps})
     targets = unlit_views(asset, maps, views, lambda done: None)
-    settled = two_phase(asset.mesh, maps, targets, atlas.texels, short, seed=settings.seed + 1, progress=report)
-    return [
-        replace(
-            old,
-            normal=np.where(mask[..., None], new.normal, old.normal),
-            roughness=np.where(mask, new.roughness, old.roughness),
-        )
-        for old, new, mask in zip(maps, settled.maps, masks, strict=True)
-    ]
+    settled = two_phase(
+        asset.mesh, maps, targets, atlas.texels, short, seed=settings.seed + 1, progress=report, only=masks
+    )
+    return list(settled.maps)
 
 
 def write_asset(folder: Path, job: Job, asset: Asset, atlas: Atlas, maps: Sequence[Maps], report: Report) -> None:

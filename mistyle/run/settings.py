@@ -51,8 +51,8 @@ class ReportSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     frames: int = Field(default=24, ge=4, le=240, description="turntable frames")
-    resolution: int = Field(default=480, ge=64, le=4096, description="pixels of a turntable frame")
-    spp: int = Field(default=24, ge=1, le=4096, description="samples per pixel of a turntable frame")
+    resolution: int = Field(default=448, ge=64, le=4096, description="pixels of a turntable frame")
+    spp: int = Field(default=8, ge=1, le=4096, description="samples per pixel of a turntable frame")
 
 
 class Settings(BaseModel):
@@ -85,7 +85,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "surface": {"samples": 80_000},
         "atlas": {"size": 1024},
         "fit": {"iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},
-        "report": {"frames": 12, "resolution": 384, "spp": 8},
+        "report": {"frames": 12, "resolution": 384, "spp": 4},
     },
     "standard": {},
     "paper": {
@@ -95,6 +95,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fit": {"iterations1": 400, "iterations2": 600, "crops": 8},
     },
 }
+# The demo has three minutes: the draft with finer strokes and a larger texture.
+PRESETS["demo"] = PRESETS["draft"] | {"surface": {"samples": 150_000}, "atlas": {"size": 2048}}
 
 
 def thread_count(settings: Settings) -> int:

@@ -35,6 +35,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "asset": str(job.out / "asset" / f"{job.name}.glb"),
         "textures": str(job.out / "asset" / "textures"),
         "report": str(job.out / "report" / "index.html"),
+        "picture": str(job.out / "report" / "overview.png"),
         "views": str(job.out / "views"),
         "stylized": str(job.out / "stylized"),
         "seconds": seconds,

@@ -16,6 +16,10 @@ What phase 1 aims at depends on how the stylizer painted (`painted`):
   their places and in their statistics. Each crop has one light of the rig alone, in turn: only lights from several
   sides tell a slope from a bright spot. With the key light on the other side the relief's shading turns around.
 
+Phase 2 likewise: a view painted without light shows the paint's own colour, so the reflection at the paint's surface
+is left out of the render. Were it in, an albedo below about 0.05 could not make up for it and dark strokes would end
+black.
+
 Both phases are judged afterwards (`fit_judge.py`), and undone where they made the pictures worse.
 """
 
@@ -113,7 +117,7 @@ def _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share
     after = tuple(fit_table.finished(table, maps, only))
     figures, kept = dict(fit.figures), True
     if judge is not None:
-        old, new = (fit_judge.figures(judge, each, phase.lights) for each in (fit.maps, after))
+        old, new = (fit_judge.figures(judge, each, phase.lights, gloss=phase.gloss) for each in (fit.maps, after))
         figures |= {f"{phase.name}.{name}": (old[name], new[name]) for name in old}
         worse = fit_judge.worse(old, new)
         kept = not worse
@@ -153,7 +157,6 @@ def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
 
     from mistyle.measure.features import load_features
     from mistyle.render.draw import tracer
-    from mistyle.render.seam import Shader
 
     welded = weld(mesh)
     pictures, masks = [], []
@@ -169,7 +172,6 @@ def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
         targets=tuple(pictures),
         masks=tuple(masks),
         features=load_features(settings.features),
-        shader=Shader((settings.crops * settings.crop_size, settings.crop_size)),
     )
 
 
@@ -182,6 +184,7 @@ def _phases(settings: FitSettings, directional: Lights, targets: Sequence[View])
         lights=directional,
         one_by_one=flat,
         clay=flat,
+        gloss=True,
         rates=moving | ({"metallic": settings.rate_roughness} if settings.metallic == "fit" else {}),
         variation={"tilt": settings.tv_normal, "roughness": settings.tv_roughness},
         iterations=settings.iterations1,
@@ -194,6 +197,7 @@ def _phases(settings: FitSettings, directional: Lights, targets: Sequence[View])
         lights=lights("phase2"),
         one_by_one=False,
         clay=False,
+        gloss=not flat,
         rates={"albedo": settings.rate_albedo} | {name: rate * settings.reduced for name, rate in moving.items()},
         variation={"albedo": _albedo_variation(settings, targets)},
         iterations=settings.iterations2,

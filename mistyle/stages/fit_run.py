@@ -57,7 +57,6 @@ class World:
     targets: tuple[Any, ...]
     masks: tuple[Bool[np.ndarray, "h w"], ...]
     features: Callable[[Any], list[Any]]
-    shader: Any
 
 
 @dataclass(frozen=True)
@@ -68,6 +67,7 @@ class Phase:
     lights: Lights
     one_by_one: bool  # each crop under one of the lights alone, in turn, and without shadows
     clay: bool
+    gloss: bool
     rates: Mapping[str, float]
     variation: Mapping[str, float]
     iterations: int
@@ -81,6 +81,7 @@ class Run:
         self, world: World, table: Table, phase: Phase, settings: FitSettings, rng: np.random.Generator
     ) -> None:
         self.world, self.table, self.phase, self.settings, self.rng = world, table, phase, settings, rng
+        self.shader = shader(settings, phase.gloss)
         self.trace: dict[str, list[float]] = {}
         self.order: list[int] = []
         self.beam = 0
@@ -137,14 +138,16 @@ class Run:
         surface = deferred.trace(self.world.traced, cameras, self.world.tangents)
         lit, towards = self._light(surface)
         where = seam.taps(surface, self.table.sizes)
+
         def picture(values: Mapping[str, np.ndarray], moving: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
             leaves = {n: torch.from_numpy(v[where.texels]).requires_grad_(n in moving) for n, v in values.items()}
             pixels = {n: seam.fetch(v, where) for n, v in materials(leaves, self.phase.clay).items()}
-            return self.world.shader(lit, pixels).reshape(count, size, size, 3).permute(0, 3, 1, 2), leaves
+            return self.shader(lit, pixels).reshape(count, size, size, 3).permute(0, 3, 1, 2), leaves
 
         plain = picture(self.table.start, {})[0] if self.phase.clay else None
         render, leaves = picture(self.table.values, self.phase.rates)
         wanted = torch.stack([crop_picture(self.world.targets[c.view], c, size) for c in crops])
+
         def image(values: np.ndarray) -> "torch.Tensor":
             return torch.from_numpy(values).reshape(count, size, size, -1).permute(0, 3, 1, 2)
 
@@ -197,11 +200,19 @@ class Run:
         part = int(np.searchsorted(self.table.offsets, texel, side="right")) - 1
         row, column = divmod(texel - self.table.offsets[part], self.table.sizes[part][1])
         shape = "x".join(map(str, self.table.sizes[part]))
+        view = self.world.cameras[crop.view].name
         return (
-            f"{self.phase.name} stopped before step {iteration + 1}: {name} or its gradient is not a number at texel (row "
-            f"{row}, column {column} of {shape}) of texture set {part}, seen in view {self.world.cameras[crop.view].name}; "
+            f"{self.phase.name} stopped before step {iteration + 1}: {name} or its gradient is not a number at texel "
+            f"(row {row}, column {column} of {shape}) of texture set {part}, seen in view {view}; "
             "the maps are those of the last good step."
         )
+
+
+def shader(settings: FitSettings, gloss: bool) -> Any:
+    """The film of one step's crops, one below the other."""
+    from mistyle.render.seam import Shader
+
+    return Shader((settings.crops * settings.crop_size, settings.crop_size), gloss=gloss)
 
 
 def materials(leaves: "Mapping[str, torch.Tensor]", clay: bool = False) -> "dict[str, torch.Tensor]":

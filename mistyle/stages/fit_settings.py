@@ -23,26 +23,48 @@ class FitSettings(BaseModel):
     iterations2: int = Field(default=300, ge=0, le=100_000, description="steps of phase 2: albedo")
     crops: int = Field(default=4, ge=1, le=64, description="crops per step")
     crop_size: int = Field(default=256, ge=32, le=1024, description="pixels along a crop's side (the paper's 256)")
-    crop_scale: tuple[float, float] = Field(default=(0.75, 1.25), description="range of a crop's side in pixels of the view / crop_size")
+    crop_scale: tuple[float, float] = Field(
+        default=(0.75, 1.25), description="range of a crop's side in pixels of the view / crop_size"
+    )
     texels_per_pixel: float = Field(
-        default=1.25, gt=0, description="the fit works on the finest mip level with at most so many texels along a pixel's side"
+        default=1.25,
+        gt=0,
+        description="the fit works on the finest mip level with at most so many texels along a pixel's side",
     )
     style1: float = Field(default=1.0, ge=0, description="weight of the style loss in phase 1")
-    statistics: float = Field(default=0.001, ge=0, description="weight of the features' Gram matrices beside it, without light")
-    relief: float = Field(default=0.15, ge=0, le=1, description="slope of the strokes' flanks (root mean square), without light")
-    smooth: float = Field(default=1.0, gt=0, description="pixels of a view by which strokes are smoothed before they have flanks")
-    sheen: float = Field(default=0.05, ge=0, le=1, description="share of the strokes' own contrast that roughness may explain")
+    statistics: float = Field(
+        default=0.001, ge=0, description="weight of the features' Gram matrices beside it, without light"
+    )
+    relief: float = Field(
+        default=0.15, ge=0, le=1, description="slope of the strokes' flanks (root mean square), without light"
+    )
+    smooth: float = Field(
+        default=1.0, gt=0, description="pixels of a view by which strokes are smoothed before they have flanks"
+    )
+    sheen: float = Field(
+        default=0.05, ge=0, le=1, description="share of the strokes' own contrast that roughness may explain"
+    )
     radius: float = Field(default=12.0, gt=0, description="pixels of a view over which mean and contrast are taken")
     tv_normal: float = Field(default=0.02, ge=0, description="weight of the normal's total variation")
     tv_roughness: float = Field(default=0.01, ge=0, description="weight of the roughness's total variation")
     style2: float = Field(default=15.0, ge=0, description="weight of the style loss in phase 2 (the paper's)")
-    tv_albedo: float = Field(default=0.5, ge=0, description="largest weight of the albedo's total variation, for a flat style")
-    colour2: float = Field(default=5.0, ge=0, description="weight of the sliced Wasserstein distance in phase 2 (the paper's)")
+    tv_albedo: float = Field(
+        default=0.5, ge=0, description="largest weight of the albedo's total variation, for a flat style"
+    )
+    colour2: float = Field(
+        default=5.0, ge=0, description="weight of the sliced Wasserstein distance in phase 2 (the paper's)"
+    )
     projections: int = Field(default=32, ge=1, le=1024, description="directions of the sliced Wasserstein distance")
     colour_samples: int = Field(default=8192, ge=16, description="pixels of the sliced Wasserstein distance")
     rate_normal: float = Field(default=0.05, gt=0, description="Adam's rate for the normal's tilt")
     rate_roughness: float = Field(default=0.03, gt=0, description="Adam's rate for the roughness")
     rate_albedo: float = Field(default=0.005, gt=0, description="Adam's rate for the albedo")
-    reduced: float = Field(default=0.05, ge=0, le=1, description="share of their rates that normal and roughness keep in phase 2")
-    judge: bool = Field(default=True, description="undo a phase that makes detail, style or view-to-view agreement worse")
-    struggle_window: int = Field(default=100, ge=1, description="last steps whose albedo gradient is accumulated (the paper's 100)")
+    reduced: float = Field(
+        default=0.05, ge=0, le=1, description="share of their rates that normal and roughness keep in phase 2"
+    )
+    judge: bool = Field(
+        default=True, description="undo a phase that makes detail, style or view-to-view agreement worse"
+    )
+    struggle_window: int = Field(
+        default=100, ge=1, description="last steps whose albedo gradient is accumulated (the paper's 100)"
+    )

@@ -58,7 +58,7 @@ def build(
     shrink: int,
     only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
 ) -> Table:
-    """A table of `maps` shrunk by the whole factor `shrink`: means over covered texels; uncovered ones take the nearest.
+    """A table of `maps` shrunk by the factor `shrink`: means over covered texels; uncovered ones take the nearest.
 
     With `only`, cells without a texel of these masks stand still.
     """
@@ -84,19 +84,28 @@ def build(
     values = {name: np.concatenate([r[name] for r in rows]) for name in CHANNELS}
     values = {name: project(name, table) for name, table in values.items()}
     start = {name: table.copy() for name, table in values.items()}
-    joined = (np.concatenate(each) for each in (right, below, columns, still))
-    return Table(tuple(sizes), values, start, *joined)
+    return Table(
+        tuple(sizes),
+        values,
+        start,
+        np.concatenate(right),
+        np.concatenate(below),
+        np.concatenate(columns),
+        np.concatenate(still),
+    )
 
 
 def project(name: str, values: Float[np.ndarray, "*t c"]) -> Float[np.ndarray, "*t c"]:
-    """The nearest allowed values: tilt inside the disk of TILT_LIMIT, roughness from ROUGHNESS_FLOOR to 1, else 0..1."""
+    """The nearest allowed values: tilt in the disk of TILT_LIMIT, roughness from ROUGHNESS_FLOOR to 1, else 0..1."""
     if name == "tilt":
         length = np.sqrt(values[..., :1] ** 2 + values[..., 1:] ** 2)
         return (values * np.minimum(1, TILT_LIMIT / np.maximum(length, 1e-6))).astype(np.float32)
     return np.clip(values, ROUGHNESS_FLOOR if name == "roughness" else 0, 1)
 
 
-def step(table: Table, name: str, texels: Int[np.ndarray, " n"], gradient: Float[np.ndarray, "n c"], rate: float) -> None:
+def step(
+    table: Table, name: str, texels: Int[np.ndarray, " n"], gradient: Float[np.ndarray, "n c"], rate: float
+) -> None:
     """One step of Adam for the given texels; those whose gradient is zero neither move nor forget (`mask_updates`)."""
     if name not in table.first:
         shape = table.values[name].shape
@@ -124,12 +133,15 @@ def nonzero(gradient: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " n"]:
 def variation(table: Table, name: str, texels: Int[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, "n c"]]:
     """Total variation among the given texels (sorted) and its gradient: means of |difference| to the right and below.
 
-    Only neighbours in the same island count. Written out instead of differentiated by torch, whose gradient of an
-    indexed read adds up in any order.
+    Of the albedo as it is (the paper's L_TV(A)); of the other maps what the fit changed, or an asset's own normal map
+    would be flattened. Only neighbours in the same island count. Written out instead of differentiated by torch, whose
+    gradient of an indexed read adds up in any order.
     """
     local = np.full(len(table.right), -1, np.int32)
     local[texels] = np.arange(len(texels), dtype=np.int32)
     values = table.values[name][texels]
+    if name != "albedo":
+        values = values - table.start[name][texels]
     gradient, total = np.zeros_like(values), 0.0
     for joined in (table.right, table.below):
         here = np.flatnonzero(joined[texels])
@@ -147,9 +159,7 @@ def variation(table: Table, name: str, texels: Int[np.ndarray, " n"]) -> tuple[f
     return total, gradient
 
 
-def finished(
-    table: Table, maps: Sequence[Maps], only: Sequence[Bool[np.ndarray, "h w"]] | None = None
-) -> list[Maps]:
+def finished(table: Table, maps: Sequence[Maps], only: Sequence[Bool[np.ndarray, "h w"]] | None = None) -> list[Maps]:
     """The maps as they came with what the fit changed laid upon them, at their own resolution (inside `only`)."""
     result = []
     for k, material in enumerate(maps):
@@ -185,7 +195,7 @@ def _change(table: Table, k: int, name: str, shape: tuple[int, int]) -> Float[np
     moved = change.any(axis=-1)
     if not moved.any():
         return None
-    index, distance = nearest(moved)
+    index, distance = nearest(np.asarray(moved))
     filled = change.reshape(-1, change.shape[-1])[index.ravel()].reshape(change.shape)
     filled = gaussian(filled, SMOOTH)
     return resize(np.where((distance <= FILL)[..., None], filled, 0).astype(np.float32), shape, "repeat")
@@ -206,7 +216,9 @@ def _apply(material: Maps, changes: Mapping[str, Float[np.ndarray, "h w c"]]) ->
     return replace(material, **fields)
 
 
-def _shrink(values: Float[np.ndarray, "h w c"], covered: Bool[np.ndarray, "h w"], by: int) -> Float[np.ndarray, "H W c"]:
+def _shrink(
+    values: Float[np.ndarray, "h w c"], covered: Bool[np.ndarray, "h w"], by: int
+) -> Float[np.ndarray, "H W c"]:
     height, width, channels = values.shape
     cells = (height // by, by, width // by, by)
     weight = covered.reshape(cells).sum(axis=(1, 3), dtype=np.float32)
