@@ -85,7 +85,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "surface": {"samples": 80_000},
         "atlas": {"size": 1024},
         "fit": {"iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},
-        "report": {"frames": 12, "resolution": 384, "spp": 4},
+        "report": {"frames": 12, "resolution": 320, "spp": 4},
     },
     "standard": {},
     "paper": {

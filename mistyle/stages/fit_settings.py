@@ -49,7 +49,7 @@ class FitSettings(BaseModel):
     tv_roughness: float = Field(default=0.01, ge=0, description="weight of the roughness's total variation")
     style2: float = Field(default=15.0, ge=0, description="weight of the style loss in phase 2 (the paper's)")
     tv_albedo: float = Field(
-        default=0.5, ge=0, description="largest weight of the albedo's total variation, for a flat style"
+        default=0.05, ge=0, description="largest weight of the albedo's total variation, for a flat style"
     )
     colour2: float = Field(
         default=5.0, ge=0, description="weight of the sliced Wasserstein distance in phase 2 (the paper's)"
