@@ -1,14 +1,12 @@
 """The weight-free stylizer: paints the surface once and answers for any point of it. Needs no network, no weights."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.asset import Picture
 from mistyle.core.mesh import Mesh
-from mistyle.core.view import Prior, View
 from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import SurfaceSettings
 
@@ -48,22 +46,3 @@ def surface_colour(
     from mistyle.surface.lookup import colour
 
     return colour(solution, positions, normals, footprint=footprint, device=array_module())
-
-
-@dataclass(frozen=True)
-class SurfaceStylizer:
-    """A solution behind the signature of stylizers that work view by view; the prior agrees by construction."""
-
-    solution: Solution
-    mesh: Mesh
-
-    def __call__(self, view: View, prior: Prior | None, rng: np.random.Generator) -> Float[np.ndarray, "h w 3"]:
-        """Linear rgb of the view, black off the mesh."""
-        from mistyle.core.image import linear_from_srgb
-        from mistyle.render.draw import gbuffer
-
-        hits = gbuffer(self.mesh, view.camera)
-        rgb = np.zeros((*hits.mask.shape, 3), np.float32)
-        at = hits.mask
-        rgb[at] = linear_from_srgb(surface_colour(self.solution, hits.position[at], hits.normal[at]))
-        return rgb
