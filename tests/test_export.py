@@ -7,11 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from gltf_cases import bumpy_sphere, from_gltf, glb_parts, no_texels, quad, quarters, strange_gltf
 
 from mistyle.core.errors import UsageError
+from mistyle.core.maps import flat_maps
 from mistyle.files import textures
+from mistyle.files.gltf import write_glb
 from mistyle.files.images import encode_png
+from mistyle.files.read import read_mesh
 from mistyle.stages import export
 from mistyle.stages.export import write_asset
 from mistyle.stages.texels import rasterise
@@ -158,3 +162,32 @@ def replace_size(maps, size: int):
     repeat = size // 16
     grown = {k: np.repeat(np.repeat(getattr(maps, k), repeat, 0), repeat, 1) for k in maps.__dataclass_fields__}
     return replace(maps, **grown)
+
+
+def test_the_objects_of_an_obj_become_nodes_of_their_own_name(tmp_path):
+    """Read back by trimesh: every object has its faces, and materials are shared between objects."""
+    lines = ["mtllib none.mtl"]
+    for k, name in enumerate(("lower half", "upper")):
+        lines += [f"o {name}", *(f"v {x} {y + 2 * k} 0" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1)))]
+        lines += [f"vt {x} {(y + k) / 2}" for x, y in ((0, 0), (1, 0), (1, 1), (0, 1))]
+        a = 4 * k
+        lines += ["usemtl paint", f"f {a + 1}/{a + 1} {a + 2}/{a + 2} {a + 3}/{a + 3}"]
+        lines += ["usemtl other"] * k + [f"f {a + 1}/{a + 1} {a + 3}/{a + 3} {a + 4}/{a + 4}"]
+    (tmp_path / "two.obj").write_text("\n".join(lines) + "\n")
+    asset = read_mesh(tmp_path / "two.obj", size=64)
+    maps = [flat_maps(16) for _ in asset.mesh.parts]
+    write_glb(tmp_path / "two.glb", asset, maps, [np.ones((16, 16), np.float32)] * len(maps), name="two")
+    scene = trimesh.load(tmp_path / "two.glb", process=False)
+    faces = {}
+    for node in scene.graph.nodes_geometry:
+        transform, geometry = scene.graph[node]
+        mesh = scene.geometry[geometry]
+        faces[node] = faces.get(node, 0) + len(mesh.faces)
+        low = mesh.vertices[:, 1].min()
+        assert low == pytest.approx(0 if "lower" in node or "lower" in geometry else 2)
+    assert sum(faces.values()) == 4
+    tree, _ = glb_parts(tmp_path / "two.glb")
+    assert [node["name"] for node in tree["nodes"]] == ["lower half", "upper"]
+    assert [material["name"] for material in tree["materials"]] == ["paint", "other"]
+    used = [[p["material"] for p in mesh["primitives"]] for mesh in tree["meshes"]]
+    assert used == [[0], [0, 1]]

@@ -52,7 +52,7 @@ def test_the_threshold_is_mean_plus_half_a_deviation():
     texels, seen = texels_of(np.array([[0, 0, 0, 0, -1]])), np.ones((1, 5), np.int32)
 
     def masked(*values: float, choice: RepairSettings = BARE) -> list[bool]:
-        return struggle_mask(np.array([values], np.float32), seen, texels, choice)[0].tolist()
+        return struggle_mask(np.array([values], np.float32), seen.astype(np.float32), seen, texels, choice)[0].tolist()
 
     # Mean 3, std sqrt(11) = 3.317, threshold 4.658; what is not covered (1000) neither counts nor is masked.
     assert masked(0, 0, 4, 8, 1000) == [False, False, False, True, False]
@@ -62,30 +62,41 @@ def test_the_threshold_is_mean_plus_half_a_deviation():
     assert masked(7, 7, 7, 7, 7) == [False] * 5
 
 
-def test_texels_seen_more_often_do_not_struggle_for_that():
-    seen = np.arange(1, 10).reshape(3, 3)
-    texels = one_island(3)
-    assert not struggle_mask(0.25 * seen.astype(np.float32), seen, texels, BARE).any()
-    gradient = 0.25 * seen.astype(np.float32)
-    gradient[0, 0] = 1.0
-    assert struggle_mask(gradient, seen, texels, BARE).tolist() == [[True, False, False]] + [[False] * 3] * 2
+def test_texels_looked_at_more_often_do_not_struggle_for_that():
+    looks = np.arange(4, 13, dtype=np.float32).reshape(3, 3)
+    seen, texels = np.ones((3, 3), int), one_island(3)
+    assert not struggle_mask(0.25 * looks, looks, seen, texels, BARE).any()
+    gradient = 0.25 * looks
+    gradient[0, 0] = 4.0
+    assert struggle_mask(gradient, looks, seen, texels, BARE).tolist() == [[True, False, False]] + [[False] * 3] * 2
+
+
+def test_one_chance_look_says_little_and_none_nothing():
+    looks = np.full((1, 6), 8, np.float32)
+    looks[0, :2] = 0.1, 0  # of the median 8, a quarter (2) counts at least
+    gradient = 0.25 * looks
+    gradient[0, 0], gradient[0, 1], gradient[0, 5] = 1.0, 9.0, 16.0
+    mask = struggle_mask(gradient, looks, np.ones((1, 6), int), texels_of(np.zeros((1, 6), int)), BARE)
+    # Means 0.5, -, 0.25 three times, 2: only the last is above 0.65 + 0.5 * 0.68.
+    assert mask.tolist() == [[False, False, False, False, False, True]]
 
 
 def test_never_seen_texels_join_the_mask_and_stay_out_of_the_statistics():
     gradient, seen = np.array([[1, 1, 1, 2, 0]], np.float32), np.array([[1, 1, 1, 1, 0]])
-    mask = struggle_mask(gradient, seen, texels_of(np.array([[0, 0, 0, 0, 0]])), BARE)
+    mask = struggle_mask(gradient, seen.astype(np.float32), seen, texels_of(np.array([[0, 0, 0, 0, 0]])), BARE)
     # Mean 1.25, std 0.433: 2 is above 1.47. With the unseen zero the mean would be 1, and 2 still above 1.32.
     assert mask.tolist() == [[False, False, False, True, True]]
-    assert struggle_mask(gradient, 0 * seen, texels_of(np.array([[0, 0, 0, 0, -1]])), BARE).tolist() == [
-        [True] * 4 + [False]
-    ]
+    assert struggle_mask(
+        gradient, 0.0 * gradient, 0 * seen, texels_of(np.array([[0, 0, 0, 0, -1]])), BARE
+    ).tolist() == [[True] * 4 + [False]]
 
 
 def test_the_mask_grows_by_its_share_and_stays_in_its_island():
     texels = two_islands(256)
     gradient = np.zeros((256, 256), np.float32)
     gradient[100, 124] = 1e4
-    mask = struggle_mask(gradient, np.ones((256, 256), int), texels, RepairSettings(dilation=3 / 256))
+    ones = np.ones((256, 256), int)
+    mask = struggle_mask(gradient, ones.astype(np.float32), ones, texels, RepairSettings(dilation=3 / 256))
     expected = np.zeros_like(mask)
     expected[97:104, 121:127] = True  # a square of side 7, cut off where the island ends
     assert np.array_equal(mask, expected)

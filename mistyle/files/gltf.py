@@ -34,7 +34,8 @@ def write_glb(
     provenance: dict | None = None,
     pictures: Sequence[Pictures] | None = None,
 ) -> None:
-    """Write the asset as a new .glb: one primitive, material and set of textures per part, atomically.
+    """Write the asset as a new .glb: a node per object that the source names, one material and set of textures per
+    part, a primitive for each part of each object; atomically.
 
     Positions are the user's: file units, file axes, corners in the order of the source's vertices. Where reading
     turned the mesh upright (Z-up files) the node carries that rotation, since glTF's scene is Y-up; the position of a
@@ -44,26 +45,27 @@ def write_glb(
     """
     pictures = pictures or [encode_pictures(m, o) for m, o in zip(maps, occlusion, strict=True)]
     rotation, offset = _node_frame(asset)
-    node: Tree = {"name": asset.name, "mesh": 0}
+    frame: Tree = {}
     if offset.any():
-        node["translation"] = (rotation @ offset).tolist()
+        frame["translation"] = (rotation @ offset).tolist()
     if not np.array_equal(rotation, np.eye(3)):
-        node["rotation"] = _quaternion(rotation)
+        frame["rotation"] = _quaternion(rotation)
+    thing, things = _objects(asset)
     tree: Tree = {
         "asset": {"version": "2.0", "generator": f"mistyle {__version__}", "extras": {"mistyle": provenance or {}}},
         "scene": 0,
-        "scenes": [{"name": name, "nodes": [0]}],
-        "nodes": [node],
-        "meshes": [{"name": asset.name, "primitives": []}],
+        "scenes": [{"name": name, "nodes": list(range(len(things)))}],
+        "nodes": [{"name": each, "mesh": k, **frame} for k, each in enumerate(things)],
+        "meshes": [{"name": each, "primitives": []} for each in things],
     }
     builder = Builder(tree, [])
     for part, stem in enumerate(part_stems(name, asset.mesh.parts)):
         if (asset.mesh.part == part).any():
-            primitive = _primitive(builder, asset, part, rotation, offset)
             uvs = asset.mesh.corner_uvs[asset.mesh.part == part]
             textures = add_textures(builder, pictures[part], stem, repeat=_leaves_square(uvs))
-            primitive["material"] = builder.put("materials", _material(asset, part, textures))
-            tree["meshes"][0]["primitives"].append(primitive)
+            material = builder.put("materials", _material(asset, part, textures))
+            for k, primitive in _primitives(builder, asset, part, thing, rotation, offset):
+                tree["meshes"][k]["primitives"].append(primitive | {"material": material})
     atomic_write(path, builder.pack())
 
 
@@ -99,23 +101,40 @@ def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> list[float]:
     return (Rotation.from_matrix(rotation).as_quat(canonical=True) + 0.0).tolist()
 
 
-def _primitive(builder: Builder, asset: Asset, part: int, rotation: np.ndarray, offset: np.ndarray) -> Tree:
+def _objects(asset: Asset) -> tuple[Int[np.ndarray, " f"], list[str]]:
+    """The object of every face, by number, and the objects' names; the asset's name where the source has none."""
+    numbers: dict[str, int] = {}
+    thing = np.zeros(len(asset.mesh.faces), np.int32)
+    for p in asset.source.primitives:
+        thing[p.start : p.stop] = numbers.setdefault(p.name or asset.name, len(numbers))
+    return thing, list(numbers) or [asset.name]
+
+
+def _primitives(
+    builder: Builder, asset: Asset, part: int, thing: Int[np.ndarray, " f"], rotation: np.ndarray, offset: np.ndarray
+) -> list[tuple[int, Tree]]:
+    """The faces of a part, object by object. Tangents are those of the part as a whole, as its normal map has them."""
     welded = weld(asset.mesh, part)
     positions = (asset.source.user_positions[welded.vertex] - offset).astype(np.float32)
     normals = unit_normals(welded.normals if np.array_equal(rotation, np.eye(3)) else welded.normals @ rotation)
     uvs = np.stack([welded.uvs[:, 0], 1 - welded.uvs[:, 1]], axis=1)
     # -v instead of v = 1 - v': tangents depend on differences only, and those of the file's own numbers decide.
     tangents = mikktspace(positions, normals, uvs * np.array([1, -1], np.float32), welded.faces)
-    vertex, faces = split_corners(welded.faces, tangents)
-    corner = np.zeros((len(vertex), 4), np.float32)
-    corner[faces.reshape(-1)] = tangents.reshape(-1, 4)
-    attributes = {
-        "POSITION": builder.attribute(positions[vertex], bounds=True),
-        "NORMAL": builder.attribute(normals[vertex]),
-        "TANGENT": builder.attribute(corner),
-        "TEXCOORD_0": builder.attribute(uvs[vertex]),
-    }
-    return {"attributes": attributes, "indices": builder.indices(faces), "mode": 4}
+    owner = thing[asset.mesh.part == part]
+    result = []
+    for k in np.unique(owner).tolist():
+        rows = np.flatnonzero(owner == k)
+        vertex, faces = split_corners(welded.faces[rows], tangents[rows])
+        corner = np.zeros((len(vertex), 4), np.float32)
+        corner[faces.reshape(-1)] = tangents[rows].reshape(-1, 4)
+        attributes = {
+            "POSITION": builder.attribute(positions[vertex], bounds=True),
+            "NORMAL": builder.attribute(normals[vertex]),
+            "TANGENT": builder.attribute(corner),
+            "TEXCOORD_0": builder.attribute(uvs[vertex]),
+        }
+        result.append((k, {"attributes": attributes, "indices": builder.indices(faces), "mode": 4}))
+    return result
 
 
 def split_corners(

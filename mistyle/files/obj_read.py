@@ -22,6 +22,7 @@ TEXTURES = {
     b"map_pm": "metallic",
     b"norm": "normal",
 }
+STATED = (b"usemtl", b"o", b"g")  # statements that hold for all faces until the next one
 # Options of a texture statement and how many values follow; the file name is what comes after them.
 OPTIONS = {b"-mm": 2, b"-o": 3, b"-s": 3, b"-t": 3, b"-blendu": 1, b"-blendv": 1, b"-boost": 1, b"-texres": 1}
 OPTIONS |= {b"-clamp": 1, b"-bm": 1, b"-imfchan": 1, b"-type": 1, b"-cc": 1}
@@ -49,7 +50,9 @@ def read_obj(path: Path, max_faces: int) -> Raw:
     too_many(len(triangles), max_faces, path)
     polygon = np.repeat(np.arange(len(sizes)), np.maximum(sizes - 2, 0))
     index = corners[triangles]
-    material, names = _materials(lines[b"usemtl"], lines[b"use_at"], polygon)
+    material, names = _stated(lines[b"usemtl"], lines[b"usemtl_at"], polygon)
+    kind = b"o" if lines[b"o"] else b"g"
+    thing, things = _stated(lines[kind], lines[kind + b"_at"], polygon)
     library, said = _libraries(lines[b"mtllib"], path)
     budget = Budget(path)
     materials = tuple(library[n](budget) if n in library else _plain(n) for n in names)
@@ -61,7 +64,7 @@ def read_obj(path: Path, max_faces: int) -> Raw:
         uvs=_pick(_table(lines[b"vt"], 2, path, "texture coordinates"), index[..., 1]),
         material=material,
         materials=materials,
-        primitives=_runs(material),
+        primitives=_runs(material, thing, things),
         notes=(*notes, *said),
     )
 
@@ -71,17 +74,18 @@ def _plain(name: str) -> RawMaterial:
 
 
 def _sorted_lines(data: bytes) -> dict[bytes, list]:
-    """The statements' arguments by keyword; `use_at` holds the number of faces before each usemtl, `counts` the
-    numbers of v, vt and vn before each face (only where faces count backwards)."""
-    found: dict[bytes, list] = {k: [] for k in (b"v", b"vt", b"vn", b"f", b"usemtl", b"use_at", b"mtllib", b"counts")}
+    """The statements' arguments by keyword; `usemtl_at`, `o_at` and `g_at` hold the number of faces before each,
+    `counts` the numbers of v, vt and vn before each face (only where faces count backwards)."""
+    found: dict[bytes, list] = {k: [] for k in (b"v", b"vt", b"vn", b"f", b"mtllib", b"counts")}
+    found |= {k: [] for name in STATED for k in (name, name + b"_at")}
     v, vt, vn, f = found[b"v"], found[b"vt"], found[b"vn"], found[b"f"]
     backwards = re.search(rb"^[ \t]*f[ \t][^\n]*-", data, re.MULTILINE) is not None
     for line in data.splitlines():
         parts = line.split(None, 1)
         if len(parts) < 2:
-            if parts and parts[0] == b"usemtl":
-                found[b"usemtl"].append(b"")
-                found[b"use_at"].append(len(f))
+            if parts and parts[0] in STATED:
+                found[parts[0]].append(b"")
+                found[parts[0] + b"_at"].append(len(f))
             continue
         keyword, rest = parts
         if keyword == b"f":
@@ -90,10 +94,11 @@ def _sorted_lines(data: bytes) -> dict[bytes, list]:
                 found[b"counts"].append((len(v), len(vt), len(vn)))
         elif keyword in (b"v", b"vt", b"vn"):
             found[keyword].append(rest)
-        elif keyword in (b"usemtl", b"mtllib"):
+        elif keyword == b"mtllib":
             found[keyword].append(rest.strip())
-            if keyword == b"usemtl":
-                found[b"use_at"].append(len(f))
+        elif keyword in STATED:
+            found[keyword].append(rest.strip())
+            found[keyword + b"_at"].append(len(f))
     return found
 
 
@@ -157,10 +162,10 @@ def _pick(table: Float[np.ndarray, "n w"], index: Int[np.ndarray, "f 3"]) -> Flo
     return picked
 
 
-def _materials(
+def _stated(
     names: list[bytes], starts: list[int], polygon: Int[np.ndarray, " t"]
 ) -> tuple[Int[np.ndarray, " t"], list[str]]:
-    """Material of every triangle, numbered in order of first use by a face."""
+    """Material, object or group of every triangle, numbered in order of first use by a face."""
     starts_at = np.array([0, *starts])
     text = ["", *(n.decode("utf-8", "replace") for n in names)]
     statement = np.searchsorted(starts_at, polygon, side="right") - 1
@@ -173,12 +178,12 @@ def _materials(
     return seen[statement], list(numbers)
 
 
-def _runs(material: Int[np.ndarray, " f"]) -> tuple[Primitive, ...]:
-    """One primitive for each run of faces with the same material."""
-    cuts = np.flatnonzero(np.diff(material)) + 1
+def _runs(material: Int[np.ndarray, " f"], thing: Int[np.ndarray, " f"], things: list[str]) -> tuple[Primitive, ...]:
+    """One primitive for each run of faces with the same material and object."""
+    cuts = np.flatnonzero((np.diff(material) != 0) | (np.diff(thing) != 0)) + 1
     bounds = [0, *cuts.tolist(), len(material)]
     return tuple(
-        Primitive(-1, -1, -1, a, b, int(material[a]), -1, -1)
+        Primitive(-1, -1, -1, a, b, int(material[a]), -1, -1, name=things[thing[a]])
         for a, b in zip(bounds[:-1], bounds[1:], strict=True)
         if b > a
     )

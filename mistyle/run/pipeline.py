@@ -273,7 +273,7 @@ def repair(
         def colours(positions: np.ndarray, normals: np.ndarray, side: float = side) -> np.ndarray:
             return linear_from_srgb(surface_colour(solution, positions, normals, footprint=side))
 
-        mask = struggle_mask(fitted.struggle[part], baked.seen[part], texels, settings.repair)
+        mask = struggle_mask(fitted.struggle[part], fitted.touched[part], baked.seen[part], texels, settings.repair)
         rng = np.random.default_rng([settings.seed, part])
         maps.append(repair_part(fitted.maps[part], mask, texels, inpainter(colours), settings.repair, rng))
         masks.append(mask)

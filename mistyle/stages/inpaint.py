@@ -17,6 +17,8 @@ from mistyle.core.maps import Maps, Texels
 # (albedo (h w 3) linear, hole (h w), texels, generator) -> albedo (h w 3); only what it answers inside the hole counts.
 Inpainter = Callable[[np.ndarray, np.ndarray, Texels, np.random.Generator], np.ndarray]
 
+FEWEST = 0.25  # share of the median number of looks below which a texel's mean gradient is chance
+
 
 class RepairSettings(BaseModel):
     """Which texels are painted again and how they are joined (paper 4.3)."""
@@ -43,18 +45,25 @@ def radius(share: float, size: int) -> int:
 
 
 def struggle_mask(
-    accumulated: Float[np.ndarray, "h w"], seen: Int[np.ndarray, "h w"], texels: Texels, settings: RepairSettings
+    accumulated: Float[np.ndarray, "h w"],
+    looks: Float[np.ndarray, "h w"],
+    seen: Int[np.ndarray, "h w"],
+    texels: Texels,
+    settings: RepairSettings,
 ) -> Bool[np.ndarray, "h w"]:
-    """The texels to paint again: those whose accumulated |gradient| per sighting exceeds mean + 0.5 std over the
-    covered texels that were seen, and those never seen; dilated by max-pooling inside their islands.
+    """The texels to paint again: those whose mean |gradient| of a look exceeds mean + 0.5 std over the texels that
+    were looked at, and those that no view sees; dilated by max-pooling inside their islands.
 
-    `accumulated` is the sum of absolute albedo gradients over the last steps of phase 2, `seen` how many views see a
-    texel. The paper thresholds the sum; without the division the mask would show how often a texel was looked at.
+    `accumulated` is the sum of absolute albedo gradients over the last steps of phase 2, `looks` how often these
+    steps looked at a texel (`Fit.touched`), `seen` how many views see it. The paper thresholds the sum; without the
+    division the mask would show how often a texel was looked at. What was hardly looked at counts as looked at
+    FEWEST times the median, or one chance pixel would decide; what was not looked at at all says nothing.
     """
-    looked = texels.covered & (seen > 0)
-    struggling = texels.covered & ~looked
+    struggling = texels.covered & (seen <= 0)
+    looked = texels.covered & (seen > 0) & (looks > 0)
     if looked.any():
-        average = accumulated[looked].astype(np.float64) / seen[looked]
+        least = FEWEST * float(np.median(looks[looked]))
+        average = accumulated[looked].astype(np.float64) / np.maximum(looks[looked], least)
         struggling[looked] = average > average.mean() + settings.deviations * average.std()
     return dilate_within(struggling, texels.island, radius(settings.dilation, texels.covered.shape[1]))
 
