@@ -267,7 +267,8 @@ def test_the_table_averages_covered_texels_and_gives_back_what_it_was_given(rng)
     np.testing.assert_allclose(lighter, np.clip(maps.albedo + 0.1, 0, 1), atol=1e-5)
 
 
-def test_steps_are_those_of_adam_and_still_texels_stand(rng):
+def test_steps_are_those_of_adam_and_still_texels_stand(rng, monkeypatch):
+    monkeypatch.setattr(fit_table, "DAMPING", 0.0)
     maps = random_maps(rng, 4)
     table = fit_table.build([maps], [blank_texels(np.zeros((4, 4), int))], 1)
     leaf = torch.from_numpy(table.values["albedo"] * 0.5 + 0.25).requires_grad_()
@@ -286,6 +287,19 @@ def test_steps_are_those_of_adam_and_still_texels_stand(rng):
     fit_table.step(table, "albedo", everywhere, gradient, 0.01)
     moved = (table.values["albedo"] != before).any(axis=1)
     assert not moved[7] and moved.sum() == 15
+
+
+def test_texels_with_little_gradient_move_little(rng):
+    """Plain Adam would move them all alike."""
+    table = fit_table.build([random_maps(rng, 4)], [blank_texels(np.zeros((4, 4), int))], 1)
+    table.values["albedo"] = np.full_like(table.values["albedo"], 0.5)
+    gradient = np.full((16, 3), 1.0, np.float32)
+    gradient[3] = 0.05
+    for _ in range(4):
+        fit_table.step(table, "albedo", np.arange(16), gradient, 0.01)
+    moved = 0.5 - table.values["albedo"][:, 0]
+    assert moved[0] == pytest.approx(0.04 / 1.3, rel=0.05)
+    assert moved[3] == pytest.approx(0.04 * 0.05 / (0.05 + 0.3), rel=0.1)
 
 
 def test_variation_by_hand_and_against_finite_differences(rng):

@@ -19,6 +19,9 @@ CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}
 TILT_LIMIT = 0.95  # a normal more than 72 degrees off faces away from most views, where its gradient is zero
 ROUGHNESS_FLOOR = 0.05  # below 0.0316 Mitsuba's roughness has no gradient
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-8  # with 0.999 texels that few views see keep stale second moments
+# Share of a map's mean gradient that damps Adam's steps: plain Adam moves a texel with a tenth of the others' gradient
+# as fast as them, and the blank parts of a picture, where the gradient is noise, drift.
+DAMPING = 0.3
 SMOOTH = 0.7  # texels of the table; a change finer than that is the noise of single steps
 FILL = 6  # texels of the table by which a change is continued beyond the last texel that was seen
 
@@ -41,6 +44,7 @@ class Table:
     first: dict[str, Float[np.ndarray, "t c"]] = field(default_factory=dict)
     second: dict[str, Float[np.ndarray, "t c"]] = field(default_factory=dict)
     steps: dict[str, Int[np.ndarray, " t"]] = field(default_factory=dict)
+    squares: dict[str, tuple[float, int]] = field(default_factory=dict)
 
     @property
     def offsets(self) -> list[int]:
@@ -49,7 +53,7 @@ class Table:
 
     def forget(self) -> None:
         """Drop Adam's moments: the next phase minimises something else."""
-        self.first, self.second, self.steps = {}, {}, {}
+        self.first, self.second, self.steps, self.squares = {}, {}, {}, {}
 
 
 def build(
@@ -106,19 +110,26 @@ def project(name: str, values: Float[np.ndarray, "*t c"]) -> Float[np.ndarray, "
 def step(
     table: Table, name: str, texels: Int[np.ndarray, " n"], gradient: Float[np.ndarray, "n c"], rate: float
 ) -> None:
-    """One step of Adam for the given texels; those whose gradient is zero neither move nor forget (`mask_updates`)."""
+    """One step of Adam for the given texels; those whose gradient is zero neither move nor forget (`mask_updates`).
+
+    The step is rate · m / (sqrt(v) + DAMPING · root mean square of all gradients of this map so far).
+    """
     if name not in table.first:
         shape = table.values[name].shape
         table.first[name], table.second[name] = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         table.steps[name] = np.zeros(shape[0], np.int32)
     moving = nonzero(gradient) & ~table.still[texels]
     rows, g = (texels, gradient) if moving.all() else (texels[moving], gradient[moving])
+    total, count = table.squares.get(name, (0.0, 0))
+    total, count = total + float(np.square(g, dtype=np.float64).sum()), count + g.size
+    table.squares[name] = total, count
+    typical = np.float32(DAMPING * np.sqrt(total / max(count, 1)) + EPSILON)
     table.steps[name][rows] += 1
     age = table.steps[name][rows, None].astype(np.float32)
     first = BETA1 * table.first[name][rows] + (1 - BETA1) * g
     second = BETA2 * table.second[name][rows] + (1 - BETA2) * g * g
     table.first[name][rows], table.second[name][rows] = first, second
-    size = first / (1 - BETA1**age) / (np.sqrt(second / (1 - BETA2**age)) + EPSILON)
+    size = first / (1 - BETA1**age) / (np.sqrt(second / (1 - BETA2**age)) + typical)
     table.values[name][rows] = project(name, table.values[name][rows] - np.float32(rate) * size)
 
 
