@@ -6,7 +6,7 @@ from os import PathLike
 from typing import Any
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "stylize"]
+__all__ = ["__version__", "fit", "fit_scene", "stylize"]
 
 
 def stylize(
@@ -34,3 +34,49 @@ def stylize(
     mesh, style = Path(mesh), Path(style)
     job = Job(mesh, style, Path(out), resolve(preset, None, settings), name or f"{mesh.stem}_{style.stem}")
     return run(job, Progress(quiet=True))
+
+
+def fit(
+    mesh: str | PathLike,
+    references: str | PathLike,
+    out: str | PathLike,
+    *,
+    lights: str | PathLike | None = None,
+    masks: str | PathLike | None = None,
+    preset: str = "standard",
+    name: str | None = None,
+    **settings: Any,
+) -> dict[str, Any]:
+    """Albedo, normal, roughness (and metallic) of a mesh from pictures of known cameras under known light.
+
+    `references` is a folder with camera.json, transforms.json or a COLMAP model, and the pictures; `lights` a
+    lights.json (None: the one in the folder; "unknown": solved for). `settings` are nested as `mistyle fit
+    --print-config` prints them, for example `recover={"metallic": True}`. Returns the paths of what was written and
+    the figures of `run.json`. Raises `mistyle.core.errors.MistyleError`.
+    """
+    from pathlib import Path
+
+    from mistyle.run.material import MaterialJob, fit_material
+    from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
+    from mistyle.run.progress import Progress
+    from mistyle.run.settings import resolve
+
+    mesh = Path(mesh)
+    job = MaterialJob(
+        mesh,
+        Path(references),
+        Path(out),
+        resolve(preset, None, settings, root=MaterialSettings, presets=MATERIAL_PRESETS),
+        name or mesh.stem,
+        lights="unknown" if lights == "unknown" else None if lights is None else Path(lights),
+        masks=None if masks is None else Path(masks),
+    )
+    return fit_material(job, Progress(quiet=True))
+
+
+def fit_scene(scene: Any, keys: Any, sensors: Any = None, references: Any = (), **options: Any) -> Any:
+    """Texture parameters of a live `mi.Scene`, fitted to a picture per sensor: see `mistyle.render.scene_fit.fit_scene`
+    for the options (loss, regularizers, callback, iterations, ...) and what comes back."""
+    from mistyle.render.scene_fit import fit_scene as run
+
+    return run(scene, keys, sensors, references, **options)

@@ -34,9 +34,9 @@ def test_every_verb_explains_itself(verb, capsys):
 
 def test_options_name_existing_settings():
     from mistyle.run.cli import OPTIONS
-    from mistyle.run.settings import known_keys
+    from mistyle.run.settings import Settings, known_keys
 
-    assert set(OPTIONS.values()) <= set(known_keys())
+    assert set(OPTIONS.values()) <= set(known_keys(Settings))
 
 
 @pytest.mark.parametrize(

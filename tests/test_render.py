@@ -390,3 +390,12 @@ def test_an_unknown_variant_is_an_environment_error() -> None:
     with pytest.raises(EnvironmentMissing, match="expected one of"):
         device.use("scalar_rgb")
     assert device.use() == device.use(device.use())
+
+
+def test_a_scene_with_an_exr_loads_on_one_thread():
+    """In a process of its own, with a limit: on one thread Mitsuba's EXR reader waits for ever."""
+    code = (
+        "from mistyle.render import device, scene; device.use(threads=1);"
+        "import drjit as dr; scene.read_template('studio', turn=0, floor=-1); assert dr.thread_count() == 1"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

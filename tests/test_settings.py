@@ -62,6 +62,6 @@ def test_assignments_nest_and_parse():
 
 
 def test_every_known_key_can_be_printed():
-    assert {"seed", "fit.iterations1", "atlas.size"} <= set(known_keys())
-    assert len(known_keys()) == len(set(known_keys()))
+    assert {"seed", "fit.iterations1", "atlas.size"} <= set(known_keys(Settings))
+    assert len(known_keys(Settings)) == len(set(known_keys(Settings)))
     assert Settings() == resolve("standard", None, {}, {}) or PRESETS["standard"]

@@ -1,23 +1,32 @@
 """Lights as records, the rigs that `scenes/` describes, and `lights.json`.
 
-`lights.json` (written beside the views, read by the fit) is one object:
+`lights.json` (written beside the views, read by the fit) is one object; a light is in one of six forms:
 
     {"version": 1, "axes": "world Y up; camera x right, y down, z forward",
      "lights": [
        {"type": "directional", "direction": [x, y, z], "irradiance": [r, g, b], "frame": "world" | "camera"},
+       {"type": "point", "position": [x, y, z], "intensity": [r, g, b], "frame": "world" | "camera"},
+       {"type": "environment", "file": "studio.hdr", "turn": degrees, "scale": s},
        {"type": "ambient", "radiance": [r, g, b]},
        {"type": "spherical_gaussian", "axis": [x, y, z], "sharpness": s, "amplitude": [r, g, b]},
-       {"type": "scene", "file": "studio.xml"}]}
+       {"type": "scene", "file": "studio.xml"}],
+     "views": {"name of a view": [light, ...]}}
+
+`lights` shine in every view that `views` does not name; a view that it names has its own list instead. One of the two
+is enough. "frame" is "world" where it is left out, "turn" 0 and "scale" 1.
 
 Directions and axes are unit vectors that point TOWARDS the light. Colours are linear Rec.709. `irradiance` is what a
-surface that faces the light receives; `radiance` arrives from every direction; a spherical Gaussian (world frame)
-sends amplitude · exp(sharpness · (axis · w - 1)) from direction w; "scene" means that only the named Mitsuba scene
-file describes the light.
+surface that faces the light receives; a point light of `intensity` i at distance d gives irradiance i / d²; one at the
+camera's origin is a co-located flash; `radiance` arrives from every direction; an environment is a latitude-longitude
+picture of linear radiance times `scale`, laid out as `environment_directions` says and then turned by `turn` degrees
+about +Y (from +Z towards +X), its file (.exr or .hdr) is found beside `lights.json`; a spherical Gaussian (world
+frame) sends amplitude · exp(sharpness · (axis · w - 1)) from direction w; "scene" means that only the named Mitsuba
+scene file describes the light. The world is the cameras' world, and lengths are in its units.
 """
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeGuard
@@ -28,6 +37,7 @@ from jaxtyping import Float
 
 from mistyle.core.camera import Camera, look_at
 from mistyle.core.errors import InputRefused
+from mistyle.core.image import bilinear
 from mistyle.core.paths import scenes
 
 Colour = tuple[float, float, float]
@@ -43,6 +53,32 @@ class Directional:
     direction: Vector
     irradiance: Colour
     frame: Literal["world", "camera"] = "world"
+
+
+@dataclass(frozen=True)
+class Point:
+    """A delta light at a place, in the world or in the camera's (OpenCV) axes; (0, 0, 0) there is a co-located flash.
+
+    Irradiance of a surface that faces it from distance d is intensity / d². Lengths are working units.
+    """
+
+    position: Vector
+    intensity: Colour
+    frame: Literal["world", "camera"] = "world"
+
+
+@dataclass(frozen=True, eq=False)
+class Environment:
+    """Light from infinitely far, by a latitude-longitude map of linear radiance (rows of `environment_directions`).
+
+    `turn` degrees about +Y, from +Z towards +X, turn the map's world with everything in it. `file` is where it came
+    from, for `lights.json`.
+    """
+
+    radiance: Float[np.ndarray, "eh ew 3"]
+    turn: float = 0.0
+    scale: float = 1.0
+    file: str = ""
 
 
 @dataclass(frozen=True)
@@ -68,10 +104,14 @@ class SceneLights:
     file: str
 
 
-Light = Directional | Ambient | SphericalGaussian | SceneLights
+Light = Directional | Point | Environment | Ambient | SphericalGaussian | SceneLights
 Lights = tuple[Light, ...]
+# Gives the radiance of an environment's file, as named in lights.json.
+Load = Callable[[str], Float[np.ndarray, "eh ew 3"]]
 NAMES = {
     Directional: "directional",
+    Point: "point",
+    Environment: "environment",
     Ambient: "ambient",
     SphericalGaussian: "spherical_gaussian",
     SceneLights: "scene",
@@ -105,6 +145,24 @@ def spherical_gaussian(light: SphericalGaussian, directions: Float[np.ndarray, "
     return lobe[..., None] * np.asarray(light.amplitude)
 
 
+def environment_radiance(light: Environment, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
+    """Radiance from unit world directions: the turned map's bilinear value, times its scale."""
+    height, width = light.radiance.shape[:2]
+    x, y, z = np.moveaxis(np.asarray(directions, float) @ turn_about_y(light.turn), -1, 0)
+    # Rows lie at theta = 0 .. pi, the first and the last at the poles; columns' middles are half a column in.
+    row = np.arccos(np.clip(y, -1, 1)) / np.pi * (height - 1) + 0.5
+    column = np.arctan2(x, -z) / (2 * np.pi) % 1.0 * width
+    padded = np.concatenate([light.radiance[:, -1:], light.radiance, light.radiance[:, :1]], axis=1)
+    px = np.stack([column + 1, row], axis=-1).reshape(-1, 2)
+    return bilinear(padded.astype(np.float32), px).reshape(directions.shape) * np.float32(light.scale)
+
+
+def turn_about_y(degrees: float) -> Float[np.ndarray, "3 3"]:
+    """The rotation about +Y that takes +Z towards +X; columns are the turned axes."""
+    cos, sin = math.cos(math.radians(degrees)), math.sin(math.radians(degrees))
+    return np.array([[cos, 0, sin], [0, 1, 0], [-sin, 0, cos]])
+
+
 def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"]:
     """World direction of every pixel of a latitude-longitude map as Mitsuba's `envmap` reads it.
 
@@ -118,7 +176,9 @@ def environment_directions(height: int, width: int) -> Float[np.ndarray, "h w 3"
 
 
 def bake_environment(rig: Sequence[Light], height: int = 128) -> Float[np.ndarray, "h w 3"]:
-    """Latitude-longitude radiance (width twice the height) of spherical Gaussians and ambient light."""
+    """Latitude-longitude radiance (width twice the height) of spherical Gaussians, ambient light and environments.
+
+    ValueError for other lights."""
     directions = environment_directions(height, 2 * height)
     total = np.zeros(directions.shape)
     for light in rig:
@@ -126,35 +186,88 @@ def bake_environment(rig: Sequence[Light], height: int = 128) -> Float[np.ndarra
             total += spherical_gaussian(light, directions)
         elif isinstance(light, Ambient):
             total += np.asarray(light.radiance)
+        elif isinstance(light, Environment):
+            total += environment_radiance(light, directions)
         else:
             raise ValueError(f"cannot bake {type(light).__name__} into an environment map")
     return total.astype(np.float32)
 
 
-def to_json(rig: Lights) -> dict[str, Any]:
-    """The content of `lights.json`."""
-    return {"version": 1, "axes": AXES, "lights": [{"type": NAMES[type(light)], **_plain(light)} for light in rig]}
+def to_json(rig: Lights, views: Mapping[str, Lights] | None = None) -> dict[str, Any]:
+    """The content of `lights.json`; `views` names the views that have lights of their own.
+
+    An environment is written by its file's name; ValueError where it has none.
+    """
+    own = {"views": {name: _plain(lights) for name, lights in views.items()}} if views else {}
+    return {"version": 1, "axes": AXES, "lights": _plain(rig), **own}
 
 
-def from_json(data: dict[str, Any], where: str = "lights.json") -> Lights:
-    """Read `lights.json`'s content; InputRefused names the entry that is wrong. Directions are normalised."""
-    entries = data.get("lights") if isinstance(data, dict) else None
-    if not isinstance(entries, list):
-        raise InputRefused(f'{where}: expected an object with a list "lights"; see the schema in the README.')
-    return tuple(_light(entry, f"{where}: lights[{k}]") for k, entry in enumerate(entries))
+def from_json(data: dict[str, Any], where: str = "lights.json", load: Load | None = None) -> Lights:
+    """The lights of `lights.json`'s content; InputRefused names the entry that is wrong. Directions are normalised.
+
+    `load` reads the file that an environment names; without it environments are refused. Lights of single views are
+    not looked at (`lights_of_views`).
+    """
+    return _list(data.get("lights"), f"{where}: lights", load)
 
 
-def _plain(light: Light) -> dict[str, Any]:
+def lights_of_views(
+    data: dict[str, Any], names: Sequence[str], where: str = "lights.json", load: Load | None = None
+) -> tuple[Lights, ...]:
+    """The lights of each of the views `names`, from the lists "views" and "lights".
+
+    InputRefused: a view without lights; and, where a common list would hide the mistake, a name in "views" that none of
+    the views has.
+    """
+    own = data.get("views", {})
+    if not isinstance(own, dict):
+        raise InputRefused(f'{where}: "views" is a {type(own).__name__}; expected an object: view name -> [lights].')
+    common = from_json(data, where, load) if "lights" in data or not own else None
+    strange = sorted(set(own) - set(names))
+    if strange and common is not None:
+        raise InputRefused(
+            f'{where}: "views" names {strange[0]!r}, which is none of the {len(names)} views ({names[0]!r}, ...). '
+            "Write the view's name as in the camera file."
+        )
+    missing = [name for name in names if name not in own]
+    if common is None and missing:
+        raise InputRefused(
+            f"{where}: no lights for the view {missing[0]!r} ({len(missing)} of {len(names)} views have none). "
+            'Add it to "views", or write "lights" for all views that are not named there.'
+        )
+    read = {name: _list(own[name], f"{where}: views[{name!r}]", load) for name in names if name in own}
+    return tuple(read[name] if name in read else common or () for name in names)
+
+
+def _plain(rig: Lights) -> list[dict[str, Any]]:
+    return [{"type": NAMES[type(light)], **_fields(light)} for light in rig]
+
+
+def _fields(light: Light) -> dict[str, Any]:
+    if isinstance(light, Environment):
+        if not light.file:
+            raise ValueError("an environment without a file's name cannot be written to lights.json")
+        return {"file": light.file, "turn": light.turn, "scale": light.scale}
     return {key: list(value) if isinstance(value, tuple) else value for key, value in vars(light).items()}
 
 
-def _light(entry: Any, where: str) -> Light:
+def _list(entries: Any, where: str, load: Load | None) -> Lights:
+    if not isinstance(entries, list):
+        file, _, key = where.rpartition(": ")
+        raise InputRefused(f"{file}: expected an object with a list at {key}; found {type(entries).__name__}.")
+    return tuple(_light(entry, f"{where}[{k}]", load) for k, entry in enumerate(entries))
+
+
+def _light(entry: Any, where: str, load: Load | None) -> Light:
     kind = entry.get("type") if isinstance(entry, dict) else None
     if kind == "directional":
-        frame = entry.get("frame", "world")
-        if frame not in ("world", "camera"):
-            raise InputRefused(f'{where}: frame is {frame!r}; expected "world" or "camera".')
-        return Directional(_unit(entry, "direction", where), _triple(entry, "irradiance", where, 0.0), frame)
+        colour = _triple(entry, "irradiance", where, 0.0)
+        return Directional(_unit(entry, "direction", where), colour, _frame(entry, where))
+    if kind == "point":
+        colour = _triple(entry, "intensity", where, 0.0)
+        return Point(_triple(entry, "position", where), colour, _frame(entry, where))
+    if kind == "environment":
+        return _environment(entry, where, load)
     if kind == "ambient":
         return Ambient(_triple(entry, "radiance", where, 0.0))
     if kind == "spherical_gaussian":
@@ -165,7 +278,24 @@ def _light(entry: Any, where: str) -> Light:
         return SphericalGaussian(axis, float(sharpness), amplitude)
     if kind == "scene" and isinstance(entry.get("file"), str):
         return SceneLights(entry["file"])
-    raise InputRefused(f"{where}: type is {kind!r}; expected directional, ambient, spherical_gaussian or scene.")
+    raise InputRefused(f"{where}: type is {kind!r}; expected one of {', '.join(NAMES.values())}.")
+
+
+def _frame(entry: dict, where: str) -> Literal["world", "camera"]:
+    frame = entry.get("frame", "world")
+    if frame not in ("world", "camera"):
+        raise InputRefused(f'{where}: frame is {frame!r}; expected "world" or "camera".')
+    return frame
+
+
+def _environment(entry: dict, where: str, load: Load | None) -> Environment:
+    file, turn, scale = entry.get("file"), entry.get("turn", 0.0), entry.get("scale", 1.0)
+    if not isinstance(file, str) or not file or load is None:
+        expected = "lights without files here" if load is None else "the name of an .exr or .hdr beside lights.json"
+        raise InputRefused(f"{where}: file is {file!r}; expected {expected}.")
+    if not _number(turn) or not _number(scale) or scale < 0:
+        raise InputRefused(f"{where}: turn is {turn!r}, scale is {scale!r}; expected degrees and a number >= 0.")
+    return Environment(load(file), float(turn), float(scale), file)
 
 
 def _triple(entry: dict, key: str, where: str, least: float = -math.inf) -> Vector:

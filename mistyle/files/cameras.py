@@ -11,11 +11,14 @@
 z_min and z_max are null where nothing is seen. On reading, R and t of one of the two conventions are enough. The space
 is the working space: the mesh in a bounding sphere of radius 1 about the origin, Y up.
 
-`transforms.json` is the NeRF/Blender convention: `transform_matrix` is world from camera with OpenGL axes.
+`transforms.json` is the NeRF/Blender convention: `transform_matrix` is world from camera with OpenGL axes. Ours says
+with "space" that it is in the working space; another's is in whatever space its maker chose.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Annotated, Any
 
@@ -24,6 +27,7 @@ from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mistyle.core.camera import OPENGL_FROM_OPENCV, Camera
+from mistyle.core.distortion import Lens, is_distorted
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import refuse
 from mistyle.files.read import read_json
@@ -32,7 +36,7 @@ SPACE = "working space: bounding sphere of radius 1 about the origin, right-hand
 MAX_SIDE = 16384
 # How far a stored rotation may be from a rotation: files with five digits pass.
 RIGID = 1e-4
-DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+ENDINGS = (".exr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
@@ -76,11 +80,23 @@ class _Frame(BaseModel):
     """A frame of a transforms.json; intrinsics stand in the frame or above all frames."""
 
     file_path: str = Field("", max_length=1000)
+    mask_path: str | None = Field(None, max_length=1000)
     transform_matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)]
 
 
 class _Transforms(BaseModel):
     frames: Annotated[list[dict[str, Any]], Field(min_length=1, max_length=4096)]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One photograph of a model of cameras: its name (unique), its files as the model names them, its pose and lens."""
+
+    name: str
+    picture: str
+    mask: str | None
+    world_from_cam: Float[np.ndarray, "4 4"]
+    lens: Lens
 
 
 def camera_entry(camera: Camera, depth: Float[np.ndarray, "h w"] | None = None) -> dict[str, Any]:
@@ -114,7 +130,7 @@ def transforms(cameras: Sequence[Camera], files: Sequence[str]) -> dict[str, Any
         for camera, file in zip(cameras, files, strict=True)
     ]
     first = _intrinsics(cameras[0]) if cameras else {}
-    return {"camera_model": "PINHOLE", "aabb_scale": 1, **first, "frames": frames}
+    return {"camera_model": "PINHOLE", "aabb_scale": 1, "space": SPACE, **first, "frames": frames}
 
 
 def read_entries(path: Path) -> list[tuple[Camera, ViewEntry]]:
@@ -139,45 +155,85 @@ def read_cameras(path: Path, size: tuple[int, int] = (1024, 1024)) -> list[Camer
     tree = read_json(Path(path))
     if "frames" not in tree:
         return [camera for camera, _ in read_entries(Path(path))]
+    frames = read_frames(Path(path), lambda file: size)
+    for frame in frames:
+        where = f"view '{frame.name}'"
+        if is_distorted(frame.lens):
+            fix = "Undistort the pictures and cameras first"
+            raise refuse(path, f"lens distortion in {where}", "pinhole cameras", fix)
+        _check_square(*frame.lens.focal, where, Path(path))
+    return [Camera(f.world_from_cam, f.lens.focal[0], f.lens.centre, f.lens.size, f.name) for f in frames]
+
+
+def read_frames(path: Path, size_of: Callable[[str], tuple[int, int]]) -> list[Frame]:
+    """The frames of a `transforms.json` with their lenses (k1 k2 k3 p1 p2), in the file's order and space.
+
+    `size_of` gives (height, width) of the picture that a frame names, where the file does not say (w, h). Refused:
+    fisheye and other camera models, matrices that are no rigid motion.
+    """
+    tree = read_json(path)
     try:
-        frames = _Transforms.model_validate(tree).frames
-        return [_frame_camera(frame, tree, size, k, Path(path)) for k, frame in enumerate(frames)]
+        known = [_Frame.model_validate(frame) for frame in _Transforms.model_validate(tree).frames]
+        names = unique_names([frame.file_path or f"view_{k:03d}" for k, frame in enumerate(known)])
+        return [
+            _frame(frame, {**tree, **raw}, name, size_of, path)
+            for frame, raw, name in zip(known, tree["frames"], names, strict=True)
+        ]
     except ValidationError as error:
-        raise _unfit(Path(path), error, "a transforms.json (NeRF/Blender convention)") from error
+        raise _unfit(path, error, "a transforms.json (NeRF/Blender convention)") from error
 
 
-def _frame_camera(
-    frame: Mapping[str, Any], tree: Mapping[str, Any], size: tuple[int, int], k: int, path: Path
-) -> Camera:
-    known = _Frame.model_validate(frame)
-    name = PurePosixPath(known.file_path.replace("\\", "/")).name or f"view_{k:03d}"
-    for ending in (".png", ".jpg", ".jpeg", ".exr", ".webp"):
-        name = name.removesuffix(ending)
+def unique_names(files: Sequence[str]) -> list[str]:
+    """A name for each picture: its file's without folder and ending, or with the folders where two would be alike."""
+    paths = [PurePosixPath(file.replace("\\", "/")) for file in files]
+    short = [stem(path.name) for path in paths]
+    alike = {name for name, times in Counter(short).items() if times > 1}
+    return [
+        stem("_".join(part for part in path.parts if part not in ("/", ".", ".."))) if name in alike else name
+        for path, name in zip(paths, short, strict=True)
+    ]
+
+
+def stem(name: str) -> str:
+    """The name without a picture's ending; other dots stay."""
+    return name[: -len(ending)] if (ending := PurePosixPath(name).suffix).lower() in ENDINGS else name
+
+
+def _frame(
+    known: _Frame, fields: Mapping[str, Any], name: str, size_of: Callable[[str], tuple[int, int]], path: Path
+) -> Frame:
     where = f"view '{name}'"
 
     def number(key: str) -> float | None:
-        value = frame.get(key, tree.get(key))
+        value = fields.get(key)
         if value is None or (isinstance(value, int | float) and math.isfinite(value)):
             return value
         raise refuse(path, f"{key} = {value!r} in {where}", "a finite number", "Correct the file")
 
-    if any(number(key) for key in DISTORTION):
-        raise refuse(path, f"lens distortion in {where}", "pinhole cameras", "Undistort the pictures and cameras first")
-    width, height = int(number("w") or size[1]), int(number("h") or size[0])
+    model = fields.get("camera_model", "OPENCV")
+    fix = "Undistort the pictures and cameras first"
+    if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL") or fields.get("is_fisheye"):
+        raise refuse(path, f"the camera model {str(model)[:80]!r} in {where}", "PINHOLE or OPENCV", fix)
+    if number("k4"):
+        raise refuse(path, f"lens distortion k4 in {where}", "at most k1 k2 k3 p1 p2", fix)
+    high, wide = number("h"), number("w")
+    height, width = (int(high), int(wide)) if high and wide else size_of(known.file_path)
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise refuse(path, f"{width} x {height} pixels in {where}", f"1 to {MAX_SIDE} on a side", "Correct the file")
     angle = number("camera_angle_x")
     fx = number("fl_x") or (width / (2 * math.tan(angle / 2)) if angle and 0 < angle < math.pi else None)
-    if fx is None or fx <= 0:
-        raise refuse(path, f"no focal length in {where}", "fl_x or camera_angle_x", "Add one of them")
     fy = number("fl_y") or fx
+    if fx is None or fy is None or fx <= 0 or fy <= 0:
+        raise refuse(path, f"no focal length in {where}", "fl_x or camera_angle_x", "Add one of them")
     cx, cy = number("cx"), number("cy")
     matrix = np.asarray(known.transform_matrix) @ OPENGL_FROM_OPENCV
-    _check(matrix[:3, :3], fx, fy, where, path)
+    check_rotation(matrix[:3, :3], where, path)
     if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
         raise refuse(path, f"a projective matrix in {where}", "a last row 0 0 0 1", "Write rigid matrices")
-    centre = (width / 2 if cx is None else cx, height / 2 if cy is None else cy)
-    return Camera(matrix, float(fx), centre, (height, width), name)
+    k1, k2, k3, p1, p2 = (float(number(key) or 0.0) for key in ("k1", "k2", "k3", "p1", "p2"))
+    centre = (width / 2 if cx is None else float(cx), height / 2 if cy is None else float(cy))
+    lens = Lens((float(fx), float(fy)), centre, (height, width), (k1, k2, k3), (p1, p2))
+    return Frame(name, known.file_path, known.mask_path, matrix, lens)
 
 
 def _camera(entry: ViewEntry, path: Path) -> Camera:
@@ -190,7 +246,8 @@ def _camera(entry: ViewEntry, path: Path) -> Camera:
     cam_from_world = np.eye(4)
     cam_from_world[:3, :3], cam_from_world[:3, 3] = pose.R, pose.t
     cam_from_world = flip @ cam_from_world
-    _check(cam_from_world[:3, :3], entry.fx, entry.fy, where, path)
+    _check_square(entry.fx, entry.fy, where, path)
+    check_rotation(cam_from_world[:3, :3], where, path)
     world_from_cam = np.eye(4)
     world_from_cam[:3, :3] = cam_from_world[:3, :3].T
     world_from_cam[:3, 3] = -cam_from_world[:3, :3].T @ cam_from_world[:3, 3]
@@ -199,9 +256,13 @@ def _camera(entry: ViewEntry, path: Path) -> Camera:
     return Camera(world_from_cam, entry.fx, (entry.cx, entry.cy), size, entry.name, azimuth, elevation)
 
 
-def _check(rotation: Float[np.ndarray, "3 3"], fx: float, fy: float, where: str, path: Path) -> None:
+def _check_square(fx: float, fy: float, where: str, path: Path) -> None:
     if abs(fx - fy) > RIGID * fx:
         raise refuse(path, f"fx = {fx:g}, fy = {fy:g} in {where}", "square pixels", "Resample the pictures")
+
+
+def check_rotation(rotation: Float[np.ndarray, "3 3"], where: str, path: Path) -> None:
+    """Refuse a matrix that is no rotation within RIGID."""
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
         fix = "Take scale and mirroring out of the matrix"
         raise refuse(path, f"a matrix that is no rotation in {where}", "an orthonormal right-handed one", fix)

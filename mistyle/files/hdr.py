@@ -44,6 +44,19 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
     return planes
 
 
+def size_of_exr(path: Path) -> tuple[int, int]:
+    """See `read_size` in files/read.py."""
+    import OpenEXR
+
+    try:
+        headers = [part.header for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts]
+    except (RuntimeError, ValueError, TypeError, KeyError) as error:
+        raise refuse(path, f"a header that cannot be read ({str(error)[:120]})", "an OpenEXR file", AGAIN) from error
+    _check(headers, path)
+    width, height = _window(headers[0], "displayWindow")[2:]
+    return height, width
+
+
 def _window(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
     """x0, y0, width and height."""
     low, high = header[name]

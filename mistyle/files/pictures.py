@@ -56,6 +56,16 @@ def read_picture(path: Path) -> Picture:
     return Picture(rgb=rgb, alpha=alpha, path=path, notes=tuple(notes))
 
 
+def size_of_picture(path: Path) -> tuple[int, int]:
+    """See `read_size` in files/read.py."""
+    image, _ = _open(read_bytes(path, MAX_PICTURE_BYTES), str(path))
+    try:
+        turned = image.getexif().get(0x0112, 1) in range(5, 9)
+    except (OSError, ValueError, SyntaxError, KeyError, TypeError):
+        turned = False  # as in `_upright`
+    return (image.width, image.height) if turned else (image.height, image.width)
+
+
 Kind = Literal["colour", "normal", "data"]
 
 

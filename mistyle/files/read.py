@@ -17,7 +17,18 @@ from mistyle.files.bounds import refuse
 from mistyle.files.gltf_check import load_gltf, read_json
 from mistyle.files.pictures import read_picture
 
-__all__ = ["Picture", "load_gltf", "read_exr", "read_hdr", "read_json", "read_mesh", "read_picture"]
+__all__ = [
+    "Picture",
+    "load_gltf",
+    "read_exr",
+    "read_hdr",
+    "read_json",
+    "read_mesh",
+    "read_npy",
+    "read_picture",
+    "read_radiance",
+    "read_size",
+]
 
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 
@@ -82,3 +93,49 @@ def read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
     from mistyle.files.hdr import read_hdr as read
 
     return read(Path(path))
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array of numbers in an .npy file; files of objects and damaged ones are refused."""
+    import io
+
+    from mistyle.files.bounds import read_bytes
+
+    path = Path(path)
+    data = read_bytes(path)
+    try:
+        found = np.load(io.BytesIO(data), allow_pickle=False)
+    except (ValueError, OSError, EOFError, KeyError, TypeError, MemoryError, OverflowError) as error:
+        raise refuse(path, f"no array ({str(error)[:100]})", "an .npy file of numbers", "Write it again") from error
+    if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiub":
+        raise refuse(path, f"{getattr(found, 'dtype', type(found).__name__)}", "an array of numbers", "Write it again")
+    return found
+
+
+def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """An environment map: linear Rec.709 radiance >= 0 of an .exr (its R, G, B) or .hdr, row 0 at the top."""
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind not in (".exr", ".hdr"):
+        raise refuse(path, f"a file ending in '{kind}'", "an .exr or .hdr environment map", "Convert it to one of them")
+    if kind == ".hdr":
+        return read_hdr(path)
+    planes = read_exr(path)
+    if not {"R", "G", "B"} <= set(planes):
+        raise refuse(path, f"channels {', '.join(sorted(planes))[:200]}", "R, G and B", "Write the colours as R, G, B")
+    radiance = np.stack([planes[c] for c in "RGB"], axis=-1)
+    if not np.isfinite(radiance).all() or radiance.min() < 0:
+        raise refuse(path, "radiance that is negative, NaN or infinite", "finite radiance >= 0", "Write it again")
+    return radiance
+
+
+def read_size(path: Path) -> tuple[int, int]:
+    """Height and width of a picture (EXIF orientation applied) or an .exr (display window), from its header alone."""
+    path = Path(path)
+    if not path.is_file():
+        raise refuse(path, "nothing", "a picture", "Check the path")
+    if path.suffix.lower() == ".exr":
+        from mistyle.files.hdr import size_of_exr as size_of
+    else:
+        from mistyle.files.pictures import size_of_picture as size_of
+    return size_of(path)

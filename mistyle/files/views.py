@@ -30,7 +30,7 @@ from mistyle.core.view import View
 from mistyle.files.bounds import beside, refuse
 from mistyle.files.cameras import SPACE, ViewEntry, camera_entry, read_cameras, read_entries, transforms
 from mistyle.files.images import encode_png, write_exr, write_png
-from mistyle.files.read import read_exr, read_json, read_picture
+from mistyle.files.read import read_exr, read_json, read_picture, read_radiance
 from mistyle.files.store import atomic_write, sha256_file
 
 __all__ = ["read_cameras", "read_lights", "read_views", "write_views"]
@@ -106,7 +106,7 @@ def read_lights(path: Path) -> Lights:
     """A `lights.json`, or the one in a folder of views."""
     path = Path(path)
     found = path / "lights.json" if path.is_dir() else path
-    return from_json(read_json(found), str(found))
+    return from_json(read_json(found), str(found), lambda name: read_radiance(beside(found, name)))
 
 
 def read_views(folder: Path) -> list[View]:
@@ -140,7 +140,7 @@ def _read_view(folder: Path, camera: Camera, entry: ViewEntry | None) -> View:
     planes = read_exr(exr) if exr.is_file() else {}
     if planes and not {"R", "G", "B"} <= set(planes):
         raise refuse(exr, f"channels {', '.join(sorted(planes))[:200]}", "R, G and B", "Write the colours as R, G, B")
-    picture = _picture(folder, camera, entry, exr if planes else None)
+    picture = standing_picture(folder, camera, entry, exr if planes else None)
     if picture is None:
         return _view(camera, _stack(planes, "R", "G", "B"), planes.get("A"), planes, exr)
     found = read_picture(picture)
@@ -152,7 +152,7 @@ def _read_view(folder: Path, camera: Camera, entry: ViewEntry | None) -> View:
     return _view(camera, linear if alpha is None else linear * alpha[..., None], alpha, planes, picture)
 
 
-def _picture(folder: Path, camera: Camera, entry: ViewEntry | None, exr: Path | None) -> Path | None:
+def standing_picture(folder: Path, camera: Camera, entry: ViewEntry | None, exr: Path | None) -> Path | None:
     """The picture that stands for the view instead of its EXR, or None when the EXR does."""
     there = [path for ending in PICTURES if (path := folder / f"{camera.name}{ending}").is_file()]
     if entry is not None and entry.png is not None:

@@ -80,10 +80,8 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
     rays = [_directions(camera) for camera in cameras]
     origins = np.repeat(np.stack([camera.position for camera in cameras]), [len(r) for r in rays], axis=0)
     ray = mi.Ray3f(_points(mi.Point3f, origins), _points(mi.Vector3f, np.concatenate(rays)))
-    first = traced.scene.ray_intersect_preliminary(ray, coherent=True)
-    point = first.compute_surface_interaction(ray, mi.RayFlags.All)
+    point, frame = intersect(traced, ray, tangents)
     valid = point.is_valid()
-    frame = point.sh_frame if tangents is None else _tangent_frame(point, first.prim_uv, tangents)
     towards = -ray.d
     u, v = dr.select(valid, point.uv.x, 0), dr.select(valid, 1 - point.uv.y, 0)
     face = dr.select(valid, mi.Int32(point.prim_index), -1)
@@ -103,6 +101,15 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
         towards=towards,
         point=point,
     )
+
+
+def intersect(traced: Tracer, ray: Any, tangents: Float[np.ndarray, "f 3 4"] | None) -> tuple[Any, Any]:
+    """Where rays first meet the mesh: Mitsuba's surface interaction, and the frame of the normal map (see `trace`)."""
+    import mitsuba as mi
+
+    first = traced.scene.ray_intersect_preliminary(ray, coherent=True)
+    point = first.compute_surface_interaction(ray, mi.RayFlags.All)
+    return point, point.sh_frame if tangents is None else _tangent_frame(point, first.prim_uv, tangents)
 
 
 def light(traced: Tracer, surface: Surface, lights: Lights, *, shadows: bool = True) -> Lit:

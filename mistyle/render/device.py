@@ -1,6 +1,8 @@
 """Which Mitsuba variant draws, and on how many threads. Chosen at run time, never by an import."""
 
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 from mistyle.bootstrap import use_llvm
 from mistyle.core.errors import EnvironmentMissing
@@ -43,6 +45,21 @@ def use(variant: str | None = None, threads: int | None = None) -> str:
             raise ValueError(f"threads is {threads}; expected 1 or more")
         dr.set_thread_count(threads)
     return variant
+
+
+@contextmanager
+def file_threads() -> Iterator[None]:
+    """Two threads at least: with one, Mitsuba 3.9 waits for ever when it reads or writes an OpenEXR file."""
+    import drjit as dr
+
+    before = dr.thread_count()
+    if before < 2:
+        dr.set_thread_count(2)
+    try:
+        yield
+    finally:
+        if before < 2:
+            dr.set_thread_count(before)
 
 
 def _first_that_answers(built: list[str]) -> str:

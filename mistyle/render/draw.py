@@ -63,7 +63,9 @@ def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
     traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
     height, width = camera.size
     directions, cosines = _directions(camera)
-    ray = mi.Ray3f(mi.Point3f(*camera.position.tolist()), mi.Vector3f(np.ascontiguousarray(directions.T)))
+    # Opaque: as literals every camera would compile a kernel of its own.
+    origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.position))
+    ray = mi.Ray3f(origin, mi.Vector3f(np.ascontiguousarray(directions.T)))
     hit = traced.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     valid = hit.is_valid()
     face = dr.select(valid, mi.Int32(hit.prim_index), -1)
@@ -175,7 +177,7 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
     import mitsuba as mi
 
     device.use()
-    shapes = scenery.object_shapes(mesh, maps, flip_invalid=True)
+    shapes = scenery.object_shapes(mesh, maps, flip_invalid=True, frame="mikkt")
     for camera in cameras:
         described = scenery.scene_dict(
             mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes

@@ -17,7 +17,7 @@ import re
 from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -27,11 +27,16 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh, weld
 from mistyle.core.paths import scenes
-from mistyle.render import device
+from mistyle.core.tangents import mikktspace
+from mistyle.render import device, plugins
 
 TEMPLATES = ("paper_views", "phase1_directional", "phase2_ambient", "studio", "hdri")
 
-# `mi.traverse` names of the textures that an optimiser moves, for texture set {p}.
+# Reflectance models and frames of normal maps: `plugins.py` has those that Mitsuba lacks.
+Model = Literal["principled", "gltf"]
+Frame = Literal["mitsuba", "mikkt"]
+
+# `mi.traverse` names of the textures that an optimiser moves, for texture set {p}; of every model and frame.
 PARAMETERS = {
     "albedo": "part{p}.bsdf.brdf_0.nested_bsdf.base_color.data",
     "normal": "part{p}.bsdf.brdf_0.normalmap.data",
@@ -47,16 +52,29 @@ def parameters(part: int) -> dict[str, str]:
     return {name: pattern.format(p=part) for name, pattern in PARAMETERS.items()}
 
 
-def mitsuba_mesh(mesh: Mesh, part: int | None, bsdf: Any = None, name: str = "object") -> Any:
+def mitsuba_mesh(
+    mesh: Mesh,
+    part: int | None,
+    bsdf: Any = None,
+    name: str = "object",
+    *,
+    tangents: Float[np.ndarray, "f 3 4"] | None = None,
+) -> Any:
     """A Mitsuba mesh of one texture set (None: of all faces), faces in the order of `Mesh.faces`.
 
     v is flipped here and nowhere else: Mitsuba's texture row 0 is v = 0, ours is v = 1. `bsdf` is a loaded BSDF.
+    `tangents` (of all the mesh's faces, as `mikktspace` makes them) become the attributes that `mistyle_normalmap`
+    reads.
     """
     import drjit as dr
     import mitsuba as mi
 
     device.use()
     welded = weld(mesh, part)
+    attributes: dict[str, Any] = {}
+    if tangents is not None:
+        chosen = tangents if part is None else tangents[mesh.part == part]
+        welded, attributes = plugins.with_tangents(welded, chosen)
     props = mi.Properties()
     if bsdf is not None:
         props["mesh_bsdf"] = bsdf
@@ -71,6 +89,8 @@ def mitsuba_mesh(mesh: Mesh, part: int | None, bsdf: Any = None, name: str = "ob
     values["vertex_texcoords"] = mi.Float(np.ascontiguousarray(uvs.ravel(), np.float32))
     values["faces"] = mi.UInt32(np.ascontiguousarray(welded.faces.ravel(), np.uint32))
     values.update()
+    for key, data in attributes.items():
+        shape.add_attribute(key, data.shape[1], data.ravel())
     dr.eval(values["vertex_positions"], values["vertex_normals"], values["vertex_texcoords"])
     return shape
 
@@ -86,42 +106,65 @@ def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
     return {"type": "bitmap", "data": data, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 
-def bsdf_dict(maps: Maps, flip_invalid: bool = False) -> dict:
-    """twosided(normalmap(principled)) with four textures; the normal texture holds (n + 1) / 2.
+def bsdf_dict(
+    maps: Maps, flip_invalid: bool = False, *, model: Model = "principled", frame: Frame = "mitsuba"
+) -> dict[str, Any]:
+    """twosided(normalmap(model)) with four textures; the normal texture holds (n + 1) / 2.
 
     Shadowing correction is off, as glTF viewers have none. Dielectric index 1.5. A perturbed normal that faces away
     from the camera is black, with no gradient; `flip_invalid` tilts it the other way instead, which pictures want and
-    gradients do not (it depends on the view and mirrors them).
+    gradients do not (it depends on the view and mirrors them). `frame` "mikkt" needs a mesh that carries tangents.
+    The plugins that `model` "gltf" and `frame` "mikkt" name are registered with Mitsuba's current variant.
     """
-    principled = {
-        "type": "principled",
+    textures = {
         "base_color": texture_dict(maps.albedo),
         "roughness": texture_dict(maps.roughness[..., None]),
         "metallic": texture_dict(maps.metallic[..., None]),
         "specular": 0.5,
     }
     normal = {
-        "type": "normalmap",
         "normalmap": texture_dict(maps.normal * 0.5 + 0.5),
         "flip_invalid_normals": flip_invalid,
-        "use_shadowing_function": False,
-        "bsdf": principled,
+        "bsdf": {"type": {"principled": "principled", "gltf": plugins.GLTF}[model], **textures},
     }
+    if frame == "mitsuba":
+        normal = {"type": "normalmap", "use_shadowing_function": False, **normal}
+    elif frame == "mikkt":
+        normal = {"type": plugins.NORMALMAP, **normal}
+    else:
+        raise ValueError(f"frame is {frame!r}; expected 'mitsuba' or 'mikkt'")
+    if model == "gltf" or frame == "mikkt":
+        plugins.register()
     return {"type": "twosided", "bsdf": normal}
 
 
-def object_shapes(mesh: Mesh, maps: Sequence[Maps] | None, flip_invalid: bool = False) -> dict[str, Any]:
-    """One loaded shape per texture set, by name; `maps` None means neutral grey. Reusable in many scenes."""
+def object_shapes(
+    mesh: Mesh,
+    maps: Sequence[Maps] | None,
+    flip_invalid: bool = False,
+    *,
+    model: Model = "principled",
+    frame: Frame = "mitsuba",
+) -> dict[str, Any]:
+    """One loaded shape per texture set, by name; `maps` None means neutral grey. Reusable in many scenes.
+
+    `frame` "mikkt" shades normal maps in MikkTSpace frames, as glTF viewers do.
+    """
     import mitsuba as mi
 
     device.use()
     chosen = list(maps) if maps is not None else [flat_maps(2, NEUTRAL_GREY)] * len(mesh.parts)
     if len(chosen) != len(mesh.parts):
         raise ValueError(f"{len(chosen)} maps came for {len(mesh.parts)} texture sets ({', '.join(mesh.parts)})")
+    tangents = None
+    if frame == "mikkt":
+        welded = weld(mesh)
+        tangents = mikktspace(welded.positions, welded.normals, welded.uvs, welded.faces)
     shapes = {}
     for p in range(len(mesh.parts)):
         if (mesh.part == p).any():
-            shapes[f"part{p}"] = mitsuba_mesh(mesh, p, mi.load_dict(bsdf_dict(chosen[p], flip_invalid)), f"part{p}")
+            bsdf = mi.load_dict(bsdf_dict(chosen[p], flip_invalid, model=model, frame=frame))
+            shapes[f"part{p}"] = mitsuba_mesh(mesh, p, bsdf, f"part{p}", tangents=tangents)
     return shapes
 
 
@@ -200,12 +243,13 @@ def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | 
     if hdri is not None and "hdri" not in declared:
         raise InputRefused(f'{path}: takes no environment map; it needs <default name="hdri" value="..."/>.')
     with TemporaryDirectory() as folder:
-        if hdri is not None:
-            given["hdri"] = str(Path(folder, "hdri.exr"))
-            mi.Bitmap(np.ascontiguousarray(hdri, np.float32)).write(given["hdri"])
         try:
-            # Merging meshes, an optimisation of the loader, would lose their ids.
-            scene = mi.load_file(str(path), optimize=False, **given)
+            with device.file_threads():
+                if hdri is not None:
+                    given["hdri"] = str(Path(folder, "hdri.exr"))
+                    mi.Bitmap(np.ascontiguousarray(hdri, np.float32)).write(given["hdri"])
+                # Merging meshes, an optimisation of the loader, would lose their ids.
+                scene = mi.load_file(str(path), optimize=False, **given)
         except RuntimeError as error:
             raise InputRefused(f"{path}: Mitsuba cannot load this scene. {error}") from error
     if not isinstance(scene, mi.Scene) or all(shape.id() != "object" for shape in scene.shapes()):
@@ -228,12 +272,14 @@ def scene_dict(
     backdrop: bool = True,
     integrator: dict | None = None,
     shapes: dict[str, Any] | None = None,
+    model: Model = "principled",
+    frame: Frame = "mitsuba",
 ) -> dict:
     """The scene as a dictionary for `mi.load_dict`, with a sensor when a camera is given.
 
-    `maps` None: neutral grey. `shapes` (of `object_shapes`) saves building the object again; mesh and maps are then
-    not looked at, except for the floor's height. `integrator` replaces the template's. Emitters with ids "camera_…"
-    are placed for `camera` (without one they keep the file's places).
+    `maps` None: neutral grey. `shapes` (of `object_shapes`) saves building the object again; mesh, maps, `model` and
+    `frame` are then not looked at, except for the floor's height. `integrator` replaces the template's. Emitters with
+    ids "camera_…" are placed for `camera` (without one they keep the file's places).
     """
     import mitsuba as mi
 
@@ -258,7 +304,7 @@ def scene_dict(
             values["to_world"] = to_world
             values.update()
         result["sensor"] = sensor_dict(camera, spp, seed)
-    result.update(shapes if shapes is not None else object_shapes(mesh, maps))
+    result.update(shapes if shapes is not None else object_shapes(mesh, maps, model=model, frame=frame))
     return result
 
 

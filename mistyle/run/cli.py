@@ -8,22 +8,16 @@ import argparse
 import json
 import signal
 import sys
-import textwrap
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from mistyle import __version__
 from mistyle.core.errors import MistyleError, Stopped, UsageError
+from mistyle.run.cli_fit import add_fit
+from mistyle.run.options import add_job_options, add_mesh_options, examples, said_settings
 
 Command = Callable[[argparse.Namespace], int]
-
-
-def _examples(text: str) -> dict[str, Any]:
-    return {
-        "epilog": "examples:\n" + textwrap.indent(textwrap.dedent(text).strip(), "  "),
-        "formatter_class": argparse.RawDescriptionHelpFormatter,
-    }
 
 
 def parser() -> argparse.ArgumentParser:
@@ -31,13 +25,14 @@ def parser() -> argparse.ArgumentParser:
     top = argparse.ArgumentParser(
         prog="mistyle",
         description="A mesh and one style picture in; the same mesh with stylized, physically based textures out.",
-        **_examples(
+        **examples(
             """
             python3 -m mistyle demo                                 see it work: mesh, style and report made here
             mistyle stylize bunny.obj starry_night.jpg -o out/      the main job
             mistyle stylize chair.glb wave.jpg -o out/ --preset draft
             mistyle render bunny.obj -o views/                      the 16 views of the paper, with depth and normals
             mistyle bake bunny.obj views/ -o baked/                 edited views back onto the texture
+            mistyle fit chair.glb photographs/ -o fitted/           albedo, normal and roughness from pictures
             mistyle doctor                                          what this machine has, what is missing
             """
         ),
@@ -48,6 +43,7 @@ def parser() -> argparse.ArgumentParser:
     _add_demo(verbs)
     _add_render(verbs)
     _add_bake(verbs)
+    add_fit(verbs)
     doctor = verbs.add_parser(
         "doctor", help="what was found on this machine, what is missing, and the command that fixes it"
     )
@@ -57,38 +53,6 @@ def parser() -> argparse.ArgumentParser:
     test.add_argument("arguments", nargs="*", help="passed on to pytest")
     test.set_defaults(command=_test)
     return top
-
-
-def _add_job_options(verb: argparse.ArgumentParser) -> None:
-    """Options that every job has; None means: not said here."""
-    verb.add_argument(
-        "--preset",
-        choices=["draft", "standard", "paper"],
-        help="draft: about a minute; standard (default); paper: the paper's own counts",
-    )
-    verb.add_argument(
-        "--config", type=Path, metavar="JOB.toml", help="settings from a file, as --print-config prints them"
-    )
-    verb.add_argument(
-        "--set",
-        action="append",
-        default=[],
-        metavar="KEY=VALUE",
-        help="any setting by its dotted name, e.g. --set fit.refine=off",
-    )
-    verb.add_argument("--seed", type=int, help="every random choice follows from it (default 0)")
-    verb.add_argument("--threads", type=int, help="threads to use; the result depends on it (default: all cores)")
-    verb.add_argument("--json", action="store_true", help="one JSON object on stdout, logs on stderr")
-    verb.add_argument("--print-config", action="store_true", help="print every setting as TOML and stop")
-
-
-def _add_mesh_options(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--uv",
-        choices=["auto", "keep", "new"],
-        help="authored UVs: keep, replace, or (auto) replace only where unusable",
-    )
-    verb.add_argument("--up", choices=["y", "z"], help="the axis of the mesh file that points up (default y)")
 
 
 def _add_view_options(verb: argparse.ArgumentParser) -> None:
@@ -127,7 +91,7 @@ def _add_stylize(verbs: Any) -> None:
     verb = verbs.add_parser(
         "stylize",
         help="mesh + style picture -> stylized asset, textures and report",
-        **_examples(
+        **examples(
             """
             mistyle stylize bunny.obj starry_night.jpg -o out/
             mistyle stylize chair.glb great_wave.jpg -o out/ --preset draft --atlas 1024
@@ -140,8 +104,8 @@ def _add_stylize(verbs: Any) -> None:
     verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help=".obj .ply .stl .off .glb .gltf")
     verb.add_argument("style", type=Path, nargs="?", metavar="STYLE", help="any picture")
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; the same command again goes on there")
-    _add_job_options(verb)
-    _add_mesh_options(verb)
+    add_job_options(verb)
+    add_mesh_options(verb)
     _add_view_options(verb)
     _add_style_options(verb)
     verb.set_defaults(command=_stylize)
@@ -150,8 +114,8 @@ def _add_stylize(verbs: Any) -> None:
 def _add_demo(verbs: Any) -> None:
     verb = verbs.add_parser("demo", help="run the main job on a mesh and a painting that come with mistyle")
     verb.add_argument("-o", "--out", type=Path, default=Path("mistyle-demo"), help="run folder (default mistyle-demo)")
-    _add_job_options(verb)
-    _add_mesh_options(verb)
+    add_job_options(verb)
+    add_mesh_options(verb)
     _add_view_options(verb)
     _add_style_options(verb)
     verb.set_defaults(command=_demo)
@@ -161,7 +125,7 @@ def _add_render(verbs: Any) -> None:
     verb = verbs.add_parser(
         "render",
         help="render a mesh from a rig of cameras: EXR layers, PNG, camera and light files",
-        **_examples(
+        **examples(
             """
             mistyle render bunny.obj -o views/
             mistyle render bunny.obj -o turn/ --rig turntable --resolution 512 --spp 64
@@ -171,8 +135,8 @@ def _add_render(verbs: Any) -> None:
     )
     verb.add_argument("mesh", type=Path, metavar="MESH")
     verb.add_argument("-o", "--out", type=Path, required=True, metavar="DIR")
-    _add_job_options(verb)
-    _add_mesh_options(verb)
+    add_job_options(verb)
+    add_mesh_options(verb)
     _add_view_options(verb)
     verb.set_defaults(command=_render)
 
@@ -181,7 +145,7 @@ def _add_bake(verbs: Any) -> None:
     verb = verbs.add_parser(
         "bake",
         help="project pictures of known cameras onto the mesh's texture",
-        **_examples(
+        **examples(
             """
             mistyle bake bunny.obj views/ -o baked/
             mistyle bake bunny.obj edited_views/ -o baked/ --atlas 4096
@@ -193,8 +157,8 @@ def _add_bake(verbs: Any) -> None:
     verb.add_argument("-o", "--out", type=Path, required=True, metavar="OUT")
     verb.add_argument("--atlas", type=int, metavar="N", help="texture size")
     verb.add_argument("--name", help="name of the asset (default: the mesh's)")
-    _add_job_options(verb)
-    _add_mesh_options(verb)
+    add_job_options(verb)
+    add_mesh_options(verb)
     verb.set_defaults(command=_bake)
 
 
@@ -219,19 +183,9 @@ OPTIONS = {
 
 def _settings(options: argparse.Namespace, preset: str | None = None) -> Any:
     """The resolved settings of a command."""
-    from mistyle.run.settings import assignments, merge, resolve
+    from mistyle.run.settings import merge, resolve
 
-    said: dict[str, Any] = {}
-    for option, key in OPTIONS.items():
-        value = getattr(options, option, None)
-        if value is not None:
-            leaf: Any = str(value) if isinstance(value, Path) else value
-            for name in reversed(key.split(".")):
-                leaf = {name: leaf}
-            said = merge(said, leaf)
-    said = merge(said, _rig(options))
-    said = merge(said, assignments(options.set, "--set"))
-    return resolve(options.preset or preset, options.config, said)
+    return resolve(options.preset or preset, options.config, merge(_rig(options), said_settings(options, OPTIONS)))
 
 
 def _rig(options: argparse.Namespace) -> dict[str, Any]:

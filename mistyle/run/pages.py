@@ -15,7 +15,6 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
-from mistyle.run.settings import Settings
 from mistyle.run.stages import STAGES
 from mistyle.run.summary import MEANINGS, figures, versions
 
@@ -48,12 +47,12 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         facts=facts(made),
         notes=tuple(Note(text) for text in (*made.asset.source.notes, *made.style.notes, *made.fit.notes)),
         steps=steps(made, Shot(before, "as baked"), Shot(beauty, "after fit and repair")),
-        maps=map_sets(made),
+        maps=tuple(MapSet(n, map_shots(m)) for n, m in zip(made.asset.mesh.parts, made.repaired.maps, strict=True)),
         timings=tuple(Timing(STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
         figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k.split(".")[-1]]) for k, v in figures(made).items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),
-        files=files(made),
+        files=file_list(made.folder, made.job.name),
     )
     write_report(folder / "index.html", page)
 
@@ -71,7 +70,7 @@ def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
     return np.clip(np.concatenate(row[:-1], axis=1), 0, 1)
 
 
-def frames(asset: Asset, maps: Sequence[Maps], settings: Settings, report: Callable[[float], None]) -> list[np.ndarray]:
+def frames(asset: Asset, maps: Sequence[Maps], settings: Any, report: Callable[[float], None]) -> list[np.ndarray]:
     """Pictures all round the asset, transparent where nothing is, sRGB."""
     chosen, size = settings.report, (settings.report.resolution, settings.report.resolution)
     cameras = [
@@ -80,7 +79,7 @@ def frames(asset: Asset, maps: Sequence[Maps], settings: Settings, report: Calla
     return [shown(picture) for picture in render(asset, maps, cameras, settings, report=report)]
 
 
-def close_up(settings: Settings) -> Camera:
+def close_up(settings: Any) -> Camera:
     """The camera of the picture that stands for the asset."""
     size = (settings.report.resolution * 2, settings.report.resolution * 2)
     return orbit(30, ELEVATION, distance=4, fov=30, size=size)
@@ -90,7 +89,7 @@ def render(
     asset: Asset,
     maps: Sequence[Maps],
     cameras: Sequence[Camera],
-    settings: Settings,
+    settings: Any,
     report: Callable[[float], None] = lambda done: None,
     backdrop: bool = False,
     finer: int = 1,
@@ -202,26 +201,23 @@ def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
     return (*kept, *((name, f"{a:.4g} → {b:.4g}") for name, (a, b) in fit.figures.items()))
 
 
-def map_sets(made: Any) -> tuple[MapSet, ...]:
-    """The maps of every texture set, as written beside the asset."""
-    sets = []
-    for name, maps in zip(made.asset.mesh.parts, made.repaired.maps, strict=True):
-        shots = (
-            Shot(srgb_from_linear(maps.albedo), "albedo", "sRGB"),
-            Shot(maps.normal * 0.5 + 0.5, "normal", "tangent space, +Y, MikkTSpace"),
-            Shot(maps.roughness, "roughness", "linear"),
-            Shot(maps.metallic, "metallic", "linear"),
-        )
-        sets.append(MapSet(name, shots))
-    return tuple(sets)
+def map_shots(maps: Maps) -> tuple[Shot, ...]:
+    """The maps of a texture set, as written beside the asset."""
+    return (
+        Shot(srgb_from_linear(maps.albedo), "albedo", "sRGB"),
+        Shot(maps.normal * 0.5 + 0.5, "normal", "tangent space, +Y, MikkTSpace"),
+        Shot(maps.roughness, "roughness", "linear"),
+        Shot(maps.metallic, "metallic", "linear"),
+    )
 
 
-def setting_groups(settings: Settings) -> dict[str, tuple[Setting, ...]]:
+def setting_groups(settings: BaseModel) -> dict[str, tuple[Setting, ...]]:
     """Every setting with its meaning, by stage."""
     groups: dict[str, tuple[Setting, ...]] = {}
     alone: list[Setting] = []
-    default = Settings()
-    for name in Settings.model_fields:
+    root = type(settings)
+    default = root()
+    for name in root.model_fields:
         value = getattr(settings, name)
         if isinstance(value, BaseModel):
             groups[name] = tuple(
@@ -234,14 +230,14 @@ def setting_groups(settings: Settings) -> dict[str, tuple[Setting, ...]]:
                 for k, f in type(value).model_fields.items()
             )
         else:
-            meaning = Settings.model_fields[name].description or ""
+            meaning = root.model_fields[name].description or ""
             alone.append(Setting(name, str(value), meaning, value != getattr(default, name)))
     return {"job": tuple(alone)} | groups
 
 
-def files(made: Any) -> tuple[File, ...]:
+def file_list(folder: Path, name: str) -> tuple[File, ...]:
     """The files of the asset as its own list names them."""
-    listed = json.loads((made.folder / f"{made.job.name}.json").read_text(encoding="utf-8"))["files"]
+    listed = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))["files"]
     return tuple(
         File(
             f"asset/{entry['file']}",

@@ -19,7 +19,7 @@ from mistyle.core.mesh import face_areas
 from mistyle.core.view import View
 from mistyle.run.inputs import input_files
 from mistyle.run.progress import Progress, Report
-from mistyle.run.settings import Settings, thread_count
+from mistyle.run.settings import ReadSettings, Settings, thread_count
 from mistyle.run.stages import Job, Run
 
 
@@ -63,8 +63,11 @@ class Made:
     folder: Path
 
 
-def start_engines(settings: Settings) -> str:
-    """Choose the Mitsuba variant and set the thread counts of Dr.Jit, torch and OpenCV; returns the variant."""
+def start_engines(settings: Any) -> str:
+    """Choose the Mitsuba variant and set the thread counts of Dr.Jit, torch and OpenCV; returns the variant.
+
+    `settings` is the root record of any kind of job: its `threads` and `variant` count.
+    """
     import cv2
     import torch
 
@@ -103,7 +106,9 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
 
 def _stages(run: Run, files: Sequence[Path], style: Picture) -> Made:
     s, seed = run.job.settings, run.job.settings.seed
-    asset = run.record("mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s, r))
+    asset = run.record(
+        "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)
+    )
     atlas = run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
     views = views_stage(run, asset, atlas)
     solution = run.record(
@@ -123,12 +128,10 @@ def _stages(run: Run, files: Sequence[Path], style: Picture) -> Made:
     return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder)
 
 
-def read(path: Path, settings: Settings, report: Report) -> Asset:
-    """The mesh, normalised and with usable UVs."""
+def read(path: Path, chosen: ReadSettings, size: int, report: Report) -> Asset:
+    """The mesh, normalised and with UVs usable for an atlas of `size`."""
     from mistyle.files.read import read_mesh
 
-    chosen = settings.read
-    size = settings.atlas.size
     return read_mesh(path, uv=chosen.uv, up=chosen.up, max_faces=chosen.max_faces, size=size, progress=report)
 
 
@@ -173,7 +176,8 @@ def draw(folder: Path, asset: Asset, maps: Sequence[Maps], settings: Settings, r
 
     template = settings.draw.scene or "paper_views"
     views = draw_views(asset.mesh, maps, cameras_of(settings), template, settings.draw.spp, settings.seed, report)
-    write_views(folder, views, lights("phase1"), paper_files=settings.draw.paper_files)
+    # What lit these very views, so that they can be fitted to.
+    write_views(folder, views, lights(str(template)), paper_files=settings.draw.paper_files)
 
 
 def paint(asset: Asset, style: Picture, settings: Settings, report: Report) -> Any:
@@ -316,7 +320,10 @@ def write_asset(folder: Path, job: Job, asset: Asset, atlas: Atlas, maps: Sequen
     """The files that other programs open."""
     from mistyle.stages.export import write_asset as write
 
-    occlusion = [ambient(asset, part, job.settings, report) for part in range(len(asset.mesh.parts))]
+    occlusion = [
+        ambient(asset, part, job.settings.atlas.size, job.settings.seed, report)
+        for part in range(len(asset.mesh.parts))
+    ]
     from mistyle.stages.texels import pad_maps
 
     padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(maps, atlas.texels, strict=True)]
@@ -324,17 +331,16 @@ def write_asset(folder: Path, job: Job, asset: Asset, atlas: Atlas, maps: Sequen
     write(folder, job.name, asset, padded, occlusion, atlas.texels, provenance=provenance)
 
 
-def ambient(asset: Asset, part: int, settings: Settings, report: Report) -> np.ndarray:
+def ambient(asset: Asset, part: int, size: int, seed: int, report: Report) -> np.ndarray:
     """Ambient occlusion of a texture set, computed at a quarter of the atlas: it has no finer detail than the mesh."""
     from mistyle.core.image import resize
     from mistyle.render.occlusion import ambient_occlusion
     from mistyle.stages.texels import pad, rasterise
 
-    size = settings.atlas.size
     coarse = rasterise(asset.mesh, part, max(size // 4, 64))
     values = np.ones(coarse.covered.shape, np.float32)
     at = coarse.covered
-    values[at] = ambient_occlusion(asset.mesh, coarse.position[at], coarse.normal[at], seed=settings.seed)
+    values[at] = ambient_occlusion(asset.mesh, coarse.position[at], coarse.normal[at], seed=seed)
     report((part + 1) / len(asset.mesh.parts))
     return np.clip(resize(pad(values, coarse, 8), (size, size)), 0, 1)
 
@@ -346,7 +352,7 @@ def render_views(mesh: Path, out: Path, settings: Settings, progress: Progress) 
     input_files(mesh)
     start_engines(settings)
     with progress.stage("mesh", "read the mesh") as report:
-        asset = read(mesh, settings, report)
+        asset = read(mesh, settings.read, settings.atlas.size, report)
         atlas = lay_out(asset, settings, lambda done: None)
     with progress.stage("views", "render the views") as report:
         atomic_folder(out, lambda folder: draw(folder, asset, atlas.start, settings, report))
@@ -362,7 +368,7 @@ def bake_views(mesh: Path, views: Path, out: Path, settings: Settings, name: str
     input_files(mesh)
     start_engines(settings)
     with progress.stage("mesh", "read the mesh") as report:
-        asset = read(mesh, settings, report)
+        asset = read(mesh, settings.read, settings.atlas.size, report)
         atlas = lay_out(asset, settings, lambda done: None)
     seen_by = with_geometry(asset, read_views(views))
     maps = []

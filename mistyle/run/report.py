@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from mistyle.files.store import atomic_write
+from mistyle.run.charts import Chart, svg
 from mistyle.run.report_pictures import Sizes, accents, palette, webp
 
 Pixels: TypeAlias = (
@@ -53,7 +54,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Step:
-    """One stage of the job: a heading, a sentence or two, comparisons and pictures, and a few facts.
+    """One stage of the job: a heading, a sentence or two, comparisons, charts and pictures, and a few facts.
 
     `section` names the paper's section; `columns` is how many pictures stand in a row on a wide screen.
     """
@@ -64,6 +65,7 @@ class Step:
     pairs: tuple[Pair, ...] = ()
     shots: tuple[Shot, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
+    charts: tuple[Chart, ...] = ()
     columns: int = 4
 
 
@@ -128,6 +130,7 @@ class Report:
 
     `turntable` and `plain` are frames of equal size and number all round the stylized and the original asset, evenly
     spaced, transparent where nothing is; the first is what is seen first. `made` says when and with what in one line.
+    The title reads "mesh relation style".
     """
 
     title: str
@@ -146,6 +149,7 @@ class Report:
     settings: Mapping[str, tuple[Setting, ...]] = field(default_factory=dict)
     versions: tuple[tuple[str, str], ...] = ()
     files: tuple[File, ...] = ()
+    relation: str = "in the style of"
 
 
 def write_report(path: Path, report: Report) -> None:
@@ -176,7 +180,8 @@ def render(report: Report, scale: float = 1.0) -> str:
     env = jinja2.Environment(
         loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    env.filters |= {"seconds": seconds, "size": size, "slug": slug}
+    # The chart's own texts are escaped by svg().
+    env.filters |= {"seconds": seconds, "size": size, "slug": slug, "svg": lambda chart: Markup(svg(chart))}
     script = (here / "report.js").read_text(encoding="utf-8")
     swatches = palette(report.painting.picture)
     return env.get_template("report.html.j2").render(

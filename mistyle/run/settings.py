@@ -1,5 +1,7 @@
 """All settings of a job in one place: the root record only lists one record per stage, and the presets.
 
+Other kinds of job have a root record of their own (run/material_settings.py) and are resolved by the same functions.
+
 Precedence, lowest first: defaults, preset, `--config FILE`, the environment (MISTYLE_VGG, MISTYLE_SET), command line.
 """
 
@@ -8,7 +10,7 @@ import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -99,7 +101,10 @@ PRESETS: dict[str, dict[str, Any]] = {
 PRESETS["demo"] = PRESETS["draft"] | {"surface": {"samples": 150_000}, "atlas": {"size": 2048}}
 
 
-def thread_count(settings: Settings) -> int:
+Root = TypeVar("Root", bound=BaseModel)
+
+
+def thread_count(settings: Any) -> int:
     """The threads a job uses: as set, else the cores that this process may run on."""
     if settings.threads:
         return settings.threads
@@ -132,7 +137,7 @@ def assignments(pairs: Iterable[str], origin: str) -> dict[str, Any]:
     return result
 
 
-def known_keys(model: type[BaseModel] = Settings, prefix: str = "") -> list[str]:
+def known_keys(model: type[BaseModel], prefix: str = "") -> list[str]:
     """Every dotted setting, leaves only."""
     keys: list[str] = []
     for name, field in model.model_fields.items():
@@ -144,19 +149,17 @@ def known_keys(model: type[BaseModel] = Settings, prefix: str = "") -> list[str]
     return keys
 
 
-def validate(values: Mapping[str, Any], origin: str) -> Settings:
+def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
     """Settings from nested values; refuses an unknown key with the nearest known one, a wrong value with its path."""
     try:
-        return Settings.model_validate(dict(values))
+        return root.model_validate(dict(values))
     except ValidationError as error:
         first = error.errors()[0]
         path = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
-            near = difflib.get_close_matches(path, known_keys(), n=1, cutoff=0.5)
+            near = difflib.get_close_matches(path, known_keys(root), n=1, cutoff=0.5)
             hint = f"; did you mean '{near[0]}'?" if near else ""
-            raise UsageError(
-                f"{origin}: there is no setting '{path}'{hint} (mistyle stylize --print-config lists all)"
-            ) from None
+            raise UsageError(f"{origin}: there is no setting '{path}'{hint} (--print-config lists all)") from None
         raise UsageError(f"{origin}: {path} = {first['input']!r}: {first['msg'].lower()}") from None
 
 
@@ -175,7 +178,9 @@ def resolve(
     config: Path | None,
     command_line: Mapping[str, Any],
     environment: Mapping[str, str] = os.environ,
-) -> Settings:
+    root: type[Root] = Settings,
+    presets: Mapping[str, Mapping[str, Any]] = PRESETS,
+) -> Root:
     """The settings of a job after every layer; each layer is checked alone so that the message names the guilty one."""
     layers: list[tuple[str, Mapping[str, Any]]] = []
     if config is not None:
@@ -184,21 +189,21 @@ def resolve(
         values.pop("preset", None)
         layers.append((str(config), values))
     preset = preset or "standard"
-    if preset not in PRESETS:
-        raise UsageError(f"there is no preset '{preset}'; choose one of {', '.join(PRESETS)}")
-    if environment.get("MISTYLE_VGG"):
+    if preset not in presets:
+        raise UsageError(f"there is no preset '{preset}'; choose one of {', '.join(presets)}")
+    if environment.get("MISTYLE_VGG") and "fit" in root.model_fields:
         layers.append(("MISTYLE_VGG", {"fit": {"features": environment["MISTYLE_VGG"]}}))
     variable = environment.get("MISTYLE_SET", "")
     layers.append(("MISTYLE_SET", assignments(filter(None, map(str.strip, variable.split(";"))), "MISTYLE_SET")))
     layers.append(("command line", command_line))
-    values: Mapping[str, Any] = PRESETS[preset]
+    values: Mapping[str, Any] = presets[preset]
     for origin, layer in layers:
         values = merge(values, layer)
-        validate(values, origin)
-    return validate(values, "settings")
+        validate(values, origin, root)
+    return validate(values, "settings", root)
 
 
-def as_toml(settings: Settings) -> str:
+def as_toml(settings: BaseModel) -> str:
     """The settings as a TOML file that `--config` reads back."""
     lines: list[str] = []
 

@@ -1,9 +1,9 @@
 """The stages of a run and how each is kept: under a key made of everything it depends on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from mistyle.core.errors import UsageError
 from mistyle.core.paths import PACKAGE
@@ -24,8 +24,20 @@ STAGES = {
     "asset": "write the asset",
     "report": "write the report",
 }
+# Those of `mistyle fit`.
+MATERIAL_STAGES = {
+    "mesh": "read the mesh",
+    "texels": "lay out the texture",
+    "cameras": "place the cameras",
+    "light": "find the light",
+    "recover": "fit the material",
+    "measure": "measure the fit",
+    "asset": "write the asset",
+    "scene": "write the Mitsuba scene",
+    "report": "write the report",
+}
 # These stand in the run folder itself, for people; the others in work/.
-VISIBLE = ("views", "stylized", "asset", "report")
+VISIBLE = ("views", "stylized", "asset", "scene", "report")
 
 
 @dataclass(frozen=True)
@@ -40,13 +52,30 @@ class Job:
     redo_from: str | None = None
 
 
-class Run:
+@runtime_checkable
+class Kept(Protocol):
+    """What a run must know of any kind of job: where it works, and what its keys and stages hang on."""
+
+    @property
+    def out(self) -> Path: ...
+
+    @property
+    def settings(self) -> Any: ...
+
+    @property
+    def redo_from(self) -> str | None: ...
+
+
+Work = TypeVar("Work", bound=Kept)
+
+
+class Run(Generic[Work]):
     """Keeps the stages of one run folder; a class because it holds the folder's locks until it is closed."""
 
-    def __init__(self, job: Job, progress: Progress) -> None:
-        if job.redo_from is not None and job.redo_from not in STAGES:
-            raise UsageError(f"--from {job.redo_from}: there is no such stage; choose one of {', '.join(STAGES)}")
-        self.job, self.progress = job, progress
+    def __init__(self, job: Work, progress: Progress, stages: Mapping[str, str] = STAGES) -> None:
+        if job.redo_from is not None and job.redo_from not in stages:
+            raise UsageError(f"--from {job.redo_from}: there is no such stage; choose one of {', '.join(stages)}")
+        self.job, self.progress, self.stages = job, progress, stages
         self.redoing = False
         self.keys: dict[str, str] = {}
         # A changed program or thread count may change bytes: both belong to every key.
@@ -74,13 +103,13 @@ class Run:
         self.redoing = self.redoing or name == self.job.redo_from
         found = None if self.redoing else keeper.get(name, key)
         if found is not None:
-            self.progress.skip(name, STAGES[name])
+            self.progress.skip(name, self.stages[name])
             return found
 
         def fill(folder: Path) -> None:
             write(folder, report)
 
-        with self.progress.stage(name, STAGES[name]) as report:
+        with self.progress.stage(name, self.stages[name]) as report:
             return keeper.put(name, key, fill)
 
     def record(self, name: str, after: Sequence[str], inputs: Any, make: Callable[[Report], Any]) -> Any:

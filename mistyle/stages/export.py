@@ -26,6 +26,7 @@ from mistyle.files.gltf_alpha import Cutout, cutouts
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.store import atomic_folder, atomic_write, carry_over, sha256_file
 from mistyle.files.textures import Pictures, encode_pictures, normal_colours, orm_colours, part_stems, safe_name
+from mistyle.stages.texels import corner_weights
 
 NORMAL_CONVENTION = {
     "space": "tangent",
@@ -162,29 +163,11 @@ def _alphas(asset: Asset, texels: Sequence[Texels]) -> list[Float[np.ndarray, "h
 
 def _carried(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, "h w"]:
     """Sample the file's alpha at every covered texel's place in the file's own UVs; around islands the nearest one."""
-    rows, columns = np.nonzero(texels.covered)
-    face = texels.face[rows, columns]
+    rows, columns, face, weights = corner_weights(asset.mesh, texels)
     height, width = texels.covered.shape
-    point = np.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], axis=1)
-    uvs = asset.mesh.corner_uvs[face].astype(np.float64)
-    # UVs count modulo 1: a face that crosses the border paints texels on the other side of the square.
-    point += np.rint(uvs.mean(axis=1) - point)
-    weights = _barycentric(uvs, point)
     place = (weights[..., None] * cutout.uvs[face]).sum(axis=1)
     size = np.array(cutout.alpha.shape[::-1])
     px = np.stack([place[:, 0], 1 - place[:, 1]], axis=1) * size
     alpha = np.ones((height, width), np.float32)
     alpha[rows, columns] = bilinear(cutout.alpha, px, edge="repeat")
     return nearest_fill(alpha, texels.covered)
-
-
-def _barycentric(uvs: Float[np.ndarray, "n 3 2"], point: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
-    """Weights of the corners, clipped to the face (a texel at its rim lies outside by less than its own size)."""
-    a, b, c = uvs[:, 0], uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
-    p = point - a
-    area = b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]
-    safe = np.where(area == 0, 1, area)
-    s = (p[:, 0] * c[:, 1] - p[:, 1] * c[:, 0]) / safe
-    t = (b[:, 0] * p[:, 1] - b[:, 1] * p[:, 0]) / safe
-    weights = np.clip(np.stack([1 - s - t, s, t], axis=1), 0, 1)
-    return weights / weights.sum(axis=1, keepdims=True)

@@ -172,6 +172,32 @@ def _weights(frame, face, x, y, wraps, size) -> list[Float[np.ndarray, " n"]]:
     return [(1 - l1 - l2).astype(np.float32), l1.astype(np.float32), l2.astype(np.float32)]
 
 
+def corner_weights(
+    mesh: Mesh, texels: Texels
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """Row, column, face and barycentric weights of every covered texel; weights at a sliver's rim are clipped to it."""
+    rows, columns = np.nonzero(texels.covered)
+    face = texels.face[rows, columns]
+    height, width = texels.covered.shape
+    point = np.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], axis=1)
+    uvs = mesh.corner_uvs[face].astype(np.float64)
+    # UVs count modulo 1: a face that crosses the border paints texels on the other side of the square.
+    point += np.rint(uvs.mean(axis=1) - point)
+    return rows, columns, face, _barycentric(uvs, point)
+
+
+def _barycentric(uvs: Float[np.ndarray, "n 3 2"], point: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Weights of the corners, clipped to the face (a texel at its rim lies outside by less than its own size)."""
+    a, b, c = uvs[:, 0], uvs[:, 1] - uvs[:, 0], uvs[:, 2] - uvs[:, 0]
+    p = point - a
+    area = b[:, 0] * c[:, 1] - b[:, 1] * c[:, 0]
+    safe = np.where(area == 0, 1, area)
+    s = (p[:, 0] * c[:, 1] - p[:, 1] * c[:, 0]) / safe
+    t = (b[:, 0] * p[:, 1] - b[:, 1] * p[:, 0]) / safe
+    weights = np.clip(np.stack([1 - s - t, s, t], axis=1), 0, 1)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
 def start_maps(material: Material, texels: Texels, size: int, metallic: Literal["keep", "zero"] = "keep") -> Maps:
     """The material's own maps at the atlas's size, factors applied; flat where it has none (paper 4.2 starts there).
 

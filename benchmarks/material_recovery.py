@@ -1,0 +1,252 @@
+"""How well materials are recovered from pictures, beside the usual ways, on the same pictures and in the same time.
+
+    python -m benchmarks.material_recovery --out FOLDER [--json FILE] [--assets avocado suzanne ...] [--mesh FILE.glb]
+
+Every object stands twice: with its own maps, and ("_strong") with synthetic ones that no constant comes near. What is
+rendered, at which resolution and with which texels: `recovery_truth.py`, `recovery_pictures.py`. Fitted from grey, with
+metallic unknown; 16 evenly spread views x 3 camera-fixed lights one at a time, and ("_paper") the paper's own rig with
+its lights together. Texel figures are over the surface that at least three cameras see, weighted by area;
+"confident_" ones over the 95 % of it that the fit trusts most. Relit: four lights of no reference, cameras between
+theirs, mean over the pictures.
+
+`figures` are ours. `baselines`: "constant" is the best map of one value; "together" is ours from the same pictures
+summed by view (all lights on); "naive" and "naive_pyramid" are `naive_fit.py` for as many seconds as ours took.
+`gain_over_naive_db` is relight_psnr_l minus that of the naive loop.
+"""
+
+import argparse
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory, gettempdir
+
+import numpy as np
+
+from benchmarks import recovery_pictures as drawing
+from benchmarks import recovery_report as report
+from benchmarks.recovery_ours import ours
+from benchmarks.recovery_pictures import Shot
+from benchmarks.recovery_rivals import naive, write_job
+from benchmarks.recovery_truth import ASSETS, UV, Truth, data_folder, find_asset, seen, truth
+from mistyle.core.errors import MistyleError, UsageError
+from mistyle.core.maps import Maps
+from mistyle.measure.material_metrics import best_constant, confident, map_errors, mean_errors, relight_errors
+from mistyle.render.scene import Frame
+
+LEAST_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table to make: an object, its maps, where the pictures are taken from."""
+
+    name: str
+    file: Path
+    uv: UV
+    strong: bool
+    paper: bool = False
+
+
+def main(argv: list[str] | None = None) -> None:
+    options = parse(argv)
+    if options.stanford_orb or options.tensoir:
+        published(options)
+        return
+    figures: dict[str, float] = {}
+    baselines: dict[str, float] = {}
+    notes: list[str] = []
+    for row in rows(options):
+        methods, said = measure(row, options)
+        name = label(row)
+        for method, values in methods.items():
+            target = figures if method == "ours" else baselines
+            prefix = name if method == "ours" else f"{name}.{method}"
+            target.update({f"{prefix}.{key}": value for key, value in values.items()})
+        quiet = str(options.json) == "-"
+        notes.extend(f"{name}: {line}" for line in said)
+        if not quiet:
+            print(report.table(name, methods))
+            print("\n".join(f"  {line}" for line in said))
+            if not row.paper and not options.quick:
+                print("\n".join(report.verdicts(methods, row.strong)))
+            print(flush=True)
+        # After every row, so that a run that is stopped leaves what it had.
+        if not quiet:
+            report.write(figures, baselines, notes, options.json)
+    if str(options.json) == "-":
+        report.write(figures, baselines, notes, options.json)
+
+
+def published(options: argparse.Namespace) -> None:
+    """The rows of a published data set alone."""
+    from benchmarks import recovery_datasets as sets
+
+    if options.stanford_orb:
+        figures = sets.stanford_orb(options.stanford_orb, frame=options.frame, spp=options.spp)
+    elif options.mesh and options.environments:
+        figures = sets.tensoir(
+            options.tensoir, options.mesh, options.environments, frame=options.frame, spp=options.spp
+        )
+    else:
+        raise UsageError("--tensoir needs --mesh FILE (the scene's mesh) and --environments FOLDER (its .hdr maps).")
+    if str(options.json) != "-":
+        for name, value in figures.items():
+            print(f"{name:<60} {value:8.2f}")
+    report.write(figures, {}, [], options.json)
+
+
+def parse(argv: list[str] | None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="one object, small pictures: a minute or two")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the figures as JSON ('-': to stdout only)")
+    parser.add_argument("--out", type=Path, metavar="FOLDER", help="pictures side by side, by row")
+    parser.add_argument("--cache", type=Path, default=Path(gettempdir(), "mistyle_recovery"), help="rendered pictures")
+    parser.add_argument("--data", type=Path, default=data_folder(), help="folder of the real data (MISTYLE_DATA)")
+    parser.add_argument("--assets", nargs="+", choices=list(ASSETS), default=None)
+    parser.add_argument("--maps", nargs="+", choices=["real", "strong", "paper"], default=["real", "strong", "paper"])
+    parser.add_argument("--mesh", type=Path, metavar="FILE", help="any textured glTF instead of the assets")
+    parser.add_argument("--uv", choices=["own", "new"], default="own", help="the file's UVs where usable, or ours")
+    parser.add_argument("--frame", choices=["mikkt", "mitsuba"], default="mikkt", help="frame of the normal maps")
+    parser.add_argument("--resolution", type=int, default=None)
+    parser.add_argument("--views", type=int, default=None)
+    parser.add_argument("--spp", type=int, default=None, help="samples of the references; the relit have a quarter")
+    parser.add_argument("--stanford-orb", type=Path, metavar="FOLDER", help="this data set instead, where you have it")
+    parser.add_argument("--tensoir", type=Path, metavar="FOLDER", help="a scene of TensoIR-Synthetic instead")
+    parser.add_argument("--environments", type=Path, metavar="FOLDER", help="TensoIR's environment maps")
+    parser.add_argument("--no-naive", action="store_true", help="leave the two rivals out")
+    options = parser.parse_args(argv)
+    quick = options.quick
+    options.resolution = options.resolution or (128 if quick else 512)
+    options.views = options.views or (12 if quick else 16)
+    options.spp = options.spp or (32 if quick else 128)
+    if quick:
+        options.assets, options.maps = options.assets or ["avocado"], ["strong"]
+    return options
+
+
+def rows(options: argparse.Namespace) -> list[Row]:
+    if options.mesh:
+        files: list[tuple[str, Path, UV]] = [(options.mesh.stem.lower(), options.mesh, "auto")]
+    else:
+        names = options.assets or list(ASSETS)
+        files = [(n, find_asset(n, options.data), ASSETS[n][1]) for n in names]
+    kinds = [("real", False, False), ("strong", True, False), ("paper", True, True)]
+    return [
+        Row(name, file, "new" if options.uv == "new" else uv, strong, paper)
+        for name, file, uv in files
+        for kind, strong, paper in kinds
+        if kind in options.maps
+    ]
+
+
+def label(row: Row) -> str:
+    return f"{row.name}{'_strong' if row.strong else ''}{'_paper' if row.paper else ''}"
+
+
+def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, float]], list[str]]:
+    """All methods' figures of one row, ours first, and what there is to say about it."""
+    size, frame = options.resolution, options.frame
+    cameras = drawing.paper_cameras(size) if row.paper else drawing.fibonacci(options.views, size)
+    known = truth(row.file, row.name, drawing.fibonacci(1, size)[0], row.uv, row.strong)
+    shots = drawing.one_at_a_time(cameras)
+    pictures = drawing.render(known.mesh, known.maps, shots, frame=frame, spp=options.spp, cache=options.cache)
+    counts = seen(known, cameras)
+    weights = [a * (n >= LEAST_VIEWS) for a, n in zip(known.areas, counts, strict=True)]
+    summed = drawing.together(shots, pictures)
+    main_shots, main_pictures = summed if row.paper else (shots, pictures)
+
+    judge = Judge(known, weights, options)
+    fitted = ours(known, main_shots, main_pictures, frame)
+    methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
+    methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
+    all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
+    if not row.paper:
+        other = ours(known, *summed, frame)
+        methods["together"] = judge(other.maps, frame, "together") | {"seconds": other.seconds}
+    steps = {}
+    if not options.no_naive:
+        with TemporaryDirectory() as folder:
+            write_job(Path(folder), known, main_shots, main_pictures)
+            for method, extra in (("naive", ()), ("naive_pyramid", ("--pyramid",))):
+                maps, steps[method] = naive(Path(folder), known, fitted.seconds, *extra)
+                all_maps[method] = maps
+                methods[method] = judge(maps, "mitsuba", method) | {"seconds": fitted.seconds, "steps": steps[method]}
+        gain = methods["ours"]["relight_psnr_l"] - methods["naive"]["relight_psnr_l"]
+        methods["ours"]["gain_over_naive_db"] = gain
+    if options.out:
+        folder = options.out / label(row)
+        folder.mkdir(parents=True, exist_ok=True)
+        trust = fitted.confidence[0] if fitted.confidence else None
+        firsts = {method: maps[0] for method, maps in all_maps.items()}
+        report.map_sheet(folder / "maps.png", firsts, trust, known.texels[0].covered)
+        report.relit_sheet(folder / "relit.png", {"truth": judge.reference, **judge.shown})
+    return methods, [*describe(known, weights, main_pictures), *fitted.notes, *_steps(steps)]
+
+
+class Judge:
+    """The measures of one object: holds the relit truth, so that every method meets the same pictures."""
+
+    def __init__(self, known: Truth, weights: list[np.ndarray], options: argparse.Namespace):
+        self.known, self.weights, self.options = known, weights, options
+        hdri = options.data / "hdri" / "studio_small_03_1k.hdr"
+        rigs = drawing.unseen(hdri, options.resolution, 1 if options.quick else 2)
+        self.shots: list[Shot] = [shot for shots in rigs.values() for shot in shots]
+        self.each = len(self.shots) // len(rigs)
+        self.truth = self._relit(known.maps, options.frame)
+        self.shown: dict[str, list[np.ndarray]] = {}
+
+    @property
+    def reference(self) -> list[np.ndarray]:
+        return self.truth[:: self.each]
+
+    def __call__(
+        self, maps: Sequence[Maps], frame: Frame, method: str, confidence: Sequence[np.ndarray] | None = None
+    ) -> dict[str, float]:
+        result: dict[str, float] = asdict(map_errors(self.known.maps, maps, self.weights))
+        if confidence is not None:
+            trusted = confident_weights(self.weights, confidence)
+            result |= {f"confident_{k}": v for k, v in asdict(map_errors(self.known.maps, maps, trusted)).items()}
+        pictures = self._relit(maps, frame)
+        self.shown[method] = pictures[:: self.each]
+        errors = [
+            relight_errors(a[..., :3], b[..., :3], a[..., 3] > 0.5) for a, b in zip(self.truth, pictures, strict=True)
+        ]
+        return result | {f"relight_{k}": v for k, v in asdict(mean_errors(errors)).items()}
+
+    def _relit(self, maps: Sequence[Maps], frame: Frame) -> list[np.ndarray]:
+        spp = max(8, self.options.spp // 4)
+        return drawing.render(
+            self.known.mesh, maps, self.shots, frame=frame, spp=spp, seed=1, cache=self.options.cache / "relit"
+        )
+
+
+def confident_weights(weights: Sequence[np.ndarray], confidence: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """`confident` over all texture sets at once."""
+    flat = confident(
+        np.concatenate([w.ravel() for w in weights])[None], np.concatenate([c.ravel() for c in confidence])[None]
+    )[0]
+    ends = np.cumsum([w.size for w in weights])[:-1]
+    return [part.reshape(w.shape) for part, w in zip(np.split(flat, ends), weights, strict=True)]
+
+
+def describe(known: Truth, weights: Sequence[np.ndarray], pictures: Sequence[np.ndarray]) -> list[str]:
+    area = sum(float(a.sum()) for a in known.areas)
+    share = sum(float(w.sum()) for w in weights) / area
+    sizes = ", ".join(f"{len(t.covered)}² with {int(t.covered.sum())} covered" for t in known.texels)
+    return [
+        f"{len(pictures)} pictures of {pictures[0].shape[1]} x {pictures[0].shape[0]}; texels {sizes};"
+        f" {share:.1%} of the surface is seen by at least {LEAST_VIEWS} cameras"
+    ]
+
+
+def _steps(steps: Mapping[str, float]) -> list[str]:
+    return [f"{method}: {int(n)} steps" for method, n in steps.items()]
+
+
+if __name__ == "__main__":
+    try:
+        main()
+    except MistyleError as error:
+        print(error, file=sys.stderr)
+        sys.exit(error.exit_code)

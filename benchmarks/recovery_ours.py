@@ -1,0 +1,38 @@
+"""Our own fit as the benchmarks call it."""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from benchmarks.recovery_pictures import Shot
+from benchmarks.recovery_truth import Truth
+from mistyle.core.capture import in_memory
+from mistyle.core.maps import Maps
+from mistyle.render.scene import Frame
+from mistyle.stages.recover import recover
+from mistyle.stages.recover_settings import RecoverSettings
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Maps and confidence per texture set; seconds from pictures in memory to maps, everything included."""
+
+    maps: tuple[Maps, ...]
+    confidence: tuple[np.ndarray, ...]
+    seconds: float
+    notes: tuple[str, ...]
+
+
+def ours(
+    known: Truth, shots: Sequence[Shot], pictures: Sequence[np.ndarray], frame: Frame, seed: int = 0, **chosen: Any
+) -> Fitted:
+    """Fit from scratch, metallic unknown, default settings but for `chosen`. The truth lends mesh and atlas only."""
+    cameras = [s.camera for s in shots]
+    captures = in_memory(cameras, [s.lights for s in shots], [np.ascontiguousarray(p[..., :3]) for p in pictures])
+    settings = RecoverSettings(**({"metallic": True, "frame": frame} | chosen))
+    start = time.perf_counter()
+    found = recover(known.mesh, known.texels, captures, settings, seed)
+    return Fitted(found.maps, found.confidence, time.perf_counter() - start, found.notes)

@@ -1,0 +1,58 @@
+"""Reference pictures: what known cameras saw under known lights. What a material is fitted to."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.core.camera import Camera
+from mistyle.core.light import Lights
+
+Loaded = tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]
+
+
+@dataclass(frozen=True)
+class Captures:
+    """n pictures of one object, in working units; the pixels are loaded one picture at a time.
+
+    cameras  where each was taken from; their names are the pictures' names
+    lights   what lit each picture
+    load     picture k: linear Rec.709 radiance (already divided by its exposure), and which pixels count (inside the
+             user's mask, finite, not saturated); pixels beside the mesh may be marked as counting and are ignored
+    """
+
+    cameras: tuple[Camera, ...]
+    lights: tuple[Lights, ...]
+    load: Callable[[int], Loaded]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+
+def in_memory(
+    cameras: Sequence[Camera],
+    lights: Sequence[Lights],
+    pictures: Sequence[Float[np.ndarray, "h w 3"]],
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+) -> Captures:
+    """Captures of pictures that are at hand; without masks every finite pixel counts."""
+    if not len(cameras) == len(lights) == len(pictures):
+        raise ValueError(f"{len(cameras)} cameras, {len(lights)} lights and {len(pictures)} pictures do not match")
+
+    def load(k: int) -> Loaded:
+        picture = pictures[k]
+        usable = np.isfinite(picture).all(axis=-1)
+        return picture, usable & masks[k] if masks is not None else usable
+
+    return Captures(tuple(cameras), tuple(lights), load)
+
+
+def subset(captures: Captures, chosen: Sequence[int]) -> Captures:
+    """Some of the pictures, in the given order."""
+    rows = [int(k) for k in chosen]
+    return Captures(
+        tuple(captures.cameras[k] for k in rows),
+        tuple(captures.lights[k] for k in rows),
+        lambda k: captures.load(rows[k]),
+    )

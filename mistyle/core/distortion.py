@@ -1,0 +1,135 @@
+"""Lenses of photographs, and the pinhole camera that sees the same without distortion and with square pixels.
+
+Brown's model as OpenCV, COLMAP and transforms.json write it. With x, y = tangents in the camera (x right, y down) and
+r² = x² + y²,
+
+    x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶) + 2 p1 x y + p2 (r² + 2 x²)
+    y' = y (1 + k1 r² + k2 r⁴ + k3 r⁶) + p1 (r² + 2 y²) + 2 p2 x y
+    pixel = (fx x' + cx, fy y' + cy)
+
+in the pixel convention of core/camera.py. The model holds as far out as its radial part rises; beyond, it folds back.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.core.camera import pixel_centres
+from mistyle.core.image import bilinear
+
+# Focal lengths that differ by less than this share are taken as one: 0.02 pixels at the border of 4000.
+SQUARE = 1e-5
+ROWS = 256  # of a picture at a time, so that the coordinates of 12 megapixels need not fit in memory together
+
+
+@dataclass(frozen=True)
+class Lens:
+    """How a photograph's pixels follow from tangents: `focal` (x, y) and `centre` in pixels, `size` (height, width),
+    `radial` k1 k2 k3 and `tangential` p1 p2 without unit."""
+
+    focal: tuple[float, float]
+    centre: tuple[float, float]
+    size: tuple[int, int]
+    radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    tangential: tuple[float, float] = (0.0, 0.0)
+
+
+def is_distorted(lens: Lens) -> bool:
+    """Whether straight lines come out bent."""
+    return any(lens.radial) or any(lens.tangential)
+
+
+def is_pinhole(lens: Lens) -> bool:
+    """Whether the photograph is what core/camera.py's Camera sees: no distortion, square pixels."""
+    return not is_distorted(lens) and abs(lens.focal[0] - lens.focal[1]) <= SQUARE * lens.focal[0]
+
+
+def pinhole(lens: Lens) -> tuple[float, tuple[float, float], tuple[int, int]]:
+    """Focal length, centre and size of the pinhole camera that a photograph is resampled to.
+
+    The longer focal length counts for both axes, so that no direction loses resolution; the field of view is that of
+    the photograph without its distortion.
+    """
+    if is_pinhole(lens):
+        return lens.focal[0], lens.centre, lens.size
+    focal = max(lens.focal)
+    wide, high = focal / lens.focal[0], focal / lens.focal[1]
+    size = (max(1, round(lens.size[0] * high)), max(1, round(lens.size[1] * wide)))
+    return focal, (lens.centre[0] * wide, lens.centre[1] * high), size
+
+
+def distort(lens: Lens, tangents: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    """Where the lens sends tangents (x, y) of the camera; NaN beyond the radius where the radial part stops rising."""
+    x, y = np.moveaxis(np.asarray(tangents, float), -1, 0)
+    (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
+    r2 = x * x + y * y
+    radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    sent = np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+    return np.where((r2 < _reach(lens))[..., None], sent, np.nan)
+
+
+def undistort(lens: Lens, sent: Float[np.ndarray, "*n 2"], steps: int = 20) -> Float[np.ndarray, "*n 2"]:
+    """The inverse of `distort`, by Newton's method; NaN where it finds no tangent within 1e-9."""
+    (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
+    target = np.asarray(sent, float)
+    found = target.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(steps):
+            x, y = found[..., 0], found[..., 1]
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # of `radial`, by r², twice
+            xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+            yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+            xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+            off = distort(lens, found) - target
+            determinant = xx * yy - xy * xy
+            step = np.stack([yy * off[..., 0] - xy * off[..., 1], xx * off[..., 1] - xy * off[..., 0]], axis=-1)
+            found = found - step / determinant[..., None]
+        miss = np.abs(distort(lens, found) - target).max(axis=-1, keepdims=True)
+    return np.where(miss < 1e-9, found, np.nan)
+
+
+def px_in_photograph(lens: Lens, px: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    """Pixel coordinates in the photograph of pixel coordinates of its `pinhole`; NaN where the lens sees nothing."""
+    focal, centre, _ = pinhole(lens)
+    return distort(lens, (px - np.asarray(centre)) / focal) * np.asarray(lens.focal) + np.asarray(lens.centre)
+
+
+def resample(
+    lens: Lens, picture: Float[np.ndarray, "h w c"], counts: Bool[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "H W c"], Bool[np.ndarray, "H W"]]:
+    """The photograph as its `pinhole` sees it (linear values, bilinear), and which of its pixels count.
+
+    A pixel counts when every pixel that it is mixed from does; what lies beyond the photograph is 0 and does not.
+    A photograph that needs no resampling comes back as it is.
+    """
+    if is_pinhole(lens):
+        return picture, counts
+    size = pinhole(lens)[2]
+    height, width = lens.size
+    values = np.concatenate([np.where(counts[..., None], picture, 0), counts[..., None]], axis=-1).astype(np.float32)
+    result = np.zeros((*size, values.shape[-1]), np.float32)
+    for start in range(0, size[0], ROWS):
+        rows = pixel_centres((min(ROWS, size[0] - start), size[1])) + np.array([0, start])
+        px = px_in_photograph(lens, rows)
+        with np.errstate(invalid="ignore"):
+            inside = ((px >= 0) & (px <= [width, height])).all(axis=-1)
+        result[start : start + ROWS][inside] = bilinear(values, px[inside])
+    whole = result[..., -1] > 0.999  # the weights of four pixels add to 1 but for rounding
+    return np.where(whole[..., None], result[..., :-1], 0), whole
+
+
+def _reach(lens: Lens) -> float:
+    """The square of the radius up to which r (1 + k1 r² + k2 r⁴ + k3 r⁶) rises."""
+    k1, k2, k3 = lens.radial
+    roots = np.roots([7 * k3, 5 * k2, 3 * k1, 1.0]) if any(lens.radial) else np.zeros(0)
+    rising = [float(root.real) for root in roots if abs(root.imag) < 1e-9 * max(abs(root), 1) and root.real > 0]
+    return min(rising, default=np.inf)

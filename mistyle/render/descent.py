@@ -1,0 +1,213 @@
+"""Adam on the table of texels (`render/shade.py`), preconditioned by an image pyramid, without ever waiting for it.
+
+A texture moves by the sum of what every level of its pyramid moves by: level 0 is the texture, each further level has
+half the rows and columns and sees the sum of the gradients of its texels. Adam's step has the same length on every
+level, so that what is wrong over a wide area is mended at once (Weier et al. 2025, Laplacian mipmaps). A texel whose
+gradient is zero neither moves nor forgets (masked updates). A texel whose gradient is not a number stands still from
+then on, and the first picture and channel of which that was true are kept.
+
+Everything runs in one frozen function per step; sums are gathers in a fixed order.
+"""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.render import device
+from mistyle.render.texel_lm import aligned
+
+CHANNELS = ("albedo", "albedo", "albedo", "normal", "normal", "roughness", "metallic")
+BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12
+FINE = 0xFFFFFFFF  # nothing went wrong in this texel
+
+
+class Descent:
+    """Moments of every level of every texture set's pyramid, and the step.
+
+    `rates` are factors of the rate per channel of the table (8 of them, 0: stands still); `still` names texels that do
+    not move at all; roughness stays within floor..1, |tilt| below `tilt`, the rest within 0..1.
+    """
+
+    def __init__(
+        self,
+        sizes: Sequence[tuple[int, int]],
+        rates: Sequence[float],
+        *,
+        levels: int = 1,
+        floor: float = 0.04,
+        tilt: float = 0.95,
+        still: Bool[np.ndarray, " t"] | None = None,
+    ) -> None:
+        device.use()
+        import drjit as dr
+        import mitsuba
+
+        mi: Any = mitsuba
+        self.sizes = [tuple(size) for size in sizes]
+        self.rates, self.floor, self.tilt = tuple(rates), floor, tilt
+        self.texels = sum(rows * columns for rows, columns in sizes)
+        self.pyramids = [_levels(size, levels) for size in self.sizes]
+        widths = [rows * columns for pyramid in self.pyramids for rows, columns in pyramid]
+        self.moments = [[mi.Float(aligned(np.zeros(8 * n))) for n in widths] for _ in range(2)]
+        self.ages = [mi.Float(aligned(np.zeros(n))) for n in widths]
+        free = np.full(self.texels, FINE, np.uint32)
+        if still is not None:
+            free[still] = FINE - 1
+        self.blame = mi.UInt32(aligned(free, np.uint32))
+        self._run = dr.freeze(self._step)
+
+    def step(self, table: Any, gradient: Any, rate: float, picture: int) -> Any:
+        """The table (a Dr.Jit Float, 8 a texel) after one step against `gradient` (likewise) of `picture`."""
+        import drjit as dr
+        import mitsuba
+
+        mi: Any = mitsuba
+        table, self.moments, self.ages, self.blame = self._run(
+            table, gradient, self.moments, self.ages, self.blame,
+            dr.opaque(mi.Float, float(rate)), dr.opaque(mi.UInt32, 8 * picture),
+        )  # fmt: skip
+        return table
+
+    def state(self) -> dict[str, np.ndarray]:
+        """All that a resumed descent needs besides the table."""
+        names = ("first", "second")
+        result = {
+            f"{n}{k}": np.array(a) for n, part in zip(names, self.moments, strict=True) for k, a in enumerate(part)
+        }
+        return result | {f"age{k}": np.array(a) for k, a in enumerate(self.ages)} | {"blame": np.array(self.blame)}
+
+    def restore(self, state: dict[str, np.ndarray]) -> None:
+        """Go on from `state()`."""
+        import mitsuba
+
+        mi: Any = mitsuba
+        count = len(self.ages)
+        self.moments = [[mi.Float(aligned(state[f"{n}{k}"])) for k in range(count)] for n in ("first", "second")]
+        self.ages = [mi.Float(aligned(state[f"age{k}"])) for k in range(count)]
+        self.blame = mi.UInt32(aligned(state["blame"], np.uint32))
+
+    def stopped(self) -> list[tuple[int, str, int]]:
+        """(texel, map, picture) of every texel whose gradient was not a number."""
+        blame: Int[np.ndarray, " t"] = np.array(self.blame)
+        bad = np.flatnonzero(blame < FINE - 1)
+        return [(int(k), CHANNELS[int(blame[k]) % 8], int(blame[k]) // 8) for k in bad]
+
+    def _step(self, table, gradient, moments, ages, blame, rate, picture) -> Any:
+        import drjit as dr
+        import mitsuba
+
+        mi: Any = mitsuba
+        texel = dr.arange(mi.UInt32, self.texels)
+        rows = [dr.gather(mi.Float, gradient, texel * 8 + c) for c in range(7)]
+        finite = mi.Bool(True)
+        channel = mi.UInt32(0)
+        for c in reversed(range(7)):
+            good = dr.isfinite(rows[c])
+            finite &= good
+            channel = dr.select(good, channel, c)
+        blame = dr.select((blame == FINE) & ~finite, picture + channel, blame)
+        moves = blame == FINE
+        packed = dr.ravel(mi.ArrayXf([dr.select(moves, r, 0) for r in rows] + [dr.zeros(mi.Float, self.texels)]))
+        old = [dr.gather(mi.Float, table, texel * 8 + c) for c in range(8)]
+        first, second, age, moved, start, k = [], [], [], [], 0, 0
+        for size, pyramid in zip(self.sizes, self.pyramids, strict=True):
+            count = size[0] * size[1]
+            fine = dr.gather(mi.ArrayXf, packed, dr.arange(mi.UInt32, count) + start, shape=(8, count))
+            total = None
+            for level, shape in enumerate(pyramid):
+                if level:
+                    fine = _halved(fine, pyramid[level - 1], shape)
+                new1, new2, new_age, step = self._adam(fine, moments[0][k], moments[1][k], ages[k])
+                first.append(new1)
+                second.append(new2)
+                age.append(new_age)
+                total = step if total is None else total + _spread(step, shape, size)
+                k += 1
+            moved.append(total)
+            start += count
+        change = moved[0] if len(moved) == 1 else [dr.concat([m[c] for m in moved]) for c in range(8)]
+        new = [old[c] - rate * self.rates[c] * change[c] if self.rates[c] else old[c] for c in range(8)]
+        new = [dr.select(moves, a, b) for a, b in zip(self._projected(new), old, strict=True)]
+        table = dr.ravel(mi.ArrayXf(new))
+        dr.eval(table, first, second, age, blame)
+        return table, [first, second], age, blame
+
+    def _adam(self, g, first, second, age) -> tuple[Any, Any, Any, Any]:
+        """Moments and step of one level; 0 where the gradient is 0."""
+        import drjit as dr
+        import mitsuba
+
+        mi: Any = mitsuba
+        width = dr.width(age)
+        row = dr.arange(mi.UInt32, width)
+        old1, old2 = (dr.gather(mi.ArrayXf, a, row, shape=(8, width)) for a in (first, second))
+        on = g[0] != 0
+        for c in range(1, 7):
+            on |= g[c] != 0
+        age = dr.select(on, age + 1, age)
+        new1, new2 = BETA1 * old1 + (1 - BETA1) * g, BETA2 * old2 + (1 - BETA2) * dr.square(g)
+        scale1, scale2 = 1 / (1 - BETA1**age), 1 / (1 - BETA2**age)
+        step = dr.select(on, new1 * scale1 / (dr.sqrt(new2 * scale2) + EPSILON), 0)
+        return dr.ravel(dr.select(on, new1, old1)), dr.ravel(dr.select(on, new2, old2)), age, step
+
+    def _projected(self, x: list) -> list:
+        import drjit as dr
+
+        scale = dr.minimum(1, self.tilt / dr.maximum(dr.sqrt(dr.square(x[3]) + dr.square(x[4])), 1e-9))
+        colour = [dr.clip(v, 0, 1) for v in x[:3]]
+        return [*colour, x[3] * scale, x[4] * scale, dr.clip(x[5], self.floor, 1), dr.clip(x[6], 0, 1), x[7]]
+
+
+def _levels(size: tuple[int, int], levels: int) -> list[tuple[int, int]]:
+    result = [size]
+    while len(result) < levels and min(result[-1]) > 8:
+        result.append((-(-result[-1][0] // 2), -(-result[-1][1] // 2)))
+    return result
+
+
+def _halved(fine: Any, size: tuple[int, int], half: tuple[int, int]) -> Any:
+    """Sums over 2 x 2 texels."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    packed, count = dr.ravel(fine), half[0] * half[1]
+    index = dr.arange(mi.UInt32, count)
+    row, column = index // half[1], index % half[1]
+    total = dr.zeros(mi.ArrayXf, (8, count))
+    for dy in (0, 1):
+        for dx in (0, 1):
+            y, x = 2 * row + dy, 2 * column + dx
+            inside = (y < size[0]) & (x < size[1])
+            total += dr.gather(mi.ArrayXf, packed, y * size[1] + x, active=inside, shape=(8, count))
+    return total
+
+
+def _spread(coarse: Any, shape: tuple[int, int], size: tuple[int, int]) -> Any:
+    """Bilinear interpolation of a level's texels at those of the texture."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    packed, count = dr.ravel(coarse), size[0] * size[1]
+    index = dr.arange(mi.UInt32, count)
+    by = 2 ** round(np.log2(size[0] / shape[0]))
+    y, x = (mi.Float(index // size[1]) + 0.5) / by - 0.5, (mi.Float(index % size[1]) + 0.5) / by - 0.5
+    low_y, low_x = dr.floor(y), dr.floor(x)
+    total = dr.zeros(mi.ArrayXf, (8, count))
+    for dy, wy in ((0, 1 - (y - low_y)), (1, y - low_y)):
+        for dx, wx in ((0, 1 - (x - low_x)), (1, x - low_x)):
+            row = mi.UInt32(dr.clip(low_y + dy, 0, shape[0] - 1))
+            column = mi.UInt32(dr.clip(low_x + dx, 0, shape[1] - 1))
+            total += wx * wy * dr.gather(mi.ArrayXf, packed, row * shape[1] + column, shape=(8, count))
+    return total
+
+
+def table_on_device(table: Float[np.ndarray, "t 8"]) -> Any:
+    """The table as Dr.Jit array, in memory that starts at a multiple of 64 bytes."""
+    import mitsuba
+
+    mi: Any = mitsuba
+    return mi.Float(aligned(table.ravel()))

@@ -1,0 +1,373 @@
+"""What the samples of a picture see of the surface and of its lights, traced once and kept in packed arrays.
+
+Geometry, cameras and lights stand still while materials are fitted. `collect` traces a fixed grid of rays a pixel and
+keeps of each sample that meets the mesh inside the picture's mask and that any light reaches: where it reads the
+textures, the direction to the camera and to the lights in its tangent frame, and how much of each light arrives. The
+work comes in blocks of rows, so that a picture of any size needs bounded memory.
+
+Bytes: 29 a sample and 16 more per delta light (pixel 4, texel 4, step 1, place in the texel 8, wi 12; wo 12 and
+strength 4 per light), 32 a sample for the transpose, 12 a texel that is read, 8 a pixel; soft light adds 37 a sample
+and one bit per cell of the sky.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float, Int, Integer
+
+from mistyle.core.camera import Camera
+from mistyle.core.light import Directional, Lights, Point, SceneLights, direction_in_world
+from mistyle.core.mesh import Mesh, weld
+from mistyle.core.tangents import mikktspace
+from mistyle.render import deferred, device
+from mistyle.render.draw import Tracer
+from mistyle.render.sky import VARIANTS, Sky, sky
+
+FrameKind = Literal["mikkt", "mitsuba"]
+
+# Rays per block: what tracing holds at once is about 500 bytes a ray.
+BLOCK_RAYS = 1 << 20
+
+
+@dataclass(frozen=True)
+class Samples:
+    """n lit samples of a block, pixel after pixel, padded with samples of no strength (Dr.Jit arrays only).
+
+    slot      which of the block's lit pixels the sample belongs to
+    texel     row of the table of texels that is the top left one of the bilinear fetch
+    step      row of `steps(sizes)`: how far it is to the texels on the right and below
+    x, y      where between them the sample lies, 0..1
+    wi        unit direction to the camera, in the tangent frame, z > 0 (a back side is mirrored, as `twosided` does)
+    wo        per delta light the unit direction to it, in the same frame
+    strength  per delta light 0 where it is hidden or below the horizon, else 1 (directional) or 1 / distance² (point)
+    frame     the tangent frame's axes (s, t, n) in the world, n mirrored with wi; None without soft light
+    variant   which part of the sky's cells the sample sees (`sky.VARIANTS`)
+    visible   UInt32 words: bit k of sample j's word i (at i · n + j) says whether it sees cell 32 i + k
+    """
+
+    slot: Any
+    texel: Any
+    step: Any
+    x: Any
+    y: Any
+    wi: Any
+    wo: tuple[Any, ...]
+    strength: tuple[Any, ...]
+    frame: tuple[Any, Any, Any] | None
+    variant: Any
+    visible: Any
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """p lit pixels of a block, ascending, padded with pixels of no samples: Dr.Jit arrays only.
+
+    index   row · width + column in the picture
+    first   its first sample
+    count   how many samples it has
+    """
+
+    index: Any
+    first: Any
+    count: Any
+
+
+@dataclass(frozen=True)
+class Transpose:
+    """The bilinear fetch the other way round: which samples read each of t texels (Dr.Jit arrays only).
+
+    texel ascends; texel k is read by `sample[begin[k]:end[k]]`, with the bilinear `weight`. Padding has begin = end.
+    """
+
+    texel: Any
+    begin: Any
+    end: Any
+    sample: Any
+    weight: Any
+
+
+@dataclass(frozen=True)
+class Hits:
+    """One block of a picture. `counts` are the samples, pixels and texels without padding.
+
+    lights    colour of each delta light (irradiance, or intensity of a point), linear Rec.709
+    sky       the soft light
+    covered   samples on the mesh of the block's pixels, lit or not; row 0 of it is row `row` of the picture
+    dark      pixels of the picture that are covered but that no light reaches
+    bytes     of the Dr.Jit arrays
+    """
+
+    samples: Samples
+    pixels: Pixels
+    transpose: Transpose
+    lights: Float[np.ndarray, "l 3"]
+    sky: Sky | None
+    row: int
+    covered: Integer[np.ndarray, "rows w"]
+    dark: Integer[np.ndarray, " d"]
+    counts: tuple[int, int, int]
+    bytes: int
+
+
+def tangents_of(mesh: Mesh, frame: FrameKind) -> Float[np.ndarray, "f 3 4"] | None:
+    """What `collect` needs for a frame: MikkTSpace's tangents per face corner, or None for Mitsuba's own."""
+    if frame == "mitsuba":
+        return None
+    welded = weld(mesh)
+    return mikktspace(welded.positions, welded.normals, welded.uvs, welded.faces)
+
+
+def grid(subsamples: int) -> Float[np.ndarray, "s 2"]:
+    """Centres (x, y) of a square grid of samples in a pixel; `subsamples` is a square number."""
+    side = round(subsamples**0.5)
+    if side < 1 or side * side != subsamples:
+        raise ValueError(f"subsamples is {subsamples}; expected a square number: 1, 4, 9, 16, …")
+    line = (np.arange(side) + 0.5) / side
+    return np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2).astype(np.float32)
+
+
+def steps(sizes: Sequence[tuple[int, int]]) -> Int[np.ndarray, "k 2"]:
+    """How far (in rows of the table) the right and the lower texel are: rows 4 · set + 2 · wraps down + wraps right."""
+    table = []
+    for rows, columns in sizes:
+        for down in (columns, columns - rows * columns):
+            table += [(right, down) for right in (1, 1 - columns)]
+    return np.array(table, np.int32)
+
+
+def cells(
+    uv: Float[np.ndarray, "n 2"], part: Int[np.ndarray, " n"], sizes: Sequence[tuple[int, int]]
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
+    """Bilinear fetch from texture sets of `sizes` (rows, columns), all texels one after the other, row by row.
+
+    Top left texel, its row of `steps`, and the place (x, y) between the texels, 0..1. Texel centres at +0.5, row 0 is
+    v = 1, textures repeat: exactly what Mitsuba's bitmap texture does. `uv` is v up.
+    """
+    offsets = np.cumsum([0] + [rows * columns for rows, columns in sizes])
+    rows, columns = np.asarray(sizes, np.int64)[part].T
+    place = np.stack([uv[:, 0].astype(np.float64) * columns, (1 - uv[:, 1].astype(np.float64)) * rows], axis=1) - 0.5
+    whole = np.floor(place)
+    column, row = whole.astype(np.int64).T % np.stack([columns, rows])
+    step = 4 * part.astype(np.int64) + 2 * (row == rows - 1) + (column == columns - 1)
+    return offsets[part] + row * columns + column, step, place - whole
+
+
+def collect(
+    traced: Tracer,
+    camera: Camera,
+    lights: Lights,
+    mask: Bool[np.ndarray, "h w"],
+    sizes: Sequence[tuple[int, int]],
+    tangents: Float[np.ndarray, "f 3 4"] | None = None,
+    *,
+    subsamples: int = 4,
+    shadows: bool = True,
+    soft: Sky | None = None,
+) -> Iterator[Hits]:
+    """The blocks of one picture, top to bottom, without those that see nothing of the mesh.
+
+    `tangents` as of `tangents_of`; `sizes` (rows, columns) of the texture sets; `soft` is `sky.sky(lights)`, made here
+    if it is not given. Shadow rays start where Mitsuba's start. ValueError for lights that only a scene file describes.
+    """
+    device.use()
+    height, width = camera.size
+    if mask.shape != camera.size:
+        raise ValueError(f"{camera.name}: a mask of {mask.shape} pixels came for a camera of {camera.size}")
+    known = [light for light in lights if isinstance(light, Directional | Point)]
+    if any(isinstance(light, SceneLights) for light in lights):
+        raise ValueError(f"{camera.name}: light that only a scene file describes cannot be collected")
+    soft = soft or sky(lights)
+    rows = max(1, BLOCK_RAYS // (width * subsamples))
+    for row in range(0, height, rows):
+        block = _block(traced, camera, known, mask[row : row + rows], row, sizes, tangents, subsamples, shadows, soft)
+        if block is not None:
+            yield block
+
+
+def _block(traced, camera, lights, mask, row, sizes, tangents, subsamples, shadows, soft) -> Hits | None:
+    import drjit as dr
+    import mitsuba as mi
+
+    width = camera.size[1]
+    wanted = np.flatnonzero(mask) + row * width
+    if len(wanted) == 0:
+        return None
+    pixel, offset = np.repeat(wanted.astype(np.uint32), subsamples), np.tile(grid(subsamples), (len(wanted), 1))
+    ray = _rays(camera, pixel, offset)
+    point, frame = deferred.intersect(traced, ray, tangents)
+    wi = frame.to_local(-ray.d)
+    valid = point.is_valid() & (wi.z != 0)
+    side = dr.mulsign(mi.Float(1), wi.z)
+    lit, wo, strength = valid & (soft is not None), [], []
+    for light in lights:
+        direction, arriving = _arriving(traced, point, light, camera, valid, shadows)
+        local = frame.to_local(direction)
+        local.z *= side
+        arriving = dr.select(valid & (local.z > 0), arriving, 0)
+        lit |= arriving > 0
+        wo.append(local)
+        strength.append(arriving)
+    wi.z *= side
+    face = mi.UInt32(point.prim_index)
+    dr.eval(valid, lit, wi, wo, strength, face, point.uv)
+    on, kept = np.array(valid), np.flatnonzero(np.array(lit)).astype(np.uint32)
+    hit = np.bincount(pixel[on] - row * width, minlength=mask.size).reshape(mask.shape)
+    if not on.any():
+        return None
+    part = traced.mesh.part[np.array(face)[kept]]
+    uv = np.array(point.uv).T[kept]
+    texel, step, place = cells(np.stack([uv[:, 0], 1 - uv[:, 1].astype(np.float64)], axis=1), part, sizes)
+
+    size = padded(len(kept))
+    where = own(mi.UInt32, _pad(kept, size))
+    real = dr.arange(mi.UInt32, size) < len(kept)
+    lit_pixels, first, slot, count = np.unique(pixel[kept], return_index=True, return_inverse=True, return_counts=True)
+    axes: Any = None
+    variant, visible = None, None
+    if soft is not None:
+        axes = tuple(dr.gather(mi.Vector3f, mi.Vector3f(a), where) for a in (frame.s, frame.t, frame.n * side))
+        position, normal = (dr.gather(mi.Vector3f, mi.Vector3f(a), where) for a in (point.p, point.n))
+        variant = own(mi.UInt8, _pad(_variants(pixel[kept], kept % subsamples, subsamples, width), size))
+        visible = _visible(traced, position, normal, axes[2], variant, soft, shadows)
+    samples = Samples(
+        slot=own(mi.UInt32, _pad(slot.astype(np.uint32), size)),
+        texel=own(mi.UInt32, _pad(texel.astype(np.uint32), size)),
+        step=own(mi.UInt8, _pad(step.astype(np.uint8), size)),
+        x=own(mi.Float, _pad(place[:, 0].astype(np.float32), size)),
+        y=own(mi.Float, _pad(place[:, 1].astype(np.float32), size)),
+        wi=dr.gather(mi.Vector3f, wi, where),
+        wo=tuple(dr.gather(mi.Vector3f, w, where) for w in wo),
+        strength=tuple(dr.select(real, dr.gather(mi.Float, s, where), 0) for s in strength),
+        frame=axes,
+        variant=variant,
+        visible=visible,
+    )
+    p = padded(len(lit_pixels))
+    pixels = Pixels(*(own(mi.UInt32, _pad(a.astype(np.uint32), p)) for a in (lit_pixels, first, count)))
+    transpose, touched = _transpose(texel, step, place, sizes, size)
+    dr.make_opaque(samples, pixels, transpose)
+    soft_bytes = 37 + 4 * -(-len(soft.direction) // 32) if soft is not None else 0
+    return Hits(
+        samples=samples,
+        pixels=pixels,
+        transpose=transpose,
+        lights=np.array([_colour(light) for light in lights], np.float32).reshape(-1, 3),
+        sky=soft,
+        row=row,
+        covered=hit.astype(np.uint16),
+        dark=np.setdiff1d(np.unique(pixel[on]), lit_pixels),
+        counts=(len(kept), len(lit_pixels), touched),
+        bytes=size * (61 + 16 * len(lights) + soft_bytes) + 12 * p + 12 * padded(touched),
+    )
+
+
+def padded(count: int) -> int:
+    """The next of eight sizes per octave: frozen functions are recorded once per size, so there must be few."""
+    unit = max(64, 1 << max(0, (count - 1).bit_length() - 4))
+    return max(unit, -(-count // unit) * unit)
+
+
+def own(kind: Any, values: np.ndarray) -> Any:
+    """A Dr.Jit array in memory of its own: NumPy's is aligned now so, now so, and a frozen function minds."""
+    import drjit as dr
+
+    return kind(values) + dr.opaque(kind, 0)
+
+
+def _pad(values: np.ndarray, size: int) -> np.ndarray:
+    result = np.zeros(size, values.dtype)
+    result[: len(values)] = values
+    return result
+
+
+def _rays(camera: Camera, pixel: Integer[np.ndarray, " n"], offset: Float[np.ndarray, "n 2"]) -> Any:
+    import drjit as dr
+    import mitsuba as mi
+
+    index = mi.UInt32(pixel)
+    width = camera.size[1]
+    x = (mi.Float(index % width) + mi.Float(offset[:, 0].copy()) - camera.centre[0]) / camera.focal
+    y = (mi.Float(index // width) + mi.Float(offset[:, 1].copy()) - camera.centre[1]) / camera.focal
+    axes: list[Any] = [mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T]
+    right, down, forward = axes
+    return mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))
+
+
+def _arriving(traced, point, light, camera: Camera, valid, shadows: bool) -> tuple[Any, Any]:
+    """World direction to a delta light, and which share of its colour arrives from there."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if isinstance(light, Directional):
+        direction = mi.Vector3f(direction_in_world(light, camera).tolist())
+        strength, shadow = mi.Float(1), point.spawn_ray(direction)
+    else:
+        position = np.asarray(light.position, float)
+        if light.frame == "camera":
+            position = camera.world_from_cam[:3, :3] @ position + camera.position
+        away = mi.Point3f(position.tolist()) - point.p
+        strength = dr.rcp(dr.squared_norm(away))
+        direction, shadow = away * dr.sqrt(strength), point.spawn_ray_to(mi.Point3f(position.tolist()))
+    if shadows:
+        strength = dr.select(traced.scene.ray_test(shadow, active=valid), 0, strength)
+    return direction, strength
+
+
+def _variants(pixel, subsample, subsamples: int, width: int) -> Integer[np.ndarray, " n"]:
+    """Different ones for the samples of a pixel and for pixels that are close."""
+    dither = 4 * (pixel % width % 4) + pixel // width % 4
+    return ((subsample * max(1, VARIANTS // subsamples) + dither) % VARIANTS).astype(np.uint8)
+
+
+def _visible(traced, position, normal, up, variant, soft: Sky, shadows: bool) -> Any:
+    """The words of `Samples.visible`; `up` is the shading normal on the camera's side."""
+    import drjit as dr
+    import mitsuba as mi
+
+    point = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
+    point.p, point.n = position, normal
+    words, directions = [], mi.Float(soft.direction.ravel())
+    for first in range(0, len(soft.direction), 32):
+        word = mi.UInt32(0)
+        for k in range(min(32, len(soft.direction) - first)):
+            # Opaque: one kernel for all directions.
+            start = dr.opaque(mi.UInt32, (first + k) * VARIANTS)
+            towards = dr.gather(mi.Vector3f, directions, start + mi.UInt32(variant))
+            seen = dr.dot(up, towards) > 0
+            if shadows:
+                seen &= ~traced.scene.ray_test(point.spawn_ray(towards), active=seen)
+            word |= dr.select(seen, dr.opaque(mi.UInt32, 1 << k), mi.UInt32(0))
+            dr.eval(word)
+        words.append(word)
+    return dr.concat(words)
+
+
+def _colour(light: Directional | Point) -> tuple[float, float, float]:
+    return light.irradiance if isinstance(light, Directional) else light.intensity
+
+
+def _transpose(texel, step, place, sizes, size: int) -> tuple[Transpose, int]:
+    """A counting sort by texel; samples of one texel stay in order, so that its sum has one order."""
+    import mitsuba as mi
+    import scipy.sparse as sparse
+
+    right, down = steps(sizes)[step].astype(np.int64).T
+    index = texel[:, None] + np.stack([np.zeros_like(right), right, down, right + down], axis=1)
+    total = sum(rows * columns for rows, columns in sizes)
+    shape = (len(texel), total)
+    by_sample = sparse.csr_matrix(
+        (np.arange(index.size, dtype=np.uint32), index.ravel(), np.arange(0, index.size + 1, 4)), shape=shape
+    )
+    by_texel: Any = by_sample.tocsc()
+    touched = np.flatnonzero(np.diff(by_texel.indptr))
+    t = padded(len(touched))
+    begin, end = (_pad(by_texel.indptr[touched + k].astype(np.uint32), t) for k in (0, 1))
+    x, y = place.T
+    weight = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1).ravel()[by_texel.data]
+    integers = (_pad(touched.astype(np.uint32), t), begin, end, _pad(by_texel.data // 4, 4 * size))
+    first, begins, ends, sample = (own(mi.UInt32, a) for a in integers)
+    return Transpose(first, begins, ends, sample, own(mi.Float, _pad(weight.astype(np.float32), 4 * size))), len(
+        touched
+    )

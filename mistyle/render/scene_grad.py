@@ -1,0 +1,269 @@
+"""One camera's loss and its gradient for the parameters of a live Mitsuba scene.
+
+The picture is rendered with many samples and no gradient, the loss is differentiated for the pixels, and that goes
+back through the scene with few samples (`render_backward`). The two take different random numbers, so the gradient
+of a squared loss has no bias from the picture's own noise.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.image import srgb_from_linear
+from mistyle.render import scene as scenery
+from mistyle.render.scene_keys import Parameter
+
+# (picture, reference) -> number; both Mitsuba tensors (h, w, 3), linear
+Loss = Callable[[Any, Any], Any]
+
+
+@dataclass(frozen=True)
+class Sight:
+    """A camera and what it should see: tensors (h, w, c) of the reference and of the values that count."""
+
+    sensor: Any
+    reference: Any
+    counts: Any
+    share: float  # of the pixels that count
+
+
+def log_srgb_l1(picture: Any, reference: Any) -> Any:
+    """Mean |s(picture) - s(reference)| with s(x) = sRGB(log(x + 1)) (Munkberg et al. 2022, equation 7).
+
+    Highlights weigh no more than what lies beside them.
+    """
+    import drjit as dr
+
+    return dr.mean(dr.abs(_log_srgb(picture) - _log_srgb(reference)), axis=None)
+
+
+def l2(picture: Any, reference: Any) -> Any:
+    """Mean squared difference of linear radiance."""
+    import drjit as dr
+
+    return dr.mean(dr.square(picture - reference), axis=None)
+
+
+LOSSES: dict[str, Loss] = {"log_srgb_l1": log_srgb_l1, "l2": l2}
+
+
+def _log_srgb(linear: Any) -> Any:
+    import drjit as dr
+
+    x: Any = dr.log(dr.maximum(linear, 0) + 1)
+    root: Any = dr.power(dr.maximum(x, 0.0031308), 1 / 2.4)
+    return dr.select(x <= 0.0031308, 12.92 * x, 1.055 * root - 0.055)
+
+
+def total_variation(weight: float, keys: Sequence[str] | None = None) -> Callable[[Mapping[str, Any]], Any]:
+    """A regularizer: weight · mean |difference of neighbouring texels| of every texture (or of those of `keys`)."""
+    import drjit as dr
+
+    def penalty(values: Mapping[str, Any]) -> Any:
+        total: Any = 0.0
+        for key, texture in values.items():
+            if len(texture.shape) == 3 and (keys is None or key in keys):
+                total += dr.mean(dr.abs(texture[1:] - texture[:-1]), axis=None)
+                total += dr.mean(dr.abs(texture[:, 1:] - texture[:, :-1]), axis=None)
+        return weight * total
+
+    return penalty
+
+
+def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]:
+    """An integrator with gradients, and notes: `wanted` (a plugin's name, a dictionary or an integrator), the scene's
+    own where it has them, else `prb` (`prbvolpath` in a scene with media) with the depth of the scene's own.
+    """
+    import mitsuba as mi
+
+    if isinstance(wanted, mi.Integrator):
+        return wanted, ()
+    if wanted is not None:
+        try:
+            made: Any = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
+        except RuntimeError as error:
+            raise UsageError(
+                f"the integrator '{wanted}' cannot be made; expected for example 'prb'. {error}"
+            ) from error
+        if not isinstance(made, mi.Integrator):
+            raise UsageError(f"'{wanted}' is no integrator; expected for example 'prb'.")
+        return made, ()
+    own = scene.integrator()
+    if own is None:
+        return mi.load_dict({"type": "prb"}), ("The scene has no integrator; prb takes its place.",)
+    if isinstance(own, mi.ad.integrators.common.ADIntegrator) or own.class_name() == "DirectIntegrator":
+        return own, ()
+    depth = re.search(r"max_depth = (\d+)", str(own))
+    plugin = "prbvolpath" if "vol" in own.class_name().lower() else "prb"
+    replacement: dict[str, Any] = {"type": plugin, "hide_emitters": bool(getattr(own, "hide_emitters", False))}
+    if depth:
+        # Unlimited depth is stored as 2^32 - 1.
+        replacement["max_depth"] = int(depth[1]) if int(depth[1]) < 2**31 else -1
+    note = f"{own.class_name()} has no gradients; {plugin} takes its place"
+    return mi.load_dict(replacement), (f"{note} with max_depth {replacement.get('max_depth', 6)}.",)
+
+
+def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str) -> Sight:
+    """Check one reference picture against its camera. Raises InputRefused, calling the camera `name`."""
+    import mitsuba as mi
+
+    film: Any = sensor.film()
+    columns, rows = (int(n) for n in film.crop_size())
+    if reference.ndim != 3 or reference.shape[2] != 3:
+        raise InputRefused(f"the reference of {name} has the shape {reference.shape}; expected (rows, columns, 3).")
+    if reference.shape[:2] != (rows, columns):
+        raise InputRefused(
+            f"the reference of {name} has {reference.shape[1]} x {reference.shape[0]} pixels, its film {columns} x "
+            f"{rows}. Render it at the film's size, or set the film's width and height to the picture's."
+        )
+    used = np.ones((rows, columns), bool) if mask is None else mask
+    if used.shape != (rows, columns):
+        raise InputRefused(f"the mask of {name} has the shape {used.shape}; expected {(rows, columns)}.")
+    if not used.any():
+        raise InputRefused(f"the mask of {name} leaves no pixel. Leave this camera out, or check the mask.")
+    bad = int((~np.isfinite(reference[used])).any(axis=-1).sum())
+    if bad:
+        raise InputRefused(
+            f"the reference of {name} has {bad} pixels that are NaN or infinite. Mask them, or render it again."
+        )
+    if not (reference[used] > 0).any():
+        raise InputRefused(f"the reference of {name} is black everywhere. Check the picture and the scene's lights.")
+    if (reference[used] >= 1).all() and np.ptp(reference[used]) == 0:
+        raise InputRefused(f"the reference of {name} is saturated everywhere. Use a shorter exposure, or EXR pictures.")
+    if film.base_channels_count() < 3:
+        raise InputRefused(f'the film of {name} has one channel; expected <string name="pixel_format" value="rgb"/>.')
+    clean = np.where(used[..., None], reference, 0)
+    tensor: Any = mi.TensorXb
+    return Sight(
+        sensor=sensor,
+        reference=mi.TensorXf(np.ascontiguousarray(clean, np.float32)),
+        counts=tensor(np.ascontiguousarray(np.broadcast_to(used[..., None], clean.shape))),
+        share=float(used.mean()),
+    )
+
+
+def picture(scene: Any, integrator: Any, sensor: Any, spp: int, seed: int) -> Any:
+    """The linear picture, a tensor without gradient; memory is that of at most 64 samples a pixel."""
+    import drjit as dr
+    import mitsuba as mi
+
+    times, each = scenery.passes(spp)
+    total: Any = 0
+    with dr.suspend_grad():
+        for k in range(times):
+            number = dr.opaque(mi.UInt32, (seed + k * 0x9E3779B1) % 2**32)
+            image = mi.render(scene, sensor=sensor, integrator=integrator, spp=each, seed=number)
+            total = image if times == 1 else total + image / times
+        dr.eval(total)
+    return total
+
+
+def compare(shown: Any, view: Sight, loss: Loss) -> tuple[float, Any, int]:
+    """The loss over the pixels that count, its gradient for the picture, and how many values of it are no numbers.
+
+    Pixels that do not count, or are NaN or infinite, are set to the reference's: they have no gradient.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    moving = mi.TensorXf(dr.detach(shown))
+    dr.enable_grad(moving)
+    three = moving[..., :3]
+    finite = dr.isfinite(dr.detach(three))
+    value = loss(dr.select(view.counts & finite, three, view.reference), view.reference)
+    dr.backward(value)
+    gradient = dr.grad(moving)
+    gradient = dr.select(dr.isfinite(gradient), gradient, 0)
+    broken = int(np.asarray(dr.count(~finite, axis=None)).ravel()[0])
+    return float(np.asarray(value).ravel()[0]) / view.share, gradient, broken
+
+
+def gradients(
+    scene: Any,
+    table: Any,
+    chosen: Sequence[Parameter],
+    values: Mapping[str, np.ndarray],
+    integrator: Any,
+    view: Sight,
+    loss: Loss,
+    spp: tuple[int, int],
+    seeds: tuple[int, int],
+) -> tuple[float, dict[str, np.ndarray], int]:
+    """Loss of one camera, dL/dvalue of every chosen parameter by key, and the picture's values that are no numbers.
+
+    `table` is what `mi.traverse` gave; `values` are put into the scene first. `spp` and `seeds`: of the picture, of
+    the gradient.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    # Fresh variables each time: a backward pass takes the graph of the one before with it.
+    moving = put(table, chosen, values, grad=True)
+    shown = picture(scene, integrator, view.sensor, spp[0], seeds[0])
+    value, pixels, broken = compare(shown, view, loss)
+    # The gradient of a mean is tiny, too small for textures of 16 bits; it is scaled here and back below.
+    scale = float(np.prod(pixels.shape[:2]))
+    integrator.render_backward(
+        scene, table, pixels * scale, view.sensor, seed=dr.opaque(mi.UInt32, seeds[1]), spp=spp[1]
+    )
+    result = {p.key: array(dr.grad(moving[p.key]), p) / np.float32(scale * view.share) for p in chosen}
+    return value, result, broken
+
+
+def regularized(
+    table: Any, chosen: Sequence[Parameter], values: Mapping[str, np.ndarray], penalties: Sequence[Any]
+) -> tuple[float, dict[str, np.ndarray]]:
+    """The sum of the regularizers and its gradient by key."""
+    import drjit as dr
+
+    moving = {p.key: typed(type(table[p.key]), values[p.key]) for p in chosen}
+    dr.enable_grad(moving)
+    total: Any = sum(penalty(moving) for penalty in penalties)
+    dr.backward(total)
+    gradient = {p.key: array(dr.grad(moving[p.key]), p) for p in chosen}
+    return float(np.asarray(total).ravel()[0]), gradient
+
+
+def psnr(shown: Any, view: Sight) -> float:
+    """PSNR in dB of clipped sRGB over the pixels that count; infinite for equal pictures."""
+    counts = np.array(view.counts)
+    images = [srgb_from_linear(np.clip(np.nan_to_num(np.array(x)[..., :3]), 0, 1)) for x in (shown, view.reference)]
+    error = float(np.square(images[0] - images[1], dtype=np.float64)[counts].mean())
+    return float("inf") if error == 0 else -10 * float(np.log10(error))
+
+
+def put(
+    table: Any, chosen: Sequence[Parameter], values: Mapping[str, np.ndarray], grad: bool = False
+) -> dict[str, Any]:
+    """Set parameters of the scene; with `grad` they ask for gradients. Returns what was set."""
+    import drjit as dr
+
+    result = {}
+    for parameter in chosen:
+        result[parameter.key] = typed(type(table[parameter.key]), values[parameter.key])
+        if grad:
+            dr.enable_grad(result[parameter.key])
+        table[parameter.key] = result[parameter.key]
+    table.update()
+    return result
+
+
+def array(value: Any, parameter: Parameter) -> np.ndarray:
+    """A Mitsuba value as float32 of the parameter's shape."""
+    return np.array(value, dtype=np.float32).reshape(parameter.shape)
+
+
+def typed(kind: Any, values: np.ndarray) -> Any:
+    """The reverse of `array`; never a literal, which would compile a kernel for each value."""
+    import drjit as dr
+    import mitsuba as mi
+
+    if dr.is_tensor_v(kind):
+        return kind(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
+    if dr.depth_v(kind) > 1:
+        return kind(*[mi.Float(np.full(1, v, np.float32)) for v in values])
+    return kind(mi.Float(np.ascontiguousarray(values, np.float32)))

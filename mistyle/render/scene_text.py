@@ -1,0 +1,170 @@
+"""The text of a Mitsuba scene file: where a parameter's element stands, and what replaces it."""
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.parsers import expat
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from mistyle.render.scene_keys import Parameter
+
+Edit = tuple[int, int, str]  # first byte, byte after the last, what comes in their place
+
+
+def children(node: Any) -> list[tuple[str, int]]:
+    """Property names and node numbers of what a parsed node holds, in the file's order."""
+    import mitsuba as mi
+
+    kind = mi.Properties.Type.ResolvedReference
+    return [(name, node.props[name].index()) for name in node.props.keys() if node.props.type(name) == kind]
+
+
+def _find(state: Any, p: Parameter) -> tuple[Any, str | None] | None:
+    """The parsed node of a parameter's texture, or the node and the name of its literal."""
+    roots = {state.nodes[index].props.id(): index for _, index in children(state.nodes[0])}
+    for name in p.names:
+        head, *parts = name.split(".")
+        if head not in roots:
+            continue
+        node, left = state.nodes[roots[head]], parts
+        while left:
+            inner = _child(state, node, left[0])
+            if inner is None:
+                break
+            node, left = state.nodes[inner], left[1:]
+            if left == ["value"]:  # a literal that is spelt as a plugin
+                return None
+        if left == ["data"]:
+            return node, None
+        if len(left) == 1 or (len(left) == 2 and left[1] == "value"):
+            return node, left[0]
+    return None
+
+
+def _child(state: Any, node: Any, name: str) -> int | None:
+    """The child that `mi.traverse` calls `name`: by its name in the file, else the n-th material, the emitter, …"""
+    import mitsuba as mi
+
+    held = children(node)
+    for called, index in held:
+        if called == name:
+            return index
+    stem, number = re.fullmatch(r"(.*?)(?:_(\d+))?", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
+    kinds = {"bsdf": mi.ObjectType.BSDF, "brdf": mi.ObjectType.BSDF, "nested_bsdf": mi.ObjectType.BSDF}
+    kinds |= {"emitter": mi.ObjectType.Emitter, "normalmap": mi.ObjectType.Texture}
+    fitting = [index for _, index in held if state.nodes[index].type == kinds.get(stem)]
+    place = int(number or 0)
+    return fitting[place] if place < len(fitting) else None
+
+
+@dataclass(frozen=True)
+class _Element:
+    """One element of the text: bytes `begin`..`end`, its start tag ends at `body`."""
+
+    tag: str
+    attributes: dict[str, str]
+    begin: int
+    body: int
+    end: int
+    parent: int | None
+
+
+def _elements(source: bytes) -> list[_Element]:
+    parser = expat.ParserCreate()
+    found: list[dict[str, Any]] = []
+    above: list[int] = []
+
+    def opened(tag: str, attributes: dict[str, str]) -> None:
+        begin = parser.CurrentByteIndex
+        body = begin + len(re.match(rb"<(?:[^<>\"']|\"[^\"]*\"|'[^']*')*>", source[begin:])[0])  # pyright: ignore
+        parent = above[-1] if above else None
+        above.append(len(found))
+        found.append({"tag": tag, "attributes": attributes, "begin": begin, "body": body, "parent": parent})
+
+    def closed(tag: str) -> None:
+        element = found[above.pop()]
+        end = parser.CurrentByteIndex
+        alone = source[: element["body"]].endswith(b"/>")
+        element["end"] = element["body"] if alone else end + source[end:].index(b">") + 1
+
+    parser.StartElementHandler, parser.EndElementHandler = opened, closed
+    parser.Parse(source, True)
+    return [_Element(**element) for element in found]
+
+
+def edits_of(
+    state: Any, source: bytes, p: Parameter, values: np.ndarray, file: Path | None, out: Path
+) -> list[Edit] | str:
+    """What to replace in the text for one parameter, or why that cannot be."""
+    place = _find(state, p)
+    if place is None:
+        return "its element could not be told from the others."
+    node, literal = place
+    if node.file_index:
+        return "it stands in an included file, which is left as it is."
+    elements = _elements(source)
+    at = next((k for k, e in enumerate(elements) if e.begin == node.offset - 1), None)
+    if at is None:
+        return "its element could not be found in the text."
+    inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
+    if literal is None:
+        if file is None or "filename" not in inner:
+            return "its texture has no file name that could be replaced."
+        old = inner["filename"]
+        edits = [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>')]
+        # An 8-bit or 16-bit format would round what the file holds.
+        return edits + [(inner[name].begin, inner[name].end, "") for name in ("format",) if name in inner]
+    if p.kind != "value":
+        return f"a scene file cannot hold it; it was written as {file.name if file else 'nothing'}."
+    old = inner.get(literal)
+    numbers = " ".join(f"{float(v):.9g}" for v in values)
+    tag = "rgb" if len(values) == 3 else "float"
+    if len(values) not in (1, 3):
+        return f"it has {len(values)} numbers."
+    text = f"<{tag} name={quoteattr(literal)} value={quoteattr(numbers)}/>"
+    if old is not None:
+        return [(old.begin, old.end, text)]
+    element = elements[at]
+    if element.body != element.end:
+        return [(element.body, element.body, text)]
+    return [(element.end - 2, element.end, f">{text}</{element.tag}>")]
+
+
+def surroundings(source: bytes, path: Path, defines: Mapping[str, str], out: Path) -> list[Edit]:
+    """Defaults as they were given, and the way back to the original's folder."""
+    edits: list[Edit] = []
+    elements = _elements(source)
+    for e in elements:
+        name = e.attributes.get("name", "")
+        if e.tag == "default" and name in defines:
+            text = f"<default name={quoteattr(name)} value={quoteattr(defines[name])}/>"
+            edits.append((e.begin, e.end, text))
+    if out.parent.resolve() == path.parent.resolve():
+        return edits
+    for e in elements:
+        if e.tag == "path" and not Path(e.attributes.get("value", "/")).is_absolute():
+            there = _from(out, path.parent / e.attributes["value"])
+            edits.append((e.begin, e.end, f"<path value={quoteattr(there)}/>"))
+    body = elements[0].body
+    edits.append((body, body, f"\n<path value={quoteattr(_from(out, path.parent))}/>"))
+    return edits
+
+
+def _from(out: Path, folder: Path) -> str:
+    try:
+        return Path(os.path.relpath(folder.resolve(), out.parent.resolve())).as_posix()
+    except ValueError:  # another drive
+        return folder.resolve().as_posix()
+
+
+def spliced(source: bytes, edits: Sequence[Edit]) -> bytes:
+    result, at = [], 0
+    for begin, end, text in sorted(edits):
+        result += [source[at:begin], text.encode()]
+        at = end
+    return b"".join([*result, source[at:]])

@@ -1,0 +1,459 @@
+"""Material of every texel by itself, by a batched Levenberg–Marquardt solver: texels are the lanes.
+
+Where geometry, cameras and lights are known and light arrives from deltas, a texel's own observations determine its
+own unknowns x = (albedo r, g, b, tilt x, tilt y, roughness, metallic), and no picture has to be rendered. With the
+reflectance albedo · paint + gloss of `render/bsdf.py` and irradiance E the model of an observation is, per channel c,
+
+    f_c(x) = sum over its lights of E_c (albedo_c paint(tilt, roughness, metallic) + gloss(tilt, roughness, metallic))
+
+and the solver minimises  sum_c,k rho(w_k (f_ck - y_ck)) + sum_j prior_j (x_j - mean_j)²  with Huber's rho. The albedo
+enters linearly and its channels do not meet, so the normal matrix is an arrow: the albedo is eliminated by its Schur
+complement, and what remains is a 4 x 4 system, solved by Cholesky in each lane.
+
+All iterations are one kernel, a symbolic loop in a symbolic loop: it walks over a lane's observations, accumulates the
+normal matrix at the values to be tried, accepts or rejects them, and proposes the next. Lanes are sorted by their
+number of observations, and observation k of neighbouring lanes lies in neighbouring memory. Sums run within a lane in
+a fixed order, so the result has the same bytes in every run at any number of threads.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, Integer
+
+from mistyle.render import bsdf, device
+from mistyle.render.texel_algebra import Sums, flat_of, nothing, spread_of, step, triangle, unflat
+
+UNKNOWNS = ("albedo_r", "albedo_g", "albedo_b", "tilt_x", "tilt_y", "roughness", "metallic")
+LANES = 1 << 16
+STEP = 1e-3  # of central differences, the twin of the derivatives by AD
+MIN_Z2 = 1e-4
+LIGHTER, HEAVIER = 0.25, 5.0  # factors of the damping after a step that helped, and after one that did not
+
+
+@dataclass(frozen=True)
+class Points:
+    """Surface points of t texels: position and tangent frame (rows: tangent, bitangent, normal; unit), in the world."""
+
+    position: Float[np.ndarray, "t 3"]
+    frame: Float[np.ndarray, "t 3 3"]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Where pictures were taken from and what lit them. Picture v has the lights first[v] : first[v + 1].
+
+    eye         world position of the camera
+    vector      unit direction towards the light, or where `near` the light's position, in the world
+    near        1 for a point light, whose irradiance is that at distance 1
+    irradiance  linear Rec.709
+    """
+
+    eye: Float[np.ndarray, "v 3"]
+    first: Int[np.ndarray, " v1"]
+    vector: Float[np.ndarray, "l 3"]
+    near: Float[np.ndarray, " l"]
+    irradiance: Float[np.ndarray, "l 3"]
+
+    @property
+    def single(self) -> bool:
+        """Whether every picture has exactly one light."""
+        return bool((np.diff(self.first) == 1).all())
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What pictures say about t texels, by texel: those of texel i are start[i] : start[i + 1].
+
+    rgb     linear radiance that left the texel towards the camera
+    weight  one over its standard deviation
+    lit     bit l is set where light l of the picture (counted within the picture) reaches the texel
+    """
+
+    start: Int[np.ndarray, " t1"]
+    picture: Int[np.ndarray, " o"]
+    rgb: Float[np.ndarray, "o 3"]
+    weight: Float[np.ndarray, " o"]
+    lit: Integer[np.ndarray, " o"]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """`values` (t, 7) in the order of UNKNOWNS; `cost` without the prior; `spread` (t, 7), standard deviations.
+
+    spread² is the diagonal of the inverse of normal matrix + prior: what the observations leave open. `diagonal` is
+    that of the normal matrix alone.
+    """
+
+    values: Float[np.ndarray, "t 7"]
+    cost: Float[np.ndarray, " t"]
+    spread: Float[np.ndarray, "t 7"]
+    diagonal: Float[np.ndarray, "t 7"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to solve. `huber` is in standard deviations; `floor` the least roughness; `tilt` bounds |tilt|.
+
+    With `metallic` False metallic keeps its value. `differences` takes central differences instead of AD.
+    """
+
+    model: str = "principled"
+    metallic: bool = False
+    huber: float = 3.0
+    floor: float = 0.04
+    tilt: float = 0.95
+    differences: bool = False
+
+
+class Problem:
+    """Observations on the device, ready to be solved again and again with other targets, priors and starts."""
+
+    def __init__(self, points: Points, rig: Rig, observations: Observations, options: Options) -> None:
+        device.use()
+        import mitsuba
+
+        mi: Any = mitsuba
+        self.options, self.single = options, rig.single
+        self.texels = len(points.position)
+        count = np.diff(observations.start)
+        self.order = np.argsort(-count, kind="stable")
+        self.rig = {
+            "eye": mi.Float(aligned(rig.eye.ravel())),
+            "first": mi.UInt32(aligned(rig.first, np.uint32)),
+            "light": mi.Float(aligned(_light_rows(rig).ravel())),
+        }
+        self.chunks = []
+        for low in range(0, self.texels, LANES):
+            texel = self.order[low : low + LANES]
+            if count[texel[0]] == 0:
+                break
+            self.chunks.append(_chunk(points, observations, texel, count[texel]))
+
+    def retarget(self, rgb: Float[np.ndarray, "o 3"]) -> None:
+        """Replace what was observed; rows in the order of the Observations."""
+        for chunk in self.chunks:
+            chunk["rgb"] = _columns(rgb[chunk["rows"]])
+
+    def reweight(self, weight: Float[np.ndarray, " o"]) -> None:
+        """Replace the weights."""
+        import mitsuba
+
+        mi: Any = mitsuba
+        for chunk in self.chunks:
+            chunk["weight"] = mi.Float(aligned(np.where(chunk["real"], weight[chunk["rows"]], 0)))
+
+    def solve(
+        self,
+        start: Float[np.ndarray, "t 7"],
+        mean: Float[np.ndarray, "t 7"],
+        prior: Float[np.ndarray, "t 7"],
+        iterations: int,
+        progress: Callable[[float], None] = lambda done: None,
+    ) -> Solution:
+        """`iterations` steps from `start`; `prior` is the weight of (x - mean)². Texels without observations end at
+        `mean`, with the prior's spread."""
+        values, cost = np.clip(mean, 0, 1).astype(np.float32), np.zeros(self.texels, np.float32)
+        values[:, 3:5] = mean[:, 3:5]
+        spread = (1 / np.sqrt(np.maximum(prior, 1e-12))).astype(np.float32)
+        diagonal = np.zeros((self.texels, 7), np.float32)
+        for k, chunk in enumerate(self.chunks):
+            texel = chunk["texel"]
+            values[texel], cost[texel], spread[texel], diagonal[texel] = self._solve(
+                chunk, start[texel], mean[texel], prior[texel], iterations
+            )
+            progress((k + 1) / len(self.chunks))
+        return Solution(values, cost, spread, diagonal)
+
+    def predict(self, values: Float[np.ndarray, "t 7"]) -> Float[np.ndarray, "o 3"]:
+        """The model's radiance of every observation."""
+        import drjit as dr
+
+        total = max((int(chunk["rows"].max()) for chunk in self.chunks), default=-1) + 1
+        result = np.zeros((total, 3), np.float32)
+        for chunk in self.chunks:
+            x = _columns(values[chunk["texel"]])
+            seen = [dr.zeros(type(x[0]), len(chunk["rows"])) for _ in range(3)]
+            sizes = self._scatter(chunk, x, seen)
+            dr.eval(seen, sizes)
+            real = chunk["real"]
+            result[chunk["rows"][real]] = np.stack([np.array(c)[real] for c in seen], axis=1)
+        return result
+
+    def _scatter(self, chunk: dict, x: list, seen: list) -> Any:
+        import drjit as dr
+
+        def body(k, done):
+            index = k * chunk["width"] + chunk["lane"]
+            paint, gloss, _, _ = self._response(chunk, index, x, derivatives=False)
+            for c in range(3):
+                dr.scatter(seen[c], dr.fma(x[c], paint[c], gloss[c]), index)
+            return k + 1, done
+
+        start = (dr.zeros(type(chunk["count"]), chunk["width"]), dr.zeros(type(x[0]), chunk["width"]))
+        return dr.while_loop(start, lambda k, done: k < chunk["count"], body)
+
+    def _solve(self, chunk: dict, start, mean, prior, iterations: int) -> tuple[np.ndarray, ...]:
+        import drjit as dr
+
+        mean, prior = _columns(mean), _columns(prior)
+        first = _project(_columns(start), self.options)
+        kind, width = type(first[0]), chunk["width"]
+        free = 7 if self.options.metallic else 6
+
+        def body(k, *state):
+            tried, kept, sums, best, damping = state[:7], state[7:14], unflat(state[14:47]), state[47], state[48]
+            new = self._accumulate(chunk, list(tried))
+            total = new.cost
+            for v, m, p in zip(tried, mean, prior, strict=True):
+                total = dr.fma(p, dr.square(v - m), total)
+            better = total < best
+            damping = dr.clip(damping * dr.select(better, LIGHTER, HEAVIER), 1e-7, 1e6)
+            best = dr.select(better, total, best)
+            kept = [dr.select(better, a, b) for a, b in zip(tried, kept, strict=True)]
+            flat = [dr.select(better, a, b) for a, b in zip(flat_of(new), flat_of(sums), strict=True)]
+            change = step(unflat(flat), kept, mean, prior, damping)
+            tried = [v - s if j < free else v for j, (v, s) in enumerate(zip(kept, change, strict=True))]
+            return k + 1, *_project(tried, self.options), *kept, *flat, best, damping
+
+        state = [*first, *[kind(v) for v in first], *flat_of(nothing(kind, width))]
+        state += [dr.full(kind, 1e30, width), dr.full(kind, 1e-2 / LIGHTER, width)]
+        # An opaque number of iterations: another number does not compile another kernel.
+        last = dr.opaque(type(chunk["count"]), iterations + 1)
+        start_state = (dr.zeros(type(chunk["count"]), width), *state)
+        done = dr.while_loop(start_state, lambda k, *rest: k < last, body, label="levenberg_marquardt")[1:]
+        kept, sums = list(done[7:14]), unflat(done[14:47])
+        spread, diagonal = spread_of(sums, prior)
+        dr.eval(kept, sums.cost, spread, diagonal)
+        return _rows(kept), np.array(sums.cost), _rows(spread), _rows(diagonal)
+
+    def _accumulate(self, chunk: dict, x: list) -> Sums:
+        """Normal matrix, gradient and cost of every lane at x."""
+        import drjit as dr
+
+        kind, huber = type(x[0]), self.options.huber
+
+        def body(k, *flat):
+            sums = unflat(flat)
+            index = k * chunk["width"] + chunk["lane"]
+            paint, gloss, d_paint, d_gloss = self._response(chunk, index, x, derivatives=True)
+            weight = dr.gather(kind, chunk["weight"], index)
+            aa, aq, qq, ga, gq = (list(part) for part in sums[:5])
+            cost = sums.cost
+            residual, slope = [], []
+            for c in range(3):
+                y = dr.gather(kind, chunk["rgb"][c], index)
+                residual.append(weight * (dr.fma(x[c], paint[c], gloss[c]) - y))
+                slope.append([weight * dr.fma(x[c], d_paint[c][q], d_gloss[c][q]) for q in range(4)])
+            # One robust weight for the three channels: what spoils an observation spoils its colour.
+            size = dr.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
+            inside = size <= huber
+            robust = dr.select(inside, 1, huber / dr.maximum(size, 1e-20))
+            cost += dr.select(inside, dr.square(size), huber * (2 * size - huber))
+            for c in range(3):
+                a, r = weight * paint[c], residual[c] * robust
+                ra = a * robust
+                aa[c] = dr.fma(ra, a, aa[c])
+                ga[c] = dr.fma(a, r, ga[c])
+                for q in range(4):
+                    aq[4 * c + q] = dr.fma(ra, slope[c][q], aq[4 * c + q])
+                    gq[q] = dr.fma(slope[c][q], r, gq[q])
+                    rq = slope[c][q] * robust
+                    for p in range(q + 1):
+                        qq[triangle(q, p)] = dr.fma(rq, slope[c][p], qq[triangle(q, p)])
+            return k + 1, *aa, *aq, *qq, *ga, *gq, cost
+
+        start = (dr.zeros(type(chunk["count"]), chunk["width"]), *flat_of(nothing(kind, chunk["width"])))
+        done = dr.while_loop(start, lambda k, *rest: k < chunk["count"], body, label="texel_lm")
+        return unflat(done[1:])
+
+    def _response(self, chunk: dict, index: Any, x: list, *, derivatives: bool) -> tuple[list, list, list, list]:
+        """paint and gloss times irradiance per channel, and their derivatives by the tilt, roughness and metallic."""
+        import drjit as dr
+        import mitsuba
+
+        mi: Any = mitsuba
+        picture = dr.gather(mi.UInt32, chunk["picture"], index)
+        eye = dr.gather(mi.Point3f, self.rig["eye"], picture)
+        wi = _local(chunk["frame"], dr.normalize(eye - chunk["position"]))
+        first = dr.gather(mi.UInt32, self.rig["first"], picture)
+        if self.single:
+            return self._light(chunk, first, mi.Float(1), wi, x, derivatives)
+        lit, last = dr.gather(mi.UInt32, chunk["lit"], index), dr.gather(mi.UInt32, self.rig["first"], picture + 1)
+        width = 30 if derivatives else 6
+        zeros = tuple(dr.zeros(mi.Float, dr.width(chunk["lane"])) for _ in range(width))
+
+        def body(light, *flat):
+            shines = dr.select(((lit >> (light - first)) & 1) == 1, mi.Float(1), mi.Float(0))
+            parts = self._light(chunk, light, shines, wi, x, derivatives)
+            return light + 1, *(a + b for a, b in zip(flat, _flat4(parts), strict=True))
+
+        done = dr.while_loop((mi.UInt32(first), *zeros), lambda light, *rest: light < last, body, label="lights")
+        return _unflat4(done[1:], derivatives)
+
+    def _light(self, chunk: dict, light: Any, scale: Any, wi: Any, x: list, derivatives: bool) -> tuple:
+        import drjit as dr
+        import mitsuba
+
+        mi: Any = mitsuba
+        row = [dr.gather(mi.Float, self.rig["light"], light * 8 + k) for k in range(7)]
+        near = row[3] > 0.5
+        vector = mi.Vector3f(row[0], row[1], row[2])
+        to_light = vector - dr.select(near, mi.Vector3f(chunk["position"]), mi.Vector3f(0))
+        distance2 = dr.squared_norm(to_light)
+        wo = _local(chunk["frame"], to_light * dr.rsqrt(distance2))
+        scale = scale * dr.select(near, 1 / distance2, 1)
+        irradiance = [row[4 + c] * scale for c in range(3)]
+        terms = _terms if not derivatives else _differences if self.options.differences else _derivatives
+        paint, gloss, d_paint, d_gloss = terms(self.options, wi, wo, x[3:])
+        return (
+            [e * paint for e in irradiance],
+            [e * gloss for e in irradiance],
+            [[e * d for d in d_paint] for e in irradiance],
+            [[e * d for d in d_gloss] for e in irradiance],
+        )
+
+
+def _terms(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
+    import drjit as dr
+
+    z = dr.sqrt(dr.maximum(1 - dr.square(q[0]) - dr.square(q[1]), MIN_Z2))
+    normal = type(wi)(q[0], q[1], z)
+    paint, gloss = bsdf.terms(options.model, wi, wo, normal, q[2], q[3])
+    return paint, gloss, [], []
+
+
+def _derivatives(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
+    """By forward-mode AD: the operations that several directions share are compiled once."""
+    import drjit as dr
+
+    moving = [type(v)(v) for v in q]
+    dr.enable_grad(moving)
+    paint, gloss, _, _ = _terms(options, wi, wo, moving)
+    d_paint, d_gloss = [], []
+    for j, v in enumerate(moving):
+        if j == 3 and not options.metallic:
+            d_paint.append(dr.zeros(type(v)))
+            d_gloss.append(dr.zeros(type(v)))
+            continue
+        for other in moving:
+            dr.set_grad(other, 1.0 if other is v else 0.0)
+        dr.enqueue(dr.ADMode.Forward, moving)
+        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearInterior)
+        d_paint.append(dr.grad(paint))
+        d_gloss.append(dr.grad(gloss))
+        dr.clear_grad(paint)
+        dr.clear_grad(gloss)
+    return dr.detach(paint), dr.detach(gloss), d_paint, d_gloss
+
+
+def _differences(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
+    import drjit as dr
+
+    paint, gloss, _, _ = _terms(options, wi, wo, q)
+    d_paint, d_gloss = [], []
+    for j in range(4):
+        if j == 3 and not options.metallic:
+            d_paint.append(dr.zeros(type(q[j])))
+            d_gloss.append(dr.zeros(type(q[j])))
+            continue
+        high, low = (_terms(options, wi, wo, [v + e if k == j else v for k, v in enumerate(q)]) for e in (STEP, -STEP))
+        d_paint.append((high[0] - low[0]) * (0.5 / STEP))
+        d_gloss.append((high[1] - low[1]) * (0.5 / STEP))
+    return paint, gloss, d_paint, d_gloss
+
+
+def _project(x: list, options: Options) -> list:
+    import drjit as dr
+
+    length = dr.sqrt(dr.square(x[3]) + dr.square(x[4]))
+    scale = dr.minimum(1, options.tilt / dr.maximum(length, 1e-9))
+    colour = [dr.clip(v, 0, 1) for v in x[:3]]
+    return [*colour, x[3] * scale, x[4] * scale, dr.clip(x[5], options.floor, 1), dr.clip(x[6], 0, 1)]
+
+
+def _flat4(parts: tuple) -> list:
+    paint, gloss, d_paint, d_gloss = parts
+    return [*paint, *gloss, *(d for row in d_paint for d in row), *(d for row in d_gloss for d in row)]
+
+
+def _unflat4(flat: Any, derivatives: bool) -> tuple[list, list, list, list]:
+    flat = list(flat)
+    if not derivatives:
+        return flat[:3], flat[3:6], [[]] * 3, [[]] * 3
+    return (
+        flat[:3],
+        flat[3:6],
+        [flat[6 + 4 * c : 10 + 4 * c] for c in range(3)],
+        [flat[18 + 4 * c : 22 + 4 * c] for c in range(3)],
+    )
+
+
+def _local(frame: tuple, vector: Any) -> Any:
+    import drjit as dr
+
+    return type(vector)(dr.dot(frame[0], vector), dr.dot(frame[1], vector), dr.dot(frame[2], vector))
+
+
+def aligned(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
+    """A copy that starts at a multiple of 64 bytes.
+
+    Dr.Jit reads NumPy's memory in place and compiles the alignment into its kernels: arrays that happen to start
+    elsewhere would be another kernel in every call.
+    """
+    values = np.asarray(values)
+    count = values.size * np.dtype(kind).itemsize
+    memory = np.empty(count + 64, np.uint8)
+    first = -memory.ctypes.data % 64
+    result = memory[first : first + count].view(kind).reshape(values.shape)
+    result[...] = values
+    return result
+
+
+def _columns(values: Float[np.ndarray, "n c"]) -> list:
+    import mitsuba
+
+    mi: Any = mitsuba
+    return [mi.Float(aligned(values[:, j])) for j in range(values.shape[1])]
+
+
+def _rows(columns: list) -> Float[np.ndarray, "n c"]:
+    return np.stack([np.array(c) for c in columns], axis=1)
+
+
+def _light_rows(rig: Rig) -> Float[np.ndarray, "l 8"]:
+    rows = np.zeros((len(rig.vector), 8), np.float32)
+    rows[:, :3], rows[:, 3], rows[:, 4:7] = rig.vector, rig.near, rig.irradiance
+    return rows
+
+
+def _chunk(points: Points, seen: Observations, texel: Int[np.ndarray, " n"], count: Int[np.ndarray, " n"]) -> dict:
+    """One chunk's observations, k-th ones of all lanes together; `rows` says where they came from, `real` whether."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    width, most = len(texel), int(count[0])
+    slot = np.arange(most)[:, None]
+    real = (slot < count).ravel()
+    rows = np.where(real, (seen.start[texel] + slot).ravel(), 0)
+    frame = points.frame[texel]
+    chunk = {
+        "texel": texel,
+        "width": width,
+        "rows": rows,
+        "real": real,
+        "lane": dr.arange(mi.UInt32, width),
+        "count": mi.UInt32(aligned(count, np.uint32)),
+        "position": mi.Point3f(*_columns(points.position[texel])),
+        "frame": tuple(mi.Vector3f(*_columns(frame[:, k])) for k in range(3)),
+        "picture": mi.UInt32(aligned(seen.picture[rows], np.uint32)),
+        "weight": mi.Float(aligned(np.where(real, seen.weight[rows], 0))),
+        "lit": mi.UInt32(aligned(seen.lit[rows], np.uint32)),
+        "rgb": _columns(seen.rgb[rows]),
+    }
+    dr.eval(chunk["lane"])
+    dr.make_opaque(chunk["lane"])
+    return chunk

@@ -1,0 +1,122 @@
+"""What pixel centres see and which lights reach it: how a texel learns in which pictures it appears, and how lit."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.core.camera import Camera
+from mistyle.core.light import Directional, Light, Lights, Point, direction_in_world
+from mistyle.render import deferred, device
+from mistyle.render.draw import Tracer
+from mistyle.render.hits import BLOCK_RAYS
+from mistyle.render.texel_lm import Rig, aligned
+
+
+@dataclass(frozen=True)
+class Look:
+    """Surface points through the pixel centres of a camera, world; zero beside the mesh.
+
+    normal  interpolated shading normal, unit, not turned towards the camera
+    lit     per light whether a shadow ray from the point reaches it
+    """
+
+    position: Float[np.ndarray, "h w 3"]
+    normal: Float[np.ndarray, "h w 3"]
+    mask: Bool[np.ndarray, "h w"]
+    lit: tuple[Bool[np.ndarray, "h w"], ...]
+
+
+def look(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> Look:
+    """One exact ray through every pixel centre, and from where it ends one shadow ray to every delta light.
+
+    Lights are Directional or Point; their frame "camera" is that of `camera`. Shadow rays start where Mitsuba's do.
+    """
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    device.use()
+    height, width = camera.size
+    position, normal = np.zeros((height * width, 3), np.float32), np.zeros((height * width, 3), np.float32)
+    mask, lit = np.zeros(height * width, bool), np.zeros((len(lights), height * width), bool)
+    right, down, forward = (mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T)
+    for low in range(0, height * width, BLOCK_RAYS):
+        part = slice(low, min(low + BLOCK_RAYS, height * width))
+        index = dr.arange(mi.UInt32, part.start, part.stop)
+        x = (mi.Float(index % width) + 0.5 - camera.centre[0]) / camera.focal
+        y = (mi.Float(index // width) + 0.5 - camera.centre[1]) / camera.focal
+        ray = mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))
+        point, _ = deferred.intersect(traced, ray, None)
+        valid = point.is_valid()
+        reached = [valid & ~traced.scene.ray_test(_shadow(point, light, camera), active=valid) for light in lights]
+        where, facing = point.p & valid, point.sh_frame.n & valid
+        dr.eval(where, facing, valid, reached)
+        position[part], normal[part], mask[part] = np.array(where).T, np.array(facing).T, np.array(valid)
+        for k, each in enumerate(reached):
+            lit[k, part] = np.array(each)
+    shape = camera.size
+    return Look(
+        position.reshape(*shape, 3),
+        normal.reshape(*shape, 3),
+        mask.reshape(shape),
+        tuple(a.reshape(shape) for a in lit),
+    )
+
+
+def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
+    """The solver's record of pictures and their delta lights."""
+    vector, near, irradiance = [], [], []
+    for camera, own in zip(cameras, lights, strict=True):
+        for light in own:
+            if isinstance(light, Directional):
+                vector.append(direction_in_world(light, camera))
+                irradiance.append(light.irradiance)
+            elif isinstance(light, Point):
+                vector.append(place(light, camera))
+                irradiance.append(light.intensity)
+            else:
+                raise ValueError(f"{type(light).__name__} is no delta light")
+            near.append(float(isinstance(light, Point)))
+    return Rig(
+        eye=np.stack([camera.position for camera in cameras]).astype(np.float32),
+        first=np.cumsum([0] + [len(own) for own in lights]),
+        vector=np.array(vector, np.float32).reshape(-1, 3),
+        near=np.array(near, np.float32),
+        irradiance=np.array(irradiance, np.float32).reshape(-1, 3),
+    )
+
+
+def place(light: Point, camera: Camera) -> Float[np.ndarray, "3"]:
+    """World position of a point light."""
+    position = np.asarray(light.position, float)
+    return camera.world_from_cam[:3, :3] @ position + camera.position if light.frame == "camera" else position
+
+
+def reaches(
+    traced: Tracer, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "3"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether straight lines from points just above the surface to the world point `target` meet no face."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    device.use()
+    origin = mi.Point3f(*(mi.Float(aligned(c)) for c in (position + 1e-3 * normal).T))
+    away = mi.Point3f(np.asarray(target, float).tolist()) - origin
+    distance = dr.norm(away)
+    ray = mi.Ray3f(origin, away / distance, distance * (1 - 1e-4), 0.0, [])
+    return ~np.array(traced.scene.ray_test(ray))
+
+
+def _shadow(point: Any, light: Light, camera: Camera) -> Any:
+    import mitsuba
+
+    mi: Any = mitsuba
+    if isinstance(light, Directional):
+        return point.spawn_ray(mi.Vector3f(direction_in_world(light, camera).tolist()))
+    if isinstance(light, Point):
+        return point.spawn_ray_to(mi.Point3f(place(light, camera).tolist()))
+    raise ValueError(f"{type(light).__name__} is no delta light")

@@ -1,0 +1,36 @@
+"""Checkpoints of long fits: a folder that is replaced as a whole, named after everything that the fit depends on."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+
+from mistyle.core.errors import InputRefused
+from mistyle.files.records import load_record, save_record
+from mistyle.files.store import atomic_folder
+
+
+def place(out: Path, key: str) -> Path:
+    """Where the checkpoint of the fit with this key lies in a run folder."""
+    return out / "work" / f"checkpoint-{key[:16]}"
+
+
+def save(folder: Path, arrays: dict[str, np.ndarray]) -> None:
+    """Replace the checkpoint; a process that dies meanwhile leaves the older one."""
+    atomic_folder(folder, lambda new: save_record(new / "record", arrays))
+
+
+def load(folder: Path) -> dict[str, np.ndarray] | None:
+    """The checkpoint, or None where there is none that can be read: the fit then begins again."""
+    if not (folder / "record").is_dir():
+        return None
+    try:
+        return load_record(folder / "record")
+    except InputRefused:
+        return None
+
+
+def clear(out: Path) -> None:
+    """Remove the checkpoints of a run folder, those of other settings too: what they led to is kept or given up."""
+    for folder in (out / "work").glob("checkpoint-*"):
+        shutil.rmtree(folder, ignore_errors=True)

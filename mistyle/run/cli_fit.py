@@ -1,0 +1,168 @@
+"""The verb `mistyle fit`: a material for a mesh from pictures, or texture parameters of any Mitsuba scene."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import UsageError
+from mistyle.run.options import add_job_options, add_mesh_options, examples, said_settings
+
+# Option of the command line -> dotted setting.
+OPTIONS = {
+    "seed": "seed",
+    "threads": "threads",
+    "uv": "read.uv",
+    "up": "read.up",
+    "atlas": "atlas.size",
+    "start": "start",
+    "align": "references.align",
+    "refine_poses": "references.refine_poses",
+    "hold_out": "references.hold_out",
+    "hold_out_light": "references.hold_out_light",
+    "material": "recover.model",
+    "frame": "recover.frame",
+    "metallic": "recover.metallic",
+    "iterations": "recover.iterations",
+    "memory": "recover.memory",
+}
+
+
+def add_fit(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "fit",
+        help="albedo, normal and roughness of a mesh from pictures under known light; or parameters of a Mitsuba scene",
+        **examples(
+            """
+            mistyle fit chair.glb photographs/ -o fitted/                    camera.json or transforms.json, lights.json
+            mistyle fit chair.glb colmap/ -o fitted/ --align --light unknown  a COLMAP model, light not known
+            mistyle fit helmet.glb renders/ -o fitted/ --uv new --metallic --material gltf
+            mistyle fit --scene room.xml --list                              what could be fitted in a Mitsuba scene
+            mistyle fit --scene room.xml --references shots/ -o out/ --optimize 'chair.*.base_color' wall.bsdf.roughness
+            """
+        ),
+    )
+    verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help=".obj .ply .stl .off .glb .gltf")
+    verb.add_argument(
+        "references",
+        type=Path,
+        nargs="?",
+        metavar="REFERENCES",
+        help="a folder with camera.json, transforms.json or a COLMAP model, and its pictures",
+    )
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; the same command again goes on there")
+    add_job_options(verb, ("draft", "standard"), "draft: a texture of 512²; standard (default): 1024²")
+    add_mesh_options(verb)
+    _add_reference_options(verb)
+    _add_material_options(verb)
+    _add_scene_options(verb)
+    verb.set_defaults(command=run_fit)
+
+
+def _add_reference_options(verb: argparse.ArgumentParser) -> None:
+    given = verb.add_argument_group("the pictures")
+    given.add_argument(
+        "--lights", type=Path, metavar="FILE", help="a lights.json (default: the one beside the cameras)"
+    )
+    given.add_argument("--light", choices=["known", "unknown"], default="known", help="unknown: solve for it too")
+    given.add_argument("--masks", type=Path, metavar="DIR", help="a mask per picture, by name; white counts")
+    given.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")
+    given.add_argument("--pictures", type=Path, metavar="DIR", help="where a COLMAP model's pictures are, if elsewhere")
+    given.add_argument(
+        "--align", action="store_true", default=None, help="find the similarity from the mesh to the cameras' space"
+    )
+    given.add_argument("--refine-poses", action="store_true", default=None, help="improve the cameras before fitting")
+    given.add_argument("--hold-out", type=int, metavar="N", help="keep N pictures from the fit, to measure it by")
+    given.add_argument(
+        "--hold-out-light", type=int, metavar="K", help="keep the pictures of the K-th light (from 0) from the fit"
+    )
+
+
+def _add_material_options(verb: argparse.ArgumentParser) -> None:
+    made = verb.add_argument_group("the material")
+    made.add_argument("--name", help="name of the asset (default: the mesh's)")
+    made.add_argument("--atlas", type=int, metavar="N", help="texture size")
+    made.add_argument(
+        "--material", choices=["principled", "gltf"], help="Mitsuba's principled (default), or glTF's for engines"
+    )
+    made.add_argument("--frame", choices=["mikkt", "mitsuba"], help="tangent frame of the normal map (default mikkt)")
+    made.add_argument("--metallic", action="store_true", default=None, help="fit metalness too")
+    made.add_argument("--start", choices=["nothing", "own"], help="own: begin from the mesh's own material")
+    made.add_argument("--iterations", type=int, metavar="N", help="steps of the gradient stage")
+    made.add_argument("--memory", type=float, metavar="GB", help="memory for cached surface hits and references")
+    made.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
+
+
+def _add_scene_options(verb: argparse.ArgumentParser) -> None:
+    scene = verb.add_argument_group("any Mitsuba scene instead of MESH and REFERENCES")
+    scene.add_argument("--scene", type=Path, metavar="SCENE.xml", help="the scene (trusted like code)")
+    scene.add_argument(
+        "--references", dest="shots", type=Path, metavar="DIR", help="a picture per sensor, by id or order"
+    )
+    scene.add_argument("--optimize", nargs="+", default=[], metavar="KEY", help="parameters to fit; globs")
+    scene.add_argument("--list", action="store_true", help="list what can be fitted, and why the rest cannot, and stop")
+    scene.add_argument("-D", dest="defines", action="append", default=[], metavar="NAME=VALUE", help="as for mitsuba")
+    scene.add_argument("-m", dest="variant", metavar="VARIANT", help="as for mitsuba")
+    scene.add_argument("-s", dest="sensor", type=int, metavar="INDEX", help="fit to this sensor only")
+    scene.add_argument("-t", dest="threads", type=int, metavar="N", help="as --threads")
+
+
+def run_fit(options: argparse.Namespace) -> int:
+    """Dispatch to the two uses, and say so where they are mixed."""
+    if options.scene is not None:
+        if options.mesh is not None:
+            raise UsageError("give either MESH and REFERENCES, or --scene SCENE.xml with --references DIR, not both")
+        from mistyle.run.scene_fit import run_scene
+
+        return run_scene(options)
+    settings = material_settings(options)
+    if options.print_config:
+        from mistyle.run.settings import as_toml
+
+        sys.stdout.write(as_toml(settings))
+        return 0
+    wrong = [f"--{name}" for name in ("optimize", "list", "defines", "sensor") if getattr(options, name)]
+    if wrong:
+        raise UsageError(f"{wrong[0]} belongs to --scene SCENE.xml; see mistyle fit --help")
+    missing = [n for n in ("mesh", "references", "out") if getattr(options, n) is None]
+    if missing:
+        wanted = ", ".join("-o OUT" if m == "out" else m.upper() for m in missing)
+        raise UsageError(f"fit needs {wanted} (or --scene SCENE.xml); see mistyle fit --help")
+    return _fit_mesh(options, settings)
+
+
+def material_settings(options: argparse.Namespace) -> Any:
+    """The resolved settings of `mistyle fit MESH REFERENCES`."""
+    from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
+    from mistyle.run.settings import resolve
+
+    said = said_settings(options, OPTIONS)
+    return resolve(options.preset, options.config, said, root=MaterialSettings, presets=MATERIAL_PRESETS)
+
+
+def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
+    from mistyle.run.material import MaterialJob, fit_material
+    from mistyle.run.progress import Progress
+
+    job = MaterialJob(
+        options.mesh,
+        options.references,
+        options.out,
+        settings,
+        options.name or options.mesh.stem,
+        "unknown" if options.light == "unknown" else options.lights,
+        options.masks,
+        options.exposure,
+        options.pictures,
+        options.redo_from,
+    )
+    summary = fit_material(job, Progress())
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        for label in ("asset", "textures", "scene", "report", "picture"):
+            print(f"{label:<9} {summary[label]}", file=sys.stderr)
+        for name, value in summary["figures"].items():
+            print(f"{name:<17} {value:.4g}", file=sys.stderr)
+    return 0

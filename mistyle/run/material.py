@@ -1,0 +1,342 @@
+"""`mistyle fit`: a mesh and pictures of it under known light -> its material, measured against what was held out.
+
+Stages are kept as those of `stylize` are (run/pipeline.py): a killed run goes on from the last finished stage, and the
+fit itself from its last checkpoint.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.asset import Asset
+from mistyle.core.camera import Camera
+from mistyle.core.capture import Captures, subset
+from mistyle.core.errors import InputRefused
+from mistyle.core.light import Lights, SceneLights
+from mistyle.core.maps import Maps, Texels
+from mistyle.run import checkpoint
+from mistyle.run.inputs import input_files
+from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
+from mistyle.run.pipeline import ambient, read, start_engines
+from mistyle.run.progress import Progress, Report
+from mistyle.run.stages import MATERIAL_STAGES, Run
+
+
+@dataclass(frozen=True)
+class MaterialJob:
+    """What to fit and to what. `lights` and `masks` are files beside or instead of those in the references' folder;
+    lights "unknown" are solved for."""
+
+    mesh: Path
+    references: Path
+    out: Path
+    settings: MaterialSettings
+    name: str
+    lights: Path | Literal["unknown"] | None = None
+    masks: Path | None = None
+    exposure: Path | None = None
+    pictures: Path | None = None
+    redo_from: str | None = None
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The cameras in working space, the lights there, and what was done to bring them there."""
+
+    cameras: tuple[Camera, ...]
+    lights: tuple[Lights, ...]
+    notes: tuple[str, ...]
+    figures: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Measured:
+    """How well the fit explains each picture, those that it saw and those that it did not.
+
+    names, held   the picture's name; whether it was kept from the fit
+    psnr          of the picture in sRGB (peak 1, over the pixels that count), dB
+    worst         the pictures to look at: (index, reference, prediction), linear
+    conversion    mean relative difference of the same maps under the other material model
+    """
+
+    names: tuple[str, ...]
+    held: tuple[bool, ...]
+    psnr: tuple[float, ...]
+    worst: tuple[tuple[int, Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]], ...]
+    conversion: float
+
+
+@dataclass(frozen=True)
+class MadeMaterial:
+    """Everything a job made, as the report wants it."""
+
+    job: MaterialJob
+    asset: Asset
+    texels: tuple[Texels, ...]
+    captures: Captures
+    placed: Placed
+    recovered: Any
+    measured: Measured
+    folder: Path
+
+
+def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
+    """Read, place, fit, measure and write; returns the paths of what was written and the figures of `run.json`.
+
+    Raises a MistyleError for everything that a user can mend; what was finished before stays.
+    """
+    from mistyle.files.captures import read_captures, read_shots
+    from mistyle.run.material_report import material_report, write_summary
+
+    files = input_files(job.mesh)
+    s = job.settings
+    captures = read_captures(
+        job.references,
+        lights=job.lights,
+        masks=job.masks,
+        exposure=job.exposure,
+        pictures=job.pictures,
+        saturation=s.references.saturation,
+    )
+    refuse_scene_lights(captures, job.references)
+    shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
+    pictures = [path for shot in shots for path in (shot.picture, shot.mask) if path is not None]
+    with Run(job, progress, MATERIAL_STAGES) as run:
+        start_engines(s)
+        asset = run.record(
+            "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(job.mesh, s.read, s.atlas.size, r)
+        )
+        texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
+        given = [pictures, [vars(c) for c in captures.cameras], captures.lights, s.references]
+        placed = run.record("cameras", ["mesh"], given, lambda r: place(job, asset, captures, r))
+        captures = replace(captures, cameras=placed.cameras, lights=placed.lights)
+        if job.lights == "unknown":
+            captures = with_light(run, asset, captures)
+        kept, _ = hold_out(captures, s.references)
+        inputs = [s.recover, s.references, s.start, s.seed]
+        after = ["texels", "cameras", *(["light"] if job.lights == "unknown" else [])]
+        recovered = run.record("recover", after, inputs, lambda r: solve(run, asset, texels, subset(captures, kept), r))
+        measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
+        folder = run.stage("asset", ["recover"], [job.name], lambda f, r: write(f, job, asset, texels, recovered, r))
+        run.stage("scene", ["recover"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, captures))
+        made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
+        run.stage(
+            "report",
+            ["asset", "measure"],
+            [s.report, job.name],
+            lambda f, r: material_report(f, made, progress, r),
+        )
+        return write_summary(made, run)
+
+
+def refuse_scene_lights(captures: Captures, references: Path) -> None:
+    """A light that only a Mitsuba scene file describes cannot be summed."""
+    for camera, rig in zip(captures.cameras, captures.lights, strict=True):
+        named = next((light for light in rig if isinstance(light, SceneLights)), None)
+        if named is not None:
+            raise InputRefused(
+                f"{references}: found the picture '{camera.name}' lit by the scene file {named.file}, expected lights "
+                "that lights.json describes (directional, point, environment, ...). Write one and hand it in with "
+                "--lights, use --light unknown, or fit the scene itself with --scene."
+            )
+
+
+def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[Texels, ...]:
+    """Every texture set, rasterised."""
+    from mistyle.stages.texels import rasterise
+
+    result = []
+    for part in range(len(asset.mesh.parts)):
+        result.append(rasterise(asset.mesh, part, settings.atlas.size))
+        report((part + 1) / len(asset.mesh.parts))
+    return tuple(result)
+
+
+def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) -> Placed:
+    """The cameras in working space: as they are, through the mesh's own units, or aligned and refined on request."""
+    from mistyle.core.align import moved
+    from mistyle.files.captures import camera_space, check_pixels, read_shots, silhouette, sparse_points
+    from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
+
+    chosen = job.settings.references
+    figures: dict[str, float] = {}
+    notes = list(check_pixels(captures, lambda done: report(0.3 * done)))
+    masks, sparse = None, sparse_points(job.references) if chosen.align else None
+    if chosen.align or chosen.refine_poses:
+        shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
+        try:
+            masks = [silhouette(shot) for shot in shots]
+        except InputRefused:
+            if sparse is None or chosen.refine_poses or job.masks is not None:
+                raise
+            notes.append("The pictures have no masks: the mesh was aligned to the model's points alone.")
+    if chosen.align:
+        rng = np.random.default_rng(job.settings.seed)
+        if sparse is not None:
+            found = align_by_points(asset.mesh, sparse.position, captures.cameras, masks, rng)
+        else:
+            found = align_by_masks(asset.mesh, captures.cameras, masks or (), rng)
+        captures = moved(captures, found.work_from_cams)
+        if len(found.after):
+            figures |= {"align_px": float(np.nanmean(found.after))}
+    elif camera_space(job.references) == "own":
+        captures = moved(captures, asset.source.work_from_user)
+    report(0.6)
+    if chosen.refine_poses:
+        refined = refine_poses(
+            asset.mesh, captures.cameras, masks or (), progress=lambda done: report(0.6 + 0.4 * done)
+        )
+        captures = replace(captures, cameras=refined.cameras)
+        before, after = (float(np.nanmean(each)) for each in (refined.before, refined.after))
+        figures |= {"pose_px_before": before, "pose_px_after": after}
+    return Placed(captures.cameras, captures.lights, tuple(notes), figures)
+
+
+def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
+    """The captures lit by an environment that is solved for together with a first material."""
+    from mistyle.stages.unknown_light import find_light
+
+    s: MaterialSettings = run.job.settings
+    found = run.record(
+        "light", ["cameras"], [s.recover, s.seed], lambda r: find_light(asset.mesh, captures, s.recover, s.seed, r)
+    )
+    return replace(captures, lights=tuple((found.light,) for _ in captures.cameras))
+
+
+def lights_in_order(lights: Sequence[Lights]) -> list[int]:
+    """The number of each picture's light, by order of first appearance."""
+    seen: list[Lights] = []
+    result = []
+    for rig in lights:
+        if rig not in seen:
+            seen.append(rig)
+        result.append(seen.index(rig))
+    return result
+
+
+def hold_out(captures: Captures, settings: ReferenceSettings) -> tuple[list[int], list[int]]:
+    """(fitted to, kept for measuring): evenly chosen pictures, and those of the light that is kept away."""
+    count, number = len(captures), lights_in_order(captures.lights)
+    away = {k for k in range(count) if number[k] == settings.hold_out_light}
+    rest = [k for k in range(count) if k not in away]
+    wanted = (len(rest) // 12 if len(rest) >= 24 else 0) if settings.hold_out < 0 else settings.hold_out
+    # Multiples of the golden ratio: even steps would meet the same light of each view again and again.
+    order = np.argsort(np.arange(len(rest)) * 0.6180339887498949 % 1)
+    away |= {rest[int(k)] for k in order[:wanted]}
+    kept = [k for k in range(count) if k not in away]
+    if not kept:
+        raise InputRefused(f"all {count} references would be held out, none is left to fit to; hold out fewer")
+    return kept, sorted(away)
+
+
+def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, report: Report) -> Any:
+    """The fit, with checkpoints in work/ under the stage's key: one of another job is not taken up."""
+    from mistyle.stages.recover import recover
+    from mistyle.stages.texels import start_maps
+
+    s: MaterialSettings = run.job.settings
+    start = None
+    if s.start == "own":
+        start = [start_maps(m, t, s.atlas.size) for m, t in zip(asset.materials, texels, strict=True)]
+    folder = checkpoint.place(run.job.out, run.keys["recover"])
+    made = recover(
+        asset.mesh,
+        texels,
+        captures,
+        s.recover,
+        s.seed,
+        report,
+        start=start,
+        save=lambda arrays: checkpoint.save(folder, arrays),
+        resume=checkpoint.load(folder),
+    )
+    checkpoint.clear(run.job.out)
+    return made
+
+
+def measure(
+    asset: Asset, maps: Sequence[Maps], captures: Captures, settings: MaterialSettings, report: Report
+) -> Measured:
+    """Every picture predicted by the fitted maps and compared with what it shows."""
+    from mistyle.core.image import srgb_from_linear
+    from mistyle.measure.metrics import psnr
+    from mistyle.render import shade
+    from mistyle.render.draw import tracer
+
+    chosen, sizes = settings.recover, [m.roughness.shape for m in maps]
+    traced, table = tracer(asset.mesh), shade.pack(maps)
+    other = "gltf" if chosen.model == "principled" else "principled"
+    _, held = hold_out(captures, settings.references)
+    errors: list[float] = []
+    shown: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+    converted: list[float] = []
+    looked_at = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
+    for k in range(len(captures)):
+        one = subset(captures, [k])
+        rendered = [
+            picture_of(traced, one, sizes, table, model, chosen)
+            for model in ([chosen.model, other] if k in looked_at else [chosen.model])
+        ]
+        rgb, counts = captures.load(k)
+        counts = counts & (rendered[0][1] > 0.999)
+        if counts.any():
+            errors.append(psnr(srgb_from_linear(rgb)[counts], srgb_from_linear(rendered[0][0])[counts]))
+        else:
+            errors.append(float("nan"))
+        if k in looked_at:
+            shown[k] = (np.where(counts[..., None], rgb, 0).astype(np.float32), rendered[0][0])
+            scale = float(rendered[0][0][counts].mean()) if counts.any() else 0.0
+            if scale > 0:
+                converted.append(float(np.abs(rendered[1][0] - rendered[0][0])[counts].mean()) / scale)
+        report((k + 1) / len(captures))
+    return Measured(
+        names=tuple(camera.name for camera in captures.cameras),
+        held=tuple(k in set(held) for k in range(len(captures))),
+        psnr=tuple(errors),
+        worst=tuple((k, *pair) for k, pair in shown.items()),
+        conversion=float(np.mean(converted)) if converted else float("nan"),
+    )
+
+
+def picture_of(traced: Any, captures: Captures, sizes, table, model: str, chosen: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The one picture of `captures` as the maps predict it, and its coverage."""
+    from mistyle.render.shade import Shade
+
+    shade = Shade(traced, captures, sizes, model=model, frame=chosen.frame, subsamples=4)
+    shade.table = table
+    return shade.image(0), shade.coverage(0)
+
+
+def write(
+    folder: Path, job: MaterialJob, asset: Asset, texels: Sequence[Texels], recovered: Any, report: Report
+) -> None:
+    """The asset as `stylize` writes it."""
+    from mistyle.stages.export import write_asset
+    from mistyle.stages.texels import pad_maps
+
+    occlusion = [
+        ambient(asset, part, job.settings.atlas.size, job.settings.seed, report)
+        for part in range(len(asset.mesh.parts))
+    ]
+    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(recovered.maps, texels, strict=True)]
+    provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
+    write_asset(folder, job.name, asset, padded, occlusion, texels, provenance=provenance)
+
+
+def scene(
+    folder: Path, job: MaterialJob, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures
+) -> None:
+    """A Mitsuba scene of the result that renders where mistyle is not installed."""
+    from mistyle.stages.frames import mitsuba_normals
+    from mistyle.stages.scene_file import write_scene
+    from mistyle.stages.texels import pad_maps
+
+    turned = list(recovered.maps)
+    if job.settings.recover.frame == "mikkt":
+        turned = [replace(m, normal=mitsuba_normals(asset.mesh, m, t)) for m, t in zip(turned, texels, strict=True)]
+    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(turned, texels, strict=True)]
+    write_scene(folder, job.name, asset.mesh, padded, captures.cameras, captures.lights[0])

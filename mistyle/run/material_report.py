@@ -1,0 +1,206 @@
+"""What `mistyle fit` reports: the page, and `run.json`."""
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mistyle.core.image import luminance, srgb_from_linear
+from mistyle.files.store import atomic_write
+from mistyle.run.charts import Chart
+from mistyle.run.pages import close_up, file_list, frames, heat, map_shots, render, setting_groups, shown, side_by_side
+from mistyle.run.progress import Progress
+from mistyle.run.report import Figure, MapSet, Note, Pair, Report, Shot, Step, Timing, write_report
+from mistyle.run.stages import MATERIAL_STAGES, Run
+from mistyle.run.summary import earlier, merged_seconds, peak_gb, versions
+
+MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
+    "seen_share": ("share of the covered texels that at least one reference sees", "higher"),
+    "confident_share": ("share of the covered texels whose material the references determine well", "higher"),
+    "psnr_fitted": ("mean PSNR (sRGB, peak 1) of the pictures that the material was fitted to, dB", "higher"),
+    "psnr_held_out": ("mean PSNR (sRGB, peak 1) of the pictures that were kept from the fit, dB", "higher"),
+    "conversion_error": (
+        "mean relative difference of the same maps under the other material model: what a viewer of that model adds",
+        "lower",
+    ),
+    "align_px": ("distance of the mesh's outline from the masks' after alignment, pixels", "lower"),
+    "pose_px_before": ("how far cameras were from the mesh's outline, pixels, before they were refined", "lower"),
+    "pose_px_after": ("how far cameras are from the mesh's outline, pixels, after they were refined", "lower"),
+}
+
+
+def material_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
+    """Draw the pictures and write `index.html`, `beauty.png` and `overview.png` into `folder`."""
+    from mistyle.files.images import write_png
+
+    settings, maps = made.job.settings, made.recovered.maps
+    turntable = frames(made.asset, maps, settings, lambda done: report(0.7 * done))
+    beauty = shown(render(made.asset, maps, [close_up(settings)], settings, backdrop=True, finer=4)[0])[..., :3]
+    _, reference, predicted = made.measured.worst[0]
+    write_png(folder / "beauty.png", beauty)
+    shots = [encoded(reference, reference), encoded(predicted, reference), beauty]
+    write_png(folder / "overview.png", side_by_side(shots))
+    report(0.9)
+    found = figures(made)
+    page = Report(
+        title=made.job.name,
+        mesh=made.job.mesh.name,
+        style=f"{len(made.captures)} pictures of {made.job.references.name}",
+        relation="fitted to",
+        painting=Shot(encoded(reference, reference), f"A reference: {made.measured.names[made.measured.worst[0][0]]}"),
+        turntable=tuple(turntable),
+        made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
+        facts=facts(made),
+        notes=tuple(Note(t) for t in (*made.asset.source.notes, *made.placed.notes, *made.recovered.notes)),
+        steps=steps(made),
+        maps=map_sets(made),
+        timings=tuple(Timing(MATERIAL_STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
+        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k]) for k, v in found.items()),
+        settings=setting_groups(settings),
+        versions=tuple(versions().items()),
+        files=file_list(made.folder, made.job.name),
+    )
+    write_report(folder / "index.html", page)
+
+
+def encoded(picture: np.ndarray, exposed_by: np.ndarray) -> np.ndarray:
+    """A linear picture for the eye: the brightest percent of `exposed_by` is white."""
+    light = luminance(exposed_by)
+    bright = float(np.percentile(light[light > 0], 99)) if (light > 0).any() else 1.0
+    return srgb_from_linear(np.clip(picture / max(bright, 1e-6), 0, 1).astype(np.float32))
+
+
+def facts(made: Any) -> tuple[tuple[str, str], ...]:
+    mesh = made.asset.mesh
+    return (
+        ("faces", f"{len(mesh.faces):,}"),
+        ("texture sets", str(len(mesh.parts))),
+        ("texture size", f"{made.job.settings.atlas.size}²"),
+        ("pictures", str(len(made.captures))),
+        ("held out", str(sum(made.measured.held))),
+        ("material", made.job.settings.recover.model),
+    )
+
+
+def steps(made: Any) -> tuple[Step, ...]:
+    measured = made.measured
+    pairs = tuple(
+        Pair(
+            Shot(encoded(reference, reference), "reference"),
+            Shot(encoded(predicted, reference), "predicted"),
+            f"{measured.names[k]}: {measured.psnr[k]:.1f} dB{', held out' if measured.held[k] else ''}",
+        )
+        for k, reference, predicted in measured.worst
+    )
+    differences = tuple(
+        Shot(difference(reference, predicted), f"{measured.names[k]}: error", "white: 0.1 of the picture's white")
+        for k, reference, predicted in measured.worst
+    )
+    compare = Step(
+        "References and predictions",
+        "What the pictures show, and what the fitted material shows from the same camera under the same light.",
+        pairs=pairs,
+        shots=differences,
+        columns=4,
+    )
+    curves = Step("Convergence", "The loss of the fit, step by step.", charts=tuple(curve_charts(made.recovered.trace)))
+    bars = Step(
+        "Every picture",
+        "PSNR of each prediction (sRGB, peak 1).",
+        charts=(
+            Chart(
+                "PSNR by picture",
+                {
+                    "fitted": [p if not h else float("nan") for p, h in zip(measured.psnr, measured.held, strict=True)],
+                    "held out": [p if h else float("nan") for p, h in zip(measured.psnr, measured.held, strict=True)],
+                },
+                x_label="picture",
+                y_label="dB",
+                bars=True,
+            ),
+        ),
+    )
+    parts = list(zip(made.asset.mesh.parts, made.texels, strict=True))
+    trust = Step(
+        "Confidence",
+        "How well the references determine each texel's material: dark blue not at all, yellow well; and by how many "
+        "pictures it is seen.",
+        shots=tuple(
+            Shot(picture, f"{name}: {what}", sharp=True)
+            for k, (name, t) in enumerate(parts)
+            for what, picture in (
+                ("confidence", heat(made.recovered.confidence[k], t)),
+                ("seen", heat(made.recovered.seen[k] / max(len(made.captures), 1), t)),
+            )
+        ),
+        columns=2,
+    )
+    return (compare, curves, bars, trust)
+
+
+def curve_charts(trace: dict[str, list[float]]) -> list[Chart]:
+    return [Chart(name, {name: values}, x_label="step", log=True) for name, values in trace.items() if len(values) > 1]
+
+
+def difference(reference: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """|difference| in sRGB, ten times as bright."""
+    apart = np.abs(encoded(predicted, reference) - encoded(reference, reference))
+    return np.clip(10 * np.where((reference > 0).any(axis=-1, keepdims=True), apart, 0), 0, 1)
+
+
+def map_sets(made: Any) -> tuple[MapSet, ...]:
+    return tuple(MapSet(n, map_shots(m)) for n, m in zip(made.asset.mesh.parts, made.recovered.maps, strict=True))
+
+
+def figures(made: Any) -> dict[str, float]:
+    covered = [t.covered for t in made.texels]
+    total = max(sum(int(c.sum()) for c in covered), 1)
+
+    def share(masks: Sequence[np.ndarray]) -> float:
+        return sum(int((m & c).sum()) for m, c in zip(masks, covered, strict=True)) / total
+
+    def mean(held: bool) -> float:
+        values = [p for p, h in zip(made.measured.psnr, made.measured.held, strict=True) if h == held]
+        return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
+
+    found = {
+        "seen_share": share([s > 0 for s in made.recovered.seen]),
+        "confident_share": share([c > 0.5 for c in made.recovered.confidence]),
+        "psnr_fitted": mean(False),
+        "psnr_held_out": mean(True),
+        "conversion_error": made.measured.conversion,
+        **made.placed.figures,
+    }
+    return {name: value for name, value in found.items() if np.isfinite(value)}
+
+
+def write_summary(made: Any, run: Run) -> dict[str, Any]:
+    """Write `run.json`; returns what the caller wants to know."""
+    job = made.job
+    path = job.out / "run.json"
+    summary = {
+        "name": job.name,
+        "asset": str(job.out / "asset" / f"{job.name}.glb"),
+        "textures": str(job.out / "asset" / "textures"),
+        "scene": str(job.out / "scene" / f"{job.name}.xml"),
+        "report": str(job.out / "report" / "index.html"),
+        "picture": str(job.out / "report" / "overview.png"),
+        "seconds": merged_seconds(path, run),
+        "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
+        "figures": figures(made),
+        "notes": [*made.asset.source.notes, *made.placed.notes, *made.recovered.notes],
+    }
+    record = summary | {
+        "inputs": {"mesh": job.mesh.name, "references": job.references.name},
+        "pictures": [
+            {"name": n, "held_out": h, "psnr": p if np.isfinite(p) else None}
+            for n, h, p in zip(made.measured.names, made.measured.held, made.measured.psnr, strict=True)
+        ],
+        "seed": job.settings.seed,
+        "settings": job.settings.model_dump(mode="json"),
+        "versions": versions(),
+    }
+    atomic_write(path, (json.dumps(record, indent=1) + "\n").encode())
+    return summary

@@ -1,0 +1,54 @@
+"""The settings of `mistyle fit`: one record per stage, as run/settings.py has them for `stylize`."""
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mistyle.run.settings import ReadSettings, ReportSettings
+from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.texels import AtlasSettings
+
+
+class ReferenceSettings(BaseModel):
+    """How the pictures that a material is fitted to are read and placed."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    saturation: float = Field(
+        default=1.0, gt=0, le=1, description="encoded value from which a channel is blown out (JPEGs stop short of 1)"
+    )
+    align: bool = Field(default=False, description="find the similarity that brings the mesh into the cameras' space")
+    refine_poses: bool = Field(default=False, description="improve every camera against the mesh before fitting")
+    hold_out: int = Field(
+        default=-1,
+        ge=-1,
+        le=1000,
+        description="pictures kept from the fit to measure it by; -1: one in twelve, from 24 pictures on",
+    )
+    hold_out_light: int = Field(
+        default=-1,
+        ge=-1,
+        le=1000,
+        description="keep the pictures of this light (by order of appearance) from the fit, to measure it by; -1: none",
+    )
+
+
+class MaterialSettings(BaseModel):
+    """One fit of a material: a mesh, pictures of it, and how."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
+    threads: int = Field(default=0, ge=0, le=1024, description="threads of the renderer; 0 takes all cores")
+    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
+    start: Literal["nothing", "own"] = Field(
+        default="nothing", description="begin from nothing, or from the material that the mesh brings along"
+    )
+    read: ReadSettings = ReadSettings()
+    references: ReferenceSettings = ReferenceSettings()
+    atlas: AtlasSettings = AtlasSettings(size=1024)
+    recover: RecoverSettings = RecoverSettings()
+    report: ReportSettings = ReportSettings(frames=12, resolution=384, spp=16)
+
+
+MATERIAL_PRESETS: dict[str, dict[str, Any]] = {"draft": {"atlas": {"size": 512}}, "standard": {}}

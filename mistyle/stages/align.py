@@ -1,0 +1,329 @@
+"""Bringing cameras and mesh together by what can be seen of the mesh: its silhouettes, and its shading where known.
+
+A silhouette's residual is a distance in pixels. At every rim pixel of the mesh as drawn, the observed mask's signed
+distance d_seen less the drawn mask's own d_drawn is how far the rim must move along the gradient of d_seen; the rim's
+points on the mesh say how a motion moves it (to first order the rim stays the same points). Gauss-Newton on all rims
+gives the motion: seven parameters for a similarity of all cameras, six for a camera of its own.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from mistyle.core.align import moved_camera, similarity
+from mistyle.core.camera import Camera
+from mistyle.core.contours import block_means, contour_distance, rim_of, signed_distance, slope_of
+from mistyle.core.errors import InputRefused
+from mistyle.core.icp import align_points, in_masks, visual_hull
+from mistyle.core.image import luminance
+from mistyle.core.mesh import Mesh
+from mistyle.render.draw import Tracer, gbuffer, tracer
+
+LEVELS = (96, 256)  # pixels along the longer side, coarse to fine
+WAYS = 3  # of laying the visual hull on the mesh that the silhouettes are asked about
+STEPS = 12  # at most, per level
+FAR = 0.05  # root mean square distance of an object's points from its mesh that no reconstruction reaches
+STILL = 0.01  # pixels that a step moves the rims when nothing more is to be gained
+# How far a camera may plausibly be off: it holds the motions that neither silhouette nor shading shows.
+TURN, SHIFT = np.radians(3.0), 0.03
+
+_View = tuple[Camera, np.ndarray, int]  # shrunk camera, its mask, how many pixels of the picture one of its is wide
+
+# Linear radiance that camera (of whatever size) number k should see of the mesh.
+Predict = Callable[[Camera, int], Float[np.ndarray, "h w 3"]]
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """A similarity to the working space and how well each view's silhouette fits: mean distance of the contours in
+    pixels of the full picture, with the starting similarity and with the one found. NaN where a view shows nothing."""
+
+    work_from_cams: Float[np.ndarray, "4 4"]
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Refined cameras and the mean distance of each one's contours, in pixels, before and after."""
+
+    cameras: tuple[Camera, ...]
+    before: tuple[float, ...]
+    after: tuple[float, ...]
+
+
+def align_by_points(
+    mesh: Mesh,
+    points: Float[np.ndarray, "n 3"],
+    cameras: Sequence[Camera],
+    masks: Sequence[Bool[np.ndarray, "h w"]] | None,
+    rng: np.random.Generator,
+) -> Alignment:
+    """The similarity from COLMAP's points (those inside the masks, where there are masks), then from the silhouettes.
+
+    Without masks the points must be the object's own. InputRefused when they do not lie on the mesh, or when they lie
+    on it equally well another way round and no masks can tell.
+    """
+    own = points if masks is None else points[in_masks(points, cameras, masks)]
+    if len(own) < 20:
+        raise InputRefused(
+            f"--align: found {len(own)} of {len(points)} points on the object; expected at least 20. "
+            "Check the masks, or reconstruct with more pictures."
+        )
+    found, *_ = align_points(mesh, own, rng)
+    if found.residual > FAR:
+        raise InputRefused(
+            f"--align: the points stay {found.residual:.3f} of the mesh's radius away; expected less than {FAR}. "
+            "Hand in masks (the points show other things too), or check that this is the mesh of the pictures."
+        )
+    if masks is None:
+        if found.rival < 1.1:
+            raise InputRefused(
+                "--align: found two ways to lay the points on the mesh that fit equally well (it is symmetric); "
+                "expected one. Hand in masks, or align the cameras by hand."
+            )
+        return Alignment(found.work_from_cams, (), ())
+    return align_by_masks(mesh, cameras, masks, rng, start=found.work_from_cams)
+
+
+def align_by_masks(
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    rng: np.random.Generator,
+    start: Float[np.ndarray, "4 4"] | None = None,
+    levels: Sequence[int] = LEVELS,
+) -> Alignment:
+    """The similarity from the cameras' space to the working space under which silhouettes fit the masks.
+
+    Without a `start`, the visual hull that the masks carve is laid on the mesh first; that needs views from around the
+    object. With one, it may be off by some 20 degrees and a third of the size.
+    """
+    if not any(mask.any() for mask in masks):
+        raise InputRefused("--align: found only empty masks; expected the object's. Check that white is the object.")
+    traced = tracer(mesh)
+    coarse = [_shrunk(camera, mask, levels[0]) for camera, mask in zip(cameras, masks, strict=True)]
+    if start is None:
+        start = _from_hull(mesh, traced, cameras, masks, coarse, rng)
+    matrix = _descend(traced, coarse, start)
+    for side in levels[1:]:
+        small = [_shrunk(camera, mask, side) for camera, mask in zip(cameras, masks, strict=True)]
+        matrix = _descend(traced, small, matrix)
+    finest = [_shrunk(camera, mask, levels[-1]) for camera, mask in zip(cameras, masks, strict=True)]
+    return Alignment(matrix, _distances(traced, finest, start), _distances(traced, finest, matrix))
+
+
+def _from_hull(
+    mesh: Mesh,
+    traced: Tracer,
+    cameras: Sequence[Camera],
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    coarse: Sequence[_View],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "4 4"]:
+    """Of the ways in which the visual hull lies on the mesh, the one whose silhouettes fit best: a hull from few views
+    has humps that the mesh has not, so that its own residual may favour another."""
+    try:
+        shell = visual_hull(cameras, masks)
+    except ValueError as error:
+        raise InputRefused(f"--align: found that {error}; expected one object in all. Check the masks.") from error
+    ways = [found.work_from_cams for found in align_points(mesh, shell, rng, trim=0.8)]
+    misfits = [_misfit(traced, coarse, way) for way in ways]
+    order = np.argsort(misfits)[:WAYS]
+    close = [ways[k] for k in order if misfits[k] <= 2 * misfits[order[0]]]
+    if len(close) == 1:
+        return close[0]
+    return min((_descend(traced, coarse, way) for way in close), key=lambda way: _misfit(traced, coarse, way))
+
+
+def _misfit(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> float:
+    """Mean distance of the contours over the views; infinite where a view shows nothing of the mesh."""
+    found = _distances(traced, views, matrix)
+    return float(np.mean(np.nan_to_num(found, nan=np.inf)))
+
+
+def refine_poses(
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    masks: Sequence[Bool[np.ndarray, "h w"]],
+    *,
+    pictures: Callable[[int], tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]] | None = None,
+    predict: Predict | None = None,
+    levels: Sequence[int] = (*LEVELS, 768),
+    progress: Callable[[float], None] = lambda done: None,
+) -> Poses:
+    """Every camera (working space), turned and shifted so that the mesh's silhouette fits its mask.
+
+    With `pictures` (`Captures.load`) and `predict`, the shading's luminance is brought together too (up to a factor per
+    view): it shows the motions that a silhouette does not. What neither shows stays as it was, as do focal lengths. A
+    view whose contours would fit worse keeps its camera, and so does one that shows nothing of the mesh.
+    """
+    if (pictures is None) != (predict is None):
+        raise ValueError("shading needs both, the pictures and what they should show")
+    traced = tracer(mesh)
+    refined, before, after = [], [], []
+    for k, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
+        shading = None
+        if pictures is not None and predict is not None:
+            shading = _Shading(*pictures(k), lambda seen, k=k: predict(seen, k))
+        pose = camera
+        for side in levels:
+            pose = _settle(traced, pose, mask, side, shading)
+        finest = levels[-1]
+        old, new = (_distance(traced, *_shrunk(which, mask, finest)[:2]) for which in (camera, pose))
+        times = _shrunk(camera, mask, finest)[2]
+        kept = not np.isfinite(new) or (shading is None and new > old)
+        refined.append(camera if kept else pose)
+        before.append(old * times)
+        after.append((old if kept else new) * times)
+        progress((k + 1) / len(cameras))
+    return Poses(tuple(refined), tuple(before), tuple(after))
+
+
+@dataclass(frozen=True)
+class _Shading:
+    """A picture (linear, which pixels count) and what a camera should see."""
+
+    picture: Float[np.ndarray, "h w 3"]
+    counts: Bool[np.ndarray, "h w"]
+    predict: Callable[[Camera], Float[np.ndarray, "h w 3"]]
+
+
+def _shrunk(camera: Camera, mask: np.ndarray, side: int) -> tuple[Camera, np.ndarray, int]:
+    """Camera and mask with about `side` pixels along the longer side, and how much smaller: by an odd number, so that
+    no pixel is half in and half out, which would move all contours outwards or all inwards."""
+    if mask.shape != camera.size:
+        raise ValueError(f"a mask of {mask.shape} for a camera of {camera.size}")
+    times = 2 * round((max(camera.size) / side - 1) / 2) + 1 if max(camera.size) > side else 1
+    small = block_means(mask.astype(np.float32), times) >= 0.5
+    focal, centre = camera.focal / times, (camera.centre[0] / times, camera.centre[1] / times)
+    return replace(camera, focal=focal, centre=centre, size=small.shape), small, times
+
+
+def _distance(traced: Tracer, camera: Camera, mask: np.ndarray) -> float:
+    return contour_distance(gbuffer(traced, camera).mask, mask)
+
+
+def _distances(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> tuple[float, ...]:
+    return tuple(times * _distance(traced, moved_camera(camera, matrix), mask) for camera, mask, times in views)
+
+
+def _rows(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Camera coordinates (n 3) of points, and how pixels move with them: (n 2 3)."""
+    cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
+    z = np.maximum(cam[:, 2], 1e-6)
+    moves = np.zeros((len(cam), 2, 3))
+    moves[:, 0, 0] = moves[:, 1, 1] = 1
+    moves[:, :, 2] = -cam[:, :2] / z[:, None]
+    return cam, moves * (camera.focal / z)[:, None, None]
+
+
+def _rotating(points: np.ndarray) -> np.ndarray:
+    """d (w x p) / d w = -[p]x, (n 3 3)."""
+    x, y, z = points.T
+    zero = np.zeros_like(x)
+    return np.stack([np.stack([zero, z, -y], 1), np.stack([-z, zero, x], 1), np.stack([y, -x, zero], 1)], axis=1)
+
+
+def _rim_rows(
+    traced: Tracer, camera: Camera, seen: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """The rim's points (n 3, working space), their camera coordinates, the residuals (n) and how these change with
+    the camera coordinates (n 3); None where the mesh or the mask shows no rim."""
+    hits = gbuffer(traced, camera)
+    rim = rim_of(hits.mask)
+    if not rim.any() or not seen.any():
+        return None
+    distance = signed_distance(seen)
+    slope = slope_of(distance)[rim]
+    residual = (distance - signed_distance(hits.mask))[rim]
+    points = hits.position[rim].astype(float)
+    cam, moves = _rows(camera, points)
+    return points, cam, residual, np.einsum("nk,nkj->nj", slope, moves)
+
+
+def _weights(residual: np.ndarray) -> np.ndarray:
+    """Huber's, so that a hole in a mask or a cable beside the object pulls no more than a pixel's error does."""
+    limit = max(1.0, 1.5 * float(np.median(np.abs(residual))))
+    return limit / np.maximum(np.abs(residual), limit)
+
+
+def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.ndarray:
+    """Gauss-Newton on the similarity: the mesh turns, shifts and grows in its own space, all cameras together."""
+    for _ in range(STEPS):
+        lhs, rhs, rows = np.zeros((7, 7)), np.zeros(7), []
+        for camera, seen, _ in views:
+            placed = moved_camera(camera, matrix)
+            found = _rim_rows(traced, placed, seen)
+            if found is None:
+                continue
+            points, _, residual, by_cam = found
+            by_world = by_cam @ placed.cam_from_world[:3, :3]
+            turning = np.einsum("nj,njk->nk", by_world, _rotating(points))
+            jacobian = np.concatenate([turning, by_world, (by_world * points).sum(axis=1, keepdims=True)], axis=1)
+            weight = _weights(residual)
+            lhs += (jacobian * weight[:, None]).T @ jacobian
+            rhs += (jacobian * weight[:, None]).T @ residual
+            rows.append(jacobian)
+        if not rows:
+            break
+        step = -np.linalg.solve(lhs + np.diag(1e-4 * lhs.diagonal() + 1e-9), rhs)
+        step /= max(1.0, float(np.abs(step).max()) / 0.3)
+        motion = similarity(float(np.exp(step[6])), Rotation.from_rotvec(step[:3]).as_matrix(), step[3:6])
+        # The mesh's motion, seen from the mesh, moves the cameras the other way.
+        matrix = np.linalg.inv(motion) @ matrix
+        if np.sqrt(np.mean((np.concatenate(rows) @ step) ** 2)) < STILL:
+            break
+    return matrix
+
+
+def _settle(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading: _Shading | None) -> Camera:
+    """Gauss-Newton on one camera's pose at one size."""
+    small, seen, times = _shrunk(camera, mask, side)
+    depth = max(float(np.linalg.norm(camera.position)), 1e-6)
+    prior = np.diag(1 / np.array([TURN] * 3 + [SHIFT * depth] * 3) ** 2)
+    total = np.zeros(6)
+    for _ in range(STEPS):
+        found = _rim_rows(traced, small, seen)
+        if found is None:
+            break
+        _, cam, residual, by_cam = found
+        jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotating(cam)), by_cam], axis=1)
+        if shading is not None:
+            more = _shading_rows(traced, small, times, shading)
+            jacobian, residual = np.concatenate([jacobian, more[0]]), np.concatenate([residual, more[1]])
+        weight = _weights(residual)
+        lhs = (jacobian * weight[:, None]).T @ jacobian + prior
+        step = -np.linalg.solve(lhs, (jacobian * weight[:, None]).T @ residual + prior @ total)
+        total += step
+        motion = similarity(1.0, Rotation.from_rotvec(step[:3]).as_matrix(), step[3:])
+        small = replace(small, world_from_cam=small.world_from_cam @ np.linalg.inv(motion))
+        if np.sqrt(np.mean((jacobian @ step) ** 2)) < STILL:
+            break
+    return replace(camera, world_from_cam=small.world_from_cam)
+
+
+def _shading_rows(traced: Tracer, camera: Camera, times: int, shading: _Shading) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals of the luminance, as pixels (over the picture's mean slope), and how the camera's motion changes them.
+
+    A point of the mesh keeps the luminance that the drawn view gives it; where the picture has it is asked.
+    """
+    hits = gbuffer(traced, camera)
+    drawn = luminance(shading.predict(camera))
+    counts = block_means(shading.counts.astype(np.float32), times) > 0.999
+    seen = luminance(block_means(shading.picture, times))
+    inner = hits.mask & counts & (signed_distance(hits.mask & counts) > 2) & np.isfinite(drawn)
+    if inner.sum() < 50:
+        return np.zeros((0, 6)), np.zeros(0)
+    gain = float((seen[inner] * drawn[inner]).sum() / max((drawn[inner] ** 2).sum(), 1e-12))
+    slope = slope_of(seen)[inner]
+    scale = float(np.sqrt((slope**2).sum(axis=1).mean()))
+    if scale < 1e-9:
+        return np.zeros((0, 6)), np.zeros(0)
+    cam, moves = _rows(camera, hits.position[inner].astype(float))
+    by_cam = np.einsum("nk,nkj->nj", slope, moves) / scale
+    jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotating(cam)), by_cam], axis=1)
+    return jacobian, (seen - gain * drawn)[inner] / scale

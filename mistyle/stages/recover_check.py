@@ -1,0 +1,68 @@
+"""Which reference pictures say something, and what is taken off them."""
+
+import numpy as np
+
+from mistyle.core.camera import Camera, in_frame, px_from_world
+from mistyle.core.capture import Captures, Loaded, subset
+from mistyle.core.errors import InputRefused
+from mistyle.core.image import resize
+from mistyle.core.light import Lights
+from mistyle.core.mesh import Mesh
+
+LEAST_VIEWS = 3
+
+
+def usable(mesh: Mesh, captures: Captures, notes: list[str]) -> Captures:
+    """The pictures that say something. A picture of another size than its camera is refused, as are captures of which
+    nothing is left."""
+    if len(captures) == 0:
+        raise InputRefused("No reference pictures came; give at least three views of the object.")
+    kept, silent = [], []
+    for k, camera in enumerate(captures.cameras):
+        rgb, mask = captures.load(k)
+        if rgb.shape[:2] != camera.size or mask.shape != camera.size:
+            found, wanted = "x".join(map(str, rgb.shape[1::-1])), "x".join(map(str, camera.size[::-1]))
+            raise InputRefused(
+                f"Picture '{camera.name}' has {found} pixels, its camera {wanted}. Resize one to the other's size."
+            )
+        reason = _why_not(mesh, camera, captures.lights[k], rgb, mask)
+        (silent if reason else kept).append((k, reason))
+    for k, reason in silent:
+        notes.append(f"Picture '{captures.cameras[k].name}' is left out: {reason}.")
+    if not kept:
+        reasons = "; ".join(sorted({reason for _, reason in silent}))
+        raise InputRefused(f"None of {len(captures)} reference pictures can be used ({reasons}). Check cameras, masks"
+                           " and exposure.")  # fmt: skip
+    views = {captures.cameras[k].world_from_cam.tobytes() for k, _ in kept}
+    if len(views) < LEAST_VIEWS:
+        notes.append(
+            f"Only {len(views)} different view(s) can be used: the fit is singular, normals and roughness are guesses."
+            f" Give at least {LEAST_VIEWS} views, better 16 around the object."
+        )
+    return subset(captures, [k for k, _ in kept])
+
+
+def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: np.ndarray) -> str:
+    """Why a picture cannot be used, or nothing."""
+    px, depth = px_from_world(camera, mesh.positions.astype(np.float64))
+    if not (in_frame(camera, px) & (depth > 0)).any():
+        return "its camera cannot see the mesh"
+    if not lights:
+        return "no light is given for it"
+    if not mask.any():
+        return "none of its pixels counts (all are saturated, masked or not numbers)"
+    if not (rgb[mask] > 0).any():
+        return "it is all black"
+    return ""
+
+
+def without(captures: Captures, indirect: dict[int, np.ndarray]) -> Captures:
+    """The pictures less their indirect light, as coarse pictures that may still come."""
+
+    def load(k: int) -> Loaded:
+        rgb, mask = captures.load(k)
+        if k in indirect:
+            rgb = rgb - resize(indirect[k], captures.cameras[k].size)
+        return rgb, mask
+
+    return Captures(captures.cameras, captures.lights, load)

@@ -1,0 +1,273 @@
+"""From pictures to what each texel was seen to reflect: the observations of the per-texel solver.
+
+A texel's reference value is the picture, interpolated bilinearly where the texel's centre is seen. It counts where all
+four pixels around that place count, show the texel's own surface, and lie, with their neighbours, wholly in the light
+or wholly out of it: pixels on the edge of a shadow or a silhouette are mixtures that no material explains.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.camera import Camera
+from mistyle.core.capture import Captures
+from mistyle.core.image import erode
+from mistyle.core.light import Directional, Point
+from mistyle.core.maps import Texels
+from mistyle.core.mesh import Mesh
+from mistyle.render.draw import Tracer
+from mistyle.render.texel_lm import Observations, Points, Rig
+from mistyle.render.texel_views import look, rig
+
+REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
+LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane
+PERCENTILE = 95.0  # of the observed radiance: the unit of the noise
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """The observations of one picture: rows of the Observations, top left pixel and place between the four, 0..1."""
+
+    rows: Int[np.ndarray, " n"]
+    pixel: Int[np.ndarray, " n"]
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Everything that the pictures say about t covered texels (those of all sets, one set after the other).
+
+    texel     flat index of each into the concatenated sets
+    sightings per picture
+    views     how many different cameras observed each texel
+    """
+
+    texel: Int[np.ndarray, " t"]
+    points: Points
+    rig: Rig
+    observations: Observations
+    sightings: tuple[Sighting, ...]
+    views: Int[np.ndarray, " t"]
+
+    @property
+    def seen(self) -> Int[np.ndarray, " t"]:
+        """How many pictures observed each texel in the light."""
+        return np.diff(self.observations.start)
+
+
+def gather(
+    traced: Tracer,
+    texels: Sequence[Texels],
+    captures: Captures,
+    tangents: Float[np.ndarray, "f 3 4"] | None,
+    *,
+    facing: float = 0.2,
+    noise: float = 0.002,
+    relative: float = 0.01,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Gathered:
+    """All observations under delta lights (pictures with any other light are left out).
+
+    `facing` is the least cosine between the texel's normal and the camera; the standard deviation of an observation of
+    radiance y is noise · (the brightest radiance, robustly) + relative · y, larger where the surface turns away and
+    where the texel is smaller than the pixel, which then says more about its neighbours.
+    """
+    covered = [t.covered for t in texels]
+    texel = np.flatnonzero(np.concatenate([c.ravel() for c in covered]))
+    position = np.concatenate([t.position[c] for t, c in zip(texels, covered, strict=True)])
+    face = np.concatenate([t.face[c] for t, c in zip(texels, covered, strict=True)])
+    normal = np.concatenate([t.normal[c] for t, c in zip(texels, covered, strict=True)])
+    size = np.concatenate([texel_sizes(t) for t in texels])[texel]
+    points = Points(position, texel_frames(traced.mesh, face, position, normal, tangents))
+    used = [k for k, own in enumerate(captures.lights) if all(isinstance(s, Directional | Point) for s in own)]
+    parts: list[tuple] = []
+    views = np.zeros(len(texel), np.int32)
+    for done, group in enumerate(_by_camera(captures.cameras, used)):
+        camera = captures.cameras[group[0]]
+        beams = [light for k in group for light in captures.lights[k]]
+        seen = look(traced, camera, beams)
+        near, pixel, x, y, worth = _visible(camera, seen, position, normal, size, facing)
+        any_light, first = np.zeros(len(near), bool), 0
+        for k in group:
+            count = len(captures.lights[k])
+            lit = [_steady(mask, seen.mask) for mask in seen.lit[first : first + count]]
+            first += count
+            rgb, usable = captures.load(k)
+            ids, values, bits, chosen = _observe(rgb, usable, lit, near, pixel, x, y)
+            any_light[chosen] = True
+            parts.append((k, ids, values, bits, pixel[chosen], x[chosen], y[chosen], worth[chosen]))
+        views[near[any_light]] += 1
+        progress((done + 1) / max(len(used) / max(len(group), 1), 1))
+    return _assemble(texel, points, captures, parts, views, noise, relative)
+
+
+def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, "n 3"]:
+    """Any picture of the camera, at the places of its observations."""
+    return _bilinear(image, at.pixel, at.x, at.y)
+
+
+def texel_frames(
+    mesh: Mesh,
+    face: Int[np.ndarray, " t"],
+    position: Float[np.ndarray, "t 3"],
+    normal: Float[np.ndarray, "t 3"],
+    tangents: Float[np.ndarray, "f 3 4"] | None,
+) -> Float[np.ndarray, "t 3 3"]:
+    """Tangent, bitangent and normal at surface points, as `render/deferred.py` builds them at samples.
+
+    With `tangents` (MikkTSpace, per corner) the interpolated tangent made perpendicular to the normal; without them
+    Mitsuba's own frame, the face's dp/du made perpendicular.
+    """
+    if tangents is None:
+        tangent, hand = _along_u(mesh)[face], np.ones(len(face), np.float32)
+    else:
+        corners = mesh.positions[mesh.faces[face]].astype(np.float32)
+        weights = _barycentric(corners, position)
+        tangent = (tangents[face, :, :3] * weights[..., None]).sum(axis=1)
+        hand = np.sign(tangents[face, 2, 3])
+    s = tangent - normal * (normal * tangent).sum(axis=1, keepdims=True)
+    length = np.linalg.norm(s, axis=1, keepdims=True)
+    spare = np.where(np.abs(normal[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
+    spare = spare - normal * (normal * spare).sum(axis=1, keepdims=True)
+    s = np.where(length > 1e-6, s / np.maximum(length, 1e-6), spare / np.linalg.norm(spare, axis=1, keepdims=True))
+    t = np.cross(normal, s) * hand[:, None]
+    return np.stack([s, t, normal], axis=1).astype(np.float32)
+
+
+def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
+    """The shorter side of every texel on the surface, from where its neighbours in the island lie; 0 without any."""
+    p, island = texels.position, texels.island
+    sides = np.full((2, *island.shape), np.inf, np.float32)
+    for axis, side in enumerate(sides):
+        ahead, here = np.moveaxis(p, axis, 0), np.moveaxis(np.asarray(side), axis, 0)
+        label = np.moveaxis(island, axis, 0)
+        same = (label[1:] == label[:-1]) & (label[1:] >= 0)
+        length = np.where(same, np.sqrt(((ahead[1:] - ahead[:-1]) ** 2).sum(axis=-1)), np.inf)
+        here[:-1] = length
+        here[1:] = np.minimum(here[1:], length)
+    smallest = sides.min(axis=0).ravel()
+    return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
+
+
+def _along_u(mesh: Mesh) -> Float[np.ndarray, "f 3"]:
+    """dp/du of every face."""
+    p, uv = mesh.positions[mesh.faces].astype(np.float64), mesh.corner_uvs.astype(np.float64)
+    e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
+    result = (d2[:, 1:] * e1 - d1[:, 1:] * e2) / np.where(area != 0, area, 1)[:, None]
+    return (result / np.maximum(np.linalg.norm(result, axis=1, keepdims=True), 1e-30)).astype(np.float32)
+
+
+def _barycentric(corners: Float[np.ndarray, "t 3 3"], position: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
+    e1, e2, d = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], position - corners[:, 0]
+    a, b, c = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
+    f, g = (e1 * d).sum(1), (e2 * d).sum(1)
+    area = a * c - b * b
+    safe = np.where(area > 1e-20, area, 1)
+    l1 = np.clip(np.where(area > 1e-20, (c * f - b * g) / safe, 1 / 3), 0, 1)
+    l2 = np.clip(np.where(area > 1e-20, (a * g - b * f) / safe, 1 / 3), 0, 1)
+    return np.stack([1 - l1 - l2, l1, l2], axis=1)
+
+
+def _by_camera(cameras: Sequence[Camera], used: Sequence[int]) -> list[list[int]]:
+    """Pictures taken from one place with one lens belong together."""
+    groups: dict[tuple, list[int]] = {}
+    for k in used:
+        camera = cameras[k]
+        key = (camera.world_from_cam.tobytes(), camera.focal, camera.centre, camera.size)
+        groups.setdefault(key, []).append(k)
+    return list(groups.values())
+
+
+def _visible(camera: Camera, seen, position, normal, size, facing: float) -> tuple[np.ndarray, ...]:
+    """Texels whose four pixels show their own surface: index, top left pixel, place between the pixels, and what the
+    observation is worth, 0..1."""
+    height, width = camera.size
+    eye = camera.position.astype(np.float32)
+    away = eye - position
+    distance = np.sqrt((away**2).sum(axis=1))
+    cosine = (away * normal).sum(axis=1) / np.maximum(distance, 1e-12)
+    local = (position - eye) @ camera.world_from_cam[:3, :3].astype(np.float32)
+    depth = np.maximum(local[:, 2], 1e-6)
+    x = local[:, 0] / depth * np.float32(camera.focal) + np.float32(camera.centre[0] - 0.5)
+    y = local[:, 1] / depth * np.float32(camera.focal) + np.float32(camera.centre[1] - 0.5)
+    inside = (cosine > facing) & (local[:, 2] > 0) & (x >= 0) & (y >= 0) & (x < width - 1) & (y < height - 1)
+    near = np.flatnonzero(inside)
+    left, top = np.floor(x[near]), np.floor(y[near])
+    pixel = (top * width + left).astype(np.int64)
+    p, n = position[near], normal[near]
+    unit = depth[near] / np.float32(camera.focal)
+    reach, lift = (REACH * unit / cosine[near]) ** 2, LIFT * unit / cosine[near]
+    good = np.ones(len(near), bool)
+    hit, front, mask = seen.position.reshape(-1, 3), seen.normal.reshape(-1, 3), seen.mask.ravel()
+    for step in (0, 1, width, width + 1):
+        d = hit.take(pixel + step, axis=0) - p
+        good &= mask.take(pixel + step) & ((d * d).sum(axis=1) <= reach)
+        good &= np.abs((d * n).sum(axis=1)) <= lift
+        good &= (front.take(pixel + step, axis=0) * n).sum(axis=1) > 0.5
+    chosen = near[good]
+    worth = np.sqrt(cosine[chosen]) * np.minimum(size[chosen] / unit[good], 1)
+    return chosen, pixel[good], (x[near] - left)[good], (y[near] - top)[good], worth
+
+
+def _steady(lit: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
+    """1 where a pixel and its neighbours on the mesh are all lit, 0 where none is, -1 at the edge of a shadow."""
+    whole, none = erode(lit | ~mask, 1) & mask, erode(~lit | ~mask, 1)
+    return np.where(whole, 1, np.where(none, 0, -1)).astype(np.int8)
+
+
+def _observe(rgb, usable, lit, near, pixel, x, y) -> tuple[np.ndarray, ...]:
+    """Texels that one picture observes in the light: index, radiance, light bits, which of `near`."""
+    usable = erode(usable & np.isfinite(rgb).all(axis=-1), 1)
+    width = rgb.shape[1]
+    good, bits = np.ones(len(near), bool), np.zeros(len(near), np.uint32)
+    corners = [pixel + step for step in (0, 1, width, width + 1)]
+    for corner in corners:
+        good &= usable.ravel().take(corner)
+    for k, state in enumerate(lit):
+        four = np.stack([state.ravel().take(corner) for corner in corners])
+        on, off = (four == 1).all(axis=0), (four == 0).all(axis=0)
+        good &= on | off
+        bits |= np.where(on, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
+    chosen = np.flatnonzero(good & (bits != 0))
+    values = _bilinear(rgb, pixel[chosen], x[chosen], y[chosen])
+    return near[chosen], values, bits[chosen], chosen
+
+
+def _bilinear(image: Float[np.ndarray, "h w 3"], pixel, x, y) -> Float[np.ndarray, "n 3"]:
+    flat, width = image.reshape(-1, 3), image.shape[1]
+    x, y = x[:, None], y[:, None]
+    top = flat.take(pixel, axis=0) * (1 - x) + flat.take(pixel + 1, axis=0) * x
+    bottom = flat.take(pixel + width, axis=0) * (1 - x) + flat.take(pixel + width + 1, axis=0) * x
+    return top * (1 - y) + bottom * y
+
+
+def _assemble(texel, points, captures: Captures, parts, views, noise: float, relative: float) -> Gathered:
+    """Sort the observations by texel; within a texel they follow the pictures' order."""
+    parts = sorted(parts, key=lambda part: part[0])
+    count = np.zeros(len(texel), np.int64)
+    for part in parts:
+        count[part[1]] += 1
+    start = np.concatenate([[0], np.cumsum(count)])
+    filled, total = start[:-1].copy(), int(start[-1])
+    picture, lit = np.zeros(total, np.int32), np.zeros(total, np.uint32)
+    rgb, worth = np.zeros((total, 3), np.float32), np.ones(total, np.float32)
+    nothing = np.zeros(0, np.int64)
+    sightings = [Sighting(nothing, nothing, nothing.astype(np.float32), nothing.astype(np.float32))] * len(captures)
+    for k, ids, values, bits, pixel, x, y, share in parts:
+        rows = filled[ids]
+        filled[ids] += 1
+        picture[rows], lit[rows], rgb[rows], worth[rows] = k, bits, values, share
+        sightings[k] = Sighting(rows, pixel, x.astype(np.float32), y.astype(np.float32))
+    level = np.maximum(rgb.max(axis=1, initial=0), 0)
+    unit = float(np.percentile(level, PERCENTILE)) if total else 1.0
+    weight = worth / (noise * max(unit, 1e-6) + relative * level)
+    observations = Observations(start, picture, rgb, weight.astype(np.float32), lit)
+    return Gathered(texel, points, rig(captures.cameras, _delta(captures)), observations, tuple(sightings), views)
+
+
+def _delta(captures: Captures) -> list:
+    return [own if all(isinstance(s, Directional | Point) for s in own) else () for own in captures.lights]

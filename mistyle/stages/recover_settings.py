@@ -1,0 +1,64 @@
+"""What a user may choose about fitting materials to pictures under known light."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class RecoverSettings(BaseModel):
+    """Choices of `stages/recover.py`; defaults are what measuring on synthetic maps of known truth suggested.
+
+    Lengths of radiance are relative to the brightest that was observed, so no default depends on the exposure.
+    """
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    model: Literal["principled", "gltf"] = Field(
+        default="principled", description="reflectance: Mitsuba's principled, or glTF's metallic-roughness exactly"
+    )
+    frame: Literal["mikkt", "mitsuba"] = Field(
+        default="mikkt", description="frame of the normal map: MikkTSpace as engines have it, or Mitsuba 3.9's per face"
+    )
+    metallic: bool = Field(default=False, description="fit metallic too; without it the start's is kept (0 if none)")
+    solver: Literal["both", "texels", "pictures"] = Field(
+        default="both",
+        description="texel by texel (Levenberg-Marquardt), then whole pictures (Adam), or one of them alone",
+    )
+    solver_texels: int = Field(
+        default=2_000_000, ge=1, description="most texels solved one by one; a finer atlas is solved at a coarser level"
+    )
+    solver_iterations: int = Field(default=12, ge=1, le=1000, description="steps from each start")
+    rounds: int = Field(
+        default=3,
+        ge=0,
+        le=100,
+        description="how often what the pictures still differ by is given back to the texels, which are solved again",
+    )
+    neighbours: float = Field(
+        default=0.05, gt=0, description="standard deviation between a texel and the mean of its neighbours"
+    )
+    noise: float = Field(default=0.002, gt=0, le=1, description="standard deviation of a pixel in the dark")
+    relative: float = Field(default=0.01, ge=0, le=1, description="standard deviation of a pixel relative to its value")
+    facing: float = Field(
+        default=0.2, gt=0, lt=1, description="least cosine between a texel's normal and the camera that observes it"
+    )
+    iterations: int = Field(default=480, ge=0, le=1_000_000, description="steps of Adam, one picture each")
+    rate: float = Field(default=0.003, gt=0, le=1, description="Adam's first rate; it falls to zero along a cosine")
+    levels: int | None = Field(
+        default=None,
+        ge=1,
+        le=16,
+        description="levels of the pyramid that preconditions Adam; none: 1 after the texels were solved, else 5",
+    )
+    loss: Literal["log_srgb_l1", "l2"] = Field(default="log_srgb_l1", description="what Adam minimises")
+    subsamples: int = Field(default=4, ge=1, le=64, description="samples a pixel, a square number")
+    roughness_floor: float = Field(
+        default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
+    )
+    bounces: int = Field(
+        default=1, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
+    )
+    bounce_samples: int = Field(default=64, ge=1, le=4096, description="samples a pixel of that estimate")
+    shadows: bool = Field(default=True, description="whether the object shadows itself")
+    memory: float = Field(default=4.0, gt=0, description="GB for what is kept of the pictures' samples")
+    checkpoint: float = Field(default=60.0, gt=0, description="seconds between checkpoints")

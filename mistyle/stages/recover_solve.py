@@ -1,0 +1,174 @@
+"""Rounds of the per-texel solver: neighbours help those that saw little, and the pictures correct what they model not.
+
+The solver takes a texel's radiance for that of the picture at one place, but a pixel is a mean over its area of
+interpolated texels. So after each solve the pictures are rendered as they are really made (`render/shade.py`), and
+what they still differ by is added to what the texels should reach (defect correction): at the end the pictures agree.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.image import nearest
+from mistyle.core.maps import Texels
+from mistyle.render.texel_lm import Problem, Solution
+from mistyle.stages.recover_observe import Gathered, fetch
+from mistyle.stages.recover_settings import RecoverSettings
+
+# Where a texel is thought to be before anything was seen, and how far from there (standard deviations).
+PRIOR_MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.5, 0.0)
+PRIOR_SPREAD = (1.0, 1.0, 1.0, 0.6, 0.6, 0.8, 0.8)
+STARTS = (0.25, 0.7)  # roughness has local minima
+RESTARTS = 3  # rounds in which texels also try what their neighbours found
+MISFIT = 0.1  # cost per observation above which a texel has less to say to its neighbours
+BLUR = 4  # steps of spreading, each to the four nearest texels
+
+Table = Float[np.ndarray, "a 8"]
+Values = Float[np.ndarray, "t 7"]
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """All texels of all sets in one row after the other: which are covered, and which neighbours share an island."""
+
+    sizes: tuple[tuple[int, int], ...]
+    covered: tuple[np.ndarray, ...]
+    right: tuple[np.ndarray, ...]
+    below: tuple[np.ndarray, ...]
+    closest: tuple[np.ndarray, ...]
+
+    @property
+    def offsets(self) -> list[int]:
+        """Where each set begins, and the end."""
+        return [0, *np.cumsum([rows * columns for rows, columns in self.sizes]).tolist()]
+
+
+def atlas(texels: Sequence[Texels]) -> Atlas:
+    """The atlas of some texture sets."""
+    covered = tuple(t.covered for t in texels)
+    islands = [t.island for t in texels]
+    return Atlas(
+        sizes=tuple((t.covered.shape[0], t.covered.shape[1]) for t in texels),
+        covered=covered,
+        right=tuple((i[:, :-1] == i[:, 1:]) & (i[:, 1:] >= 0) for i in islands),
+        below=tuple((i[:-1] == i[1:]) & (i[1:] >= 0) for i in islands),
+        closest=tuple(nearest(c)[0].ravel() if c.any() else np.arange(c.size) for c in covered),
+    )
+
+
+def spread_out(values: Values, gathered: Gathered, where: Atlas) -> Table:
+    """The table of an atlas: covered texels have their values, the others those of the nearest covered one."""
+    table = np.zeros((where.offsets[-1], 8), np.float32)
+    table[:, :7] = PRIOR_MEAN
+    table[gathered.texel, :7] = values
+    return fill(table, where)
+
+
+def fill(table: Table, where: Atlas, only: np.ndarray | None = None) -> Table:
+    """Uncovered texels (of `only`, where given) take the values of the nearest covered one of their set."""
+    result = table.copy()
+    for k, closest in enumerate(where.closest):
+        low, high = where.offsets[k], where.offsets[k + 1]
+        empty = ~where.covered[k].ravel()
+        if only is not None:
+            empty &= only[low:high]
+        result[low:high][empty] = table[low:high][closest[empty]]
+    return result
+
+
+def neighbourhood(
+    values: Float[np.ndarray, "t c"], weight: Float[np.ndarray, "t c"], gathered: Gathered, where: Atlas, steps: int
+) -> Float[np.ndarray, "t c"]:
+    """Weighted mean over the texels around within the same island; where none has a weight, the texel's own value."""
+    channels = values.shape[1]
+    full = np.zeros((2, where.offsets[-1], channels), np.float32)
+    full[0, gathered.texel], full[1, gathered.texel] = values * weight, weight
+    for k, size in enumerate(where.sizes):
+        part = full[:, where.offsets[k] : where.offsets[k + 1]].reshape(2, *size, channels)
+        right, below = where.right[k][..., None], where.below[k][..., None]
+        for _ in range(steps):
+            total = 2 * part
+            total[:, :, :-1] += part[:, :, 1:] * right
+            total[:, :, 1:] += part[:, :, :-1] * right
+            total[:, :-1] += part[:, 1:] * below
+            total[:, 1:] += part[:, :-1] * below
+            part[...] = total * np.float32(0.2)
+    summed, weights = full[:, gathered.texel]
+    return np.where(weights > 1e-12, summed / np.maximum(weights, 1e-12), values).astype(np.float32)
+
+
+def first_solve(
+    problem: Problem, start: Values, mean: Values, settings: RecoverSettings, progress: Callable[[float], None]
+) -> Solution:
+    """The best of several starts: `start` itself, and every roughness (and metallic) of a coarse grid."""
+    prior = np.tile(1 / np.array(PRIOR_SPREAD, np.float32) ** 2, (len(mean), 1)).astype(np.float32)
+    tries = [start]
+    for metal in (0.1, 0.9) if settings.metallic else (None,):
+        for roughness in STARTS:
+            other = mean.copy()
+            other[:, 5] = roughness
+            if metal is not None:
+                other[:, 6] = metal
+            tries.append(other)
+    tries = tries if not np.array_equal(start, mean) else tries[1:]
+    solved = []
+    for k, each in enumerate(tries):
+        done = lambda share, k=k: progress((k + share) / len(tries))  # noqa: E731
+        solved.append(problem.solve(each, mean, prior, settings.solver_iterations, done))
+    return best(solved, mean, prior)
+
+
+def best(solutions: Sequence[Solution], mean: Values, prior: Values) -> Solution:
+    """Texel by texel the solution of least cost with its prior; the first of equals."""
+    result = solutions[0]
+    least = result.cost + ((result.values - mean) ** 2 * prior).sum(axis=1)
+    for other in solutions[1:]:
+        cost = other.cost + ((other.values - mean) ** 2 * prior).sum(axis=1)
+        better = cost < least
+        least = np.where(better, cost, least)
+        result = Solution(
+            np.where(better[:, None], other.values, result.values),
+            np.where(better, other.cost, result.cost),
+            np.where(better[:, None], other.spread, result.spread),
+            np.where(better[:, None], other.diagonal, result.diagonal),
+        )
+    return result
+
+
+def another_round(
+    problem: Problem,
+    gathered: Gathered,
+    where: Atlas,
+    solution: Solution,
+    differences: Callable[[int], np.ndarray],
+    settings: RecoverSettings,
+    number: int,
+) -> Solution:
+    """Solve again for targets corrected by `differences(k)`, reference minus render of picture k for `solution`.
+
+    Each texel's prior is the mean of its neighbours, weighted by how sure they are.
+    """
+    target = problem.predict(solution.values)
+    if len(target) < len(gathered.observations.rgb):
+        target = np.pad(target, ((0, len(gathered.observations.rgb) - len(target)), (0, 0)))
+    for k, sighting in enumerate(gathered.sightings):
+        if len(sighting.rows):
+            target[sighting.rows] += fetch(differences(k), sighting)
+    problem.retarget(target)
+    sure = 1 / np.maximum(solution.spread, 1e-4) ** 2
+    sure = np.minimum(sure, np.quantile(sure, 0.9, axis=0))
+    misfit = solution.cost / np.maximum(gathered.seen, 1) / MISFIT
+    sure = (sure / (1 + misfit[:, None]) ** 2).astype(np.float32)
+    sure[gathered.seen == 0] = 1e-6
+    mean = neighbourhood(solution.values, sure, gathered, where, BLUR)
+    prior = np.full(mean.shape, 1 / settings.neighbours**2, np.float32)
+    solved = [problem.solve(solution.values, mean, prior, 5)]
+    if number < RESTARTS:
+        for roughness in (None, 0.15, 0.4, 0.8):
+            other = mean.copy()
+            if roughness is not None:
+                other[:, 5] = roughness
+            solved.append(problem.solve(other, mean, prior, 8))
+    return best(solved, mean, prior)

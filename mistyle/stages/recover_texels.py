@@ -1,0 +1,173 @@
+"""The texels' part of a recovery: observations, solver, rounds and indirect light, at a level that fits."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.core.capture import Captures
+from mistyle.core.image import resize
+from mistyle.core.light import Directional, Point
+from mistyle.core.maps import Maps, Texels
+from mistyle.stages import recover_solve as solving
+from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.texels import rasterise
+
+
+@dataclass(frozen=True)
+class Work:
+    """What all parts of one fit share."""
+
+    traced: Any
+    tangents: np.ndarray | None
+    texels: Sequence[Texels]
+    where: solving.Atlas
+    captures: Captures
+    settings: RecoverSettings
+    notes: list[str]
+
+
+@dataclass(frozen=True)
+class Found:
+    """What the texels found out by themselves, at the atlas's resolution."""
+
+    table: Float[np.ndarray, "a 8"]
+    spread: Float[np.ndarray, "a 7"]
+    seen: Int[np.ndarray, " a"]
+    views: Int[np.ndarray, " a"]
+
+
+def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed: int, trace, progress) -> Found:
+    """`solve_texels` on the finest level with at most `solver_texels` texels, enlarged to the atlas."""
+    from mistyle.render.shade import Shade
+
+    by, settings = 1, work.settings
+    sides = [side for size in work.where.sizes for side in size]
+    while sum(int(c.sum()) for c in work.where.covered) / by**2 > settings.solver_texels:
+        if any(side % (2 * by) or side // (2 * by) < 8 for side in sides):
+            break
+        by *= 2
+    if by == 1 or settings.solver == "pictures":
+        return solve_texels(work, shade, start, indirect, seed, trace, progress)
+    mesh = shade.traced.mesh
+    texels = [rasterise(mesh, p, size[0] // by) for p, size in enumerate(work.where.sizes)]
+    where = solving.atlas(texels)
+    small = Shade(
+        shade.traced, work.captures, where.sizes, model=settings.model, frame=settings.frame,
+        subsamples=settings.subsamples, shadows=settings.shadows, memory=settings.memory * 1e9,
+    )  # fmt: skip
+    if start is not None:
+        start = [_shrunk(maps, size) for maps, size in zip(start, where.sizes, strict=True)]
+    found = solve_texels(replace(work, texels=texels, where=where), small, start, indirect, seed, trace, progress)
+    work.notes.append(f"Texels were solved one by one on a level {by} times coarser than the atlas.")
+    large = [
+        np.concatenate(
+            [
+                _enlarged(values[a:b].reshape(*size, -1), by).reshape((b - a) * by * by, -1)
+                for a, b, size in zip(where.offsets[:-1], where.offsets[1:], where.sizes, strict=True)
+            ]
+        )
+        for values in (found.table, found.spread, found.seen, found.views)
+    ]
+    return Found(large[0].astype(np.float32), large[1], large[2][:, 0], large[3][:, 0])
+
+
+def _enlarged(values: np.ndarray, by: int) -> np.ndarray:
+    """Interpolated where they are numbers, repeated where they count."""
+    if values.dtype.kind == "f":
+        return resize(values, (values.shape[0] * by, values.shape[1] * by))
+    return np.repeat(np.repeat(values, by, axis=0), by, axis=1)
+
+
+def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
+    fields = {name: resize(getattr(maps, name), size) for name in ("albedo", "normal", "roughness", "metallic")}
+    return Maps(known=np.zeros(size, bool), **fields)
+
+
+def solve_texels(
+    work: Work,
+    shade,
+    start: Sequence[Maps] | None,
+    indirect: dict[int, np.ndarray],
+    seed: int,
+    trace: dict[str, list[float]],
+    progress: Callable[[float], None],
+) -> Found:
+    """The per-texel solver and its rounds, with indirect light taken off the pictures in between."""
+    from mistyle.render.shade import pack
+    from mistyle.render.texel_lm import Options, Problem
+    from mistyle.stages.recover_observe import gather
+
+    settings, where = work.settings, work.where
+    gathered = gather(
+        work.traced, work.texels, work.captures, work.tangents,
+        facing=settings.facing, noise=settings.noise, relative=settings.relative,
+        progress=lambda done: progress(0.3 * done),
+    )  # fmt: skip
+    mean = np.tile(np.array(solving.PRIOR_MEAN, np.float32), (len(gathered.texel), 1))
+    first = mean.copy() if start is None else pack(start)[gathered.texel, :7].copy()
+    mean[:, 6] = first[:, 6]
+    spread = np.tile(np.array(solving.PRIOR_SPREAD, np.float32), (len(mean), 1))
+    values = first
+    if settings.solver != "pictures" and len(gathered.observations.rgb):
+        problem = Problem(
+            gathered.points, gathered.rig, gathered.observations,
+            Options(settings.model, settings.metallic, floor=settings.roughness_floor),
+        )  # fmt: skip
+        solution = solving.first_solve(problem, first, mean, settings, lambda done: progress(0.3 + 0.2 * done))
+        total = settings.rounds * (1 + settings.bounces)
+        for number in range(total):
+            table = solving.spread_out(solution.values, gathered, where)
+            if number and number % settings.rounds == 0:
+                take_off_indirect(work, shade, table, indirect, seed)
+            shade.table = table
+            lost: list[float] = []
+
+            def differences(k: int, lost=lost) -> np.ndarray:
+                rgb, mask = work.captures.load(k)
+                wrong = np.where(mask[..., None], np.nan_to_num(rgb) - shade.image(k), 0).astype(np.float32)
+                lost.append(float((wrong**2).mean()))
+                return wrong
+
+            solution = solving.another_round(problem, gathered, where, solution, differences, settings, number)
+            trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
+            progress(0.5 + 0.5 * (number + 1) / total)
+        # Observations that do not fit say less than their number promises.
+        values = solution.values
+        spread = solution.spread * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
+        bad = ~np.isfinite(values).all(axis=1)
+        if bad.any():
+            work.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
+            values = np.where(bad[:, None], mean, values)
+            spread = np.where(bad[:, None], np.array(solving.PRIOR_SPREAD, np.float32), spread)
+    elif settings.solver != "pictures":
+        work.notes.append("No picture is lit by directional or point lights alone: texels were not solved one by one.")
+    return Found(
+        solving.spread_out(values, gathered, where),
+        _placed(spread, gathered.texel, where, np.array(solving.PRIOR_SPREAD, np.float32)),
+        _placed(gathered.seen, gathered.texel, where, 0),
+        _placed(gathered.views, gathered.texel, where, 0),
+    )
+
+
+def take_off_indirect(work: Work, shade, table: np.ndarray, indirect: dict[int, np.ndarray], seed: int) -> None:
+    """Estimate the indirect light of every picture with the maps found so far; `indirect` then holds it."""
+    from mistyle.render.indirect import Indirect, retarget
+    from mistyle.render.shade import unpack
+
+    settings = work.settings
+    maps = unpack(table, work.where.sizes)
+    scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
+    for k, (camera, lights) in enumerate(zip(work.captures.cameras, work.captures.lights, strict=True)):
+        if all(isinstance(light, Directional | Point) for light in lights):
+            indirect[k] = scene.picture(camera, lights, settings.bounce_samples, seed + k)
+            retarget(shade, k, work.captures.load(k)[0])
+
+
+def _placed(values: np.ndarray, texel: np.ndarray, where: solving.Atlas, otherwise) -> np.ndarray:
+    result = np.zeros((where.offsets[-1], *values.shape[1:]), values.dtype)
+    result[...] = otherwise
+    result[texel] = values
+    return result

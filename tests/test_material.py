@@ -1,0 +1,227 @@
+"""`mistyle fit` as a user runs it: from a folder of pictures to an asset, a Mitsuba scene and a report."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import mistyle
+from mistyle.core.camera import look_at
+from mistyle.core.capture import in_memory
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.image import gaussian, srgb_from_linear
+from mistyle.core.light import Directional, to_json
+from mistyle.core.maps import flat_maps
+from mistyle.core.view import View
+from mistyle.files.images import write_png
+from mistyle.files.read import read_mesh
+from mistyle.files.views import write_views
+from mistyle.render import draw, shade
+from mistyle.run.charts import Chart, svg
+from mistyle.run.cli import main
+from mistyle.run.material import hold_out, lights_in_order
+from mistyle.run.material_settings import ReferenceSettings
+
+SIZE, SIDE = 64, 112
+KEYS = [
+    Directional((0.5, -0.5, -0.707), (2.5, 2.5, 2.5), "camera"),
+    Directional((-0.6, 0.2, -0.775), (2.5, 2.4, 2.3), "camera"),
+]
+QUICK = {
+    "recover": {"iterations": 40, "rounds": 1, "solver_iterations": 8},
+    "report": {"frames": 4, "resolution": 96, "spp": 1},
+}
+
+
+def bowl(path: Path) -> None:
+    """A shallow paraboloid over the unit square, UVs the square itself."""
+    n = 17
+    grid = np.stack(np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="xy"), -1).reshape(-1, 2)
+    x, y = 2 * grid.T - 1
+    lines = [f"v {a:.6f} {b:.6f} {0.25 * (1 - a * a - b * b):.6f}" for a, b in zip(x, y, strict=True)]
+    normal = np.stack([0.5 * x, 0.5 * y, np.ones_like(x)], -1)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    lines += [f"vn {a:.6f} {b:.6f} {c:.6f}" for a, b, c in normal]
+    lines += [f"vt {0.02 + 0.96 * u:.6f} {0.02 + 0.96 * v:.6f}" for u, v in grid]
+    for r in range(n - 1):
+        for c in range(n - 1):
+            a, b, d, e = (r * n + c + 1, r * n + c + 2, (r + 1) * n + c + 2, (r + 1) * n + c + 1)
+            lines.append("f " + " ".join(f"{i}/{i}/{i}" for i in (a, b, d, e)))
+    path.write_text("\n".join(lines) + "\n")
+
+
+def truth() -> object:
+    rng = np.random.default_rng(4)
+    noise = [gaussian(rng.normal(size=(SIZE, SIZE)).astype(np.float32), 3) for _ in range(6)]
+    unit = [n / n.std() for n in noise]
+    albedo = np.clip(0.4 + 0.12 * np.stack(unit[:3], -1), 0.05, 0.9).astype(np.float32)
+    tilt = 0.1 * np.stack(unit[3:5], -1)
+    normal = np.concatenate([tilt, np.sqrt(np.maximum(1 - (tilt**2).sum(-1, keepdims=True), 0.1))], -1)
+    normal = (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+    roughness = np.clip(0.45 + 0.1 * unit[5], 0.2, 0.8).astype(np.float32)
+    return replace(flat_maps(SIZE), albedo=albedo, normal=normal, roughness=roughness)
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    """A mesh file and a folder of 24 references, EXR, of 12 cameras under two lights, with their lights.json."""
+    folder = tmp_path_factory.mktemp("material")
+    bowl(folder / "bowl.obj")
+    asset = read_mesh(folder / "bowl.obj", size=SIZE)
+    cameras, rigs = [], []
+    for k in range(12):
+        angle, high = 2.4 * k, 0.55 + 0.35 * (k % 3)
+        place = 4 * np.array([np.cos(angle) * np.cos(high), np.sin(angle) * np.cos(high), np.sin(high)])
+        for j, light in enumerate(KEYS):
+            cameras.append(look_at(place.tolist(), fov=30, size=(SIDE, SIDE), name=f"c{k:02d}_{j}"))
+            rigs.append((light,))
+    blank = [np.zeros((SIDE, SIDE, 3), np.float32)] * len(cameras)
+    traced = draw.tracer(asset.mesh)
+    shader = shade.Shade(traced, in_memory(cameras, rigs, blank), [(SIZE, SIZE)], subsamples=4)
+    shader.table = shade.pack([truth()])
+    views = []
+    for k, camera in enumerate(cameras):
+        hits = draw.gbuffer(traced, camera)
+        fields = (shader.image(k), hits.depth, hits.normal, hits.uv, hits.part, hits.mask, shader.coverage(k))
+        views.append(View(camera, *fields))
+    write_views(folder / "shots", views, ())
+    named = {camera.name: rig for camera, rig in zip(cameras, rigs, strict=True)}
+    (folder / "shots" / "lights.json").write_text(json.dumps(to_json((), named)))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def fitted(shots):
+    summary = mistyle.fit(shots / "bowl.obj", shots / "shots", shots / "out", atlas={"size": SIZE}, **QUICK)
+    return shots / "out", summary
+
+
+def test_the_material_explains_pictures_that_were_held_out(fitted):
+    out, summary = fitted
+    assert summary["figures"]["psnr_held_out"] > 40
+    record = json.loads((out / "run.json").read_text())
+    assert sum(p["held_out"] for p in record["pictures"]) == 2 and len(record["pictures"]) == 24
+    assert {"c00_0", "c11_1"} <= {p["name"] for p in record["pictures"]}
+    page = (out / "report" / "index.html").read_text()
+    assert "fitted to" in page and "<svg" in page and "held out" in page
+    for path in ("asset", "scene", "report", "picture"):
+        assert Path(summary[path]).is_file()
+
+
+def test_the_mitsuba_scene_shows_what_the_reference_shows(fitted, shots):
+    """Read by `mi.load_file` with nothing of ours registered in the scene: Mitsuba's own plugins only."""
+    import mitsuba as mi
+
+    out, summary = fitted
+    text = Path(summary["scene"]).read_text()
+    assert "mistyle" not in text
+    scene = mi.load_file(summary["scene"])
+    picture = np.array(mi.render(scene, sensor=0, spp=64))[..., :3]
+    from mistyle.files.read import read_exr
+
+    planes = read_exr(shots / "shots" / "c00_0.exr")
+    reference = np.stack([planes[c] for c in "RGB"], -1)
+    inside = planes["A"] > 0.999
+    error = srgb_from_linear(picture)[inside] - srgb_from_linear(reference)[inside]
+    assert 10 * np.log10(1 / np.mean(error**2)) > 34
+
+
+def test_a_second_run_takes_everything_over(fitted, shots):
+    out, _ = fitted
+    before = {p.name: p.read_bytes() for p in (out / "asset" / "textures").iterdir()}
+    again = mistyle.fit(shots / "bowl.obj", shots / "shots", out, atlas={"size": SIZE}, **QUICK)
+    assert {p.name: p.read_bytes() for p in (out / "asset" / "textures").iterdir()} == before
+    assert again["figures"]["psnr_held_out"] > 40
+    assert not list((out / "work").glob("checkpoint-*"))
+
+
+def test_pictures_are_held_out_evenly_and_by_light():
+    cameras = [look_at((0, 0, 4), fov=30, size=(4, 4), name=f"v{k}") for k in range(48)]
+    rigs = [(KEYS[k % 2],) for k in range(48)]
+    captures = in_memory(cameras, rigs, [np.ones((4, 4, 3), np.float32)] * 48)
+    kept, held = hold_out(captures, ReferenceSettings())
+    assert len(held) == 4 and sorted(kept + held) == list(range(48))
+    assert {k % 2 for k in held} == {0, 1}
+    kept, held = hold_out(captures, ReferenceSettings(hold_out=0, hold_out_light=1))
+    assert held == list(range(1, 48, 2)) and kept == list(range(0, 48, 2))
+    assert lights_in_order(rigs) == [0, 1] * 24
+    with pytest.raises(InputRefused, match="none is left"):
+        hold_out(captures, ReferenceSettings(hold_out=48))
+
+
+def test_pictures_lit_by_a_scene_file_are_refused(shots, tmp_path):
+    (tmp_path / "lights.json").write_text('{"lights": [{"type": "scene", "file": "studio.xml"}]}')
+    with pytest.raises(InputRefused, match="studio.xml"):
+        mistyle.fit(shots / "bowl.obj", shots / "shots", tmp_path / "out", lights=tmp_path / "lights.json")
+    assert not (tmp_path / "out").exists()
+
+
+def test_usage(capsys):
+    assert main(["fit"]) == 2
+    assert "MESH" in capsys.readouterr().err
+    assert main(["fit", "a.obj", "b", "-o", "c", "--list"]) == 2
+    assert "--scene" in capsys.readouterr().err
+    assert main(["fit", "a.obj", "b", "--scene", "s.xml"]) == 2
+    assert main(["fit", "nothing.obj", "b", "-o", "c"]) == 3
+    assert main(["fit", "--print-config"]) == 0
+    assert "[recover]" in capsys.readouterr().out
+    with pytest.raises(UsageError):
+        mistyle.fit("a.obj", "b", "c", recover={"iteration": 3})
+
+
+def test_charts_draw_what_they_are_given():
+    drawn = svg(Chart("loss <b>", {"a": [1.0, 0.1, float("nan"), 0.01]}, log=True, x_label="step"))
+    assert "&lt;b&gt;" in drawn and "<b>" not in drawn and drawn.count("<polyline") == 1
+    points = drawn.split('points="')[1].split('"')[0].split()
+    assert len(points) == 3
+    heights = [float(p.split(",")[1]) for p in points]
+    assert heights[1] - heights[0] == pytest.approx((heights[2] - heights[0]) / 2, abs=0.2)
+    bars = svg(Chart("psnr", {"x": [30.0, 40.0]}, bars=True))
+    assert bars.count("<rect") == 2
+    assert "nothing to draw" in svg(Chart("empty", {"a": []}))
+
+
+SCENE = """<scene version="3.9.0">
+  <integrator type="direct"/>
+  <sensor type="perspective" id="{id}"><float name="fov" value="30"/>
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm">
+      <integer name="width" value="24"/><integer name="height" value="24"/><rfilter type="box"/>
+    </film>
+  </sensor>
+  <emitter type="constant"/>
+  <shape type="rectangle" id="wall"><bsdf type="twosided"><bsdf type="diffuse" id="paint">
+    <texture type="bitmap" name="reflectance"><string name="filename" value="{file}"/></texture></bsdf></bsdf></shape>
+</scene>"""
+
+
+def test_a_mitsuba_scene_is_fitted_from_the_command_line(tmp_path, capsys):
+    import mitsuba as mi
+
+    mi.set_variant("llvm_ad_rgb")
+    rng = np.random.default_rng(0)
+    write_png(tmp_path / "grey.png", np.full((8, 8, 3), 0.5, np.float32))
+    write_png(tmp_path / "true.png", rng.uniform(0.2, 0.8, (8, 8, 3)).astype(np.float32))
+    (tmp_path / "shots").mkdir()
+    (tmp_path / "room.xml").write_text(SCENE.format(id="front", file="grey.png"))
+    (tmp_path / "truth.xml").write_text(SCENE.format(id="front", file="true.png"))
+    picture = np.array(mi.render(mi.load_file(str(tmp_path / "truth.xml")), spp=64))[..., :3]
+    from mistyle.files.images import write_exr
+
+    write_exr(tmp_path / "shots" / "front.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)))
+    scene = str(tmp_path / "room.xml")
+    assert main(["fit", "--scene", scene, "--list"]) == 0
+    assert "wall.bsdf.brdf_0.reflectance" in capsys.readouterr().out
+    command = ["fit", "--scene", scene, "--references", str(tmp_path / "shots"), "-o", str(tmp_path / "out")]
+    assert main([*command, "--optimize", "paint.reflectanc"]) == 2
+    assert "wall.bsdf.brdf_0.reflectance" in capsys.readouterr().err
+    assert main([*command, "--optimize", "wall.bsdf.reflectance", "--iterations", "60", "--json"]) == 0
+    summary = json.loads(capsys.readouterr().out)
+    assert summary["figures"]["psnr_after"] > summary["figures"]["psnr_before"] + 8
+    again = mi.load_file(summary["scene"])
+    now = np.array(mi.render(again, spp=64))[..., :3]
+    assert np.abs(now - picture).mean() < 0.3 * np.abs(0.5**2.2 - picture).mean()
+    assert (tmp_path / "out" / "pictures" / "front.png").is_file()
+    assert "fitted to" in (tmp_path / "out" / "report" / "index.html").read_text()

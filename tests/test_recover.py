@@ -1,0 +1,307 @@
+"""Recovering materials from pictures that Mitsuba drew of maps that are known."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from test_seam import sphere
+
+from mistyle.core.camera import look_at
+from mistyle.core.capture import in_memory, subset
+from mistyle.core.errors import InputRefused
+from mistyle.core.image import gaussian
+from mistyle.core.light import Directional, Point
+from mistyle.core.maps import Maps
+from mistyle.render import device, draw
+from mistyle.render import hits as collecting
+from mistyle.render import scene as scenery
+from mistyle.render.indirect import Indirect, emitter
+from mistyle.stages.recover import recover
+from mistyle.stages.recover_check import usable
+from mistyle.stages.recover_observe import gather, texel_frames
+from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.texels import rasterise
+
+SIZE, RESOLUTION, VIEWS = 64, 80, 10
+QUICK = RecoverSettings(rounds=3, iterations=150, rate=0.002, bounces=0)
+LIGHTS = [((0.5, -0.5, -0.7), 2.0), ((-0.6, -0.3, -0.7), 1.5), ((0.0, 0.7, -0.7), 1.0)]
+
+
+def fibonacci(count, resolution):
+    """Cameras evenly around the object."""
+    k = np.arange(count) + 0.5
+    y, turn = 1 - 2 * k / count, np.pi * (3 - np.sqrt(5)) * k
+    eyes = 4 * np.stack([np.sqrt(1 - y**2) * np.cos(turn), y, np.sqrt(1 - y**2) * np.sin(turn)], axis=-1)
+    return [look_at(eye.tolist(), fov=30, size=(resolution, resolution), name=f"view{n}") for n, eye in enumerate(eyes)]
+
+
+def strong_maps(seed=0, size=SIZE, metallic=0.0):
+    """Smooth at the texel's scale: tilt 0.12, roughness 0.2..0.9, albedo 0.1..0.8."""
+    rng = np.random.default_rng(seed)
+
+    def field():
+        noise = gaussian(np.tile(rng.standard_normal((size, size)).astype(np.float32), (3, 3)), 4.0)
+        return (noise / noise.std())[size : 2 * size, size : 2 * size]
+
+    def between(low, high):
+        return (low + (high - low) * (0.5 + 0.5 * np.tanh(field()))).astype(np.float32)
+
+    xy = np.clip(0.12 * np.stack([field(), field()], axis=-1), -0.5, 0.5)
+    normal = np.concatenate([xy, np.sqrt(1 - (xy**2).sum(-1, keepdims=True))], axis=-1).astype(np.float32)
+    albedo = np.stack([between(0.1, 0.8) for _ in range(3)], axis=-1)
+    return Maps(
+        albedo, normal, between(0.2, 0.9), np.full((size, size), metallic, np.float32), np.ones((size, size), bool)
+    )
+
+
+def directional(direction, strength):
+    x, y, z = (np.asarray(direction) / np.linalg.norm(direction)).tolist()
+    return Directional((x, y, z), (strength, strength, strength), "camera")
+
+
+def photographs(mesh, maps, cameras, lights, frame, integrator, spp=64):
+    """Mitsuba's pictures, one per camera and its lights."""
+    import mitsuba
+
+    mi: Any = mitsuba
+    shapes = scenery.object_shapes(mesh, maps, frame=frame)
+    pictures = []
+    for camera, own in zip(cameras, lights, strict=True):
+        described = {"type": "scene", "integrator": integrator, "sensor": scenery.sensor_dict(camera, spp), **shapes}
+        described |= {f"light{k}": emitter(light, camera) for k, light in enumerate(own)}
+        drawn = mi.render(mi.load_dict(described, optimize=False), spp=scenery.samples(spp), seed=1)
+        pictures.append(np.array(drawn)[..., :3].astype(np.float32))
+    return pictures
+
+
+DIRECT = {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}
+
+
+@pytest.fixture(scope="module")
+def world():
+    """A sphere with strong maps, seen from ten sides under three lights one at a time; MikkTSpace frames."""
+    device.use()
+    mesh, maps = sphere(), strong_maps()
+    cameras = [replace(c, name=f"{c.name}.{k}") for c in fibonacci(VIEWS, RESOLUTION) for k in range(3)]
+    lights = [(directional(*light),) for _ in range(VIEWS) for light in LIGHTS]
+    pictures = photographs(mesh, [maps], cameras, lights, "mikkt", DIRECT)
+    return mesh, maps, rasterise(mesh, 0, SIZE), in_memory(cameras, lights, pictures)
+
+
+@pytest.fixture(scope="module")
+def recovered(world):
+    mesh, _, texels, captures = world
+    return recover(mesh, [texels], captures, QUICK, 0)
+
+
+def errors(found, maps, chosen):
+    """Degrees between the normals, roughness and albedo differences, of the chosen texels."""
+    cosine = (found.normal * maps.normal).sum(-1)[chosen]
+    angle = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+    return angle, (found.roughness - maps.roughness)[chosen], (found.albedo - maps.albedo)[chosen]
+
+
+def test_finds_the_maps(world, recovered):
+    _, maps, texels, _ = world
+    chosen = texels.covered & (recovered.views[0] >= 3)
+    assert chosen.sum() > 0.7 * texels.covered.sum()
+    angle, roughness, albedo = errors(recovered.maps[0], maps, chosen)
+    assert angle.mean() < 0.5
+    assert np.median(np.abs(roughness)) < 0.01
+    assert -10 * np.log10((albedo**2).mean()) > 38
+    assert np.median(list(recovered.residuals.values())) < 0.02
+
+
+def test_says_how_sure_it_is(world, recovered):
+    """Where it is least sure of the roughness it is most wrong; unseen texels have no confidence."""
+    _, maps, texels, _ = world
+    chosen = texels.covered & (recovered.seen[0] >= 3)
+    _, roughness, _ = errors(recovered.maps[0], maps, chosen)
+    spread = recovered.spread[0]["roughness"][chosen]
+    most, least = spread <= np.quantile(spread, 0.5), spread >= np.quantile(spread, 0.9)
+    assert np.abs(roughness[least]).mean() > 2 * np.abs(roughness[most]).mean()
+    assert (recovered.confidence[0][recovered.seen[0] == 0] == 0).all()
+    assert not recovered.maps[0].known[~texels.covered].any()
+
+
+def test_the_same_bytes_again_and_after_an_interruption(world):
+    """Two runs agree; one that stops after a checkpoint and goes on agrees with both."""
+    mesh, _, texels, captures = world
+    some = subset(captures, range(0, 30, 5))
+    settings = QUICK.model_copy(update={"iterations": 18, "rounds": 1, "checkpoint": 1e-9})
+    states = []
+    whole = recover(mesh, [texels], some, settings, 5, save=states.append)
+    assert [int(s["iteration"]) for s in states] == [6, 12]
+    assert all(isinstance(v, np.ndarray) and v.dtype != object for s in states for v in s.values())
+    resumed = recover(mesh, [texels], some, settings, 5, resume=states[0])
+    for name in ("albedo", "normal", "roughness", "metallic"):
+        assert getattr(whole.maps[0], name).tobytes() == getattr(resumed.maps[0], name).tobytes(), name
+    assert whole.trace == resumed.trace
+
+
+def test_light_between_surfaces_is_taken_off(rng):
+    """An open box lights itself; with the estimate taken off the pictures its albedo is nearer to the truth."""
+    device.use()
+    mesh, maps = hollow(), strong_maps(3)
+    maps = replace(maps, albedo=0.4 + 0.6 * maps.albedo)
+    cameras = [
+        look_at([4 * np.sin(a) * s, 4 * np.cos(a) * s, 4 * np.sqrt(1 - s * s)], fov=30, size=(48, 48), name=f"{a}{s}")
+        for a in np.arange(6) * np.pi / 3
+        for s in (0.25,)
+    ]
+    lights = [(directional(*LIGHTS[k % 3]),) for k in range(len(cameras))]
+    pictures = photographs(mesh, [maps], cameras, lights, "mikkt", {"type": "path", "max_depth": 5}, 64)
+    captures, texels = in_memory(cameras, lights, pictures), rasterise(mesh, 0, SIZE)
+    wrong = []
+    for bounces in (0, 1):
+        settings = QUICK.model_copy(update={"iterations": 0, "bounces": bounces, "bounce_samples": 64})
+        found = recover(mesh, [texels], captures, settings, 0)
+        _, _, albedo = errors(found.maps[0], maps, texels.covered & (found.seen[0] >= 4))
+        wrong.append(np.abs(albedo).mean())
+    assert wrong[1] < 0.6 * wrong[0]
+
+
+def hollow():
+    """The inside of a deep bowl, open towards +Z."""
+    mesh = sphere()
+    centre = mesh.positions[mesh.faces].mean(axis=1)
+    inside = centre[:, 2] < 0.25
+    return replace(
+        mesh,
+        faces=mesh.faces[inside][:, ::-1],
+        corner_normals=-mesh.corner_normals[inside][:, ::-1],
+        corner_uvs=mesh.corner_uvs[inside][:, ::-1] * np.array([-1, 1], np.float32) + np.array([1, 0], np.float32),
+        part=mesh.part[inside],
+    )
+
+
+def test_indirect_light_is_what_path_sees_beyond_direct(rng):
+    device.use()
+    mesh, maps = hollow(), replace(strong_maps(3), roughness=np.full((SIZE, SIZE), 0.7, np.float32))
+    camera = look_at([0.6, 0.4, 4], fov=30, size=(64, 64))
+    lights = (directional(*LIGHTS[0]), Point((1.0, 1.0, 3.0), (4.0, 4.0, 4.0)))
+    both = [
+        photographs(mesh, [maps], [camera], [lights], "mikkt", {"type": "path", "max_depth": d, "rr_depth": 100}, 256)[
+            0
+        ]
+        for d in (2, 5)
+    ]
+    difference = both[1] - both[0]
+    estimate = Indirect(mesh, [maps]).picture(camera, lights, 256, 3)
+    assert estimate.shape == difference.shape
+    inside = difference.sum(-1) > 0.01
+    assert inside.mean() > 0.1
+    wrong = gaussian(difference - estimate, 2.0)[inside]
+    assert np.sqrt((wrong**2).mean()) < 0.1 * np.sqrt((difference[inside] ** 2).mean())
+
+
+@pytest.mark.parametrize("frame", ["mikkt", "mitsuba"])
+def test_texel_frames_are_those_of_the_rays(world, frame):
+    mesh, _, texels, captures = world
+    tangents = collecting.tangents_of(mesh, frame)
+    traced = draw.tracer(mesh)
+    from mistyle.render import deferred
+
+    surface = deferred.trace(traced, [captures.cameras[0]], tangents)
+    on = np.flatnonzero(surface.mask)
+    face = draw.gbuffer(traced, captures.cameras[0]).face.ravel()[on]
+    ours = texel_frames(mesh, face, surface.position[on], surface.normal[on], tangents)
+    theirs = np.stack([np.array(axis).T[on] for axis in (surface.frame.s, surface.frame.t, surface.frame.n)], axis=1)
+    np.testing.assert_allclose(ours, theirs, atol=2e-3)
+
+
+def test_observations_are_the_pictures_at_the_texels(world):
+    """What is gathered is what the model of the true material predicts, up to the pixels' size."""
+    from mistyle.render.texel_lm import Options, Problem
+
+    mesh, maps, texels, captures = world
+    gathered = gather(draw.tracer(mesh), [texels], captures, collecting.tangents_of(mesh, "mikkt"))
+    problem = Problem(gathered.points, gathered.rig, gathered.observations, Options())
+    parts = [maps.albedo.reshape(-1, 3), maps.normal.reshape(-1, 3)[:, :2], maps.roughness.reshape(-1, 1)]
+    true = np.concatenate([*parts, maps.metallic.reshape(-1, 1)], axis=1)[gathered.texel]
+    wrong = problem.predict(true) - gathered.observations.rgb
+    assert len(wrong) > 5 * len(gathered.texel)
+    assert np.median(np.abs(wrong)) < 0.01 * np.abs(gathered.observations.rgb).max()
+    assert (gathered.views <= gathered.seen).all() and (gathered.views * 3 >= gathered.seen).all()
+
+
+def test_pictures_that_say_nothing(world):
+    mesh, _, _, captures = world
+    away = look_at([0, 0, 4], [0, 0, 8], fov=30, size=(RESOLUTION, RESOLUTION), name="away")
+    cameras = [*captures.cameras[:9], away]
+    pictures = [captures.load(k)[0] for k in range(9)] + [np.ones((RESOLUTION, RESOLUTION, 3), np.float32)]
+    masks = [np.ones((RESOLUTION, RESOLUTION), bool)] * 10
+    pictures[1] = np.zeros_like(pictures[1])
+    masks[2] = np.zeros_like(masks[2])
+    notes: list[str] = []
+    kept = usable(mesh, in_memory(cameras, captures.lights[:10], pictures, masks), notes)
+    assert len(kept) == 7
+    assert any("'view0.1'" in n and "all black" in n for n in notes)
+    assert any("'view0.2'" in n and "saturated" in n for n in notes)
+    assert any("'away'" in n and "cannot see the mesh" in n for n in notes)
+    few: list[str] = []
+    usable(mesh, subset(captures, [0, 1, 3]), few)
+    assert any("2 different view(s)" in n and "singular" in n for n in few)
+    with pytest.raises(InputRefused, match="None of 2"):
+        usable(mesh, in_memory([away, away], captures.lights[:2], pictures[:2]), [])
+    with pytest.raises(InputRefused, match="80x80"):
+        usable(mesh, in_memory(cameras[:1], captures.lights[:1], [np.ones((40, 30, 3), np.float32)]), [])
+    with pytest.raises(InputRefused, match="three views"):
+        usable(mesh, subset(captures, []), [])
+
+
+def test_a_gradient_that_is_no_number_stops_at_its_texel():
+    import drjit as dr
+    import mitsuba as mi
+
+    from mistyle.render.descent import Descent, table_on_device
+
+    device.use()
+    descent = Descent([(4, 4), (2, 2)], (1, 1, 1, 1, 1, 1, 0, 0))
+    table = np.full((20, 8), 0.5, np.float32)
+    gradient = np.ones((20, 8), np.float32)
+    gradient[17, 5] = np.nan
+    x = table_on_device(table)
+    for picture in (3, 4):
+        x = descent.step(x, mi.Float(gradient.ravel()), 0.01, picture)
+    result = np.array(x).reshape(-1, 8)
+    assert descent.stopped() == [(17, "roughness", 3)]
+    np.testing.assert_array_equal(result[17], table[17])
+    rest = np.delete(result, 17, axis=0)
+    np.testing.assert_allclose(rest[:, :6], 0.48, atol=1e-5)
+    np.testing.assert_array_equal(rest[:, 6:], 0.5)
+    assert dr.width(x) == 160
+
+
+@pytest.mark.parametrize("levels", [1, 3])
+def test_descent_is_adam_with_masked_updates(rng, levels):
+    """Against Adam in NumPy on every level; levels see sums of 2 x 2 and move by bilinear interpolation."""
+    import mitsuba as mi
+
+    from mistyle.core.image import resize
+    from mistyle.render.descent import Descent, table_on_device
+
+    device.use()
+    size = (32, 32)
+    descent = Descent([size], (1, 1, 1, 1, 1, 1, 1, 0), levels=levels)
+    table = np.full((32 * 32, 8), 0.5, np.float32)
+    x, wanted = table_on_device(table), table[:, :7].reshape(*size, 7).astype(np.float64)
+    first, second, age = ([np.zeros((32 >> k, 32 >> k, c)) for k in range(levels)] for c in (7, 7, 1))
+    for _ in range(3):
+        gradient = rng.standard_normal((32 * 32, 8)).astype(np.float32)
+        gradient[rng.random(32 * 32) < 0.3] = 0
+        x = descent.step(x, mi.Float(gradient.ravel()), 0.01, 0)
+        level = gradient[:, :7].reshape(*size, 7).astype(np.float64)
+        for k in range(levels):
+            if k:
+                level = level[::2, ::2] + level[::2, 1::2] + level[1::2, ::2] + level[1::2, 1::2]
+            on = (level != 0).any(-1, keepdims=True)
+            age[k] += on
+            first[k] = np.where(on, 0.9 * first[k] + 0.1 * level, first[k])
+            second[k] = np.where(on, 0.99 * second[k] + 0.01 * level**2, second[k])
+            with np.errstate(divide="ignore", invalid="ignore"):
+                step = first[k] / (1 - 0.9 ** age[k]) / (np.sqrt(second[k] / (1 - 0.99 ** age[k])) + 1e-12)
+            step = np.where(on, step, 0).astype(np.float32)
+            wanted -= 0.01 * (resize(step, size) if k else step)
+    np.testing.assert_allclose(np.array(x).reshape(*size, 8)[..., :7], wanted, atol=2e-5)
