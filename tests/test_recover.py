@@ -140,6 +140,31 @@ def test_the_same_bytes_again_and_after_an_interruption(world):
     assert whole.trace == resumed.trace
 
 
+def test_an_atlas_too_fine_is_solved_at_a_coarser_level(world):
+    """Half the texels along each side still find most of the albedo; the note says so."""
+    mesh, maps, texels, captures = world
+    settings = QUICK.model_copy(update={"iterations": 0, "rounds": 1, "solver_texels": 2000})
+    found = recover(mesh, [texels], captures, settings, 0)
+    assert any("2 times coarser" in note for note in found.notes)
+    assert found.maps[0].albedo.shape == (SIZE, SIZE, 3) and found.seen[0].shape == (SIZE, SIZE)
+    _, _, albedo = errors(found.maps[0], maps, texels.covered & (found.seen[0] >= 3))
+    assert -10 * np.log10((albedo**2).mean()) > 20
+
+
+def test_from_pictures_alone_and_from_a_start(world):
+    """Adam alone lowers the loss from grey; from the true maps it has nothing to do, and metallic stays the start's."""
+    mesh, maps, texels, captures = world
+    some = subset(captures, range(0, 30, 5))
+    settings = QUICK.model_copy(update={"solver": "pictures", "iterations": 24, "rate": 0.02})
+    found = recover(mesh, [texels], some, settings, 0)
+    before, after = found.trace["pictures.whole"]
+    assert after < 0.7 * before
+    start = replace(maps, metallic=np.full_like(maps.metallic, 0.25))
+    kept = recover(mesh, [texels], some, settings.model_copy(update={"iterations": 0}), 0, start=[start])
+    np.testing.assert_allclose(kept.maps[0].albedo[texels.covered], maps.albedo[texels.covered], atol=1e-6)
+    np.testing.assert_allclose(kept.maps[0].metallic[texels.covered], 0.25, atol=1e-6)
+
+
 def test_light_between_surfaces_is_taken_off(rng):
     """An open box lights itself; with the estimate taken off the pictures its albedo is nearer to the truth."""
     device.use()

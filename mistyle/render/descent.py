@@ -45,7 +45,7 @@ class Descent:
         import mitsuba
 
         mi: Any = mitsuba
-        self.sizes = [tuple(size) for size in sizes]
+        self.sizes = [(rows, columns) for rows, columns in sizes]
         self.rates, self.floor, self.tilt = tuple(rates), floor, tilt
         self.texels = sum(rows * columns for rows, columns in sizes)
         self.pyramids = [_levels(size, levels) for size in self.sizes]

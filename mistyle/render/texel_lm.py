@@ -17,95 +17,20 @@ a fixed order, so the result has the same bytes in every run at any number of th
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int, Integer
+from jaxtyping import Float, Int
 
-from mistyle.render import bsdf, device
+from mistyle.render import device
 from mistyle.render.texel_algebra import Sums, flat_of, nothing, spread_of, step, triangle, unflat
+from mistyle.render.texel_records import UNKNOWNS, Observations, Options, Points, Rig, Solution, aligned
+from mistyle.render.texel_response import derivatives, differences, terms
 
-UNKNOWNS = ("albedo_r", "albedo_g", "albedo_b", "tilt_x", "tilt_y", "roughness", "metallic")
+__all__ = ["UNKNOWNS", "Observations", "Options", "Points", "Problem", "Rig", "Solution", "aligned"]
+
 LANES = 1 << 16
-STEP = 1e-3  # of central differences, the twin of the derivatives by AD
-MIN_Z2 = 1e-4
 LIGHTER, HEAVIER = 0.25, 5.0  # factors of the damping after a step that helped, and after one that did not
-
-
-@dataclass(frozen=True)
-class Points:
-    """Surface points of t texels: position and tangent frame (rows: tangent, bitangent, normal; unit), in the world."""
-
-    position: Float[np.ndarray, "t 3"]
-    frame: Float[np.ndarray, "t 3 3"]
-
-
-@dataclass(frozen=True)
-class Rig:
-    """Where pictures were taken from and what lit them. Picture v has the lights first[v] : first[v + 1].
-
-    eye         world position of the camera
-    vector      unit direction towards the light, or where `near` the light's position, in the world
-    near        1 for a point light, whose irradiance is that at distance 1
-    irradiance  linear Rec.709
-    """
-
-    eye: Float[np.ndarray, "v 3"]
-    first: Int[np.ndarray, " v1"]
-    vector: Float[np.ndarray, "l 3"]
-    near: Float[np.ndarray, " l"]
-    irradiance: Float[np.ndarray, "l 3"]
-
-    @property
-    def single(self) -> bool:
-        """Whether every picture has exactly one light."""
-        return bool((np.diff(self.first) == 1).all())
-
-
-@dataclass(frozen=True)
-class Observations:
-    """What pictures say about t texels, by texel: those of texel i are start[i] : start[i + 1].
-
-    rgb     linear radiance that left the texel towards the camera
-    weight  one over its standard deviation
-    lit     bit l is set where light l of the picture (counted within the picture) reaches the texel
-    """
-
-    start: Int[np.ndarray, " t1"]
-    picture: Int[np.ndarray, " o"]
-    rgb: Float[np.ndarray, "o 3"]
-    weight: Float[np.ndarray, " o"]
-    lit: Integer[np.ndarray, " o"]
-
-
-@dataclass(frozen=True)
-class Solution:
-    """`values` (t, 7) in the order of UNKNOWNS; `cost` without the prior; `spread` (t, 7), standard deviations.
-
-    spread² is the diagonal of the inverse of normal matrix + prior: what the observations leave open. `diagonal` is
-    that of the normal matrix alone.
-    """
-
-    values: Float[np.ndarray, "t 7"]
-    cost: Float[np.ndarray, " t"]
-    spread: Float[np.ndarray, "t 7"]
-    diagonal: Float[np.ndarray, "t 7"]
-
-
-@dataclass(frozen=True)
-class Options:
-    """How to solve. `huber` is in standard deviations; `floor` the least roughness; `tilt` bounds |tilt|.
-
-    With `metallic` False metallic keeps its value. `differences` takes central differences instead of AD.
-    """
-
-    model: str = "principled"
-    metallic: bool = False
-    huber: float = 3.0
-    floor: float = 0.04
-    tilt: float = 0.95
-    differences: bool = False
 
 
 class Problem:
@@ -187,7 +112,7 @@ class Problem:
 
         def body(k, done):
             index = k * chunk["width"] + chunk["lane"]
-            paint, gloss, _, _ = self._response(chunk, index, x, derivatives=False)
+            paint, gloss, _, _ = self._response(chunk, index, x, slopes=False)
             for c in range(3):
                 dr.scatter(seen[c], dr.fma(x[c], paint[c], gloss[c]), index)
             return k + 1, done
@@ -238,7 +163,7 @@ class Problem:
         def body(k, *flat):
             sums = unflat(flat)
             index = k * chunk["width"] + chunk["lane"]
-            paint, gloss, d_paint, d_gloss = self._response(chunk, index, x, derivatives=True)
+            paint, gloss, d_paint, d_gloss = self._response(chunk, index, x, slopes=True)
             weight = dr.gather(kind, chunk["weight"], index)
             aa, aq, qq, ga, gq = (list(part) for part in sums[:5])
             cost = sums.cost
@@ -269,7 +194,7 @@ class Problem:
         done = dr.while_loop(start, lambda k, *rest: k < chunk["count"], body, label="texel_lm")
         return unflat(done[1:])
 
-    def _response(self, chunk: dict, index: Any, x: list, *, derivatives: bool) -> tuple[list, list, list, list]:
+    def _response(self, chunk: dict, index: Any, x: list, *, slopes: bool) -> tuple[list, list, list, list]:
         """paint and gloss times irradiance per channel, and their derivatives by the tilt, roughness and metallic."""
         import drjit as dr
         import mitsuba
@@ -280,20 +205,20 @@ class Problem:
         wi = _local(chunk["frame"], dr.normalize(eye - chunk["position"]))
         first = dr.gather(mi.UInt32, self.rig["first"], picture)
         if self.single:
-            return self._light(chunk, first, mi.Float(1), wi, x, derivatives)
+            return self._light(chunk, first, mi.Float(1), wi, x, slopes)
         lit, last = dr.gather(mi.UInt32, chunk["lit"], index), dr.gather(mi.UInt32, self.rig["first"], picture + 1)
-        width = 30 if derivatives else 6
+        width = 30 if slopes else 6
         zeros = tuple(dr.zeros(mi.Float, dr.width(chunk["lane"])) for _ in range(width))
 
         def body(light, *flat):
             shines = dr.select(((lit >> (light - first)) & 1) == 1, mi.Float(1), mi.Float(0))
-            parts = self._light(chunk, light, shines, wi, x, derivatives)
+            parts = self._light(chunk, light, shines, wi, x, slopes)
             return light + 1, *(a + b for a, b in zip(flat, _flat4(parts), strict=True))
 
         done = dr.while_loop((mi.UInt32(first), *zeros), lambda light, *rest: light < last, body, label="lights")
-        return _unflat4(done[1:], derivatives)
+        return _unflat4(done[1:], slopes)
 
-    def _light(self, chunk: dict, light: Any, scale: Any, wi: Any, x: list, derivatives: bool) -> tuple:
+    def _light(self, chunk: dict, light: Any, scale: Any, wi: Any, x: list, slopes: bool) -> tuple:
         import drjit as dr
         import mitsuba
 
@@ -306,63 +231,14 @@ class Problem:
         wo = _local(chunk["frame"], to_light * dr.rsqrt(distance2))
         scale = scale * dr.select(near, 1 / distance2, 1)
         irradiance = [row[4 + c] * scale for c in range(3)]
-        terms = _terms if not derivatives else _differences if self.options.differences else _derivatives
-        paint, gloss, d_paint, d_gloss = terms(self.options, wi, wo, x[3:])
+        chosen = terms if not slopes else differences if self.options.differences else derivatives
+        paint, gloss, d_paint, d_gloss = chosen(self.options, wi, wo, x[3:])
         return (
             [e * paint for e in irradiance],
             [e * gloss for e in irradiance],
             [[e * d for d in d_paint] for e in irradiance],
             [[e * d for d in d_gloss] for e in irradiance],
         )
-
-
-def _terms(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
-    import drjit as dr
-
-    z = dr.sqrt(dr.maximum(1 - dr.square(q[0]) - dr.square(q[1]), MIN_Z2))
-    normal = type(wi)(q[0], q[1], z)
-    paint, gloss = bsdf.terms(options.model, wi, wo, normal, q[2], q[3])
-    return paint, gloss, [], []
-
-
-def _derivatives(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
-    """By forward-mode AD: the operations that several directions share are compiled once."""
-    import drjit as dr
-
-    moving = [type(v)(v) for v in q]
-    dr.enable_grad(moving)
-    paint, gloss, _, _ = _terms(options, wi, wo, moving)
-    d_paint, d_gloss = [], []
-    for j, v in enumerate(moving):
-        if j == 3 and not options.metallic:
-            d_paint.append(dr.zeros(type(v)))
-            d_gloss.append(dr.zeros(type(v)))
-            continue
-        for other in moving:
-            dr.set_grad(other, 1.0 if other is v else 0.0)
-        dr.enqueue(dr.ADMode.Forward, moving)
-        dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearInterior)
-        d_paint.append(dr.grad(paint))
-        d_gloss.append(dr.grad(gloss))
-        dr.clear_grad(paint)
-        dr.clear_grad(gloss)
-    return dr.detach(paint), dr.detach(gloss), d_paint, d_gloss
-
-
-def _differences(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
-    import drjit as dr
-
-    paint, gloss, _, _ = _terms(options, wi, wo, q)
-    d_paint, d_gloss = [], []
-    for j in range(4):
-        if j == 3 and not options.metallic:
-            d_paint.append(dr.zeros(type(q[j])))
-            d_gloss.append(dr.zeros(type(q[j])))
-            continue
-        high, low = (_terms(options, wi, wo, [v + e if k == j else v for k, v in enumerate(q)]) for e in (STEP, -STEP))
-        d_paint.append((high[0] - low[0]) * (0.5 / STEP))
-        d_gloss.append((high[1] - low[1]) * (0.5 / STEP))
-    return paint, gloss, d_paint, d_gloss
 
 
 def _project(x: list, options: Options) -> list:
@@ -379,9 +255,9 @@ def _flat4(parts: tuple) -> list:
     return [*paint, *gloss, *(d for row in d_paint for d in row), *(d for row in d_gloss for d in row)]
 
 
-def _unflat4(flat: Any, derivatives: bool) -> tuple[list, list, list, list]:
+def _unflat4(flat: Any, slopes: bool) -> tuple[list, list, list, list]:
     flat = list(flat)
-    if not derivatives:
+    if not slopes:
         return flat[:3], flat[3:6], [[]] * 3, [[]] * 3
     return (
         flat[:3],
@@ -395,21 +271,6 @@ def _local(frame: tuple, vector: Any) -> Any:
     import drjit as dr
 
     return type(vector)(dr.dot(frame[0], vector), dr.dot(frame[1], vector), dr.dot(frame[2], vector))
-
-
-def aligned(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
-    """A copy that starts at a multiple of 64 bytes.
-
-    Dr.Jit reads NumPy's memory in place and compiles the alignment into its kernels: arrays that happen to start
-    elsewhere would be another kernel in every call.
-    """
-    values = np.asarray(values)
-    count = values.size * np.dtype(kind).itemsize
-    memory = np.empty(count + 64, np.uint8)
-    first = -memory.ctypes.data % 64
-    result = memory[first : first + count].view(kind).reshape(values.shape)
-    result[...] = values
-    return result
 
 
 def _columns(values: Float[np.ndarray, "n c"]) -> list:

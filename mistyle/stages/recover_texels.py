@@ -137,11 +137,11 @@ def solve_texels(
         # Observations that do not fit say less than their number promises.
         values = solution.values
         spread = solution.spread * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
-        bad = ~np.isfinite(values).all(axis=1)
+        bad = np.asarray(~np.isfinite(values).all(axis=1))
         if bad.any():
             work.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
-            values = np.where(bad[:, None], mean, values)
-            spread = np.where(bad[:, None], np.array(solving.PRIOR_SPREAD, np.float32), spread)
+            values = np.where(bad.reshape(-1, 1), mean, values)
+            spread = np.where(bad.reshape(-1, 1), np.array(solving.PRIOR_SPREAD, np.float32), spread)
     elif settings.solver != "pictures":
         work.notes.append("No picture is lit by directional or point lights alone: texels were not solved one by one.")
     return Found(

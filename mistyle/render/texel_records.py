@@ -1,0 +1,99 @@
+"""What the per-texel solver (`texel_lm.py`) is given, and what it answers."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int, Integer
+
+UNKNOWNS = ("albedo_r", "albedo_g", "albedo_b", "tilt_x", "tilt_y", "roughness", "metallic")
+
+
+@dataclass(frozen=True)
+class Points:
+    """Surface points of t texels: position and tangent frame (rows: tangent, bitangent, normal; unit), in the world."""
+
+    position: Float[np.ndarray, "t 3"]
+    frame: Float[np.ndarray, "t 3 3"]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Where pictures were taken from and what lit them. Picture v has the lights first[v] : first[v + 1].
+
+    eye         world position of the camera
+    vector      unit direction towards the light, or where `near` the light's position, in the world
+    near        1 for a point light, whose irradiance is that at distance 1
+    irradiance  linear Rec.709
+    """
+
+    eye: Float[np.ndarray, "v 3"]
+    first: Int[np.ndarray, " v1"]
+    vector: Float[np.ndarray, "l 3"]
+    near: Float[np.ndarray, " l"]
+    irradiance: Float[np.ndarray, "l 3"]
+
+    @property
+    def single(self) -> bool:
+        """Whether every picture has exactly one light."""
+        return bool((np.diff(self.first) == 1).all())
+
+
+@dataclass(frozen=True)
+class Observations:
+    """What pictures say about t texels, by texel: those of texel i are start[i] : start[i + 1].
+
+    rgb     linear radiance that left the texel towards the camera
+    weight  one over its standard deviation
+    lit     bit l is set where light l of the picture (counted within the picture) reaches the texel
+    """
+
+    start: Int[np.ndarray, " t1"]
+    picture: Int[np.ndarray, " o"]
+    rgb: Float[np.ndarray, "o 3"]
+    weight: Float[np.ndarray, " o"]
+    lit: Integer[np.ndarray, " o"]
+
+
+@dataclass(frozen=True)
+class Solution:
+    """`values` (t, 7) in the order of UNKNOWNS; `cost` without the prior; `spread` (t, 7), standard deviations.
+
+    spread² is the diagonal of the inverse of normal matrix + prior: what the observations leave open. `diagonal` is
+    that of the normal matrix alone.
+    """
+
+    values: Float[np.ndarray, "t 7"]
+    cost: Float[np.ndarray, " t"]
+    spread: Float[np.ndarray, "t 7"]
+    diagonal: Float[np.ndarray, "t 7"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to solve. `huber` is in standard deviations; `floor` the least roughness; `tilt` bounds |tilt|.
+
+    With `metallic` False metallic keeps its value. `differences` takes central differences instead of AD.
+    """
+
+    model: str = "principled"
+    metallic: bool = False
+    huber: float = 3.0
+    floor: float = 0.04
+    tilt: float = 0.95
+    differences: bool = False
+
+
+def aligned(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
+    """A copy that starts at a multiple of 64 bytes.
+
+    Dr.Jit reads NumPy's memory in place and compiles the alignment into its kernels: arrays that happen to start
+    elsewhere would be another kernel in every call.
+    """
+    values = np.asarray(values)
+    count = values.size * np.dtype(kind).itemsize
+    memory = np.empty(count + 64, np.uint8)
+    first = -memory.ctypes.data % 64
+    result = memory[first : first + count].view(kind).reshape(values.shape)
+    result[...] = values
+    return result
