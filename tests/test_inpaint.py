@@ -12,7 +12,7 @@ from mistyle.backends.fill import _harmonic, grow, inpainter
 from mistyle.core.maps import Maps, Texels, flat_maps
 from mistyle.stages.inpaint import RepairSettings, blend_weights, radius, repair, struggle_mask
 
-BARE = RepairSettings(dilation=0, blend=0)
+BARE = RepairSettings(dilation=0, blend=0, smooth=0)
 
 
 def texels_of(island: np.ndarray, position: np.ndarray | None = None) -> Texels:
@@ -58,7 +58,13 @@ def test_the_threshold_is_mean_plus_half_a_deviation():
     assert masked(0, 0, 4, 8, 1000) == [False, False, False, True, False]
     # Mean 3.25, std sqrt(11.6875) = 3.419, threshold 4.959.
     assert masked(0, 0, 5, 8, 1000) == [False, False, True, True, False]
-    assert masked(0, 0, 4, 8, 0, choice=RepairSettings(deviations=0, dilation=0)) == [False, False, True, True, False]
+    assert masked(0, 0, 4, 8, 0, choice=RepairSettings(deviations=0, dilation=0, smooth=0)) == [
+        False,
+        False,
+        True,
+        True,
+        False,
+    ]
     assert masked(7, 7, 7, 7, 7) == [False] * 5
 
 
@@ -96,10 +102,24 @@ def test_the_mask_grows_by_its_share_and_stays_in_its_island():
     gradient = np.zeros((256, 256), np.float32)
     gradient[100, 124] = 1e4
     ones = np.ones((256, 256), int)
-    mask = struggle_mask(gradient, ones.astype(np.float32), ones, texels, RepairSettings(dilation=3 / 256))
+    mask = struggle_mask(gradient, ones.astype(np.float32), ones, texels, RepairSettings(dilation=3 / 256, smooth=0))
     expected = np.zeros_like(mask)
     expected[97:104, 121:127] = True  # a square of side 7, cut off where the island ends
     assert np.array_equal(mask, expected)
+
+
+def test_a_place_struggles_and_noise_does_not(rng):
+    """Twice the gradient over a patch, in noise of the same strength: thresholded texel by texel it would drown."""
+    gradient = rng.exponential(1.0, (256, 256)).astype(np.float32)
+    gradient[100:140, 60:110] += 1.0
+    ones = np.ones((256, 256), int)
+    texels, looks = one_island(256), ones.astype(np.float32)
+    inside = np.zeros_like(ones, bool)
+    inside[100:140, 60:110] = True
+    alone = struggle_mask(gradient, looks, ones, texels, RepairSettings(smooth=0, dilation=0))
+    around = struggle_mask(gradient, looks, ones, texels, RepairSettings(smooth=0.015, dilation=0))
+    assert alone[~inside].mean() > 0.15 and around[~inside].mean() < 0.1
+    assert around[inside].mean() > 0.95 > alone[inside].mean()
 
 
 def test_blend_is_one_inside_zero_outside_and_falls_between():

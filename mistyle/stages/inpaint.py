@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
-from mistyle.core.image import dilate_within, distance_to
+from mistyle.core.image import dilate_within, distance_to, gaussian
 from mistyle.core.maps import Maps, Texels
 
 # (albedo (h w 3) linear, hole (h w), texels, generator) -> albedo (h w 3); only what it answers inside the hole counts.
@@ -34,6 +34,12 @@ class RepairSettings(BaseModel):
     dilation: float = Field(
         default=0.004, ge=0, le=0.1, description="radius of the mask's max-pooling as a share of the atlas's side"
     )
+    smooth: float = Field(
+        default=0.004,
+        ge=0,
+        le=0.1,
+        description="share of the atlas's side over which gradients are averaged: a lone texel does not struggle",
+    )
     blend: float = Field(
         default=0.003, ge=0, le=0.1, description="half the width of the blended boundary as a share of the atlas's side"
     )
@@ -51,19 +57,23 @@ def struggle_mask(
     texels: Texels,
     settings: RepairSettings,
 ) -> Bool[np.ndarray, "h w"]:
-    """The texels to paint again: those whose mean |gradient| of a look exceeds mean + 0.5 std over the texels that
-    were looked at, and those that no view sees; dilated by max-pooling inside their islands.
+    """The texels to paint again: those around which the mean |gradient| of a look exceeds mean + 0.5 std over the
+    texels that were looked at, and those that no view sees; dilated by max-pooling inside their islands.
 
-    `accumulated` is the sum of absolute albedo gradients over the last steps of phase 2, `looks` how often these
-    steps looked at a texel (`Fit.touched`), `seen` how many views see it. The paper thresholds the sum; without the
-    division the mask would show how often a texel was looked at. What was hardly looked at counts as looked at
-    FEWEST times the median, or one chance pixel would decide; what was not looked at at all says nothing.
+    "Around" is a Gaussian of `settings.smooth`: single texels' gradients are noise, and thresholded one by one they lie
+    scattered over everything, which the dilation then joins. `accumulated` is the sum of absolute albedo gradients over
+    the last steps of phase 2, `looks` how often these steps looked at a texel (`Fit.touched`), `seen` how many views
+    see it. The paper thresholds the sum; without the division the mask would show how often a texel was looked at. What
+    was hardly looked at counts as looked at FEWEST times the median, or one chance pixel would decide; what was not
+    looked at at all says nothing.
     """
     struggling = texels.covered & (seen <= 0)
     looked = texels.covered & (seen > 0) & (looks > 0)
     if looked.any():
         least = FEWEST * float(np.median(looks[looked]))
-        average = accumulated[looked].astype(np.float64) / np.maximum(looks[looked], least)
+        side = settings.smooth * texels.covered.shape[1]
+        total, times = (gaussian(np.where(looked, a, 0).astype(np.float32), side) for a in (accumulated, looks))
+        average = total[looked].astype(np.float64) / np.maximum(times[looked], least)
         struggling[looked] = average > average.mean() + settings.deviations * average.std()
     return dilate_within(struggling, texels.island, radius(settings.dilation, texels.covered.shape[1]))
 

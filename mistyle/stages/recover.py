@@ -25,6 +25,7 @@ from mistyle.stages.recover_texels import Found, Work, solve_level
 
 __all__ = ["RecoverSettings", "Recovered", "recover"]
 
+DAMPING = 0.3  # of a descent that begins from nothing
 # Standard deviations at which a texel's confidence has fallen to a half: normal (sine), roughness, albedo, metallic.
 HALF_SURE = {"normal": 0.05, "roughness": 0.1, "albedo": 0.05, "metallic": 0.2}
 CHANNELS = {"albedo": slice(0, 3), "normal": slice(3, 5), "roughness": slice(5, 6), "metallic": slice(6, 7)}
@@ -118,9 +119,12 @@ def descend(
     from mistyle.render.descent import Descent, table_on_device
 
     settings, count = work.settings, len(work.captures)
-    levels = settings.levels or (1 if settings.solver == "both" else 5)
+    levels = settings.levels or (1 if found.solved else 5)
     rates = (1, 1, 1, 1, 1, 1, 1 if settings.metallic else 0, 0)
-    descent = Descent(work.where.sizes, rates, levels=levels, floor=settings.roughness_floor)
+    damping = 0.0 if found.solved else DAMPING
+    descent = Descent(
+        work.where.sizes, rates, levels=levels, floor=settings.roughness_floor, damping=damping
+    )  # fmt: skip
     table, first, lost, losses = table_on_device(found.table), 0, [], trace.setdefault("pictures.loss", [])
     if resume is not None:
         first, table = int(resume["iteration"]), table_on_device(resume["table"])

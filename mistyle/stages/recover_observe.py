@@ -43,6 +43,7 @@ class Gathered:
     texel     flat index of each into the concatenated sets
     sightings per picture
     views     how many different cameras observed each texel
+    soft      how many pictures with other than delta lights show each texel; they are no observations of the solver
     """
 
     texel: Int[np.ndarray, " t"]
@@ -51,6 +52,7 @@ class Gathered:
     observations: Observations
     sightings: tuple[Sighting, ...]
     views: Int[np.ndarray, " t"]
+    soft: Int[np.ndarray, " t"]
 
     @property
     def seen(self) -> Int[np.ndarray, " t"]:
@@ -69,7 +71,7 @@ def gather(
     relative: float = 0.01,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Gathered:
-    """All observations under delta lights (pictures with any other light are left out).
+    """All observations under delta lights; of pictures with any other light only which texels they show.
 
     `facing` is the least cosine between the texel's normal and the camera; the standard deviation of an observation of
     radiance y is noise · (the brightest radiance, robustly) + relative · y, larger where the surface turns away and
@@ -101,7 +103,16 @@ def gather(
             parts.append((k, ids, values, bits, pixel[chosen], x[chosen], y[chosen], worth[chosen]))
         views[near[any_light]] += 1
         progress((done + 1) / max(len(used) / max(len(group), 1), 1))
-    return _assemble(texel, points, captures, parts, views, noise, relative)
+    soft = np.zeros(len(texel), np.int32)
+    for group in _by_camera(captures.cameras, [k for k in range(len(captures)) if k not in used]):
+        camera = captures.cameras[group[0]]
+        near, pixel, *_ = _visible(camera, look(traced, camera, []), position, normal, size, facing)
+        counts = np.zeros(len(near), np.int32)
+        for k in group:
+            counts += _usable(captures.load(k)[1], pixel)
+        soft[near] += counts
+        views[near[counts > 0]] += 1
+    return _assemble(texel, points, captures, parts, views, soft, noise, relative)
 
 
 def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, "n 3"]:
@@ -245,7 +256,13 @@ def _bilinear(image: Float[np.ndarray, "h w 3"], pixel, x, y) -> Float[np.ndarra
     return top * (1 - y) + bottom * y
 
 
-def _assemble(texel, points, captures: Captures, parts, views, noise: float, relative: float) -> Gathered:
+def _usable(mask: Bool[np.ndarray, "h w"], pixel: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+    """Whether all four pixels from `pixel`, the top left, on count."""
+    width, flat = mask.shape[1], mask.ravel()
+    return np.all([flat.take(pixel + step) for step in (0, 1, width, width + 1)], axis=0)
+
+
+def _assemble(texel, points, captures: Captures, parts, views, soft, noise: float, relative: float) -> Gathered:
     """Sort the observations by texel; within a texel they follow the pictures' order."""
     parts = sorted(parts, key=lambda part: part[0])
     count = np.zeros(len(texel), np.int64)
@@ -266,7 +283,7 @@ def _assemble(texel, points, captures: Captures, parts, views, noise: float, rel
     unit = float(np.percentile(level, PERCENTILE)) if total else 1.0
     weight = worth / (noise * max(unit, 1e-6) + relative * level)
     observations = Observations(start, picture, rgb, weight.astype(np.float32), lit)
-    return Gathered(texel, points, rig(captures.cameras, _delta(captures)), observations, tuple(sightings), views)
+    return Gathered(texel, points, rig(captures.cameras, _delta(captures)), observations, tuple(sightings), views, soft)
 
 
 def _delta(captures: Captures) -> list:

@@ -31,12 +31,13 @@ class Work:
 
 @dataclass(frozen=True)
 class Found:
-    """What the texels found out by themselves, at the atlas's resolution."""
+    """What the texels found out by themselves, at the atlas's resolution; not `solved`: only where they start."""
 
     table: Float[np.ndarray, "a 8"]
     spread: Float[np.ndarray, "a 7"]
     seen: Int[np.ndarray, " a"]
     views: Int[np.ndarray, " a"]
+    solved: bool
 
 
 def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed: int, trace, progress) -> Found:
@@ -71,7 +72,7 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
         )
         for values in (found.table, found.spread, found.seen, found.views)
     ]
-    return Found(large[0].astype(np.float32), large[1], large[2][:, 0], large[3][:, 0])
+    return Found(large[0].astype(np.float32), large[1], large[2][:, 0], large[3][:, 0], found.solved)
 
 
 def _enlarged(values: np.ndarray, by: int) -> np.ndarray:
@@ -110,8 +111,8 @@ def solve_texels(
     first = mean.copy() if start is None else pack(start)[gathered.texel, :7].copy()
     mean[:, 6] = first[:, 6]
     spread = np.tile(np.array(solving.PRIOR_SPREAD, np.float32), (len(mean), 1))
-    values = first
-    if settings.solver != "pictures" and len(gathered.observations.rgb):
+    values, solved = first, settings.solver != "pictures" and len(gathered.observations.rgb) > 0
+    if solved:
         problem = Problem(
             gathered.points, gathered.rig, gathered.observations,
             Options(settings.model, settings.metallic, floor=settings.roughness_floor),
@@ -147,8 +148,9 @@ def solve_texels(
     return Found(
         solving.spread_out(values, gathered, where),
         _placed(spread, gathered.texel, where, np.array(solving.PRIOR_SPREAD, np.float32)),
-        _placed(gathered.seen, gathered.texel, where, 0),
+        _placed(gathered.seen + gathered.soft, gathered.texel, where, 0),
         _placed(gathered.views, gathered.texel, where, 0),
+        solved,
     )
 
 
