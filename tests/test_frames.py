@@ -8,8 +8,8 @@ import torch
 from mistyle.core.camera import orbit
 from mistyle.core.light import Directional
 from mistyle.core.maps import flat_maps
-from mistyle.core.mesh import Mesh, weld
-from mistyle.core.tangents import mikktspace
+from mistyle.core.mesh import Mesh
+from mistyle.core.tangents import corner_tangents
 from mistyle.render import deferred, draw, seam
 from mistyle.stages.frames import mitsuba_normals
 from mistyle.stages.texels import pad, rasterise
@@ -63,8 +63,7 @@ def check(mirrored: bool) -> None:
     tilt = np.stack([0.3 * np.sin(columns / 9), 0.25 * np.cos(rows / 7)], -1)
     bumps = np.concatenate([tilt, np.sqrt(1 - (tilt**2).sum(-1, keepdims=True))], -1).astype(np.float32)
     bumps = pad(bumps, texels, 4)
-    welded = weld(mesh)
-    tangents = mikktspace(welded.positions, welded.normals, welded.uvs, welded.faces)
+    tangents = corner_tangents(mesh)
     turned = pad(mitsuba_normals(mesh, replace(flat_maps(SIZE), normal=bumps), texels), texels, 4)
     wanted, plain, made = shaded(mesh, bumps, tangents), shaded(mesh, bumps, None), shaded(mesh, turned, None)
     error, before = np.abs(made - wanted), np.abs(plain - wanted)

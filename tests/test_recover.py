@@ -17,9 +17,10 @@ from mistyle.render import device, draw
 from mistyle.render import hits as collecting
 from mistyle.render import scene as scenery
 from mistyle.render.indirect import Indirect, emitter
+from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
-from mistyle.stages.recover_observe import gather, texel_frames
+from mistyle.stages.recover_observe import gather
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
 

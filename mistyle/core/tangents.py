@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core.mesh import Mesh, weld
+
 _TINY = np.finfo(np.float32).tiny
 
 
@@ -65,6 +67,12 @@ class _Frames:
     tangent: Float[np.ndarray, "f 3"]
     positive: Bool[np.ndarray, " f"]
     silent: Bool[np.ndarray, " f"]
+
+
+def corner_tangents(mesh: Mesh) -> Float[np.ndarray, "f 3 4"]:
+    """`mikktspace` of a whole mesh, per face corner."""
+    welded = weld(mesh)
+    return mikktspace(welded.positions, welded.normals, welded.uvs, welded.faces)
 
 
 def _shared_vertices(positions, normals, uvs) -> tuple[np.ndarray, np.ndarray]:

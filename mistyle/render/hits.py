@@ -19,8 +19,8 @@ from jaxtyping import Bool, Float, Int, Integer
 
 from mistyle.core.camera import Camera
 from mistyle.core.light import Directional, Lights, Point, SceneLights, direction_in_world
-from mistyle.core.mesh import Mesh, weld
-from mistyle.core.tangents import mikktspace
+from mistyle.core.mesh import Mesh
+from mistyle.core.tangents import corner_tangents
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
 from mistyle.render.sky import VARIANTS, Sky, sky
@@ -115,8 +115,7 @@ def tangents_of(mesh: Mesh, frame: FrameKind) -> Float[np.ndarray, "f 3 4"] | No
     """What `collect` needs for a frame: MikkTSpace's tangents per face corner, or None for Mitsuba's own."""
     if frame == "mitsuba":
         return None
-    welded = weld(mesh)
-    return mikktspace(welded.positions, welded.normals, welded.uvs, welded.faces)
+    return corner_tangents(mesh)
 
 
 def grid(subsamples: int) -> Float[np.ndarray, "s 2"]:

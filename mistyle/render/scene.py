@@ -27,7 +27,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh, weld
 from mistyle.core.paths import scenes
-from mistyle.core.tangents import mikktspace
+from mistyle.core.tangents import corner_tangents
 from mistyle.render import device, plugins
 
 TEMPLATES = ("paper_views", "phase1_directional", "phase2_ambient", "studio", "hdri")
@@ -158,8 +158,7 @@ def object_shapes(
         raise ValueError(f"{len(chosen)} maps came for {len(mesh.parts)} texture sets ({', '.join(mesh.parts)})")
     tangents = None
     if frame == "mikkt":
-        welded = weld(mesh)
-        tangents = mikktspace(welded.positions, welded.normals, welded.uvs, welded.faces)
+        tangents = corner_tangents(mesh)
     shapes = {}
     for p in range(len(mesh.parts)):
         if (mesh.part == p).any():

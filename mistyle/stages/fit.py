@@ -32,8 +32,8 @@ from jaxtyping import Bool, Float
 from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.light import Lights, lights
 from mistyle.core.maps import Maps, Texels
-from mistyle.core.mesh import Mesh, face_areas, weld
-from mistyle.core.tangents import mikktspace
+from mistyle.core.mesh import Mesh, face_areas
+from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
 from mistyle.stages import fit_judge, fit_table
 from mistyle.stages.fit_run import Loss, Phase, Run, Shot, World
@@ -158,7 +158,6 @@ def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
     from mistyle.measure.features import load_features
     from mistyle.render.draw import tracer
 
-    welded = weld(mesh)
     pictures, masks = [], []
     for view in targets:
         rgb, inside = np.nan_to_num(view.rgb, posinf=1.0), erode(view_mask(view), 1)
@@ -167,7 +166,7 @@ def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
         masks.append(inside)
     return World(
         traced=tracer(mesh),
-        tangents=mikktspace(welded.positions, welded.normals, welded.uvs, welded.faces),
+        tangents=corner_tangents(mesh),
         cameras=tuple(view.camera for view in targets),
         targets=tuple(pictures),
         masks=tuple(masks),

@@ -16,10 +16,10 @@ from mistyle.core.capture import Captures
 from mistyle.core.image import erode
 from mistyle.core.light import Directional, Point
 from mistyle.core.maps import Texels
-from mistyle.core.mesh import Mesh
 from mistyle.render.draw import Tracer
 from mistyle.render.texel_lm import Observations, Points, Rig
 from mistyle.render.texel_views import look, rig
+from mistyle.stages.frames import texel_frames
 
 REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
 LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane
@@ -120,34 +120,6 @@ def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, 
     return _bilinear(image, at.pixel, at.x, at.y)
 
 
-def texel_frames(
-    mesh: Mesh,
-    face: Int[np.ndarray, " t"],
-    position: Float[np.ndarray, "t 3"],
-    normal: Float[np.ndarray, "t 3"],
-    tangents: Float[np.ndarray, "f 3 4"] | None,
-) -> Float[np.ndarray, "t 3 3"]:
-    """Tangent, bitangent and normal at surface points, as `render/deferred.py` builds them at samples.
-
-    With `tangents` (MikkTSpace, per corner) the interpolated tangent made perpendicular to the normal; without them
-    Mitsuba's own frame, the face's dp/du made perpendicular.
-    """
-    if tangents is None:
-        tangent, hand = _along_u(mesh)[face], np.ones(len(face), np.float32)
-    else:
-        corners = mesh.positions[mesh.faces[face]].astype(np.float32)
-        weights = _barycentric(corners, position)
-        tangent = (tangents[face, :, :3] * weights[..., None]).sum(axis=1)
-        hand = np.sign(tangents[face, 2, 3])
-    s = tangent - normal * (normal * tangent).sum(axis=1, keepdims=True)
-    length = np.linalg.norm(s, axis=1, keepdims=True)
-    spare = np.where(np.abs(normal[:, :1]) < 0.9, np.array([[1.0, 0, 0]]), np.array([[0, 1.0, 0]]))
-    spare = spare - normal * (normal * spare).sum(axis=1, keepdims=True)
-    s = np.where(length > 1e-6, s / np.maximum(length, 1e-6), spare / np.linalg.norm(spare, axis=1, keepdims=True))
-    t = np.cross(normal, s) * hand[:, None]
-    return np.stack([s, t, normal], axis=1).astype(np.float32)
-
-
 def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
     """The shorter side of every texel on the surface, from where its neighbours in the island lie; 0 without any."""
     p, island = texels.position, texels.island
@@ -161,26 +133,6 @@ def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
         here[1:] = np.minimum(here[1:], length)
     smallest = sides.min(axis=0).ravel()
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
-
-
-def _along_u(mesh: Mesh) -> Float[np.ndarray, "f 3"]:
-    """dp/du of every face."""
-    p, uv = mesh.positions[mesh.faces].astype(np.float64), mesh.corner_uvs.astype(np.float64)
-    e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    result = (d2[:, 1:] * e1 - d1[:, 1:] * e2) / np.where(area != 0, area, 1)[:, None]
-    return (result / np.maximum(np.linalg.norm(result, axis=1, keepdims=True), 1e-30)).astype(np.float32)
-
-
-def _barycentric(corners: Float[np.ndarray, "t 3 3"], position: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
-    e1, e2, d = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], position - corners[:, 0]
-    a, b, c = (e1 * e1).sum(1), (e1 * e2).sum(1), (e2 * e2).sum(1)
-    f, g = (e1 * d).sum(1), (e2 * d).sum(1)
-    area = a * c - b * b
-    safe = np.where(area > 1e-20, area, 1)
-    l1 = np.clip(np.where(area > 1e-20, (c * f - b * g) / safe, 1 / 3), 0, 1)
-    l2 = np.clip(np.where(area > 1e-20, (a * g - b * f) / safe, 1 / 3), 0, 1)
-    return np.stack([1 - l1 - l2, l1, l2], axis=1)
 
 
 def _by_camera(cameras: Sequence[Camera], used: Sequence[int]) -> list[list[int]]:
