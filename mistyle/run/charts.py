@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from html import escape
 
 WIDTH, HEIGHT = 640, 300
-LEFT, RIGHT, TOP, BOTTOM = 64, 16, 16, 40
+LEFT, RIGHT, TOP, BOTTOM = 64, 16, 28, 40
 # Told apart by people with any colour vision, and by their order (Okabe and Ito's palette without yellow).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 
@@ -70,11 +70,9 @@ def svg(chart: Chart) -> str:
         parts.append(f'<text x="{WIDTH - RIGHT}" y="{y - 4:.1f}" text-anchor="end">{escape(name)}</text>')
     if len(points) > 1:
         for k, name in enumerate(points):
-            y = TOP + 14 * k + 6
-            parts.append(
-                f'<rect x="{WIDTH - 150}" y="{y - 8}" width="10" height="10" fill="{COLOURS[k % len(COLOURS)]}"/>'
-            )
-            parts.append(f'<text x="{WIDTH - 135}" y="{y + 1}">{escape(name)}</text>')
+            x = LEFT + 120 * k
+            parts.append(f'<rect x="{x}" y="8" width="10" height="10" fill="{COLOURS[k % len(COLOURS)]}"/>')
+            parts.append(f'<text x="{x + 16}" y="17">{escape(name)}</text>')
     return "".join([*parts, "</svg>"])
 
 

@@ -106,21 +106,15 @@ def steps(made: Any) -> tuple[Step, ...]:
         columns=4,
     )
     curves = Step("Convergence", "The loss of the fit, step by step.", charts=tuple(curve_charts(made.recovered.trace)))
+    series = {
+        label: [p if h == held else float("nan") for p, h in zip(measured.psnr, measured.held, strict=True)]
+        for label, held in (("fitted", False), ("held out", True))
+        if held in measured.held
+    }
     bars = Step(
         "Every picture",
         "PSNR of each prediction (sRGB, peak 1).",
-        charts=(
-            Chart(
-                "PSNR by picture",
-                {
-                    "fitted": [p if not h else float("nan") for p, h in zip(measured.psnr, measured.held, strict=True)],
-                    "held out": [p if h else float("nan") for p, h in zip(measured.psnr, measured.held, strict=True)],
-                },
-                x_label="picture",
-                y_label="dB",
-                bars=True,
-            ),
-        ),
+        charts=(Chart("PSNR by picture", series, x_label="picture", y_label="dB", bars=True),),
     )
     parts = list(zip(made.asset.mesh.parts, made.texels, strict=True))
     trust = Step(
@@ -141,7 +135,7 @@ def steps(made: Any) -> tuple[Step, ...]:
 
 
 def curve_charts(trace: dict[str, list[float]]) -> list[Chart]:
-    return [Chart(name, {name: values}, x_label="step", log=True) for name, values in trace.items() if len(values) > 1]
+    return [Chart(name, {name: values}, x_label="step", log=True) for name, values in trace.items() if len(values) > 2]
 
 
 def difference(reference: np.ndarray, predicted: np.ndarray) -> np.ndarray:

@@ -26,6 +26,8 @@ from mistyle.stages.recover_texels import Found, Work, solve_level
 __all__ = ["RecoverSettings", "Recovered", "recover"]
 
 DAMPING = 0.3  # of a descent that begins from nothing
+# And multiples of the rate by channel: soft light says little of normals, less of roughness, most of albedo.
+SHARES = (2, 2, 2, 0.2, 0.2, 0.6, 0.6, 0)
 # Standard deviations at which a texel's confidence has fallen to a half: normal (sine), roughness, albedo, metallic.
 HALF_SURE = {"normal": 0.05, "roughness": 0.1, "albedo": 0.05, "metallic": 0.2}
 CHANNELS = {"albedo": slice(0, 3), "normal": slice(3, 5), "roughness": slice(5, 6), "metallic": slice(6, 7)}
@@ -120,7 +122,9 @@ def descend(
 
     settings, count = work.settings, len(work.captures)
     levels = settings.levels or (1 if found.solved else 5)
-    rates = (1, 1, 1, 1, 1, 1, 1 if settings.metallic else 0, 0)
+    rates = [1.0, 1, 1, 1, 1, 1, 1 if settings.metallic else 0, 0]
+    if not found.solved:
+        rates = [rate * share for rate, share in zip(rates, SHARES, strict=True)]
     damping = 0.0 if found.solved else DAMPING
     descent = Descent(
         work.where.sizes, rates, levels=levels, floor=settings.roughness_floor, damping=damping

@@ -65,7 +65,7 @@ def find_light(
     directions, angles = _grid()
     sizes = [where.covered.shape for where in texels]
     coarse = settings.model_copy(
-        update={"solver": "pictures", "iterations": STEPS, "subsamples": 1, "bounces": 0, "rate": 0.02}
+        update={"solver": "pictures", "iterations": STEPS, "subsamples": 1, "bounces": 0, "rate": 0.01}
     )
     light, residuals = Environment(np.ones((ROWS, 2 * ROWS, 3), np.float32)), []
     for number in range(ROUNDS):
