@@ -11,10 +11,13 @@ step_speedup_equal_error  seconds that mi.render needs for the gradient error of
                           a gradient with a fine grid of samples; mi.render's error falls with 1 / sqrt(samples) and its
                           time grows with them from where both were measured last (`…_spp`)
 exponent_views/…          slope of log(seconds) over log(views, pixels of a view, texels of the table)
+lm_texels_per_second      of the per-texel solver; …_differences with a Jacobian by finite differences, …_1_thread
+time_to_quality_ratio     our time to the naive loop's final relighting PSNR / that loop's (not with --quick)
 …floor_ratio              our seconds / the time it takes only to move the bytes that any such step must read and write
 """
 
 import argparse
+import os
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,7 +35,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.render import device, draw, shade
 from mistyle.render import scene as scenery
 
-DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
+DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MESH = "meshes/pbr/Avocado/Avocado.gltf"
 MAPS = {"albedo": slice(0, 3), "tilt": slice(3, 5), "roughness": slice(5, 6)}
 
@@ -340,7 +343,32 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     figures["transpose_texel_space_seconds"] = figures["transpose_shading_seconds"] * h.counts[2] / n
 
 
-MEASUREMENTS: tuple[Callable[[dict[str, float], Mesh, bool], None], ...] = (steps, transposes, growth)
+def solver(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
+    """Texels per second of the per-texel solver: on all threads and on one, and by finite differences."""
+    import drjit as dr
+
+    from mistyle.render.texel_speed import throughput
+
+    device.use()
+    texels, every = (8192 if quick else 65536), dr.thread_count()
+    figures["lm_texels_per_second"] = throughput(texels)
+    figures["lm_texels_per_second_differences"] = throughput(texels, differences=True)
+    device.use(threads=1)
+    figures["lm_texels_per_second_1_thread"] = throughput(texels)
+    device.use(threads=every)
+
+
+def quality(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
+    """Time to the naive loop's final relighting PSNR; not in a quick run, which would measure fixed costs."""
+    from benchmarks.recovery_time import figures as named
+    from benchmarks.recovery_time import time_to_quality
+
+    if not quick:
+        hdri = DATA / "hdri" / "studio_small_03_1k.hdr"
+        figures |= named(time_to_quality(DATA / MESH, hdri, seconds=120, resolution=512))
+
+
+MEASUREMENTS: tuple[Callable[[dict[str, float], Mesh, bool], None], ...] = (steps, transposes, growth, solver, quality)
 
 
 def main(argv: list[str] | None = None) -> None:

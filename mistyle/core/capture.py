@@ -42,7 +42,7 @@ def in_memory(
 
     def load(k: int) -> Loaded:
         picture = pictures[k]
-        usable = np.isfinite(picture).all(axis=-1)
+        usable = np.asarray(np.isfinite(picture).all(axis=-1))
         return picture, usable & masks[k] if masks is not None else usable
 
     return Captures(tuple(cameras), tuple(lights), load)

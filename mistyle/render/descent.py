@@ -154,7 +154,7 @@ class Descent:
         scale1, scale2 = 1 / (1 - BETA1**age), 1 / (1 - BETA2**age)
         least = mi.ArrayXf([dr.zeros(mi.Float, width) + EPSILON] * 8)
         if self.damping:
-            share = dr.maximum(dr.mean(dr.select(on, 1.0, 0.0)), 1e-6)
+            share = dr.maximum(mi.Float(dr.mean(dr.select(on, mi.Float(1), mi.Float(0)))), mi.Float(1e-6))
             square = [dr.mean(dr.select(on, new2[c] * scale2, 0)) / share for c in range(8)]
             least = mi.ArrayXf([dr.zeros(mi.Float, width) + self.damping * dr.sqrt(s) + EPSILON for s in square])
         step = dr.select(on, new1 * scale1 / (dr.sqrt(new2 * scale2) + least), 0)
