@@ -30,7 +30,7 @@ KEYS = [
     Directional((-0.6, 0.2, -0.775), (2.5, 2.4, 2.3), "camera"),
 ]
 QUICK = {
-    "recover": {"iterations": 40, "rounds": 1, "solver_iterations": 8},
+    "recover": {"iterations": 72, "rounds": 2, "solver_iterations": 10},
     "report": {"frames": 4, "resolution": 96, "spp": 1},
 }
 
