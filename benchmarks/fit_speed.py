@@ -99,7 +99,6 @@ class Naive:
     """The step through mi.render."""
 
     def __init__(self, where: Problem, integrator: dict[str, Any]) -> None:
-        import drjit as dr
         import mitsuba as mi
 
         camera = where.captures.cameras[0]
@@ -118,7 +117,7 @@ class Naive:
         self.reference = mi.TensorXf(where.captures.load(0)[0])
         self.maps = where.maps
         self.seed = 0
-        self._frozen = dr.freeze(self._traced)
+        self._frozen = device.Frozen(self._traced)
 
     def step(self, spp: int) -> list[Any]:
         """Gradients of the textures; another seed at each call."""
@@ -317,7 +316,7 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
         dr.make_opaque(gradient)
         return gradient
 
-    frozen, natural = dr.freeze(gather), dr.arange(mi.UInt32, width)
+    frozen, natural = device.Frozen(gather), dr.arange(mi.UInt32, width)
     dr.make_opaque(natural)
 
     def by_texel():
@@ -327,7 +326,7 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
 
     figures["transpose_gather_seconds"] = seconds(by_texel, repeats)
     for name, how in (("atomic", natural), ("atomic_sorted", order)):
-        scattered = dr.freeze(atomic)
+        scattered = device.Frozen(atomic)
         figures[f"transpose_{name}_seconds"] = seconds(
             lambda f=scattered, o=how: f(empty(), packed, places, weights, o), repeats
         )
@@ -336,7 +335,7 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     matrix = sparse.csr_matrix((values.ravel(), columns.ravel(), np.arange(0, 4 * n + 1, 4)), shape=(n, ours.texels)).T
     matrix, dense = matrix.tocsr(), np.array(packed).reshape(-1, 8)[:n]
     figures["transpose_scipy_seconds"] = seconds(lambda: mi.Float((matrix @ dense).ravel()), repeats)
-    shaded = dr.freeze(alone)
+    shaded = device.Frozen(alone)
     at = dr.gather(mi.Vector4f, mi.Float(adjoint.array), samples.slot)
     dr.eval(at)
     figures["transpose_shading_seconds"] = seconds(lambda: shaded(ours._textures, samples, block.lights, at), repeats)
@@ -374,6 +373,7 @@ MEASUREMENTS: tuple[Callable[[dict[str, float], Mesh, bool], None], ...] = (step
 def main(argv: list[str] | None = None) -> None:
     own = argparse.ArgumentParser(add_help=False)
     own.add_argument("--mesh", type=Path, default=DATA / MESH)
+    own.add_argument("--skip", nargs="+", default=[], choices=[m.__name__ for m in MEASUREMENTS])
     chosen, rest = own.parse_known_args(argv)
     options = arguments(__doc__ or "", rest)
     from mistyle.files.read import read_mesh
@@ -381,7 +381,8 @@ def main(argv: list[str] | None = None) -> None:
     mesh = read_mesh(chosen.mesh).mesh
     figures: dict[str, float] = {}
     for measure in MEASUREMENTS:
-        measure(figures, mesh, options.quick)
+        if measure.__name__ not in chosen.skip:
+            measure(figures, mesh, options.quick)
     finish(figures, options.json)
 
 

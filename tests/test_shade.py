@@ -1,5 +1,8 @@
 """The fast path against Mitsuba, finite differences and itself."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 from test_seam import KEY, SIZES, crop, plain_scene, random_maps, torus
@@ -315,3 +318,35 @@ def test_misuse_is_refused(traced, rng):
         made(traced, rng, [crop(8)], (KEY,), model="phong")
     with pytest.raises(ValueError, match="texture sets"):
         shade.Shade(traced, ours.captures, SIZES[:1])
+
+
+def test_arrays_let_go_while_a_function_is_recorded_do_no_harm():
+    """In a process of its own: where the collector runs during the recording, Dr.Jit aborts."""
+    code = """
+import gc
+import numpy as np
+from mistyle.render import device
+device.use()
+import drjit as dr
+import mitsuba as mi
+
+class Ring:
+    pass
+
+def leave():
+    ring = Ring()
+    ring.self, ring.array = ring, mi.Float(np.ones(4096, np.float32))
+    dr.eval(ring.array)
+
+def traced(x):
+    if gc.isenabled():
+        gc.collect()  # what may happen at any time
+    dr.eval(x)
+    return x * 2 + 40
+
+gc.collect()
+leave()
+print(np.array(device.Frozen(traced)(mi.Float(np.ones(64, np.float32))))[0])
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0 and done.stdout.strip() == "42.0", done.stderr

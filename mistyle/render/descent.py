@@ -44,7 +44,6 @@ class Descent:
         still: Bool[np.ndarray, " t"] | None = None,
     ) -> None:
         device.use()
-        import drjit as dr
         import mitsuba
 
         mi: Any = mitsuba
@@ -59,7 +58,7 @@ class Descent:
         if still is not None:
             free[still] = FINE - 1
         self.blame = mi.UInt32(aligned(free, np.uint32))
-        self._run = dr.freeze(self._step)
+        self._run = device.Frozen(self._step)
 
     def step(self, table: Any, gradient: Any, rate: float, picture: int) -> Any:
         """The table (a Dr.Jit Float, 8 a texel) after one step against `gradient` (likewise) of `picture`."""

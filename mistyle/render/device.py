@@ -1,8 +1,10 @@
 """Which Mitsuba variant draws, and on how many threads. Chosen at run time, never by an import."""
 
+import gc
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Any
 
 from mistyle.bootstrap import use_llvm
 from mistyle.core.errors import EnvironmentMissing
@@ -60,6 +62,33 @@ def file_threads() -> Iterator[None]:
     finally:
         if before < 2:
             dr.set_thread_count(before)
+
+
+class Frozen:
+    """`dr.freeze` of a function, with Python's garbage collector at rest while it runs.
+
+    An array on NumPy's memory that is let go while Dr.Jit 1.5 records ends the whole process; the collector may do
+    that at any time, to arrays that have nothing to do with the function.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        import drjit as dr
+
+        self._run = dr.freeze(function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        collecting = gc.isenabled()
+        gc.disable()
+        try:
+            return self._run(*arguments)
+        finally:
+            if collecting:
+                gc.enable()
+
+    @property
+    def n_recordings(self) -> int:
+        """How often the function has been recorded so far."""
+        return self._run.n_recordings
 
 
 def _first_that_answers(built: list[str]) -> str:

@@ -217,13 +217,12 @@ class Shade:
 
     def _function(self, block: "Block", name: str, function: Callable, *fixed: Any) -> Any:
         """`function` with its fixed arguments, frozen once per size of arrays (sizes are constants of a recording)."""
-        import drjit as dr
 
         if not self._freeze:
             return lambda *arguments: function(*fixed, *arguments)
         key = (name, *block.widths)
         if key not in self._frozen:
-            self._frozen[key] = dr.freeze(lambda *arguments: function(*fixed, *arguments))
+            self._frozen[key] = device.Frozen(lambda *arguments: function(*fixed, *arguments))
         return self._frozen[key]
 
     def blocks(self, picture: int) -> Iterator["Block"]:
