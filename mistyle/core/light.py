@@ -139,6 +139,12 @@ def direction_in_world(light: Directional, camera: Camera) -> Float[np.ndarray, 
     return camera.world_from_cam[:3, :3] @ direction if light.frame == "camera" else direction
 
 
+def position_in_world(light: Point, camera: Camera) -> Float[np.ndarray, "3"]:
+    """Where a point light stands in the world, for one fixed to the world or to `camera`."""
+    position = np.asarray(light.position, float)
+    return camera.world_from_cam[:3, :3] @ position + camera.position if light.frame == "camera" else position
+
+
 def spherical_gaussian(light: SphericalGaussian, directions: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
     """Radiance from unit world directions."""
     lobe = np.exp(light.sharpness * (directions @ np.asarray(light.axis) - 1))

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
 from mistyle.core.camera import Camera
-from mistyle.core.light import Directional, Lights, Point, SceneLights, direction_in_world
+from mistyle.core.light import Directional, Lights, Point, SceneLights, direction_in_world, position_in_world
 from mistyle.core.mesh import Mesh
 from mistyle.core.tangents import corner_tangents
 from mistyle.render import deferred, device
@@ -303,12 +303,10 @@ def _arriving(traced, point, light, camera: Camera, valid, shadows: bool) -> tup
         direction = mi.Vector3f(direction_in_world(light, camera).tolist())
         strength, shadow = mi.Float(1), point.spawn_ray(direction)
     else:
-        position = np.asarray(light.position, float)
-        if light.frame == "camera":
-            position = camera.world_from_cam[:3, :3] @ position + camera.position
-        away = mi.Point3f(position.tolist()) - point.p
+        position = mi.Point3f(position_in_world(light, camera).tolist())
+        away = position - point.p
         strength = dr.rcp(dr.squared_norm(away))
-        direction, shadow = away * dr.sqrt(strength), point.spawn_ray_to(mi.Point3f(position.tolist()))
+        direction, shadow = away * dr.sqrt(strength), point.spawn_ray_to(position)
     if shadows:
         strength = dr.select(traced.scene.ray_test(shadow, active=valid), 0, strength)
     return direction, strength

@@ -14,12 +14,11 @@ from jaxtyping import Float
 
 from mistyle.core.camera import Camera, resized
 from mistyle.core.image import gaussian, nearest_fill
-from mistyle.core.light import Directional, Light, Lights, Point, direction_in_world
+from mistyle.core.light import Directional, Light, Lights, Point, direction_in_world, position_in_world
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device
 from mistyle.render import scene as scenery
-from mistyle.render.texel_views import place
 
 COARSER = 4  # pixels along a side of the picture that one pixel of the estimate covers, at most
 LEAST = 128  # pixels along a side of the estimate, at least, where the picture has so many
@@ -83,7 +82,7 @@ def emitter(light: Light, camera: Camera) -> dict[str, Any]:
         return {"type": "directional", "direction": (-towards).tolist(), "irradiance": colour}
     if isinstance(light, Point):
         colour = {"type": "rgb", "value": list(light.intensity)}
-        return {"type": "point", "position": place(light, camera).tolist(), "intensity": colour}
+        return {"type": "point", "position": position_in_world(light, camera).tolist(), "intensity": colour}
     raise ValueError(f"the indirect light of {type(light).__name__} cannot be estimated")
 
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.light import Ambient, Environment, Light, SphericalGaussian, spherical_gaussian
+from mistyle.core.light import Ambient, Environment, Light, SphericalGaussian, environment_radiance, spherical_gaussian
 
 SOFT = (Ambient, Environment, SphericalGaussian)
 REC709 = np.array([0.2126, 0.7152, 0.0722])
@@ -111,25 +111,8 @@ def _radiance(lights: Sequence[Light], directions: Float[np.ndarray, "h w 3"]) -
         elif isinstance(light, SphericalGaussian):
             result += spherical_gaussian(light, directions)
         elif isinstance(light, Environment):
-            result += light.scale * _looked_up(light, directions)
+            result += environment_radiance(light, directions)
     return result
-
-
-def _looked_up(light: Environment, directions: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """The map's radiance, bilinear; its first and last row are the poles (`core.light.environment_directions`)."""
-    from scipy.ndimage import map_coordinates
-
-    a = np.radians(light.turn)
-    x = directions[..., 0] * np.cos(a) - directions[..., 2] * np.sin(a)
-    z = directions[..., 0] * np.sin(a) + directions[..., 2] * np.cos(a)
-    height, width = light.radiance.shape[:2]
-    row = np.arccos(np.clip(directions[..., 1], -1, 1)) / np.pi * (height - 1)
-    column = np.arctan2(x, -z) / (2 * np.pi) * width - 0.5
-    # One column more on each side: the picture closes on itself.
-    closed = np.concatenate([light.radiance[:, -1:], light.radiance, light.radiance[:, :1]], axis=1).astype(float)
-    place = [row, column % width + 1]
-    place[1] = np.where(place[1] > width + 0.5, place[1] - width, place[1])
-    return np.stack([map_coordinates(closed[..., c], place, order=1, mode="nearest") for c in range(3)], axis=-1)
 
 
 def _cut(share: Float[np.ndarray, "h w"], count: int, start: int, whole: int) -> list[tuple[int, int, int, int]]:

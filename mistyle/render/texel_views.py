@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera
-from mistyle.core.light import Directional, Light, Lights, Point, direction_in_world
+from mistyle.core.light import Directional, Light, Lights, Point, direction_in_world, position_in_world
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
 from mistyle.render.hits import BLOCK_RAYS
@@ -75,7 +75,7 @@ def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
                 vector.append(direction_in_world(light, camera))
                 irradiance.append(light.irradiance)
             elif isinstance(light, Point):
-                vector.append(place(light, camera))
+                vector.append(position_in_world(light, camera))
                 irradiance.append(light.intensity)
             else:
                 raise ValueError(f"{type(light).__name__} is no delta light")
@@ -87,12 +87,6 @@ def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
         near=np.array(near, np.float32),
         irradiance=np.array(irradiance, np.float32).reshape(-1, 3),
     )
-
-
-def place(light: Point, camera: Camera) -> Float[np.ndarray, "3"]:
-    """World position of a point light."""
-    position = np.asarray(light.position, float)
-    return camera.world_from_cam[:3, :3] @ position + camera.position if light.frame == "camera" else position
 
 
 def reaches(
@@ -118,5 +112,5 @@ def _shadow(point: Any, light: Light, camera: Camera) -> Any:
     if isinstance(light, Directional):
         return point.spawn_ray(mi.Vector3f(direction_in_world(light, camera).tolist()))
     if isinstance(light, Point):
-        return point.spawn_ray_to(mi.Point3f(place(light, camera).tolist()))
+        return point.spawn_ray_to(mi.Point3f(position_in_world(light, camera).tolist()))
     raise ValueError(f"{type(light).__name__} is no delta light")

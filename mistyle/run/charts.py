@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 
 WIDTH, HEIGHT = 640, 300
@@ -23,13 +23,12 @@ class Chart:
     y_label: str = ""
     log: bool = False
     bars: bool = False
-    marks: Mapping[str, float] = field(default_factory=dict)
 
 
 def svg(chart: Chart) -> str:
     """The chart as an <svg> element; every text is escaped."""
     points = {name: _points(chart, values) for name, values in chart.series.items()}
-    values = [y for line in points.values() for _, y in line] + [_value(chart, m) for m in chart.marks.values()]
+    values = [y for line in points.values() for _, y in line]
     if not values:
         return f'<p class="empty">{escape(chart.title)}: nothing to draw</p>'
     low, high = min(values), max(values)
@@ -64,10 +63,6 @@ def svg(chart: Chart) -> str:
         elif line:
             path = " ".join(f"{px(x):.1f},{py(y):.1f}" for x, y in _thinned(line))
             parts.append(f'<polyline points="{path}" fill="none" stroke="{colour}" stroke-width="1.8"/>')
-    for name, mark in chart.marks.items():
-        y = py(_value(chart, mark))
-        parts.append(f'<line x1="{LEFT}" x2="{WIDTH - RIGHT}" y1="{y:.1f}" y2="{y:.1f}" class="mark"/>')
-        parts.append(f'<text x="{WIDTH - RIGHT}" y="{y - 4:.1f}" text-anchor="end">{escape(name)}</text>')
     if len(points) > 1:
         for k, name in enumerate(points):
             x = LEFT + 120 * k

@@ -26,6 +26,7 @@ from mistyle.core.light import (
     SphericalGaussian,
     bake_environment,
     direction_in_world,
+    position_in_world,
 )
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
@@ -94,9 +95,7 @@ def _emitter(light, camera: Camera, folder: Path, k: int) -> Element:
         SubElement(emitter, "rgb", name="irradiance", value=_numbers(light.irradiance))
     elif isinstance(light, Point):
         emitter = Element("emitter", type="point")
-        place = np.array([*light.position, 1.0])
-        place = camera.world_from_cam @ place if light.frame == "camera" else place
-        SubElement(emitter, "point", name="position", value=_numbers(place[:3]))
+        SubElement(emitter, "point", name="position", value=_numbers(position_in_world(light, camera)))
         SubElement(emitter, "rgb", name="intensity", value=_numbers(light.intensity))
     elif isinstance(light, Ambient):
         emitter = Element("emitter", type="constant")
