@@ -82,7 +82,8 @@ def recover(
 
     notes: list[str] = []
     indirect: dict[int, np.ndarray] = {}
-    captures = without(usable(mesh, captures, notes), indirect)
+    whole = usable(mesh, captures, notes)
+    captures = without(whole, indirect)
     traced = tracer(mesh)
     where = solving.atlas(texels)
     work = Work(traced, tangents_of(mesh, settings.frame), texels, where, captures, settings, notes)
@@ -101,6 +102,9 @@ def recover(
         if not after < before:
             notes.append(f"The steps on whole pictures were undone: the loss went from {before:.3g} to {after:.3g}.")
             table = found.table
+    if settings.polish:
+        # Its pictures keep the light between surfaces.
+        table = polished(work, whole, table, seed, trace, lambda d: progress(0.95 + 0.05 * d))
     shade.table = table
     residuals = {camera.name: _residual(shade, k) for k, camera in enumerate(captures.cameras)}
     progress(1.0)
@@ -152,6 +156,30 @@ def descend(
                 saved = time.monotonic()
     _note_stopped(work, descent.stopped())
     return np.array(table).reshape(-1, 8)
+
+
+def polished(
+    work: Work,
+    captures: Captures,
+    table: Float[np.ndarray, "a 8"],
+    seed: int,
+    trace: dict[str, list[float]],
+    progress: Callable[[float], None],
+) -> Float[np.ndarray, "a 8"]:
+    """Steps through `prb` from `table`; a result that explains the pictures no better is dropped, with a note."""
+    from mistyle.render.polish import polish
+    from mistyle.render.shade import pack, unpack
+
+    s = work.settings
+    done = polish(
+        work.traced.mesh, unpack(table, work.where.sizes), captures, s.polish, model=s.model, frame=s.frame,
+        metallic=s.metallic, loss=s.loss, rate=s.rate, depth=s.polish_depth, seed=seed, progress=progress,
+    )  # fmt: skip
+    trace["polish.loss"], trace["polish.whole"] = list(done.trace), list(done.loss)
+    if not done.loss[1] < done.loss[0]:
+        work.notes.append(f"The polish was undone: the loss went from {done.loss[0]:.3g} to {done.loss[1]:.3g}.")
+        return table
+    return pack(done.maps)
 
 
 def _note_stopped(work: Work, stopped: list[tuple[int, str, int]]) -> None:

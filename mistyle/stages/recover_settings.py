@@ -59,6 +59,13 @@ class RecoverSettings(BaseModel):
         default=1, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
     )
     bounce_samples: int = Field(default=64, ge=1, le=4096, description="samples a pixel of that estimate")
+    polish: int = Field(
+        default=0,
+        ge=0,
+        le=100_000,
+        description="steps at the end through Mitsuba's prb, with light between surfaces in picture and gradient: slow",
+    )
+    polish_depth: int = Field(default=6, ge=2, le=64, description="path segments that those steps follow")
     shadows: bool = Field(default=True, description="whether the object shadows itself")
     memory: float = Field(default=4.0, gt=0, description="GB for what is kept of the pictures' samples")
     checkpoint: float = Field(default=60.0, gt=0, description="seconds between checkpoints")

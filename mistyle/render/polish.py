@@ -1,0 +1,193 @@
+"""The last steps of a material fit through `prb`: light between surfaces is in the picture and in its gradient.
+
+The fits before it know direct light only, or take an estimate of the rest off the pictures. Here every picture is
+rendered as it came about, with all bounces, and Adam on the Laplacian pyramid of every map (`pyramid.py`) goes on from
+the maps found. Gradients are Monte Carlo estimates, so it is slow and the steps are small.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.capture import Captures
+from mistyle.core.maps import Maps
+from mistyle.core.mesh import Mesh
+from mistyle.render import device, scene_grad, scene_keys
+from mistyle.render import pyramid as laplacian
+from mistyle.render import scene as scenery
+from mistyle.render.emitters import emitters
+
+SHARE = 0.7  # of the rate that each coarser level of the pyramid has
+LAST_RATE = 0.1  # share of the rate at the end
+SOLID = 0.999  # coverage from which a pixel counts: the others mix with what lies behind the object
+JUDGES = 8  # pictures by which the result is compared with the start
+# The normals' encoding halves their lengths, and their error matters most: they move more slowly than the rest.
+RATES = {"albedo": 1.0, "normal": 0.3, "roughness": 1.0, "metallic": 1.0}
+
+
+@dataclass(frozen=True)
+class Polished:
+    """maps    as given where the result is no better
+    loss    before and after, mean over the judged pictures
+    trace   loss of each step
+    """
+
+    maps: tuple[Maps, ...]
+    loss: tuple[float, float]
+    trace: tuple[float, ...]
+
+
+def polish(
+    mesh: Mesh,
+    maps: Sequence[Maps],
+    captures: Captures,
+    steps: int,
+    *,
+    model: scenery.Model = "principled",
+    frame: scenery.Frame = "mikkt",
+    metallic: bool = False,
+    loss: str = "log_srgb_l1",
+    rate: float = 1e-3,
+    depth: int = 6,
+    spp: int = 16,
+    spp_grad: int = 4,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Polished:
+    """`steps` of Adam from `maps`, one picture each, with up to `depth` path segments; see the module.
+
+    `spp` samples a pixel for the picture, `spp_grad` for its gradient. Pixels count where the picture's mask says so
+    and the object covers them whole. The same bytes come out with one thread only: Mitsuba adds up texture gradients
+    in another order in every run. Roughness stays at or above `scene_keys.ROUGHNESS_FLOOR`.
+    """
+    device.use()
+    job = _Job(mesh, maps, captures, model, frame, metallic, scene_grad.LOSSES[loss], depth)
+    judges = np.unique(np.linspace(0, len(captures) - 1, JUDGES).round().astype(int)).tolist()
+    first = values = job.values()
+    before = job.judge(first, judges, spp, seed)
+    moments = {p.key: laplacian.start(p.shape) for p in job.chosen}
+    trace = []
+    for step in range(steps):
+        turn, place = divmod(step, len(captures))
+        k = int(np.random.default_rng([seed, turn]).permutation(len(captures))[place])
+        value, gradient = job.gradient(values, k, (spp, spp_grad), _seeds(seed, step))
+        falling = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * step / steps))
+        for p, name in zip(job.chosen, job.names, strict=True):
+            usable = np.where(np.isfinite(gradient[p.key]), gradient[p.key], 0)
+            change = laplacian.change(moments[p.key], usable, rate * RATES[name] * falling, SHARE)
+            values = values | {p.key: scene_keys.project(p, values[p.key] + change)}
+        trace.append(value)
+        progress((step + 1) / steps)
+    after = job.judge(values, judges, spp, seed)
+    better = after < before
+    return Polished(tuple(job.maps(values)) if better else tuple(maps), (before, after), tuple(trace))
+
+
+class _Job:
+    """The object with its textures, which all scenes share, and one scene per picture, made when it is needed."""
+
+    def __init__(self, mesh, maps, captures, model, frame, metallic, loss, depth) -> None:
+        import mitsuba
+
+        self.mi: Any = mitsuba
+        self.start, self.captures, self.loss = tuple(maps), captures, loss
+        self.shapes = scenery.object_shapes(mesh, maps, model=model, frame=frame)
+        engine = {"type": "prb", "max_depth": depth, "rr_depth": depth + 1, "hide_emitters": True}
+        self.engine = self.mi.load_dict(engine)
+        self._environments: dict[tuple[int, ...], list[Any]] = {}
+        moving = [n for n in RATES if n != "metallic" or metallic]
+        parts = [p for p in range(len(maps)) if f"part{p}" in self.shapes]
+        wanted = {scenery.parameters(p)[name]: (p, name) for p in parts for name in moving}
+        found = scene_keys.match(self.scene(0), list(wanted))
+        self.places = [wanted[p.key] for p in found]
+        self.names = [name for _, name in self.places]
+        # What holds a normal map is known here; its plugin may be ours.
+        self.chosen = [
+            replace(p, owner="NormalMap") if name == "normal" else p for p, name in zip(found, self.names, strict=True)
+        ]
+
+    def scene(self, k: int) -> Any:
+        """Picture k's."""
+        camera = self.captures.cameras[k]
+        described = {"type": "scene", "sensor": scenery.sensor_dict(camera, 16), **self.shapes}
+        described |= {f"light{j}": light for j, light in enumerate(self._lights(k))}
+        return self.mi.load_dict(described, optimize=False)
+
+    def _lights(self, k: int) -> list[Any]:
+        """Environment maps are loaded once; other lights may depend on the camera and are nothing to load."""
+        lights, camera = self.captures.lights[k], self.captures.cameras[k]
+        key = tuple(map(id, lights))
+        if key in self._environments:
+            return self._environments[key]
+        made = emitters(lights, camera)
+        if all(light["type"] == "envmap" for light in made):
+            made = self._environments[key] = [self.mi.load_dict(light) for light in made]
+        return made
+
+    def values(self) -> dict[str, np.ndarray]:
+        """The start by key."""
+        result = {}
+        for p, (part, name) in zip(self.chosen, self.places, strict=True):
+            grid = getattr(self.start[part], name)
+            grid = grid * 0.5 + 0.5 if name == "normal" else grid
+            result[p.key] = scene_keys.project(p, np.asarray(grid, np.float32).reshape(p.shape))
+        return result
+
+    def maps(self, values: dict[str, np.ndarray]) -> list[Maps]:
+        """The start with the values in place of its own."""
+        result = list(self.start)
+        for p, (part, name) in zip(self.chosen, self.places, strict=True):
+            grid = values[p.key]
+            if name == "normal":
+                grid = grid * 2 - 1
+                grid = grid / np.linalg.norm(grid, axis=-1, keepdims=True)
+            grid = grid[..., 0] if name in ("roughness", "metallic") else grid
+            result[part] = replace(result[part], **{name: np.ascontiguousarray(grid, np.float32)})
+        return result
+
+    def _look(self, scene: Any, k: int, spp: int, seed: int) -> tuple[Any, Any]:
+        """The picture, and what it is compared with."""
+        sensor = scene.sensors()[0]
+        shown = scene_grad.picture(scene, self.engine, sensor, spp, seed)
+        rgb, mask = self.captures.load(k)
+        counts = mask & (np.array(shown)[..., 3] > SOLID)
+        clean = np.ascontiguousarray(np.where(counts[..., None], rgb, 0), np.float32)
+        wide = self.mi.TensorXb(np.ascontiguousarray(np.broadcast_to(counts[..., None], clean.shape)))
+        return shown, scene_grad.Sight(sensor, self.mi.TensorXf(clean), wide, max(float(counts.mean()), 1e-9))
+
+    def gradient(self, values, k: int, spp: tuple[int, int], seeds: tuple[int, int]):
+        """Loss of picture k and its gradient by key."""
+        import drjit as dr
+
+        scene = self.scene(k)
+        table = self._table(scene)
+        moving = scene_grad.put(table, self.chosen, values, grad=True)
+        shown, view = self._look(scene, k, spp[0], seeds[0])
+        value, pixels, _ = scene_grad.compare(shown, view, self.loss)
+        self.engine.render_backward(
+            scene, table, pixels, view.sensor, seed=dr.opaque(self.mi.UInt32, seeds[1]), spp=spp[1]
+        )
+        return value, {p.key: scene_grad.array(dr.grad(moving[p.key]), p) for p in self.chosen}
+
+    def judge(self, values, pictures: Sequence[int], spp: int, seed: int) -> float:
+        """Mean loss of some pictures, with the same random numbers each time."""
+        losses = []
+        for k in pictures:
+            scene = self.scene(k)
+            scene_grad.put(self._table(scene), self.chosen, values)
+            shown, view = self._look(scene, k, 4 * spp, _seeds(seed, 2**31 + k)[0])
+            losses.append(scene_grad.compare(shown, view, self.loss)[0])
+        return float(np.mean(losses))
+
+    def _table(self, scene: Any) -> Any:
+        table = self.mi.traverse(scene)
+        table.properties = {p.key: table.properties[p.key] for p in self.chosen}
+        return table
+
+
+def _seeds(seed: int, step: int) -> tuple[int, int]:
+    """Of picture and gradient, never the same."""
+    first, second = (int(n) for n in np.random.SeedSequence([seed, step]).generate_state(2))
+    return first, second if second != first else first ^ 1
