@@ -72,6 +72,7 @@ def fit_scene(
     sensors_per_step: int = 1,
     seed: int = 0,
     integrator: Any = None,
+    fast: bool = True,
     masks: Sequence[np.ndarray | None] | None = None,
     only: Mapping[str, np.ndarray] | None = None,
     save: Callable[[dict[str, np.ndarray]], None] | None = None,
@@ -92,6 +93,7 @@ def fit_scene(
     rate              of Adam, for values in 0..1; what has no range is scaled by its first root mean square
     pyramid           False: plain Adam on the texels
     integrator        see `scene_grad.ad_integrator`
+    fast              take gradients from `scene_fast.Fast` where its pictures are the scene's; a note says whether
     masks             pixels that count, bool (h, w), one a sensor (None: all)
     only              by key (or name): bool, which numbers of a value may change; all others keep their bytes
     save, resume      `save` receives a dictionary of arrays every `save_every` seconds, and when the callback ends or
@@ -106,7 +108,8 @@ def fit_scene(
     """
     device.use()
     plan = scene_job.Plan(iterations, spp, spp_grad, rate, pyramid, sensors_per_step, seed)
-    job, notes = scene_job.prepare(scene, keys, sensors, references, masks, only, loss, regularizers, integrator, plan)
+    given = (scene, keys, sensors, references, masks, only, loss, regularizers, integrator)
+    job, notes = scene_job.prepare(*given, plan, fast)
     edge = len(job.views) / (2 * len(job.views) + iterations * sensors_per_step)
     if resume is None:
         values = {p.key: scene_job.first(p, job) for p in job.chosen}
@@ -150,17 +153,7 @@ def _step(job: scene_job.Job, state: scene_job.State) -> None:
     total = 0.0
     for slot in range(plan.sensors_per_step):
         k = _turn(plan.seed, step * plan.sensors_per_step + slot, len(job.views))
-        value, found, broken = scene_grad.gradients(
-            job.scene,
-            job.table,
-            job.chosen,
-            state.values,
-            job.engine,
-            job.views[k],
-            job.loss,
-            (plan.spp, plan.spp_grad),
-            _seeds(plan.seed, step, slot),
-        )
+        value, found, broken = _gradients(job, state, k, _seeds(plan.seed, step, slot))
         total += value / plan.sensors_per_step
         state.broken[k] = state.broken.get(k, 0) + broken
         _add(gradient, found, state, 1 / plan.sensors_per_step, k)
@@ -177,6 +170,16 @@ def _step(job: scene_job.Job, state: scene_job.State) -> None:
         state.values[p.key] = np.where(usable, moved, state.values[p.key])
     state.trace.append(total)
     state.iteration += 1
+
+
+def _gradients(job: scene_job.Job, state: scene_job.State, k: int, seeds: tuple[int, int]):
+    """Loss and gradient of camera k, and how many values of its picture were no numbers."""
+    if job.fast is not None:
+        return *job.fast.gradients(state.values, k), 0
+    samples = (job.plan.spp, job.plan.spp_grad)
+    return scene_grad.gradients(
+        job.scene, job.table, job.chosen, state.values, job.engine, job.views[k], job.loss, samples, seeds
+    )
 
 
 def _add(total: dict, found: dict, state: scene_job.State, weight: float, sensor: int | None) -> None:

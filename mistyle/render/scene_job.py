@@ -56,6 +56,7 @@ class Job:
     free: dict[str, np.ndarray]
     scales: dict[str, float]
     plan: Plan
+    fast: Any = None  # scene_fast.Fast, where its pictures are the scene's
 
 
 @dataclass
@@ -73,7 +74,7 @@ class State:
     broken: dict[int, int] = field(default_factory=dict)
 
 
-def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, integrator, plan: Plan):
+def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, integrator, plan: Plan, fast=True):
     """Check everything and put it together; returns the job and notes."""
     import mitsuba as mi
 
@@ -103,7 +104,23 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
             free[p.key] = np.broadcast_to(wide, p.shape).astype(bool)
     scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
     function = scene_grad.LOSSES[loss] if isinstance(loss, str) else loss
-    return Job(scene, table, chosen, views, engine, function, tuple(regularizers), free, scales, plan), notes
+    quick, why = _fast(scene, chosen, views, loss, engine) if fast else (None, "it was not asked for.")
+    notes.append(
+        "Gradients came without Monte Carlo: direct light of points and directions on plain `principled` materials."
+        if quick is not None
+        else f"Gradients came through {engine.class_name()}, not through the fast path: {why}"
+    )
+    return Job(scene, table, chosen, views, engine, function, tuple(regularizers), free, scales, plan, quick), notes
+
+
+def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
+    """The fast path, or why there is none."""
+    from mistyle.render.scene_fast import Fast, NotFast
+
+    try:
+        return Fast(scene, chosen, views, loss if isinstance(loss, str) else "", engine), ""
+    except NotFast as reason:
+        return None, str(reason)
 
 
 def _views(scene: Any, sensors: Sequence[Any] | None, references: Sequence[np.ndarray], masks: Any):

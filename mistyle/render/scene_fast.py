@@ -1,0 +1,328 @@
+"""Gradients of a live Mitsuba scene without Monte Carlo, where that is the same picture (`render/shade.py`).
+
+It is where only points and directions light the scene, the integrator follows no light from surface to surface, films
+have a box filter, and what is fitted are the maps (or literals) of plain `principled` materials on meshes. Other shapes
+cast shadows; pixels that see their materials do not count. What Mitsuba does not tell about its plugins (wrapping,
+shadowing of normal maps) is found out by comparing pictures: where they disagree, `prb` it is, and a note says why.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
+from mistyle.core.capture import in_memory
+from mistyle.core.light import Directional, Point
+from mistyle.core.mesh import Mesh
+from mistyle.render import scene_grad, scene_keys, scene_walk
+from mistyle.render.draw import Tracer, gbuffer, tracer
+from mistyle.render.scene_keys import Parameter
+
+ROLES = {"base_color": slice(0, 3), "normalmap": slice(3, 5), "roughness": slice(5, 6), "metallic": slice(6, 7)}
+# Lobes of `principled` that the fast path does not have.
+ABSENT = ("anisotropic", "spec_trans", "spec_tint", "sheen", "sheen_tint", "flatness", "clearcoat")
+CHECKS = 3  # cameras whose pictures are compared
+CHECK_SPP = 64
+MANY_PIXELS = 1 << 18  # from which the check takes fewer samples
+AGREEMENT = 0.01  # of the root mean square, beyond the noise
+
+
+class NotFast(Exception):
+    """Why a scene needs Monte Carlo."""
+
+
+@dataclass(frozen=True)
+class Material:
+    """One shape's material.
+
+    roles     what `ROLES` names -> (key of `mi.traverse`, its value as stored: (h, w, c), or (n,) of a literal)
+    size      (rows, columns) of its textures
+    specular  of `principled`
+    """
+
+    roles: dict[str, tuple[str, Float[np.ndarray, "..."]]]
+    size: tuple[int, int]
+    specular: float
+
+
+class Fast:
+    """The scene's pictures as a function of the chosen parameters."""
+
+    def __init__(
+        self,
+        scene: Any,
+        chosen: Sequence[Parameter],
+        views: Sequence[scene_grad.Sight],
+        loss: str,
+        engine: Any,
+        subsamples: int = 4,
+    ) -> None:
+        """Raises NotFast with a sentence where the pictures would not be the scene's; `subsamples` a pixel."""
+        if loss not in scene_grad.LOSSES:
+            raise NotFast("the loss is a function of its own.")
+        self.loss, self.chosen, self.subsamples = loss, tuple(chosen), subsamples
+        reasons = scene_keys.fast_shapes(scene, engine)
+        self.materials = _materials(scene, reasons)
+        lights = tuple(_light(e) for e in scene.emitters())
+        held = {key for m in self.materials if m is not None for key, _ in m.roles.values()}
+        missing = next((p for p in chosen if p.key not in held), None)
+        if missing is not None:
+            raise NotFast(_missing(scene, missing, reasons))
+        kinds = {m.specular for m in self.materials if m is not None}
+        if len(kinds) > 1:
+            raise NotFast("its materials differ in `specular`.")
+        traced = tracer(_mesh(scene))
+        cameras = [_camera(view.sensor, k) for k, view in enumerate(views)]
+        masks = [self._counts(traced, camera, view) for camera, view in zip(cameras, views, strict=True)]
+        references = [np.array(view.reference) for view in views]
+        captures = in_memory(cameras, [lights] * len(cameras), references, masks)
+        self.shares = [max(view.share, 1e-9) for view in views]
+        self.shade = self._agreeing(scene, traced, captures, views, engine, kinds.pop())
+
+    def gradients(self, values: Mapping[str, np.ndarray], k: int) -> tuple[float, dict[str, np.ndarray]]:
+        """Loss of camera k and its gradient by key, as `scene_grad.gradients` has them, without noise.
+
+        What lies beside the fitted materials adds nothing to the loss.
+        """
+        self.shade.table = self._table(values)
+        value, gradient = self.shade.step([k], self.loss)
+        rows = np.array(gradient).reshape(-1, 8) / np.float32(self.shares[k])
+        result = {p.key: np.zeros(p.shape, np.float32) for p in self.chosen}
+        start = 0
+        for material in self.materials:
+            count = 4 if material is None else int(np.prod(material.size))
+            part = rows[start : start + count]
+            start += count
+            for role, (key, _) in material.roles.items() if material is not None else ():
+                if key in result:
+                    result[key] += _by_value(role, part[:, ROLES[role]], values[key])
+        return float(np.array(value)[0]) / self.shares[k], result
+
+    def _table(self, values: Mapping[str, np.ndarray]) -> Float[np.ndarray, "t 8"]:
+        parts = []
+        for material in self.materials:
+            rows = np.zeros((4 if material is None else int(np.prod(material.size)), 8), np.float32)
+            rows[:, 5] = 0.5
+            for role, (key, stored) in material.roles.items() if material is not None else ():
+                value = values.get(key, stored)
+                flat = value.reshape(-1, value.shape[-1]) if value.ndim == 3 else value[None]
+                if role == "normalmap":
+                    flat = _unit(flat)[:, :2]
+                rows[:, ROLES[role]] = flat
+            parts.append(rows)
+        return np.concatenate(parts)
+
+    def _counts(self, traced: Tracer, camera: Camera, view: scene_grad.Sight) -> np.ndarray:
+        """Pixels that count: those of the mask that see no other material, not even next to them."""
+        counts = np.array(view.counts)[..., 0].astype(bool)
+        foreign = [k for k, material in enumerate(self.materials) if material is None]
+        if foreign:
+            from mistyle.core.image import dilate
+
+            counts &= ~dilate(np.isin(gbuffer(traced, camera).part, foreign), 1)
+        return counts
+
+    def _agreeing(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
+        """The renderer whose pictures are the scene's, of the variants of a normal map that Mitsuba has."""
+        from mistyle.render.shade import Shade
+
+        sizes = [(2, 2) if m is None else m.size for m in self.materials]
+        bumped = any("normalmap" in m.roles for m in self.materials if m is not None)
+        looked = np.unique(np.linspace(0, len(views) - 1, CHECKS).round().astype(int)).tolist()
+        pairs = {k: [_picture(scene, engine, views[k].sensor, 2 * k + j) for j in (0, 1)] for k in looked}
+
+        def renderer(flip: bool, shadowing: bool, **more: Any) -> Shade:
+            options = {"subsamples": self.subsamples, "flip_invalid": flip, "shadowing": shadowing} | more
+            return Shade(traced, captures, sizes, frame="mitsuba", specular=specular, **options)
+
+        def error(variant: tuple[bool, bool]) -> float:
+            # Edges inside a pixel are all that differs by nature: many samples, kept nowhere.
+            fine = [64 if np.prod(captures.cameras[k].size) <= MANY_PIXELS else 16 for k in looked]
+            shade = renderer(*variant, subsamples=min(fine), memory=0)
+            shade.table = self._table({})
+            return max(_beyond_noise(shade.image(k), pairs[k], captures.load(k)[1], shade.coverage(k)) for k in looked)
+
+        variants = [(f, s) for f in (False, True) for s in (False, True)] if bumped else [(False, False)]
+        errors = [error(variant) for variant in variants]
+        if min(errors) > AGREEMENT:
+            raise NotFast(f"its pictures differ from the scene's own by {min(errors):.1%}.")
+        return renderer(*variants[int(np.argmin(errors))])
+
+
+def _picture(scene: Any, engine: Any, sensor: Any, seed: int) -> np.ndarray:
+    return np.array(scene_grad.picture(scene, engine, sensor, CHECK_SPP, seed))[..., :3]
+
+
+def _beyond_noise(ours: np.ndarray, pair: Sequence[np.ndarray], counts: np.ndarray, coverage: np.ndarray) -> float:
+    """Root mean square difference of two renderers beyond the noise of one, relative to the picture's."""
+    at = counts & (coverage > 0.999)
+    if not at.any():
+        return 0.0
+    mean, noise = (pair[0] + pair[1])[at] / 2, np.square(pair[0] - pair[1], dtype=np.float64)[at].mean() / 4
+    wrong = np.square(mean - ours[at], dtype=np.float64).mean()
+    # Both hold the samples' places within the pixel too; twice the noise covers that.
+    return float(np.sqrt(max(wrong - 2 * noise, 0) / max(np.square(mean, dtype=np.float64).mean(), 1e-30)))
+
+
+def _unit(stored: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
+    normal = stored * 2 - 1
+    return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
+
+
+def _by_value(role: str, gradient: Float[np.ndarray, "n c"], value: np.ndarray) -> np.ndarray:
+    """The gradient by what is stored: literals hear all texels, encoded normals through n = unit(2 t - 1)."""
+    if role == "normalmap":
+        flat = value.reshape(-1, 3)
+        length = np.maximum(np.linalg.norm(flat * 2 - 1, axis=-1, keepdims=True), 1e-12)
+        normal = _unit(flat)
+        along = (gradient * normal[:, :2]).sum(axis=-1, keepdims=True) * normal
+        full = np.concatenate([gradient, np.zeros_like(gradient[:, :1])], axis=1)
+        gradient = 2 * (full - along) / length
+    if value.ndim == 3:
+        return gradient.reshape(value.shape)
+    total = gradient.sum(axis=0)
+    return total if total.shape == value.shape else total.sum(keepdims=True)
+
+
+def _missing(scene: Any, parameter: Parameter, reasons: Mapping[str, str | None]) -> str:
+    told = next((f"{name}: {reason}" for name, reason in reasons.items() if reason is not None), None)
+    return told or f"{parameter.name} is no map of a plain `principled` on a mesh."
+
+
+def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[Material | None]:
+    """One per shape; None for those that the fast path cannot shade."""
+    import mitsuba as mi
+
+    keys: dict[Any, str] = {}
+    for key, (_, _, node, _) in mi.traverse(scene).properties.items():
+        if key.endswith((".data", ".value")):
+            keys.setdefault(node, key)
+    held = scene_walk.children(scene)
+    result = []
+    for shape in scene.shapes():
+        if not isinstance(shape, mi.Mesh):
+            raise NotFast(f"{shape.id()} is no mesh ({shape.class_name()}).")
+        plain = reasons.get(shape.id()) is None
+        result.append(_material(shape, held, keys) if plain else None)
+    if all(material is None for material in result):
+        raise NotFast(next(reason for reason in reasons.values() if reason is not None))
+    return result
+
+
+def _material(shape: Any, held: Mapping[Any, list], keys: Mapping[Any, str]) -> Material:
+    import mitsuba as mi
+
+    roles: dict[str, tuple[str, np.ndarray]] = {}
+    bsdf: Any = shape.bsdf()
+    while bsdf.class_name() != "Principled":
+        inner = [child for _, child in held[bsdf] if isinstance(child, mi.BSDF)]
+        for name, child in held[bsdf]:
+            if name == "normalmap":
+                roles[name] = _stored(child, keys)
+        bsdf = inner[0]
+    for name, child in held[bsdf]:
+        if name in ROLES:
+            roles[name] = _stored(child, keys)
+        elif name in ABSENT and np.any(np.array(_stored(child, keys)[1])):
+            raise NotFast(f"the material of {shape.id()} has {name}.")
+    sizes = {value.shape[:2] for _, value in roles.values() if value.ndim == 3}
+    if len(sizes) > 1:
+        raise NotFast(f"the textures of {shape.id()} differ in size.")
+    table: Any = mi.traverse(bsdf)
+    own = next((table[key] for key in table.keys() if key == "specular"), None)
+    if own is None:
+        raise NotFast(f"the material of {shape.id()} is given by eta, not by specular.")
+    size = next(iter(sizes), (2, 2))
+    return Material(roles, (int(size[0]), int(size[1])), float(np.array(own).ravel()[0]))
+
+
+def _stored(texture: Any, keys: Mapping[Any, str]) -> tuple[str, np.ndarray]:
+    import mitsuba as mi
+
+    table: Any = mi.traverse(texture)
+    if "to_uv" in table.keys() and not np.allclose(np.array(table["to_uv"].matrix).squeeze(), np.eye(3), atol=1e-6):
+        raise NotFast("a texture is scaled or turned (to_uv).")
+    name = next((n for n in ("data", "value") if n in table.keys()), None)
+    if name is None or texture not in keys:
+        raise NotFast(f"a texture is {texture.class_name()}.")
+    value = np.array(table[name], dtype=np.float32)
+    return keys[texture], value if name == "data" else value.reshape(-1)
+
+
+def _light(emitter: Any) -> Directional | Point:
+    import mitsuba as mi
+
+    table: Any = mi.traverse(emitter)
+    name = {"DirectionalEmitter": "irradiance", "PointLight": "intensity"}.get(emitter.class_name())
+    if name is None or f"{name}.value" not in table.keys():
+        raise NotFast(f"a light is {emitter.class_name()}.")
+    colour = np.array(table[f"{name}.value"], dtype=float).ravel()
+    red, green, blue = (float(c) for c in (colour if len(colour) == 3 else np.repeat(colour[:1], 3)))
+    if name == "intensity":
+        x, y, z = (float(v) for v in np.array(table["position"], dtype=float).ravel())
+        return Point((x, y, z), (red, green, blue))
+    along = np.array(table["to_world"].matrix, dtype=float).squeeze()[:3, 2]
+    x, y, z = (float(v) for v in -along / np.linalg.norm(along))
+    return Directional((x, y, z), (red, green, blue))
+
+
+def _camera(sensor: Any, k: int) -> Camera:
+    import mitsuba as mi
+
+    film: Any = sensor.film()
+    columns, rows = (int(n) for n in film.size())
+    table: Any = mi.traverse(sensor)
+    if sensor.class_name() != "PerspectiveCamera" or tuple(film.crop_size()) != tuple(film.size()):
+        raise NotFast(f"sensor {k} is {sensor.class_name()}, or its film is cropped.")
+    if film.rfilter().class_name() != "BoxFilter":
+        raise NotFast(f"the film of sensor {k} has {film.rfilter().class_name()}; expected the box filter.")
+    number = {
+        name: float(np.array(table[name]).ravel()[0]) if name in table.keys() else 0.0
+        for name in ("x_fov", "principal_point_offset_x", "principal_point_offset_y")
+    }
+    world_from_cam = np.array(table["to_world"].matrix, dtype=float).squeeze() @ np.linalg.inv(MITSUBA_FROM_OPENCV)
+    world_from_cam[:3, :3] /= np.linalg.norm(world_from_cam[:3, :3], axis=0)
+    focal = columns / (2 * np.tan(np.radians(number["x_fov"]) / 2))
+    centre = (
+        columns * (0.5 - number["principal_point_offset_x"]),
+        rows * (0.5 - number["principal_point_offset_y"]),
+    )
+    return Camera(world_from_cam, float(focal), centre, (rows, columns), f"sensor{k}")
+
+
+def _mesh(scene: Any) -> Mesh:
+    """All shapes as one mesh in the scene's own units, a part each."""
+    import mitsuba as mi
+
+    positions, faces, normals, uvs, part, names = [], [], [], [], [], []
+    count = 0
+    for k, shape in enumerate(scene.shapes()):
+        table: Any = mi.traverse(shape)
+        vertices = np.array(table["vertex_positions"], dtype=np.float32).reshape(-1, 3)
+        face = np.array(table["faces"]).reshape(-1, 3).astype(np.int32)
+        own = np.array(table["vertex_normals"], dtype=np.float32).reshape(-1, 3)
+        uv = np.array(table["vertex_texcoords"], dtype=np.float32).reshape(-1, 2)
+        corners = vertices[face]
+        flat = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        flat /= np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-20)
+        positions.append(vertices)
+        faces.append(face + count)
+        normals.append(own[face] if len(own) else np.repeat(flat[:, None], 3, axis=1).astype(np.float32))
+        # Mitsuba's texture row 0 is v = 0, ours v = 1.
+        uvs.append(
+            np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)[face] if len(uv) else np.zeros((len(face), 3, 2), np.float32)
+        )
+        part.append(np.full(len(face), k, np.int32))
+        names.append(shape.id())
+        count += len(vertices)
+    return Mesh(
+        np.concatenate(positions),
+        np.concatenate(faces),
+        np.concatenate(normals),
+        np.concatenate(uvs),
+        np.concatenate(part),
+        tuple(names),
+    )
