@@ -203,7 +203,8 @@ def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[Material |
     held = scene_walk.children(scene)
     result = []
     for shape in scene.shapes():
-        if not isinstance(shape, mi.Mesh):
+        # A rectangle counts as a mesh but has no vertices to show.
+        if "vertex_positions" not in mi.traverse(shape).keys():
             raise NotFast(f"{shape.id()} is no mesh ({shape.class_name()}).")
         plain = reasons.get(shape.id()) is None
         result.append(_material(shape, held, keys) if plain else None)
