@@ -108,7 +108,7 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
     notes.append(
         "Gradients came without Monte Carlo: direct light of points and directions on plain `principled` materials."
         if quick is not None
-        else f"Gradients came through {engine.class_name()}, not through the fast path: {why}"
+        else f"Gradients came through {str(engine).partition('[')[0]}, not through the fast path: {why}"
     )
     return Job(scene, table, chosen, views, engine, function, tuple(regularizers), free, scales, plan, quick), notes
 
