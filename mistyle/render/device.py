@@ -1,6 +1,7 @@
 """Which Mitsuba variant draws, and on how many threads. Chosen at run time, never by an import."""
 
 import gc
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -68,13 +69,14 @@ class Frozen:
     """`dr.freeze` of a function, with Python's garbage collector at rest while it runs.
 
     An array on NumPy's memory that is let go while Dr.Jit 1.5 records ends the whole process; the collector may do
-    that at any time, to arrays that have nothing to do with the function.
+    that at any time, to arrays that have nothing to do with the function. With $MISTYLE_PLAIN set nothing is recorded,
+    each call is traced anew: slow, and the way to go on where a recording ends the process all the same.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
         import drjit as dr
 
-        self._run = dr.freeze(function)
+        self._run: Any = function if os.environ.get("MISTYLE_PLAIN") else dr.freeze(function)
 
     def __call__(self, *arguments: Any) -> Any:
         collecting = gc.isenabled()
@@ -88,7 +90,7 @@ class Frozen:
     @property
     def n_recordings(self) -> int:
         """How often the function has been recorded so far."""
-        return self._run.n_recordings
+        return getattr(self._run, "n_recordings", 0)
 
 
 def _first_that_answers(built: list[str]) -> str:

@@ -10,7 +10,7 @@ from typing import Any
 
 from mistyle.core.errors import InputRefused
 from mistyle.run.inputs import input_files
-from mistyle.run.settings import thread_count
+from mistyle.run.settings import Settings, thread_count
 from mistyle.run.stages import STAGES, Job
 
 # Seconds on two cores, per unit named.
@@ -23,6 +23,9 @@ PER_CROP_PIXEL = 1.6e-6
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
 BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}
+
+# Read off the peaks of draft, demo and standard jobs.
+BASE_GB, GB_PER_TEXEL, GB_PER_VIEW_PIXEL = 0.9, 3.0e-7, 1.7e-7
 
 BYTES_PER_TEXEL = 190
 BYTES_PER_VIEW_PIXEL = 60
@@ -65,6 +68,13 @@ def plan(job: Job) -> dict[str, Any]:
         "disk_gb": round((texels * BYTES_PER_TEXEL + 2 * pixels * BYTES_PER_VIEW_PIXEL) / 1e9, 2),
         "free_gb": round(shutil.disk_usage(_existing(job.out)).free / 1e9, 1),
     }
+
+
+def memory_gb(settings: Settings) -> float:
+    """Peak memory of a job with one texture set, GB: what the program itself takes, the atlas, and the views."""
+    views = 16 if settings.rig.kind == "paper" else settings.rig.views
+    texels, pixels = settings.atlas.size**2, views * settings.rig.resolution**2
+    return round(BASE_GB + GB_PER_TEXEL * texels + GB_PER_VIEW_PIXEL * pixels, 1)
 
 
 def _existing(folder: Path) -> Path:

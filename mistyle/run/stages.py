@@ -69,6 +69,12 @@ class Kept(Protocol):
 Work = TypeVar("Work", bound=Kept)
 
 
+def program() -> str:
+    """A hash of mistyle itself: all of its files that could change a result."""
+    files = sorted(p for p in PACKAGE.rglob("*") if p.suffix in (".py", ".j2", ".css", ".js"))
+    return digest({str(p.relative_to(PACKAGE)): p.read_bytes() for p in files})
+
+
 class Run(Generic[Work]):
     """Keeps the stages of one run folder; a class because it holds the folder's locks until it is closed."""
 
@@ -79,9 +85,7 @@ class Run(Generic[Work]):
         self.redoing = False
         self.keys: dict[str, str] = {}
         # A changed program or thread count may change bytes: both belong to every key.
-        program = sorted(p for p in PACKAGE.rglob("*") if p.suffix in (".py", ".j2", ".css", ".js"))
-        code = {str(p.relative_to(PACKAGE)): p.read_bytes() for p in program}
-        self.base = digest([code, thread_count(job.settings), job.settings.variant])
+        self.base = digest([program(), thread_count(job.settings), job.settings.variant])
         self.visible = Keeper(job.out)
         self.hidden = Keeper(job.out / "work")
 

@@ -1,0 +1,200 @@
+"""`mistyle batch`: many jobs, one folder; what failed, why, and the command that retries only that.
+
+OUT/plan.json                    the jobs, resolved
+OUT/<name>/                      the run folder of each, as `stylize` and `fit` make them
+OUT/shards/<name>.json, .log     markers and words of the workers
+OUT/batch.json, OUT/batch.html   the summary for programs and for people
+"""
+
+import json
+import os
+import shlex
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import UsageError
+from mistyle.files.store import Keeper, atomic_write
+from mistyle.run import engines
+from mistyle.run.batch_jobs import Record, read_jobs
+from mistyle.run.batch_plan import PLAN, Plan, read_plan, write_plan
+from mistyle.run.shard import finished, marker, outcome
+
+
+@dataclass(frozen=True)
+class Choices:
+    """How a batch is run."""
+
+    engine: str = "local"
+    workers: int = 0
+    threads: int = 0
+    address: str | None = None
+    gpus: float = 0.0
+    wait: float = 300.0
+    timeout: float | None = None
+    only: tuple[str, ...] = ()
+    watch: bool = False
+
+
+def planned(jobs: Path, out: Path | None, choices: Choices) -> Plan:
+    """The plan of a jobs file, a folder of meshes and pictures, or a plan (or its folder) that is there already."""
+    is_plan = jobs.name == PLAN or (jobs.is_dir() and (jobs / PLAN).is_file())
+    if is_plan:
+        plan = read_plan(jobs)
+        if out is not None and out.absolute() != plan.out:
+            raise UsageError(
+                f"{jobs}: this plan works in {plan.out}; leave out -o, or make a new plan from the jobs file"
+            )
+        return plan
+    if out is None:
+        raise UsageError(f"{jobs}: a new batch needs -o OUT, the folder for everything it makes")
+    return Plan(out.absolute(), read_jobs(jobs, threads_each(choices)))
+
+
+def cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def workers_of(choices: Choices) -> int:
+    """Shards at a time: as asked, else one per two cores, since one job alone does not fill many."""
+    return choices.workers or max(1, cores() // (choices.threads or 2))
+
+
+def threads_each(choices: Choices) -> int:
+    """Threads of a shard: as asked, else the cores divided among the workers. The result of a job depends on it."""
+    return choices.threads or max(1, cores() // workers_of(choices))
+
+
+def run_batch(plan: Plan, choices: Choices) -> dict[str, Any]:
+    """Run every job of the plan that is not done yet; returns the summary. One failing job never stops the others."""
+    known = {job.name for job in plan.jobs}
+    unknown = [name for name in choices.only if name not in known]
+    if unknown:
+        raise UsageError(f"--only {unknown[0]}: no such job; the plan has {', '.join(sorted(known))[:300]}")
+    start = time.monotonic()
+    with Keeper(plan.out / "shards"):
+        write_plan(plan)
+        chosen = [k for k, job in enumerate(plan.jobs) if not choices.only or job.name in choices.only]
+        todo = [k for k in chosen if finished(plan, plan.jobs[k]) is None]
+        for k in todo:
+            marker(plan, plan.jobs[k], failed=True).unlink(missing_ok=True)
+        ended = {e.index: e for e in _run(plan, todo, choices, len(chosen) - len(todo))}
+        summary = summarise(plan, ended, time.monotonic() - start, reused=len(chosen) - len(todo))
+        atomic_write(plan.out / "batch.json", (json.dumps(summary, indent=1) + "\n").encode())
+        from mistyle.run.batch_page import write_page
+
+        write_page(plan, summary)
+    return summary
+
+
+def _run(plan: Plan, todo: Sequence[int], choices: Choices, reused: int) -> list[engines.Ended]:
+    from mistyle.run.batch_watch import watching
+
+    with watching(plan, todo, reused, live=choices.watch) as watch:
+        if not todo:
+            return []
+        if choices.engine == "ray":
+            return engines.ray(
+                plan, todo, threads_each(choices), watch, address=choices.address, gpus=choices.gpus,
+                wait=choices.wait, timeout=choices.timeout,
+            )  # fmt: skip
+        return engines.local(plan, todo, min(workers_of(choices), len(todo)), watch, choices.timeout)
+
+
+def summarise(plan: Plan, ended: dict[int, engines.Ended], seconds: float, reused: int) -> dict[str, Any]:
+    """How every job of the plan stands, and the command that retries what failed."""
+    rows = [_row(plan, k, job, ended.get(k)) for k, job in enumerate(plan.jobs)]
+    failed = [row["name"] for row in rows if row["state"] == "failed"]
+    retry = ["mistyle", "batch", str(plan.out / PLAN), *(["--only", *failed] if failed else [])]
+    return {
+        "out": str(plan.out),
+        "jobs": len(rows),
+        "done": sum(row["state"] == "done" for row in rows),
+        "failed": len(failed),
+        "open": sum(row["state"] == "open" for row in rows),
+        "reused": reused,
+        "seconds": round(seconds, 2),
+        "retry": shlex.join(retry) if failed else None,
+        "rows": rows,
+    }
+
+
+def _row(plan: Plan, index: int, job: Record, ended: engines.Ended | None) -> dict[str, Any]:
+    found = outcome(plan, job)
+    state, told = found.state, found.told
+    if ended is not None and ended.code != 0:
+        state = "failed" if ended.code not in (75, 130) else "open"
+    row: dict[str, Any] = {"name": job.name, "kind": job.kind, "state": state, "index": index}
+    if state == "done":
+        row |= {k: told[k] for k in ("seconds", "peak_gb", "figures")}
+    if state == "failed":
+        code = ended.code if ended is not None else told.get("exit_code", 1)
+        crash = f"the process ended with {code}" + (" twice" if ended is not None and ended.tries > 1 else "")
+        # A marker from before this try says nothing of a crash.
+        error = crash if engines.crashed(code) else told.get("error") or crash
+        row |= {"exit_code": code, "error": error, "last_lines": engines.last_lines(plan, index)}
+    return row
+
+
+def describe(summary: dict[str, Any]) -> str:
+    """The summary as a person reads it."""
+    lines = [
+        f"{summary['done']} of {summary['jobs']} done ({summary['reused']} before), {summary['failed']} failed, "
+        f"{summary['open']} open, {summary['seconds']:.0f} s"
+    ]
+    for row in summary["rows"]:
+        if row["state"] == "failed":
+            lines.append(f"  {row['name']}: exit {row['exit_code']}: {row['error']}")
+    if summary["retry"]:
+        lines.append(f"retry what failed: {summary['retry']}")
+    lines.append(f"all of them: {Path(summary['out']) / 'batch.html'}")
+    return "\n".join(lines)
+
+
+def dry_run(plan: Plan, choices: Choices) -> dict[str, Any]:
+    """What the batch would do: estimated seconds, disk and memory of every job that is not done yet."""
+    from mistyle.run.plan import memory_gb
+    from mistyle.run.plan import plan as estimate
+    from mistyle.run.settings import Settings
+    from mistyle.run.stages import Job
+
+    rows = []
+    for job in plan.jobs:
+        done = finished(plan, job) is not None
+        row: dict[str, Any] = {"name": job.name, "kind": job.kind, "done": done}
+        if job.kind == "stylize" and job.style is not None:
+            settings = Settings.model_validate(job.settings)
+            told = estimate(Job(job.mesh, job.style, plan.out / job.name, settings, job.name))
+            row |= {"seconds": told["seconds"], "disk_gb": told["disk_gb"], "memory_gb": memory_gb(settings)}
+        rows.append(row)
+    left = [row for row in rows if not row["done"]]
+    workers = min(workers_of(choices), max(len(left), 1))
+    return {
+        "out": str(plan.out),
+        "jobs": rows,
+        "workers": workers,
+        "seconds": round(sum(row.get("seconds", 0) for row in left) / workers),
+        "disk_gb": round(sum(row.get("disk_gb", 0) for row in left), 2),
+        "memory_gb": round(sum(sorted((row.get("memory_gb", 0) for row in left), reverse=True)[:workers]), 1),
+    }
+
+
+def describe_dry_run(told: dict[str, Any]) -> str:
+    """The same as a person reads it."""
+    lines = []
+    for row in told["jobs"]:
+        cost = f"about {row['seconds']} s, {row['disk_gb']} GB of disk" if "seconds" in row else "no estimate"
+        lines.append(f"  {row['name']:<40} {row['kind']:<8} {'done before' if row['done'] else cost}")
+    lines.append(
+        f"{sum(not row['done'] for row in told['jobs'])} jobs, {told['workers']} at a time: about {told['seconds']} s, "
+        f"{told['disk_gb']} GB of disk, {told['memory_gb']} GB of memory -> {told['out']}"
+    )
+    return "\n".join(lines)
+
+
+def say(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)

@@ -1,0 +1,282 @@
+"""What a batch is to do: a list, a grid or a folder, as records that are checked before anything runs.
+
+    # jobs.toml (or .yaml with the same keys); paths are relative to the file
+    preset = "draft"                       # of every job that says nothing else
+    settings = { "report.frames" = 12 }
+
+    [[job]]                                # one line each ...
+    mesh = "spot.obj"
+    style = "great_wave.jpg"
+
+    [[job]]                                # ... or a fit to pictures
+    mesh = "chair.glb"
+    references = "photographs/"
+
+    [[grid]]                               # every mesh with every style with every variant
+    meshes = ["props/*.glb"]
+    styles = ["starry_night.jpg", "woodcut.jpg"]
+    variants = [{ seed = 0 }, { seed = 1 }]
+
+A folder is a grid of the meshes and the pictures in it (or in its folders `meshes` and `styles`).
+"""
+
+import itertools
+import re
+import tomllib
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.run.inputs import input_files
+from mistyle.run.settings import assignments, merge, validate
+
+MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+MOST_JOBS = 100_000
+MOST_TOLD = 20
+
+
+class Job(BaseModel):
+    """One job as a jobs file says it: a mesh with a style picture, or with references to fit its material to."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    mesh: Path
+    style: Path | None = None
+    references: Path | None = None
+    lights: str | None = Field(default=None, description="of a fit: a lights.json, or 'unknown'")
+    masks: Path | None = None
+    exposure: Path | None = None
+    name: str | None = Field(default=None, description="name of the asset and of the job's folder")
+    preset: str | None = None
+    settings: dict[str, Any] = Field(default={}, description="nested, or dotted names as --set takes them")
+
+
+class Grid(BaseModel):
+    """Every mesh with every style, preset and variant."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    meshes: list[str] = Field(min_length=1)
+    styles: list[str] = Field(min_length=1)
+    presets: list[str] = []
+    variants: list[dict[str, Any]] = []
+
+
+class JobsFile(BaseModel):
+    """A jobs file; `preset` and `settings` are those of every job that says nothing else."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    preset: str = "standard"
+    settings: dict[str, Any] = {}
+    job: list[Job] = []
+    grid: list[Grid] = []
+
+
+Kind = Literal["stylize", "fit"]
+
+
+class Record(BaseModel):
+    """One job, resolved: what `mistyle shard` runs. Paths are absolute, settings complete."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    name: str
+    kind: Kind
+    mesh: Path
+    style: Path | None = None
+    references: Path | None = None
+    lights: str | None = None
+    masks: Path | None = None
+    exposure: Path | None = None
+    settings: dict[str, Any]
+
+
+def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
+    """Every job of a jobs file or a folder, checked: all that is wrong is told at once, before anything runs.
+
+    `threads` is what each job may use where its settings say nothing. Raises UsageError or InputRefused.
+    """
+    base = path if path.is_dir() else path.parent
+    file = _of_folder(path) if path.is_dir() else _of_file(path)
+    jobs = [*file.job, *itertools.chain.from_iterable(_spread(grid, base, str(path)) for grid in file.grid)]
+    if not jobs:
+        raise UsageError(
+            f"{path}: found no job; expected [[job]] or [[grid]] entries, or a folder of meshes and pictures"
+        )
+    if len(jobs) > MOST_JOBS:
+        raise UsageError(f"{path}: found {len(jobs)} jobs; expected {MOST_JOBS} at most. Split the file.")
+    records, wrong, code = [], [], UsageError
+    names = _names(jobs)
+    for job, name in zip(jobs, names, strict=True):
+        try:
+            records.append(_record(job, name, file, base, threads))
+        except MistyleError as error:
+            wrong.append(f"{name}: {error}")
+            code = InputRefused if isinstance(error, InputRefused) else code
+    if wrong:
+        more = f"\n  and {len(wrong) - MOST_TOLD} more" if len(wrong) > MOST_TOLD else ""
+        raise code(
+            f"{path}: {len(wrong)} of {len(jobs)} jobs cannot run; nothing was started\n  "
+            + "\n  ".join(wrong[:MOST_TOLD])
+            + more
+        )
+    return tuple(records)
+
+
+def _of_file(path: Path) -> JobsFile:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise InputRefused(f"{path}: found nothing, expected a jobs file (.toml, .yaml) or a folder") from None
+    except UnicodeDecodeError as error:
+        raise UsageError(f"{path}: not a text file: {error}") from None
+    try:
+        values = _yaml(text) if path.suffix.lower() in (".yaml", ".yml") else tomllib.loads(text)
+    except (tomllib.TOMLDecodeError, ValueError) as error:
+        raise UsageError(f"{path}: cannot be read: {error}") from None
+    if not isinstance(values, dict):
+        raise UsageError(f"{path}: found a {type(values).__name__}, expected keys such as job, grid, preset, settings")
+    for key in ("job", "grid"):
+        if isinstance(values.get(key), dict):  # [grid] for [[grid]]
+            values[key] = [values[key]]
+    return validate(values, str(path), JobsFile)
+
+
+def _yaml(text: str) -> Any:
+    import yaml
+
+    try:
+        return yaml.safe_load(text)
+    except yaml.YAMLError as error:
+        raise ValueError(str(error).replace("\n", " ")) from None
+
+
+def _of_folder(folder: Path) -> JobsFile:
+    def inside(name: str, kinds: Sequence[str]) -> list[str]:
+        place = folder / name if (folder / name).is_dir() else folder
+        return sorted(str(p.relative_to(folder)) for p in place.iterdir() if p.suffix.lower() in kinds and p.is_file())
+
+    meshes, styles = inside("meshes", MESHES), inside("styles", PICTURES)
+    if not meshes or not styles:
+        raise InputRefused(
+            f"{folder}: found {len(meshes)} meshes and {len(styles)} pictures; expected at least one of each, there or "
+            "in its folders meshes/ and styles/"
+        )
+    return JobsFile(grid=[Grid(meshes=meshes, styles=styles)])
+
+
+def _spread(grid: Grid, base: Path, origin: str) -> list[Job]:
+    """The jobs of a grid, meshes first."""
+    meshes, styles = _globbed(grid.meshes, base, origin), _globbed(grid.styles, base, origin)
+    result = []
+    for mesh, style in itertools.product(meshes, styles):
+        for preset in grid.presets or [None]:
+            for k, variant in enumerate(grid.variants or [{}]):
+                parts = [mesh.stem, style.stem]
+                parts += [preset] if preset is not None and len(grid.presets) > 1 else []
+                parts += [f"v{k}"] if len(grid.variants) > 1 else []
+                result.append(Job(mesh=mesh, style=style, preset=preset, settings=variant, name="_".join(parts)))
+    return result
+
+
+def _globbed(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
+    found: list[Path] = []
+    for pattern in patterns:
+        if any(c in pattern for c in "*?["):
+            place = Path(pattern)
+            root, inner = (
+                (Path(place.anchor), place.relative_to(place.anchor)) if place.is_absolute() else (base, place)
+            )
+            matches = sorted(p for p in root.glob(str(inner)) if p.is_file())
+            if not matches:
+                raise InputRefused(f"{origin}: '{pattern}' matches no file in {base}; check the pattern")
+            found += matches
+        else:
+            found.append(base / pattern)
+    return list(dict.fromkeys(found))
+
+
+def _names(jobs: Sequence[Job]) -> list[str]:
+    """A name for each job that no other has and that is safe as the name of a folder; equal ones get -2, -3, …"""
+    taken: set[str] = set()
+    result = []
+    for job in jobs:
+        second = job.style.stem if job.style is not None else "fit"
+        base = re.sub(r"[^\w.-]+", "-", job.name or f"{job.mesh.stem}_{second}").strip(".-") or "job"
+        name = next(n for n in itertools.chain([base], (f"{base}-{k}" for k in itertools.count(2))) if n not in taken)
+        taken.add(name)
+        result.append(name)
+    return result
+
+
+def _record(job: Job, name: str, file: JobsFile, base: Path, threads: int) -> Record:
+    if (job.style is None) == (job.references is None):
+        raise UsageError("expected either a style (stylize) or references (fit), found " + _said(job))
+    if job.style is not None and (job.lights or job.masks or job.exposure):
+        raise UsageError("lights, masks and exposure belong to a fit to references; this job has a style")
+
+    def placed(path: Path | None) -> Path | None:
+        return None if path is None else (base / path).absolute()
+
+    mesh, style, references = placed(job.mesh), placed(job.style), placed(job.references)
+    assert mesh is not None
+    input_files(mesh)
+    if mesh.suffix.lower() not in MESHES:
+        raise InputRefused(f"{mesh}: found a {mesh.suffix or 'file without suffix'}, expected {' '.join(MESHES)}")
+    if style is not None and not style.is_file():
+        raise InputRefused(f"{style}: found nothing, expected a picture; check the path")
+    if references is not None and not references.is_dir():
+        raise InputRefused(f"{references}: found no folder, expected one with cameras and pictures; check the path")
+    lights = job.lights if job.lights in (None, "unknown") else str(placed(Path(job.lights)))
+    said = merge(nested(file.settings), nested(job.settings))
+    kind: Kind = "stylize" if style is not None else "fit"
+    return Record(
+        name=name,
+        kind=kind,
+        mesh=mesh,
+        style=style,
+        references=references,
+        lights=lights,
+        masks=placed(job.masks),
+        exposure=placed(job.exposure),
+        settings=resolved(kind, job.preset or file.preset, said, threads),
+    )
+
+
+def _said(job: Job) -> str:
+    return "both" if job.style is not None else "neither"
+
+
+def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings with dotted names as nested ones."""
+    result: dict[str, Any] = {}
+    for key, value in settings.items():
+        leaf: Any = nested(value) if isinstance(value, Mapping) else value
+        for name in reversed(key.split(".")):
+            leaf = {name: leaf}
+        result = merge(result, leaf)
+    return result
+
+
+def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int) -> dict[str, Any]:
+    """All settings of a job, as JSON has them; with `threads` where they say nothing."""
+    from mistyle.run.settings import resolve
+
+    if kind == "fit":
+        from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
+
+        settings: BaseModel = resolve(preset, None, said, root=MaterialSettings, presets=MATERIAL_PRESETS)
+    else:
+        settings = resolve(preset, None, said)
+    values = settings.model_dump(mode="json")
+    return values | {"threads": values["threads"] or threads}
+
+
+def said_on_command_line(pairs: Sequence[str]) -> dict[str, Any]:
+    """`--set KEY=VALUE` of a batch."""
+    return assignments(pairs, "--set")

@@ -1,0 +1,114 @@
+"""The plan of a batch: one file that every worker reads, wherever it runs.
+
+OUT/plan.json holds the resolved jobs in order; shard number I is job I. A worker on a machine that sees the files
+elsewhere says so with path maps.
+"""
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+from mistyle import __version__
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.files.store import atomic_write
+from mistyle.run.batch_jobs import Record
+from mistyle.run.settings import validate
+
+PLAN = "plan.json"
+VERSION = 1
+
+
+@dataclass(frozen=True)
+class Plan:
+    """The jobs of a batch, and the folder that their run folders lie in."""
+
+    out: Path
+    jobs: tuple[Record, ...]
+
+
+def write_plan(plan: Plan) -> Path:
+    """OUT/plan.json; the same jobs give the same bytes."""
+    path = plan.out / PLAN
+    values = {
+        "version": VERSION,
+        "mistyle": __version__,
+        "out": str(plan.out.absolute()),
+        "jobs": [job.model_dump(mode="json") for job in plan.jobs],
+    }
+    atomic_write(path, (json.dumps(values, indent=1, sort_keys=True) + "\n").encode())
+    return path
+
+
+def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> Plan:
+    """A plan (the file or its folder), with its paths as this machine sees them. Raises InputRefused or UsageError."""
+    path = path / PLAN if path.is_dir() else path
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise InputRefused(f"{path}: found nothing, expected the plan that `mistyle batch` writes") from None
+    except (OSError, ValueError) as error:
+        raise InputRefused(f"{path}: not a plan: {error}") from None
+    if not isinstance(values, dict) or values.get("version") != VERSION or not isinstance(values.get("jobs"), list):
+        raise InputRefused(f"{path}: found no plan of version {VERSION}; write it anew with `mistyle batch`")
+    jobs = tuple(mapped(validate(job, str(path), Record), maps) for job in values["jobs"])
+    return Plan(Path(replaced(str(values["out"]), maps)), jobs)
+
+
+def mapped(job: Record, maps: Sequence[tuple[str, str]]) -> Record:
+    """A job with its paths mapped, and those inside its settings."""
+    if not maps:
+        return job
+    changed: dict[str, Any] = {"settings": _mapped_values(job.settings, maps)}
+    for name in ("mesh", "style", "references", "masks", "exposure"):
+        value = getattr(job, name)
+        if value is not None:
+            changed[name] = Path(replaced(str(value), maps))
+    if job.lights not in (None, "unknown"):
+        changed["lights"] = replaced(str(job.lights), maps)
+    return job.model_copy(update=changed)
+
+
+def _mapped_values(value: Any, maps: Sequence[tuple[str, str]]) -> Any:
+    if isinstance(value, dict):
+        return {k: _mapped_values(v, maps) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_mapped_values(v, maps) for v in value]
+    return replaced(value, maps) if isinstance(value, str) else value
+
+
+def replaced(text: str, maps: Sequence[tuple[str, str]]) -> str:
+    """`text` with the longest of the mapped folders that it lies in replaced; only whole names count."""
+    for source, target in sorted(maps, key=lambda pair: -len(pair[0])):
+        start = source.rstrip("/\\")
+        rest = text[len(start) :]
+        if text.startswith(start) and (not rest or rest[0] in "/\\"):
+            return target.rstrip("/\\") + rest.replace("\\", "/")
+    return text
+
+
+def path_maps(pairs: Sequence[str]) -> tuple[tuple[str, str], ...]:
+    """`--path-map FROM=TO` as pairs. Raises UsageError."""
+    result = []
+    for pair in pairs:
+        source, equals, target = pair.partition("=")
+        absolute = PurePath(source).is_absolute() or source[1:3] in (":\\", ":/") or source.startswith("\\\\")
+        if not equals or not target or not absolute:
+            raise UsageError(f"--path-map {pair}: expected FROM=TO with FROM absolute, for example /mnt/show=/vol/show")
+        result.append((source, target))
+    return tuple(result)
+
+
+def indices(text: str, count: int) -> tuple[int, ...]:
+    """'3', '0-7' or '0-3,8' as numbers, in order. Raises UsageError."""
+    found: list[int] = []
+    for piece in text.split(","):
+        first, dash, last = piece.strip().partition("-")
+        if not first.isdigit() or (dash and not last.isdigit()):
+            raise UsageError(f"--index {text}: expected numbers such as 3, 0-7 or 0-3,8")
+        found += range(int(first), int(last if dash else first) + 1)
+    wrong = [n for n in found if n >= count]
+    if wrong:
+        raise UsageError(f"--index {text}: the plan has {count} shards, numbered from 0; there is no {wrong[0]}")
+    return tuple(dict.fromkeys(found))

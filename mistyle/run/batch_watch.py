@@ -1,0 +1,69 @@
+"""What a person sees while a batch runs: a table that lives on a terminal, a line per shard elsewhere."""
+
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+from mistyle.run.batch_plan import Plan
+from mistyle.run.engines import Ended, Watch, last_lines
+
+ROWS = 30  # of the live table
+
+
+@contextmanager
+def watching(plan: Plan, todo: Sequence[int], reused: int, live: bool) -> Iterator[Watch]:
+    """The function that engines tell about each shard; with `live`, a table of all of them that keeps itself new."""
+    state: dict[int, tuple[float, Ended | None]] = {}
+    lock = threading.Lock()
+
+    def told(index: int, ended: Ended | None) -> None:
+        with lock:
+            begun = state[index][0] if index in state else time.monotonic()
+            state[index] = (begun, ended)
+            done = sum(e is not None for _, e in state.values())
+        if not live:
+            word = "begun" if ended is None else "done" if ended.code == 0 else f"exit {ended.code}"
+            count = f"{done + reused}/{len(todo) + reused}"
+            print(f"[{count}] {plan.jobs[index].name}: {word}", file=sys.stderr, flush=True)
+
+    if not live:
+        yield told
+        return
+    from rich.console import Console
+    from rich.live import Live
+
+    class Table:
+        """Made anew each time the screen asks for it."""
+
+        def __rich__(self) -> Any:
+            with lock:
+                return _table(plan, todo, dict(state), reused)
+
+    with Live(Table(), console=Console(stderr=True), refresh_per_second=2):
+        yield told
+
+
+def _table(plan: Plan, todo: Sequence[int], state: dict[int, tuple[float, Ended | None]], reused: int) -> Any:
+    from rich.markup import escape
+    from rich.table import Table
+
+    done = sum(e is not None for _, e in state.values())
+    running = len(state) - done
+    title = f"{done + reused} of {len(todo) + reused} done, {running} running"
+    table = Table("job", "state", "seconds", "last words", title=title, expand=True)
+    # What runs first, then what ended last.
+    ordered = sorted(state, key=lambda k: (state[k][1] is not None, -state[k][0]))[:ROWS]
+    for index in ordered:
+        begun, ended = state[index]
+        if ended is None:
+            words = last_lines(plan, index, 1)[-100:]
+            table.add_row(plan.jobs[index].name, "running", f"{time.monotonic() - begun:.0f}", escape(words))
+        else:
+            colour = "green" if ended.code == 0 else "red"
+            word = "done" if ended.code == 0 else f"exit {ended.code}"
+            words = "" if ended.code == 0 else last_lines(plan, index, 1)[-100:]
+            table.add_row(plan.jobs[index].name, f"[{colour}]{word}[/]", "", escape(words))
+    return table

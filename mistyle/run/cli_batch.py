@@ -1,0 +1,214 @@
+"""The verbs `mistyle batch`, `mistyle shard`, `mistyle farm` and `mistyle pack`."""
+
+import argparse
+import json
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from mistyle.run.options import examples
+
+
+def add_batch(verbs: Any) -> None:
+    _add_batch(verbs)
+    _add_shard(verbs)
+    _add_farm(verbs)
+    _add_pack(verbs)
+
+
+def _add_batch(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "batch",
+        help="many jobs: a list, a grid of meshes and styles, or a folder; resumes, retries, one page of results",
+        **examples(
+            """
+            mistyle batch jobs.toml -o OUT/                        [[job]] and [[grid]] entries; also .yaml
+            mistyle batch props/ -o OUT/ --dry-run                 every mesh in it with every picture in it
+            mistyle batch jobs.toml -o OUT/ --workers 8 --watch    eight at a time, with a live table
+            mistyle batch OUT/plan.json                            go on with what is not done
+            mistyle batch jobs.toml -o /share/OUT --engine ray --address auto --gpus 0.5
+            """
+        ),
+    )
+    verb.add_argument("jobs", type=Path, metavar="JOBS", help="a .toml or .yaml file, a folder, or a plan.json")
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="folder of the whole batch")
+    _add_machine_options(verb)
+    verb.add_argument("--engine", choices=["local", "ray"], default="local", help="processes here, or a Ray cluster")
+    verb.add_argument("--address", help="Ray: address of a running cluster, or auto; without it one of this machine")
+    verb.add_argument("--gpus", type=float, default=0.0, metavar="X", help="Ray: GPUs of each job, a share is allowed")
+    verb.add_argument(
+        "--wait", type=float, default=300.0, metavar="S", help="Ray: give up when nothing begins for so long"
+    )
+    verb.add_argument("--timeout", type=float, metavar="S", help="stop a job that takes longer")
+    verb.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these jobs of the plan")
+    verb.add_argument("--watch", action="store_true", help="a live table instead of a line per job")
+    verb.add_argument("--dry-run", action="store_true", help="print the plan with time, disk and memory, and stop")
+    verb.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
+    verb.set_defaults(command=_batch)
+
+
+def _add_machine_options(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument("--workers", type=int, default=0, metavar="N", help="jobs at a time (default: one per two cores)")
+    verb.add_argument(
+        "--threads",
+        type=int,
+        default=0,
+        metavar="N",
+        help="of each job; results depend on it (default: cores / workers)",
+    )
+
+
+def _add_shard(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "shard",
+        help="one job of a batch's plan; what every worker of a farm runs",
+        **examples(
+            """
+            mistyle shard OUT/plan.json --index 3
+            mistyle shard OUT/plan.json --index 0-7,12 --path-map /mnt/show=/vol/show
+            """
+        ),
+    )
+    verb.add_argument("plan", type=Path, metavar="PLAN", help="plan.json, or its folder")
+    verb.add_argument("--index", required=True, metavar="I", help="number of the shard, from 0; ranges run in order")
+    _add_map_option(verb)
+    verb.add_argument("--progress", choices=["lines", "openjd"], default="lines", help="openjd: for farms that read it")
+    verb.set_defaults(command=_shard)
+
+
+def _add_map_option(verb: argparse.ArgumentParser) -> None:
+    verb.add_argument(
+        "--path-map", action="append", default=[], metavar="FROM=TO", help="how this machine sees a folder of the plan"
+    )
+
+
+def _add_farm(verbs: Any) -> None:
+    farm = verbs.add_parser("farm", help="a batch as files for a farm's queue")
+    kinds = farm.add_subparsers(dest="farm", metavar="ACTION", required=True)
+    verb = kinds.add_parser(
+        "export",
+        help="Open Job Description bundle, Slurm array script, or command lines",
+        **examples(
+            """
+            mistyle farm export jobs.toml -o OUT/ --as openjd       then: deadline bundle submit OUT/farm
+            mistyle farm export jobs.toml -o OUT/ --as sbatch       then: sbatch OUT/farm/mistyle.sbatch
+            mistyle farm export jobs.toml -o OUT/ --as commands --path-map /mnt/show=/vol/show
+            """
+        ),
+    )
+    verb.add_argument("jobs", type=Path, metavar="JOBS", help="as for mistyle batch")
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="folder of the whole batch, seen by all workers")
+    verb.add_argument("--as", dest="form", choices=["openjd", "sbatch", "commands"], default="openjd")
+    verb.add_argument("--bundle", type=Path, metavar="DIR", help="where the files go (default OUT/farm)")
+    verb.add_argument("--program", default="mistyle", help="how a worker calls mistyle (default mistyle)")
+    verb.add_argument("--memory", type=float, default=8.0, metavar="GB", help="memory that a task asks for")
+    verb.add_argument("--gpus", type=int, default=0, metavar="N", help="GPUs that a task asks for")
+    verb.add_argument("--chunk", type=int, default=1, metavar="N", help="Open Job Description: shards of a task")
+    _add_machine_options(verb)
+    _add_map_option(verb)
+    verb.add_argument("--json", action="store_true", help="the files as one JSON object on stdout")
+    verb.set_defaults(command=_farm)
+
+
+def _add_pack(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "pack",
+        help="a folder that installs mistyle where there is no network",
+        **examples(
+            """
+            mistyle pack -o mistyle-offline/                   then there: ./install.sh /opt/mistyle
+            mistyle pack -o mistyle-offline/ --extras ray farm
+            """
+        ),
+    )
+    verb.add_argument("-o", "--out", type=Path, required=True, metavar="DIR")
+    verb.add_argument("--extras", nargs="+", default=[], metavar="NAME", help="optional parts to take along")
+    verb.set_defaults(command=_pack)
+
+
+def _pack(options: argparse.Namespace) -> int:
+    from mistyle.run.pack import pack
+    from mistyle.run.progress import Progress
+
+    folder = pack(options.out, options.extras, Progress())
+    print(f"packed: {folder} (install with {folder / 'install.sh'} TARGET)", file=sys.stderr)
+    return 0
+
+
+def _batch(options: argparse.Namespace) -> int:
+    from mistyle.run.batch import Choices, describe, describe_dry_run, dry_run, planned, run_batch, say
+
+    choices = Choices(
+        engine=options.engine,
+        workers=options.workers,
+        threads=options.threads,
+        address=options.address,
+        gpus=options.gpus,
+        wait=options.wait,
+        timeout=options.timeout,
+        only=tuple(options.only),
+        watch=options.watch and sys.stderr.isatty(),
+    )
+    plan = planned(options.jobs, options.out, choices)
+    if options.dry_run:
+        told = dry_run(plan, choices)
+        print(json.dumps(told) if options.json else describe_dry_run(told))
+        return 0
+    summary = run_batch(plan, choices)
+    if options.json:
+        print(json.dumps(summary))
+    say(describe(summary))
+    return 1 if summary["failed"] or summary["open"] and not choices.only else 0
+
+
+def _shard(options: argparse.Namespace) -> int:
+    from mistyle.run.batch_plan import indices, path_maps, read_plan
+    from mistyle.run.progress import Progress
+    from mistyle.run.shard import FarmProgress, run_shard, stages_of
+
+    plan = read_plan(options.plan, path_maps(options.path_map))
+    chosen: Sequence[int] = indices(options.index, len(plan.jobs))
+    if len(chosen) > 1:
+        return _several(options, chosen)
+    for index in chosen:
+        farm = options.progress == "openjd"
+        run_shard(plan, index, FarmProgress(len(stages_of(plan.jobs[index]))) if farm else Progress())
+    return 0
+
+
+def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
+    """Each shard of a range as a process of its own, one after the other; a failing one does not stop the rest."""
+    worst = 0
+    maps = [part for pair in options.path_map for part in ("--path-map", pair)]
+    for index in chosen:
+        line = [sys.executable, "-m", "mistyle", "shard", str(options.plan), "--index", str(index)]
+        code = subprocess.run([*line, "--progress", options.progress, *maps]).returncode
+        worst = max(worst, code if code >= 0 else 1)
+    return worst
+
+
+def _farm(options: argparse.Namespace) -> int:
+    from mistyle.run.batch import Choices, planned, say, threads_each
+    from mistyle.run.batch_plan import path_maps
+    from mistyle.run.farm import export
+
+    choices = Choices(workers=options.workers, threads=options.threads)
+    plan = planned(options.jobs, options.out, choices)
+    files = export(
+        plan,
+        options.bundle or plan.out / "farm",
+        options.form,
+        threads=threads_each(choices),
+        memory_gb=options.memory,
+        gpus=options.gpus,
+        chunk=options.chunk,
+        program=options.program,
+        maps=path_maps(options.path_map),
+    )
+    if options.json:
+        print(json.dumps({"files": [str(p) for p in files], "shards": len(plan.jobs)}))
+    else:
+        say("\n".join(str(p) for p in files))
+    return 0

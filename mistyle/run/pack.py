@@ -1,0 +1,113 @@
+"""`mistyle pack`: everything that an offline machine needs, in one folder.
+
+    DIR/wheels/       mistyle and all it stands on, in the exact versions of mistyle/constraints.txt
+    DIR/llvm/         the LLVM that works here, with the libraries beside it
+    DIR/install.sh    ./install.sh /opt/mistyle: no network, no root; the result may then be made read-only
+    DIR/SHA256SUMS    of every file
+
+The installed program writes nothing beside itself: kernels and notes go to $MISTYLE_SCRATCH (default
+$TMPDIR/mistyle-UID), which should be a local disk. A pack fits the system, processor and Python it was made with.
+"""
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from mistyle import __version__
+from mistyle.bootstrap import CONSTRAINTS, ROOT, home, in_clone, read_record
+from mistyle.core.errors import EnvironmentMissing, MistyleError
+from mistyle.files.store import atomic_folder, sha256_file
+from mistyle.run.progress import Progress
+
+INSTALL = """#!/bin/sh
+# Installs mistyle {version} from this folder into TARGET. Needs no network and no root.
+set -eu
+target=${{1:?usage: ./install.sh TARGET}}
+here=$(CDPATH= cd -- "$(dirname -- "$0")" && pwd)
+python=${{PYTHON:-python{python}}}
+command -v "$python" > /dev/null || {{ echo "mistyle: $python is needed (set PYTHON)" >&2; exit 4; }}
+(cd "$here" && sha256sum --check --quiet SHA256SUMS)
+"$python" -m venv "$target"
+"$target/bin/python" -m pip install --quiet --no-index --find-links "$here/wheels" -c "$here/constraints.txt" \\
+    'mistyle{extras}=={version}'
+mkdir -p "$target/llvm"
+cp -R "$here/llvm/." "$target/llvm/"
+cat > "$target/mistyle" << 'END'
+{start}END
+chmod +x "$target/mistyle"
+"$target/bin/python" -m compileall -q "$target/lib" || true
+echo "installed: $target/mistyle"
+"""
+
+START = """#!/bin/sh
+# mistyle from a place that may be read-only; what it keeps for later runs goes to local scratch.
+here=$(CDPATH= cd -- "$(dirname -- "$(readlink -f -- "$0")")" && pwd)
+scratch=${{MISTYLE_SCRATCH:-${{TMPDIR:-/tmp}}/mistyle-$(id -u)}}
+mkdir -p "$scratch"
+export XDG_CACHE_HOME="$scratch" DRJIT_CACHE_DIR="${{DRJIT_CACHE_DIR:-$scratch/drjit}}" PYTHONDONTWRITEBYTECODE=1
+export DRJIT_LIBLLVM_PATH="$here/llvm/{library}" LD_LIBRARY_PATH="$here/llvm${{LD_LIBRARY_PATH:+:$LD_LIBRARY_PATH}}"
+exec "$here/bin/python" -m mistyle "$@"
+"""
+
+
+def pack(folder: Path, extras: Sequence[str], progress: Progress) -> Path:
+    """Make the folder anew; needs the network once, here. Raises EnvironmentMissing without a libLLVM to take along."""
+    library, beside = llvm_files()
+    with progress.stage("pack", "collect the wheels"):
+        atomic_folder(folder, lambda new: _fill(new, extras, library, beside))
+    return folder
+
+
+def llvm_files() -> tuple[Path, list[Path]]:
+    """The libLLVM in use, and the libraries that the set-up had to fetch with it."""
+    record = read_record(home()).get("llvm") or {}
+    found = os.environ.get("DRJIT_LIBLLVM_PATH") or record.get("library")
+    if not found or not Path(found).is_file():
+        raise EnvironmentMissing("a pack takes the LLVM in use along, and there is none here; see mistyle doctor")
+    folders = [Path(f) for f in record.get("folders", ())]
+    beside = [p for f in folders for p in sorted(f.glob("*.so*")) if not p.is_symlink()]
+    return Path(found).resolve(), [p for p in beside if p.resolve() != Path(found).resolve()]
+
+
+def scripts(extras: Sequence[str], library: str) -> str:
+    """install.sh."""
+    version = ".".join(platform.python_version_tuple()[:2])
+    names = f"[{','.join(sorted(extras))}]" if extras else ""
+    return INSTALL.format(version=__version__, python=version, extras=names, start=START.format(library=library))
+
+
+def _fill(folder: Path, extras: Sequence[str], library: Path, beside: Sequence[Path]) -> None:
+    wheels = folder / "wheels"
+    wheels.mkdir()
+    names = f"[{','.join(sorted(extras))}]" if extras else ""
+    if in_clone():
+        _pip("wheel", "--no-deps", "-w", str(wheels), str(ROOT))
+        mistyle = next(wheels.glob("mistyle-*.whl"))
+        _pip("download", "-d", str(wheels), "-c", str(CONSTRAINTS), f"{mistyle}{names}")
+    else:
+        _pip("download", "-d", str(wheels), "-c", str(CONSTRAINTS), f"mistyle{names}=={__version__}")
+    # A source archive could not be built without a network.
+    sources = [p.name for p in wheels.iterdir() if p.suffix != ".whl"]
+    if sources:
+        raise MistyleError(f"no wheel for this system of {', '.join(sources)}; pack on a system that has one")
+    shutil.copy2(CONSTRAINTS, folder / "constraints.txt")
+    (folder / "llvm").mkdir()
+    for path in (library, *beside):
+        shutil.copy2(path, folder / "llvm" / path.name)
+    (folder / "install.sh").write_text(scripts(extras, library.name))
+    (folder / "install.sh").chmod(0o755)
+    files = sorted(p for p in folder.rglob("*") if p.is_file())
+    lines = [f"{sha256_file(p)}  {p.relative_to(folder).as_posix()}\n" for p in files]
+    (folder / "SHA256SUMS").write_text("".join(lines))
+
+
+def _pip(*words: str) -> None:
+    line = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *words]
+    done = subprocess.run(line, capture_output=True, text=True)
+    if done.returncode != 0:
+        told = [row for row in done.stderr.splitlines() if row.strip()]
+        raise MistyleError(f"pip {words[0]} failed: {told[-1] if told else done.returncode}")

@@ -1,0 +1,149 @@
+"""One job of a plan as one process: `mistyle shard PLAN --index I`.
+
+It may be run any number of times, anywhere, by any queue: a job whose marker OUT/shards/<name>.json has the key of the
+job and whose files still have their hashes is done; anything else is run, and goes on from its last finished stage.
+A failure leaves OUT/shards/<name>.failed.json, which the next success removes.
+"""
+
+import json
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import MistyleError
+from mistyle.files.store import atomic_write, digest, sha256_file
+from mistyle.run.batch_jobs import Record
+from mistyle.run.batch_plan import Plan
+from mistyle.run.inputs import input_files
+from mistyle.run.progress import Progress
+from mistyle.run.stages import MATERIAL_STAGES, STAGES, program
+
+SHARDS = "shards"
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a shard stands: "done", "failed" or "open"; `told` is its marker's content."""
+
+    state: str
+    told: dict[str, Any]
+
+
+def key_of(job: Record) -> str:
+    """What the result depends on: the files, the settings, the program."""
+    files = [list(input_files(job.mesh)), job.style, job.references, job.masks, job.exposure]
+    lights = Path(job.lights) if job.lights not in (None, "unknown") else job.lights
+    return digest([program(), job.kind, job.name, files, lights, job.settings])
+
+
+def marker(plan: Plan, job: Record, failed: bool = False) -> Path:
+    """Where it is written that a job is done, or why it is not."""
+    return plan.out / SHARDS / f"{job.name}{'.failed' if failed else ''}.json"
+
+
+def outcome(plan: Plan, job: Record) -> Outcome:
+    """How a job stands by its markers alone, which is quick; `finished` looks at the files."""
+    for state, failed in (("done", False), ("failed", True)):
+        told = _read(marker(plan, job, failed))
+        if told is not None:
+            return Outcome(state, told)
+    return Outcome("open", {})
+
+
+def finished(plan: Plan, job: Record) -> dict[str, Any] | None:
+    """The marker of a job that is done under its present key, with every file as it was written; else None."""
+    told = _read(marker(plan, job))
+    if told is None or told.get("key") != key_of(job):
+        return None
+    files = told.get("files", {})
+    whole = all((plan.out / p).is_file() and sha256_file(plan.out / p) == h for p, h in files.items())
+    return told if whole and files else None
+
+
+def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
+    """Run job `index` unless it is done; returns its marker's content. Raises what the job raises."""
+    job = plan.jobs[index]
+    told = finished(plan, job)
+    if told is not None:
+        progress.say(f"{job.name}: done before, taken over")
+        return told | {"reused": True}
+    start = time.monotonic()
+    failure = marker(plan, job, failed=True)
+    try:
+        summary = _run(plan, job, progress)
+    except (Exception, KeyboardInterrupt) as error:
+        code = (
+            error.exit_code if isinstance(error, MistyleError) else 130 if isinstance(error, KeyboardInterrupt) else 1
+        )
+        text = str(error) if isinstance(error, MistyleError) else f"{type(error).__name__}: {error}"
+        note = {"name": job.name, "exit_code": code, "error": text, "seconds": round(time.monotonic() - start, 2)}
+        _write(failure, note)
+        raise
+    made = [p for p in sorted((plan.out / job.name / "asset").rglob("*")) if p.is_file()]
+    made += [p for p in (plan.out / job.name / "report").glob("*.html")]
+    told = {
+        "name": job.name,
+        "key": key_of(job),
+        "files": {p.relative_to(plan.out).as_posix(): sha256_file(p) for p in made},
+        "seconds": round(time.monotonic() - start, 2),
+        "peak_gb": round(float(summary["peak_gb"]), 3),
+        "figures": summary["figures"],
+        "stages": summary["seconds"],
+    }
+    _write(marker(plan, job), told)
+    failure.unlink(missing_ok=True)
+    return told
+
+
+def _run(plan: Plan, job: Record, progress: Progress) -> dict[str, Any]:
+    out = plan.out / job.name
+    if job.kind == "fit":
+        from mistyle.run.material import MaterialJob, fit_material
+        from mistyle.run.material_settings import MaterialSettings
+
+        assert job.references is not None
+        lights = "unknown" if job.lights == "unknown" else None if job.lights is None else Path(job.lights)
+        settings = MaterialSettings.model_validate(job.settings)
+        return fit_material(
+            MaterialJob(job.mesh, job.references, out, settings, job.name, lights, job.masks, job.exposure), progress
+        )
+    from mistyle.run.pipeline import stylize
+    from mistyle.run.settings import Settings
+    from mistyle.run.stages import Job
+
+    assert job.style is not None
+    return stylize(Job(job.mesh, job.style, out, Settings.model_validate(job.settings), job.name), progress)
+
+
+def stages_of(job: Record) -> Sequence[str]:
+    """The stages a job goes through, for those who show how far it is."""
+    return tuple(MATERIAL_STAGES if job.kind == "fit" else STAGES)
+
+
+class FarmProgress(Progress):
+    """Says how far a shard is in the words of Open Job Description, one line each on stdout."""
+
+    def __init__(self, stages: int) -> None:
+        super().__init__()
+        self.stages = max(stages, 1)
+
+    def say(self, text: str) -> None:
+        done = 100 * min(len(self.seconds) / self.stages, 1.0)
+        print(f"openjd_progress: {done:.1f}\nopenjd_status: {text}", flush=True)
+        print(text, file=sys.stderr, flush=True)
+
+
+def _read(path: Path) -> dict[str, Any] | None:
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return None
+    return told if isinstance(told, dict) else None
+
+
+def _write(path: Path, values: dict[str, Any]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    atomic_write(path, (json.dumps(values, indent=1) + "\n").encode())

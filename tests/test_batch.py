@@ -1,0 +1,340 @@
+"""Batches: what a jobs file becomes, what a plan is, what a shard skips, how a farm's files look."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.run import engines
+from mistyle.run.batch import Choices, describe, dry_run, planned, run_batch, summarise
+from mistyle.run.batch_jobs import read_jobs
+from mistyle.run.batch_page import write_page
+from mistyle.run.batch_plan import PLAN, indices, path_maps, read_plan, replaced, write_plan
+from mistyle.run.farm import export
+from mistyle.run.shard import finished, key_of, marker, outcome
+
+CUBE = """v -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\nv -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1
+f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 4 7 3\nf 4 8 7\nf 1 5 8\nf 1 8 4\nf 2 3 7\nf 2 7 6
+"""
+
+
+@pytest.fixture
+def props(tmp_path) -> Path:
+    """A folder with two meshes and two pictures."""
+    folder = tmp_path / "props"
+    (folder / "meshes").mkdir(parents=True)
+    (folder / "styles").mkdir()
+    for name in ("cube", "box"):
+        (folder / "meshes" / f"{name}.obj").write_text(CUBE)
+    rng = np.random.default_rng(0)
+    for k, name in enumerate(("wave", "ink")):
+        pixels = (rng.random((12, 16, 3)) * 255).astype(np.uint8).repeat(8, 0).repeat(8, 1)
+        Image.fromarray(pixels).save(folder / "styles" / f"{name}.{('png', 'jpg')[k]}")
+    return folder
+
+
+def jobs_file(folder: Path, text: str, name: str = "jobs.toml") -> Path:
+    path = folder / name
+    path.write_text(text)
+    return path
+
+
+def test_a_folder_is_a_grid_of_what_lies_in_it(props):
+    records = read_jobs(props, 2)
+    assert [r.name for r in records] == ["box_ink", "box_wave", "cube_ink", "cube_wave"]
+    assert all(r.mesh.is_file() and r.style is not None and r.style.is_file() for r in records)
+    assert all(r.settings["threads"] == 2 for r in records)
+
+
+def test_a_list_a_grid_and_what_holds_for_all(props):
+    path = jobs_file(
+        props,
+        """
+        preset = "draft"
+        settings = { "report.frames" = 5, fit = { refine = "off" } }
+        [[job]]
+        mesh = "meshes/cube.obj"
+        style = "styles/wave.png"
+        name = "my cube/1"
+        settings = { "fit.crops" = 3, threads = 1 }
+        [[grid]]
+        meshes = ["meshes/*.obj"]
+        styles = ["styles/ink.jpg"]
+        presets = ["draft", "standard"]
+        variants = [{}, { seed = 7 }]
+        """,
+    )
+    records = read_jobs(path, 4)
+    assert [r.name for r in records][:3] == ["my-cube-1", "box_ink_draft_v0", "box_ink_draft_v1"]
+    assert len(records) == 1 + 2 * 1 * 2 * 2
+    first = records[0].settings
+    assert (first["report"]["frames"], first["fit"]["refine"], first["fit"]["crops"]) == (5, "off", 3)
+    assert first["threads"] == 1 and records[1].settings["threads"] == 4
+    assert first["rig"]["resolution"] == 512  # of the preset
+    assert records[2].settings["seed"] == 7
+    assert records[3].settings["rig"]["resolution"] == 1024
+
+
+def test_yaml_says_the_same(props):
+    toml = jobs_file(props, '[grid]\nmeshes = ["meshes/cube.obj"]\nstyles = ["styles/ink.jpg", "styles/wave.png"]\n')
+    yaml = jobs_file(
+        props, "grid:\n  meshes: [meshes/cube.obj]\n  styles: [styles/ink.jpg, styles/wave.png]\n", "j.yaml"
+    )
+    assert read_jobs(toml, 1) == read_jobs(yaml, 1)
+
+
+def test_a_fit_to_references_is_a_job_too(props):
+    (props / "photographs").mkdir()
+    path = jobs_file(props, '[[job]]\nmesh = "meshes/cube.obj"\nreferences = "photographs"\nlights = "unknown"\n')
+    (record,) = read_jobs(path, 2)
+    assert record.kind == "fit" and record.name == "cube_fit" and record.lights == "unknown"
+    assert "recover" in record.settings
+
+
+def test_all_that_is_wrong_is_told_before_anything_runs(props):
+    path = jobs_file(
+        props,
+        """
+        [[job]]
+        mesh = "meshes/none.obj"
+        style = "styles/wave.png"
+        [[job]]
+        mesh = "meshes/cube.obj"
+        style = "styles/none.png"
+        [[job]]
+        mesh = "meshes/cube.obj"
+        [[job]]
+        mesh = "meshes/cube.obj"
+        style = "styles/wave.png"
+        settings = { "fit.itrations1" = 3 }
+        """,
+    )
+    with pytest.raises(InputRefused) as refused:
+        read_jobs(path, 1)
+    text = str(refused.value)
+    for words in ("4 of 4 jobs", "none.obj", "none.png", "neither", "did you mean 'fit.iterations1'"):
+        assert words in text
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "found no job"),
+        ("jobs = 3\n", "there is no setting 'jobs'"),
+        ("[[job]\n", "cannot be read"),
+        ('[[grid]]\nmeshes = ["m/*.obj"]\nstyles = ["styles/*"]\n', "matches no file"),
+        ("preset = 3\n", "preset"),
+    ],
+)
+def test_a_wrong_jobs_file_is_refused(props, text, words):
+    with pytest.raises(MistyleError, match=words):
+        read_jobs(jobs_file(props, text), 1)
+    with pytest.raises(MistyleError):
+        read_jobs(props / "nothing.toml", 1)
+
+
+def test_a_yaml_file_builds_no_objects(props):
+    with pytest.raises(UsageError, match="cannot be read"):
+        read_jobs(jobs_file(props, "job: !!python/object/apply:os.system ['true']\n", "j.yaml"), 1)
+
+
+def test_equal_names_are_told_apart(props):
+    text = '[[job]]\nmesh = "meshes/cube.obj"\nstyle = "styles/wave.png"\n'
+    assert [r.name for r in read_jobs(jobs_file(props, text * 3), 1)] == ["cube_wave", "cube_wave-2", "cube_wave-3"]
+
+
+def test_a_plan_comes_back_as_it_was_and_moves_with_its_paths(props, tmp_path):
+    plan = planned(props, tmp_path / "out", Choices(threads=1))
+    path = write_plan(plan)
+    before = path.read_bytes()
+    assert read_plan(tmp_path / "out") == plan and write_plan(read_plan(path)).read_bytes() == before
+    moved = read_plan(path, path_maps([f"{tmp_path}=/vol/show", f"{props}=/vol/props"]))
+    assert moved.out == Path("/vol/show/out")
+    assert str(moved.jobs[0].mesh) == "/vol/props/meshes/box.obj"
+    assert planned(tmp_path / "out", None, Choices()) == plan
+    with pytest.raises(UsageError, match="leave out -o"):
+        planned(path, tmp_path / "other", Choices())
+    path.write_text(json.dumps({"version": 99}))
+    with pytest.raises(InputRefused, match="version"):
+        read_plan(path)
+
+
+def test_path_maps_take_whole_folders_and_the_longest_first():
+    maps = (("/mnt/a", "/x"), ("/mnt/a/b", "/y"))
+    assert replaced("/mnt/a/c", maps) == "/x/c"
+    assert replaced("/mnt/a/b/c", maps) == "/y/c"
+    assert replaced("/mnt/ab", maps) == "/mnt/ab"
+    assert replaced("C:\\show\\cube.obj", (("C:\\show", "/vol"),)) == "/vol/cube.obj"
+    for wrong in ("a=b", "/a", "/a="):
+        with pytest.raises(UsageError, match="FROM=TO"):
+            path_maps([wrong])
+
+
+def test_indices():
+    assert indices("3", 4) == (3,) and indices("0-2,1,5", 6) == (0, 1, 2, 5)
+    for wrong in ("4", "x", "1-", "0-9"):
+        with pytest.raises(UsageError):
+            indices(wrong, 4)
+
+
+def done_by_hand(plan, index: int) -> None:
+    """What a finished shard leaves behind, without the work."""
+    job = plan.jobs[index]
+    asset = plan.out / job.name / "asset" / "a.glb"
+    asset.parent.mkdir(parents=True)
+    asset.write_bytes(b"glTF")
+    from mistyle.files.store import sha256_file
+
+    told = {
+        "name": job.name, "key": key_of(job), "files": {f"{job.name}/asset/a.glb": sha256_file(asset)},
+        "seconds": 3.5, "peak_gb": 1.0, "figures": {"style": 0.5},
+    }  # fmt: skip
+    marker(plan, job).parent.mkdir(parents=True, exist_ok=True)
+    marker(plan, job).write_text(json.dumps(told))
+
+
+def test_a_shard_is_done_only_while_its_key_and_its_files_hold(props, tmp_path):
+    plan = planned(props, tmp_path / "out", Choices(threads=1))
+    job = plan.jobs[0]
+    assert finished(plan, job) is None
+    done_by_hand(plan, 0)
+    assert finished(plan, job) is not None and outcome(plan, job).state == "done"
+    changed = job.model_copy(update={"settings": job.settings | {"seed": 5}})
+    assert finished(plan, changed) is None
+    (plan.out / job.name / "asset" / "a.glb").write_bytes(b"broken")
+    assert finished(plan, job) is None
+    (plan.out / job.name / "asset" / "a.glb").write_bytes(b"glTF")
+    assert finished(plan, job) is not None
+    job.mesh.write_text(CUBE + "v 0 0 0\n")
+    assert finished(plan, job) is None
+
+
+def stand_in(monkeypatch, script: str) -> None:
+    """Shards that run `script` with the job's number as its argument instead."""
+    monkeypatch.setattr(engines, "command", lambda plan, index, maps=(): [sys.executable, "-c", script, str(index)])
+
+
+def test_one_failing_shard_does_not_stop_the_others(props, tmp_path, monkeypatch):
+    """Number 1 ends with an error, number 2 crashes twice, number 3 crashes once and is done on the plain path."""
+    plan = planned(props, tmp_path / "out", Choices(threads=1))
+    tries = tmp_path / "tries"
+    script = (
+        "import os,sys,signal\nk=int(sys.argv[1])\nplain=os.environ.get('MISTYLE_PLAIN','')\n"
+        f"open({str(tries)!r},'a').write(f'{{k}}{{plain}} ')\n"
+        "print('words of', k, flush=True)\n"
+        "if k==1: sys.exit(3)\n"
+        "if k==2 or (k==3 and not plain): os.kill(os.getpid(), signal.SIGSEGV)\n"
+    )
+    stand_in(monkeypatch, script)
+    for index in (0, 3):
+        done_by_hand(plan, index)
+        marker(plan, plan.jobs[index]).rename(tmp_path / f"{index}.json")
+    seen = []
+    ended = engines.local(plan, range(4), 2, lambda k, e: seen.append((k, e)))
+    assert {e.index: (e.code, e.tries) for e in ended} == {0: (0, 1), 1: (3, 1), 2: (-11, 2), 3: (0, 2)}
+    assert sorted(tries.read_text().split()) == ["0", "1", "2", "21", "3", "31"]
+    assert len(seen) == 8
+    for index in (0, 3):
+        (tmp_path / f"{index}.json").rename(marker(plan, plan.jobs[index]))
+    summary = summarise(plan, {e.index: e for e in ended}, 5.0, 0)
+    assert [r["state"] for r in summary["rows"]] == ["done", "failed", "failed", "done"]
+    assert "words of 1" in summary["rows"][1]["last_lines"] and "twice" in summary["rows"][2]["error"]
+    assert summary["retry"] == f"mistyle batch {plan.out / PLAN} --only box_wave cube_ink"
+    text = describe(summary)
+    assert "2 of 4 done" in text and "retry" in text
+
+
+def test_a_shard_that_takes_too_long_is_stopped(props, tmp_path, monkeypatch):
+    plan = planned(props, tmp_path / "out", Choices(threads=1))
+    stand_in(monkeypatch, "import time; time.sleep(60)")
+    (ended,) = engines.local(plan, [0], 1, lambda k, e: None, timeout=1.0)
+    assert ended.code == -15
+
+
+def test_an_interrupted_batch_stops_its_shards(props, tmp_path, monkeypatch):
+    plan = planned(props, tmp_path / "out", Choices(threads=1))
+    pids = tmp_path / "pids"
+    stand_in(monkeypatch, f"import os,time; open({str(pids)!r},'a').write(f'{{os.getpid()}} '); time.sleep(60)")
+
+    def interrupt(index, ended):
+        if index == 1:
+            import time
+
+            while not pids.exists():
+                time.sleep(0.05)
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        engines.local(plan, range(4), 2, interrupt)
+    for pid in pids.read_text().split():
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid), 0)
+
+
+def test_what_is_done_is_not_begun_again_and_unknown_names_are_refused(props, tmp_path, monkeypatch):
+    plan = planned(props, tmp_path / "out", Choices(threads=1))
+    for index in range(3):
+        done_by_hand(plan, index)
+    stand_in(monkeypatch, "import sys; sys.exit(0 if sys.argv[1] == '3' else 9)")
+    summary = run_batch(plan, Choices(threads=1))
+    assert (summary["reused"], summary["done"], summary["open"], summary["failed"]) == (3, 3, 1, 0)
+    with pytest.raises(UsageError, match="no such job"):
+        run_batch(plan, Choices(only=("nobody",)))
+
+
+def test_the_page_escapes_names_and_allows_no_connection(props, tmp_path):
+    plan = planned(props, tmp_path / "out", Choices(threads=1))
+    done_by_hand(plan, 0)
+    picture = plan.out / plan.jobs[0].name / "report" / "overview.png"
+    picture.parent.mkdir(parents=True)
+    Image.new("RGB", (640, 480), (200, 30, 30)).save(picture)
+    ended = {1: engines.Ended(1, 3, 1)}
+    summary = summarise(plan, ended, 1.0, 0)
+    summary["rows"][1]["error"] = "<script>alert(1)</script>"
+    text = write_page(plan, summary).read_text()
+    assert "<script>alert" not in text and "&lt;script&gt;alert" in text
+    assert "default-src 'none'" in text and "http://" not in text and "https://" not in text
+    assert text.count("data:image/webp") == 1 and 'data-value="0.5"' in text
+
+
+def test_the_dry_run_adds_up(props, tmp_path):
+    plan = planned(props, tmp_path / "out", Choices(threads=1, workers=2))
+    done_by_hand(plan, 0)
+    told = dry_run(plan, Choices(threads=1, workers=2))
+    assert [row["done"] for row in told["jobs"]] == [True, False, False, False]
+    assert told["seconds"] == round(sum(r["seconds"] for r in told["jobs"][1:]) / 2)
+    assert told["memory_gb"] == pytest.approx(2 * told["jobs"][1]["memory_gb"], abs=0.1)
+
+
+def test_slurm_and_command_lines_name_every_shard(props, tmp_path):
+    plan = planned(props, tmp_path / "out with space", Choices(threads=1))
+    maps = ((str(tmp_path), "/vol"),)
+    (lines,) = export(plan, tmp_path / "farm", "commands", threads=2, maps=maps)
+    assert len(lines.read_text().splitlines()) == 4
+    assert "'/vol/out with space/plan.json' --index 3 --path-map" in lines.read_text()
+    (script,) = export(plan, tmp_path / "farm", "sbatch", threads=2, memory_gb=6, gpus=1)
+    text = script.read_text()
+    for words in ("--array=0-3", "--cpus-per-task=2", "--mem=6144M", "--gres=gpu:1", "${SLURM_ARRAY_TASK_ID}"):
+        assert words in text
+    assert subprocess.run(["bash", "-n", str(script)]).returncode == 0
+
+
+def test_the_bundle_is_a_valid_job_template(props, tmp_path):
+    """Open Job Description's own program checks it."""
+    pytest.importorskip("openjd.cli")
+    plan = planned(props, tmp_path / "out", Choices(threads=1))
+    files = export(plan, tmp_path / "farm", "openjd", threads=2, memory_gb=6, gpus=1, chunk=2)
+    assert [f.name for f in files] == ["template.yaml", "parameter_values.yaml", "asset_references.yaml"]
+    openjd = Path(sys.executable).with_name("openjd")
+    checked = subprocess.run(
+        [openjd, "check", files[0], "--extensions", "TASK_CHUNKING"], capture_output=True, text=True
+    )
+    assert checked.returncode == 0, checked.stdout + checked.stderr
+    references = json.loads(files[2].read_text())["assetReferences"]
+    assert len(references["inputs"]["filenames"]) == 4

@@ -1,0 +1,128 @@
+"""The same plan through three engines, a worker killed in each: the same bytes come out."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import pytest
+
+from mistyle.core.paths import scenes
+from mistyle.run import engines
+from mistyle.run.batch import Choices, planned, run_batch
+from mistyle.run.batch_plan import PLAN
+from mistyle.run.farm import export
+from mistyle.run.shard import marker
+
+JOBS = """
+preset = "draft"
+settings = {{ rig = {{ kind = "turntable", views = 3, resolution = 48 }}, draw = {{ spp = 1 }}, threads = 1, \
+surface = {{ samples = 1500 }}, atlas = {{ size = 64 }}, fit = {{ refine = "off" }}, \
+report = {{ frames = 4, resolution = 64, spp = 1 }} }}
+[[grid]]
+meshes = ["{mesh}"]
+styles = ["{style}"]
+variants = [{{ seed = 0 }}, {{ seed = 1 }}]
+"""
+
+
+def plan_in(folder: Path):
+    jobs = folder.parent / "jobs.toml"
+    jobs.write_text(JOBS.format(mesh=scenes() / "demo.obj", style=scenes() / "demo_style.png"))
+    return planned(jobs, folder, Choices(workers=2, threads=1))
+
+
+def hashes(plan) -> dict[str, str]:
+    """Every file of the assets and its hash, as the markers have them; the reports hold times and are left out."""
+    told = [json.loads(marker(plan, job).read_text())["files"] for job in plan.jobs]
+    return {name: value for files in told for name, value in files.items() if "/asset/" in name}
+
+
+class Killer(threading.Thread):
+    """Ends the first process that runs shard 0 of a plan, once, with the signal that nobody can catch."""
+
+    def __init__(self, plan) -> None:
+        super().__init__(daemon=True)
+        self.words = [str(plan.out / PLAN).encode(), b"--index", b"0"]
+        self.stage = plan.out / plan.jobs[0].name / "work" / "mesh"
+        self.killed = 0
+
+    def run(self) -> None:
+        until = time.monotonic() + 120
+        while time.monotonic() < until and not self.killed:
+            for entry in Path("/proc").glob("[0-9]*"):
+                try:
+                    words = (entry / "cmdline").read_bytes().split(b"\0")
+                except OSError:
+                    continue
+                # In the middle: its first stage is done.
+                if b"shard" in words and all(w in words for w in self.words) and self.stage.is_dir():
+                    os.kill(int(entry.name), signal.SIGKILL)
+                    self.killed = int(entry.name)
+                    return
+            time.sleep(0.05)
+
+
+@pytest.fixture(scope="module")
+def local(tmp_path_factory):
+    """What processes of this machine make, one of them killed on the way and tried again by itself."""
+    plan = plan_in(tmp_path_factory.mktemp("local") / "out")
+    killer = Killer(plan)
+    killer.start()
+    summary = run_batch(plan, Choices(workers=2, threads=1))
+    assert killer.killed
+    assert (summary["done"], summary["failed"]) == (2, 0), summary
+    assert "crashed; once more" in engines.log_of(plan, 0).read_text()
+    assert "done before, taken over" in engines.log_of(plan, 0).read_text()
+    return hashes(plan)
+
+
+needs_proc = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="finds its victim in /proc")
+
+
+@needs_proc
+def test_open_job_description_makes_the_same_bytes(local, tmp_path):
+    pytest.importorskip("openjd.cli")
+    plan = plan_in(tmp_path / "out")
+    python = f"{sys.executable} -m mistyle"
+    template = export(plan, tmp_path / "farm", "openjd", threads=1, chunk=2, program=python)[0]
+    line = [
+        Path(sys.executable).with_name("openjd"), "run", template, "--step", "Shards",
+        "--job-param", f"Plan={plan.out / PLAN}", "--extensions", "TASK_CHUNKING",
+    ]  # fmt: skip
+    killer = Killer(plan)
+    killer.start()
+    first = subprocess.run(line, capture_output=True, text=True)
+    # The farm is told of the lost shard, the other one of its chunk was still run; submitted again, the rest is done.
+    assert killer.killed and first.returncode != 0
+    assert marker(plan, plan.jobs[1]).is_file()
+    second = subprocess.run(line, capture_output=True, text=True)
+    assert second.returncode == 0, second.stdout[-2000:]
+    assert "openjd_progress: " in first.stdout
+    assert hashes(plan) == local
+
+
+@needs_proc
+def test_ray_makes_the_same_bytes(local, tmp_path):
+    pytest.importorskip("ray")
+    plan = plan_in(tmp_path / "out")
+    killer = Killer(plan)
+    killer.start()
+    summary = run_batch(plan, Choices(engine="ray", workers=2, threads=1))
+    assert killer.killed
+    assert (summary["done"], summary["failed"]) == (2, 0), summary
+    assert hashes(plan) == local
+
+
+@needs_proc
+def test_ray_that_cannot_serve_says_so_instead_of_waiting(tmp_path):
+    pytest.importorskip("ray")
+    from mistyle.core.errors import MistyleError
+
+    plan = plan_in(tmp_path / "out")
+    with pytest.raises(MistyleError, match="offers .* GPUs, each shard asks for 2"):
+        run_batch(plan, Choices(engine="ray", threads=1, gpus=2))
