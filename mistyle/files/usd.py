@@ -1,0 +1,131 @@
+"""USD out: a mesh with UsdPreviewSurface materials, as text (.usda) and as one package (.usdz). Needs `usd-core`."""
+
+from collections.abc import Sequence
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.errors import EnvironmentMissing, MistyleError
+from mistyle.core.mesh import Mesh
+from mistyle.files.materialx import Look
+
+NAMES = ("Gf", "Kind", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdUtils", "UsdValidation", "Vt")
+
+
+def library() -> Any:
+    """The modules of pxr, by name. Raises EnvironmentMissing where they are not installed."""
+    try:
+        return SimpleNamespace(**{name: import_module(f"pxr.{name}") for name in NAMES})
+    except ImportError:
+        raise EnvironmentMissing("USD needs usd-core: pip install 'mistyle[usd]'") from None
+
+
+def write_usd(
+    path: Path,
+    name: str,
+    mesh: Mesh,
+    positions: Float[np.ndarray, "v 3"],
+    looks: Sequence[Look],
+    *,
+    metres_per_unit: float = 1.0,
+) -> None:
+    """Write `path` (.usda): default prim `name` of kind component with one Mesh, a GeomSubset per part.
+
+    Normals and `primvars:st` (v up) are per corner, Y up, subdivision off. Textures are 8- or 16-bit files beside the
+    stage: albedo sRGB, everything else raw; normals +Y. UDIM tiles are one texture with <UDIM> in its name, which the
+    preview surface reads; the UVs must lie in their tiles already.
+    """
+    pxr = library()
+    path.unlink(missing_ok=True)
+    stage = pxr.Usd.Stage.CreateNew(str(path))
+    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.Tokens.y)
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, metres_per_unit)
+    root = pxr.UsdGeom.Xform.Define(stage, f"/{name}")
+    stage.SetDefaultPrim(root.GetPrim())
+    pxr.Usd.ModelAPI(root.GetPrim()).SetKind(pxr.Kind.Tokens.component)
+    pxr.UsdGeom.Scope.Define(stage, f"/{name}/Materials")
+    shape = pxr.UsdGeom.Mesh.Define(stage, f"/{name}/Mesh")
+    points = np.ascontiguousarray(positions, np.float32)
+    shape.CreatePointsAttr(pxr.Vt.Vec3fArray.FromNumpy(points))
+    shape.CreateFaceVertexCountsAttr(pxr.Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
+    shape.CreateFaceVertexIndicesAttr(pxr.Vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
+    shape.CreateSubdivisionSchemeAttr(pxr.UsdGeom.Tokens.none)
+    shape.CreateExtentAttr(
+        pxr.Vt.Vec3fArray([pxr.Gf.Vec3f(*points.min(axis=0).tolist()), pxr.Gf.Vec3f(*points.max(axis=0).tolist())])
+    )
+    normals = np.ascontiguousarray(mesh.corner_normals.reshape(-1, 3), np.float32)
+    shape.CreateNormalsAttr(pxr.Vt.Vec3fArray.FromNumpy(normals))
+    shape.SetNormalsInterpolation(pxr.UsdGeom.Tokens.faceVarying)
+    st = pxr.UsdGeom.PrimvarsAPI(shape).CreatePrimvar(
+        "st", pxr.Sdf.ValueTypeNames.TexCoord2fArray, pxr.UsdGeom.Tokens.faceVarying
+    )
+    st.Set(pxr.Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.corner_uvs.reshape(-1, 2), np.float32)))
+    for part, look in enumerate(looks):
+        material = _material(pxr, stage, f"/{name}/Materials/{look.name}", look)
+        faces = np.flatnonzero(mesh.part == part).astype(np.int32)
+        subset = pxr.UsdGeom.Subset.CreateGeomSubset(
+            shape, look.name, pxr.UsdGeom.Tokens.face, pxr.Vt.IntArray.FromNumpy(faces), "materialBind"
+        )
+        pxr.UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
+    pxr.UsdShade.MaterialBindingAPI(shape).SetMaterialBindSubsetsFamilyType(pxr.UsdGeom.Tokens.partition)
+    stage.GetRootLayer().Save()
+
+
+def _material(pxr: Any, stage: Any, place: str, look: Look) -> Any:
+    material = pxr.UsdShade.Material.Define(stage, place)
+    surface = _shader(pxr, stage, f"{place}/Surface", "UsdPreviewSurface")
+    reader = _shader(pxr, stage, f"{place}/UVs", "UsdPrimvarReader_float2")
+    reader.CreateInput("varname", pxr.Sdf.ValueTypeNames.String).Set("st")
+    uv = reader.CreateOutput("result", pxr.Sdf.ValueTypeNames.Float2)
+    sockets = (
+        ("diffuseColor", look.albedo, "rgb", pxr.Sdf.ValueTypeNames.Color3f, "sRGB" if look.srgb else "raw"),
+        ("roughness", look.roughness, "r", pxr.Sdf.ValueTypeNames.Float, "raw"),
+        ("metallic", look.metallic, "r", pxr.Sdf.ValueTypeNames.Float, "raw"),
+        ("normal", look.normal, "rgb", pxr.Sdf.ValueTypeNames.Normal3f, "raw"),
+    )
+    for name, file, channel, kind, space in sockets:
+        texture = _shader(pxr, stage, f"{place}/{name}", "UsdUVTexture")
+        texture.CreateInput("file", pxr.Sdf.ValueTypeNames.Asset).Set(f"./{file}")
+        texture.CreateInput("st", pxr.Sdf.ValueTypeNames.Float2).ConnectToSource(uv)
+        texture.CreateInput("sourceColorSpace", pxr.Sdf.ValueTypeNames.Token).Set(space)
+        for side in ("wrapS", "wrapT"):
+            texture.CreateInput(side, pxr.Sdf.ValueTypeNames.Token).Set("repeat")
+        if name == "normal":
+            # n = 2 c - 1, which 8-bit files need said.
+            texture.CreateInput("scale", pxr.Sdf.ValueTypeNames.Float4).Set((2, 2, 2, 1))
+            texture.CreateInput("bias", pxr.Sdf.ValueTypeNames.Float4).Set((-1, -1, -1, 0))
+        output = texture.CreateOutput(
+            channel, pxr.Sdf.ValueTypeNames.Float3 if len(channel) > 1 else pxr.Sdf.ValueTypeNames.Float
+        )
+        surface.CreateInput(name, kind).ConnectToSource(output)
+    material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", pxr.Sdf.ValueTypeNames.Token))
+    return material
+
+
+def _shader(pxr: Any, stage: Any, place: str, kind: str) -> Any:
+    shader = pxr.UsdShade.Shader.Define(stage, place)
+    shader.CreateIdAttr(kind)
+    return shader
+
+
+def write_usdz(path: Path, stage: Path) -> None:
+    """The stage and everything it names in one package."""
+    pxr = library()
+    path.unlink(missing_ok=True)
+    if not pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(stage)), str(path)):
+        raise MistyleError(f"{path}: USD could not package {stage.name}; are all textures beside it?")
+
+
+def complaints(path: Path) -> list[str]:
+    """What USD's own validators have against a stage; empty where nothing."""
+    pxr = library()
+    stage = pxr.Usd.Stage.Open(str(path))
+    registry = pxr.UsdValidation.ValidationRegistry()
+    context = pxr.UsdValidation.ValidationContext(registry.GetOrLoadAllValidators())
+    found = context.Validate(stage)
+    serious = (pxr.UsdValidation.ValidationErrorType.Error,)
+    return [f"{e.GetName()}: {e.GetMessage()}" for e in found if e.GetType() in serious]

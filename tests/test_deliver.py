@@ -1,0 +1,206 @@
+"""Delivered files, opened by readers that are not ours: Pillow, trimesh, MaterialX, USD."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from gltf_cases import bumpy_sphere, no_texels, quad, quarters
+from PIL import Image
+
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.image import srgb_from_linear
+from mistyle.files.packing import TARGETS
+from mistyle.run.deliver import FORMATS, export, read_finished
+from mistyle.stages.export import write_asset
+
+OCCLUSION = np.linspace(0.2, 1, 256, dtype=np.float32).reshape(16, 16)
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """A run folder with an asset of two texture sets."""
+    folder = tmp_path_factory.mktemp("run")
+    asset = bumpy_sphere()
+    write_asset(
+        folder / "asset", "ball", asset, [quarters()] * 2, [OCCLUSION] * 2, [no_texels()] * 2, provenance={"seed": 1}
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def single(tmp_path_factory) -> Path:
+    """One of a single set."""
+    folder = tmp_path_factory.mktemp("single")
+    write_asset(folder / "asset", "tile", quad(), [quarters()], [OCCLUSION], [no_texels()], provenance={})
+    return folder
+
+
+def pixels(path: Path) -> np.ndarray:
+    with Image.open(path) as picture:
+        return np.asarray(picture).astype(np.float64) / 255
+
+
+def test_what_was_written_is_read_back(made):
+    finished = read_finished(made)
+    maps = quarters()
+    assert len(finished.sets) == 2 and finished.manifest["name"] == "ball"
+    for found in finished.sets:
+        np.testing.assert_allclose(found.albedo, maps.albedo, atol=1e-3)
+        np.testing.assert_allclose(found.normal * 2 - 1, maps.normal, atol=2e-3)
+        np.testing.assert_allclose(found.roughness, maps.roughness, atol=1e-3)
+        np.testing.assert_allclose(found.metallic, maps.metallic, atol=1e-3)
+        np.testing.assert_allclose(found.occlusion, OCCLUSION, atol=1e-3)
+    assert read_finished(made / "asset").manifest == read_finished(made / "asset" / "ball.json").manifest
+
+
+def test_an_edited_albedo_is_what_is_delivered(single, tmp_path):
+    import shutil
+
+    shutil.copytree(single, tmp_path / "edited")
+    picture = tmp_path / "edited" / "asset" / "textures" / "tile_albedo.png"
+    Image.new("RGB", (16, 16), (255, 0, 0)).save(picture)
+    found = read_finished(tmp_path / "edited").sets[0]
+    np.testing.assert_allclose(found.albedo, np.broadcast_to([1, 0, 0], (16, 16, 3)), atol=1e-6)
+
+
+@pytest.mark.parametrize("target", sorted(TARGETS))
+def test_every_target_writes_what_its_program_reads(single, tmp_path, target):
+    maps = quarters()
+    files = {p.name: p for p in export(single, tmp_path / "out", formats=["maps"], target=target)}
+    record = json.loads(files["tile.export.json"].read_text())
+    assert {Path(e["file"]).name for e in record["files"]} == set(files) - {"tile.export.json"}
+    if target in ("houdini", "arnold"):
+        assert set(files) == {
+            "tile.export.json",
+            *(f"tile_{m}.exr" for m in ("albedo", "normal", "roughness", "metallic")),
+        }
+        return
+    step = 1 / 255
+    np.testing.assert_allclose(pixels(files["tile_albedo.png"]), srgb_from_linear(maps.albedo), atol=step)
+    if target != "blender":
+        green = pixels(files["tile_normal.png"])[..., 1]
+        wanted = maps.normal[..., 1] * (-1 if target == "unreal" else 1) * 0.5 + 0.5
+        np.testing.assert_allclose(green, wanted, atol=step)
+    if target == "unreal":
+        packed = np.stack([OCCLUSION, maps.roughness, maps.metallic], axis=-1)
+        np.testing.assert_allclose(pixels(files["tile_orm.png"]), packed, atol=step)
+    if target == "unity-hdrp":
+        packed = np.stack([maps.metallic, OCCLUSION, np.zeros((16, 16)), 1 - maps.roughness], axis=-1)
+        np.testing.assert_allclose(pixels(files["tile_mask.png"]), packed, atol=step)
+    if target == "unity-urp":
+        found = pixels(files["tile_metallicsmoothness.png"])
+        np.testing.assert_allclose(found[..., 3], 1 - maps.roughness, atol=step)
+        np.testing.assert_allclose(found[..., 0], maps.metallic, atol=step)
+
+
+def test_names_follow_the_pattern_and_tell_sets_apart(made, tmp_path):
+    files = [p.name for p in export(made, tmp_path / "a", formats=["maps"], target="arnold")]
+    assert "ball_lower_half_albedo.exr" in files and "ball_upper_half_normal.exr" in files
+    named = export(made, tmp_path / "b", formats=["maps"], target="arnold", names="x_{asset}-{map}_v003.{udim}.{ext}")
+    assert "x_ball_lower_half-albedo_v003.1001.exr" in [p.name for p in named]
+    for wrong in ("{asset}.{ext}", "{map}.{ext}/..", "{map}.{ext}{0}", "{asset}_{map}"):
+        with pytest.raises(UsageError, match="--name"):
+            export(made, tmp_path / "c", formats=["maps"], names=wrong)
+
+
+@pytest.mark.parametrize("target", ["blender", "unreal", "houdini"])
+def test_usd_has_nothing_against_it_and_shows_the_mesh(made, tmp_path, target):
+    pytest.importorskip("pxr")
+    from mistyle.files import usd
+
+    export(made, tmp_path / "out", formats=["usd"], target=target)
+    stage_file = tmp_path / "out" / "ball.usda"
+    assert usd.complaints(stage_file) == []
+    pxr = usd.library()
+    finished = read_finished(made)
+    for path in (stage_file, tmp_path / "out" / "ball.usdz"):
+        stage = pxr.Usd.Stage.Open(str(path))
+        mesh = pxr.UsdGeom.Mesh(stage.GetPrimAtPath("/ball/Mesh"))
+        np.testing.assert_allclose(
+            np.array(mesh.GetPointsAttr().Get()), finished.asset.source.user_positions, atol=1e-6
+        )
+        st = pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").Get()
+        np.testing.assert_allclose(np.array(st).reshape(-1, 3, 2), finished.asset.mesh.corner_uvs, atol=1e-6)
+        subsets = pxr.UsdGeom.Subset.GetAllGeomSubsets(mesh)
+        assert sum(len(s.GetIndicesAttr().Get()) for s in subsets) == len(finished.asset.mesh.faces)
+        textures = [p for p in stage.Traverse() if p.GetAttribute("inputs:file")]
+        assert len(textures) == 8
+        assert all(p.GetAttribute("inputs:file").Get().resolvedPath for p in textures)
+        spaces = {p.GetName(): p.GetAttribute("inputs:sourceColorSpace").Get() for p in textures}
+        assert spaces["normal"] == "raw" and spaces["diffuseColor"] == ("raw" if target == "houdini" else "sRGB")
+
+
+@pytest.mark.parametrize("target", ["blender", "arnold"])
+def test_materialx_validates(made, tmp_path, target):
+    mx = pytest.importorskip("MaterialX")
+    export(made, tmp_path / "out", formats=["mtlx"], target=target)
+    document = mx.createDocument()
+    mx.readFromXmlFile(document, str(tmp_path / "out" / "ball.mtlx"))
+    library = mx.createDocument()
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), library)
+    document.setDataLibrary(library)
+    valid, message = document.validate()
+    assert valid, message
+    surfaces = [n for n in document.getNodes() if n.getCategory() == "open_pbr_surface"]
+    assert len(surfaces) == 2
+    for node in surfaces:
+        definition = node.getNodeDef()
+        assert definition is not None
+        for chosen in node.getInputs():
+            assert definition.getActiveInput(chosen.getName()).getType() == chosen.getType()
+    for graph in document.getNodeGraphs():
+        for node in graph.getNodes():
+            assert node.getNodeDef() is not None, node.getName()
+            if node.getCategory() == "image":
+                assert (tmp_path / "out" / node.getInput("file").getValueString()).is_file()
+
+
+def test_obj_comes_back_as_the_same_mesh(made, tmp_path):
+    export(made, tmp_path / "out", formats=["obj"], target="blender")
+    finished = read_finished(made)
+    loaded = trimesh.load(tmp_path / "out" / "ball.obj", process=False, force="mesh")
+    area = np.linalg.norm(np.cross(*np.diff(loaded.vertices[loaded.faces], axis=1).transpose(1, 0, 2)), axis=1).sum()
+    corners = finished.asset.source.user_positions[finished.asset.mesh.faces]
+    ours = np.linalg.norm(np.cross(*np.diff(corners, axis=1).transpose(1, 0, 2)), axis=1).sum()
+    assert area == pytest.approx(ours, rel=1e-5)
+    lines = (tmp_path / "out" / "ball.obj").read_text().splitlines()
+    positions = np.array([list(map(float, row.split()[1:])) for row in lines if row.startswith("v ")])
+    np.testing.assert_allclose(positions, finished.asset.source.user_positions, rtol=1e-6, atol=1e-7)
+    materials = (tmp_path / "out" / "ball.mtl").read_text()
+    for word in ("map_Kd", "map_Pr", "map_Pm", "norm"):
+        files = [row.split()[1] for row in materials.splitlines() if row.startswith(f"{word} ")]
+        assert len(files) == 2 and all((tmp_path / "out" / f).is_file() for f in files)
+
+
+def test_all_formats_at_once_and_again(single, tmp_path):
+    pytest.importorskip("pxr")
+    out = tmp_path / "out"
+    first = {p.relative_to(out): p.read_bytes() for p in export(single, out, formats=FORMATS, target="unreal")}
+    names = {p.name for p in first}
+    assert {"tile.glb", "tile.usda", "tile.usdz", "tile.mtlx", "tile.obj", "tile.mtl"} <= names
+    # Unreal's own normal map beside the one that the materials in files want.
+    assert {"tile_normal_dx.png", "tile_normal.png", "tile_orm.png", "tile_roughness.png"} <= names
+    again = {p.relative_to(out): p.read_bytes() for p in export(single, out, formats=FORMATS, target="unreal")}
+    assert again.keys() == first.keys()
+    assert [str(p) for p in first if again[p] != first[p] and p.suffix != ".usdz"] == []
+
+
+def test_what_cannot_be_delivered_is_refused(made, tmp_path):
+    with pytest.raises(InputRefused, match="found no asset"):
+        export(tmp_path, tmp_path / "out", formats=["glb"])
+    with pytest.raises(UsageError, match="'fbx' cannot be written"):
+        export(made, tmp_path / "out", formats=["fbx"])
+    with pytest.raises(UsageError, match="'maya' cannot be written"):
+        export(made, tmp_path / "out", formats=["glb"], target="maya")
+    mine = tmp_path / "mine"
+    mine.mkdir()
+    (mine / "work.psd").write_text("mine")
+    with pytest.raises(UsageError, match="holds other things"):
+        export(made, mine, formats=["glb"])
+    assert (mine / "work.psd").read_text() == "mine"
+    (tmp_path / "broken.json").write_text("{}")
+    with pytest.raises(InputRefused, match="not the list"):
+        export(tmp_path / "broken.json", tmp_path / "out", formats=["glb"])
+    assert not (tmp_path / "out").exists()
