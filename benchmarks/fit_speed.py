@@ -270,8 +270,9 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     gather        each texel sums what its samples wrote, by the stored transpose (deterministic)
     atomic        each sample adds packets of eight to its four texels; _sorted: samples in the order of their texels
     scipy         the transpose as a sparse matrix times the eight columns, one thread, waited for (deterministic)
-    texel_space   no transpose at all: every texel is shaded where it lies; here the whole of that shading, to be set
-                  against gather plus `shading`; it is another picture than the camera's
+    texel_space   no transpose at all: every texel is shaded where it lies; the whole of that shading, to be set
+                  against gather plus `shading`; it is another picture than the camera's. Not run: the seconds of
+                  `shading` scaled by texels that are read over samples
     """
     import drjit as dr
     import mitsuba as mi

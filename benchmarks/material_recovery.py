@@ -35,6 +35,7 @@ from mistyle.measure.material_metrics import best_constant, confident, map_error
 from mistyle.render.scene import Frame
 
 LEAST_VIEWS = 3
+RIVALS = ("together", "naive", "naive_pyramid")
 
 
 @dataclass(frozen=True)
@@ -114,7 +115,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--stanford-orb", type=Path, metavar="FOLDER", help="this data set instead, where you have it")
     parser.add_argument("--tensoir", type=Path, metavar="FOLDER", help="a scene of TensoIR-Synthetic instead")
     parser.add_argument("--environments", type=Path, metavar="FOLDER", help="TensoIR's environment maps")
-    parser.add_argument("--no-naive", action="store_true", help="leave the two rivals out")
+    parser.add_argument("--rivals", nargs="*", choices=RIVALS, default=list(RIVALS), help="which others to run")
     options = parser.parse_args(argv)
     quick = options.quick
     options.resolution = options.resolution or (128 if quick else 512)
@@ -161,17 +162,19 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
-    if not row.paper:
+    if not row.paper and "together" in options.rivals:
         other = ours(known, *summed, frame)
         methods["together"] = judge(other.maps, frame, "together") | {"seconds": other.seconds}
     steps = {}
-    if not options.no_naive:
+    loops = {"naive": (), "naive_pyramid": ("--pyramid",)}
+    if wanted := [method for method in loops if method in options.rivals]:
         with TemporaryDirectory() as folder:
             write_job(Path(folder), known, main_shots, main_pictures)
-            for method, extra in (("naive", ()), ("naive_pyramid", ("--pyramid",))):
-                maps, steps[method] = naive(Path(folder), known, fitted.seconds, *extra)
+            for method in wanted:
+                maps, steps[method] = naive(Path(folder), known, fitted.seconds, *loops[method])
                 all_maps[method] = maps
                 methods[method] = judge(maps, "mitsuba", method) | {"seconds": fitted.seconds, "steps": steps[method]}
+    if "naive" in methods:
         gain = methods["ours"]["relight_psnr_l"] - methods["naive"]["relight_psnr_l"]
         methods["ours"]["gain_over_naive_db"] = gain
     if options.out:

@@ -12,22 +12,67 @@ from torch import nn
 from mistyle.core.errors import InputRefused
 from mistyle.measure import features
 from mistyle.measure.features import SOFTNESS, filter_bank, load_features
+from mistyle.measure.losses import style_aligned, style_statistics
 
 
 def picture(rng, channels=3, size=32, count=2):
     return torch.from_numpy(rng.random((count, channels, size, size)).astype(np.float32))
 
 
+def polarities(maps):
+    """The two rectified polarities, 8 maps each, of a level of the bank, which keeps them turned by 45 degrees."""
+    response, size = maps[:, :8], maps[:, 8:16]
+    return torch.cat([size + response, size - response], dim=1) * 0.5**0.5
+
+
+def plain_bank(image):
+    """The bank with rectified maps, written out and differentiated by torch."""
+    functional = nn.functional
+    kernels = features._kernels(image.device, image.dtype)
+    planes = features._opponent(image)
+    levels = [planes := features._half(planes) if level else planes for level in range(features.LEVELS)]
+    padded = [functional.pad(p, (3, 3, 3, 3), mode="replicate") for p in levels]
+    responses = [functional.conv2d(p[:, :1], kernels) for p in padded]
+    energy = [(r[:, :4].square() + r[:, 4:].square() + 2 * SOFTNESS**2).sqrt() for r in responses]
+    maps = []
+    for level, (p, r) in enumerate(zip(padded, responses, strict=True)):
+        size = (r.square() + SOFTNESS**2).sqrt()
+        parts = [0.5 * (size + r), 0.5 * (size - r)]
+        if level + 1 < features.LEVELS:
+            coarser = functional.interpolate(energy[level + 1], size=r.shape[2:], mode="bilinear")
+            parts.append((energy[level] * coarser).sqrt())
+        parts.append(features.LOW_SCALE * levels[level])
+        parts += [functional.conv2d(p[:, c : c + 1], kernels[[0, 2]]) for c in range(1, p.shape[1]) if level]
+        maps.append(torch.cat(parts, dim=1))
+    return maps
+
+
+@pytest.mark.parametrize("channels", [1, 3])
+def test_the_bank_measures_as_its_plain_twin_does(rng, channels):
+    """Aligned and Gram distances and their gradients are those of the rectified maps, differentiated by torch."""
+    image, other = picture(rng, channels, 48).double(), picture(rng, channels, 48).double()
+    mask = torch.ones(2, 1, 48, 48, dtype=torch.float64)
+    found = []
+    for bank in (filter_bank, plain_bank):
+        leaf = image.clone().requires_grad_()
+        maps, wanted = bank(leaf), bank(other)
+        values = style_aligned(maps, wanted, mask), style_statistics(maps, wanted, mask, mask)
+        slopes = [torch.autograd.grad(v, leaf, retain_graph=True)[0] for v in values]
+        found.append((torch.stack(values).detach(), *slopes))
+    for mine, theirs in zip(*found, strict=True):
+        torch.testing.assert_close(mine, theirs, rtol=1e-9, atol=1e-15)
+
+
 def test_sizes_halve_and_grey_lacks_only_the_colour_maps(rng):
     maps, grey = filter_bank(picture(rng, 3, 64)), filter_bank(picture(rng, 1, 64))
     assert [m.shape[2] for m in maps] == [64, 32, 16, 8]
-    assert [m.shape[1] for m in maps] == [27, 27, 27, 23]
+    assert [m.shape[1] for m in maps] == [23, 27, 27, 23]
     assert [m.shape[1] for m in grey] == [21, 21, 21, 17]
 
 
 def test_a_flat_picture_has_no_detail():
     for maps in filter_bank(torch.full((1, 1, 32, 32), 0.4)):
-        oriented, low = maps[:, :16], maps[:, -1:]
+        oriented, low = polarities(maps), maps[:, -1:]
         # The rectifier is rounded: it gives half of SOFTNESS at rest.
         torch.testing.assert_close(oriented, torch.full_like(oriented, SOFTNESS / 2), atol=1e-5, rtol=0)
         torch.testing.assert_close(low, torch.full_like(low, 0.4 * features.LOW_SCALE))
@@ -42,11 +87,11 @@ def test_the_odd_filter_measures_slope_and_the_even_one_curvature():
     assert float((kernels[0] * column).sum()) == pytest.approx(features.ODD_SCALE, rel=0.03)
     assert float(kernels[4].sum()) == pytest.approx(0, abs=1e-12)
     # A bright ridge answers positively, a valley negatively, and a ramp not at all.
-    ramp = filter_bank((x / 64).expand(1, 1, 32, 32))[0][0, :, 16, 16]
+    ramp = polarities(filter_bank((x / 64).expand(1, 1, 32, 32))[0])[0, :, 16, 16]
     assert float(ramp[0] - ramp[8]) == pytest.approx(features.ODD_SCALE / 64, rel=0.03)
     assert float(ramp[4] - ramp[12]) == pytest.approx(0, abs=1e-5)
     ridge = torch.exp(-((x - 16) ** 2) / 4).expand(1, 1, 32, 32)
-    up, down = filter_bank(ridge)[0][0, :, 16, 16], filter_bank(-ridge)[0][0, :, 16, 16]
+    up, down = (polarities(filter_bank(p)[0])[0, :, 16, 16] for p in (ridge, -ridge))
     assert float(up[4]) > 0.5 > 0.05 > float(up[12])
     assert float(down[12]) == pytest.approx(float(up[4]))
 

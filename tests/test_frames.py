@@ -52,7 +52,7 @@ def shaded(mesh: Mesh, normal: np.ndarray, tangents) -> np.ndarray:
     maps = flat_maps(SIZE)
     tables = {"albedo": maps.albedo.reshape(-1, 3), "normal": normal.reshape(-1, 3)}
     tables |= {"roughness": maps.roughness.reshape(-1, 1), "metallic": maps.metallic.reshape(-1, 1)}
-    pixels = {name: torch.from_numpy(seam.bilinear(table, where)) for name, table in tables.items()}
+    pixels = torch.from_numpy(seam.bilinear(np.concatenate(list(tables.values()), axis=1), where))
     return seam.Shader(camera.size)(lit, pixels).numpy()[..., 0]
 
 

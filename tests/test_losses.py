@@ -84,14 +84,44 @@ def test_pixels_outside_the_mask_do_not_matter_at_all(rng):
     assert bool((leaf.grad[(mask == 0).expand_as(a)] == 0).all())
 
 
-def test_statistics_forget_places_and_aligned_features_do_not(rng):
+KINDS = pytest.mark.parametrize("kind", ["gram", "mean-std", "swd"])
+
+
+@KINDS
+def test_statistics_forget_places_and_aligned_features_do_not(rng, kind):
     a = random_picture(rng, count=1)
     order = torch.from_numpy(rng.permutation(24 * 24))
     shuffled = a.flatten(2)[:, :, order].view_as(a)
     mask = torch.ones(1, 1, 24, 24)
     maps = losses.masked_features(as_is, a, shuffled, mask, mask)
-    assert float(losses.style_statistics(*maps, mask, mask)) < 1e-10
+    assert float(losses.style_statistics(*maps, mask, mask, kind=kind)) < 1e-10
     assert float(losses.style_aligned(*maps, mask)) > 0.05
+
+
+@KINDS
+def test_statistics_lead_to_the_target_and_look_only_inside_the_masks(rng, kind):
+    """Descending along the gradient brings another picture's features near; what lies outside has none."""
+    target, leaf = random_picture(rng, count=2) * 0.3 + 0.6, random_picture(rng, count=2).requires_grad_()
+    mask = torch.zeros(2, 1, 24, 24)
+    mask[..., 4:20, 6:24] = 1
+    found = []
+    for _ in range(60):
+        maps, wanted = losses.masked_features(as_is, leaf, target, mask, mask)
+        loss = losses.style_statistics(maps, wanted, mask, mask, kind=kind, rng=np.random.default_rng(1))
+        (slope,) = torch.autograd.grad(loss, leaf)
+        assert bool((slope[(mask == 0).expand_as(leaf)] == 0).all())
+        found.append(float(loss.detach()))
+        leaf = (leaf - 0.02 * slope / slope.abs().max()).detach().requires_grad_()
+    assert found[-1] < 0.2 * found[0]
+
+
+def test_mean_and_deviation_by_hand():
+    maps = torch.tensor([[1.0, 3.0], [2.0, 2.0]]).view(1, 2, 1, 2)
+    wanted = torch.tensor([[4.0, 4.0], [1.0, 3.0]]).view(1, 2, 1, 2)
+    mask = torch.ones(1, 1, 1, 2)
+    # means 2, 2 against 4, 2; deviations 1, 0 against 0, 1; the target's mean squares are 16 and 5.
+    value = losses.style_statistics([maps], [wanted], mask, mask, kind="mean-std")
+    assert float(value) == pytest.approx((4 + 0 + 1 + 1) / 4 / 10.5, rel=1e-4)
 
 
 def test_gram_by_hand():

@@ -73,12 +73,12 @@ def tables(maps) -> dict[str, np.ndarray]:
 class Path:
     """From tables to picture, the way the fit goes."""
 
-    def __init__(self, mesh, cameras, lights, sizes=SIZES, tangents=None, shadows=True):
+    def __init__(self, mesh, cameras, lights, sizes=SIZES, tangents=None, shadows=True, **options):
         traced = draw.tracer(mesh)
         surface = deferred.trace(traced, cameras, tangents)
         self.lit = deferred.light(traced, surface, lights, shadows=shadows)
         self.taps = seam.taps(surface, sizes)
-        self.shader = seam.Shader(self.lit.size)
+        self.shader = seam.Shader(self.lit.size, **options)
 
     def leaves(self, tables, moving=("albedo", "normal", "roughness")):
         return {
@@ -87,7 +87,8 @@ class Path:
         }
 
     def draw(self, leaves):
-        return self.shader(self.lit, {name: seam.fetch(leaf, self.taps) for name, leaf in leaves.items()})
+        pixels = seam.fetch(torch.cat(list(leaves.values()), dim=1), self.taps)
+        return self.shader(self.lit, pixels, [name for name, leaf in leaves.items() if leaf.requires_grad])
 
 
 def crop(size=48) -> Camera:
@@ -111,13 +112,44 @@ def plain_scene(mesh, maps, camera, light):
     return mi.load_dict({"type": "scene", "integrator": integrator, "sensor": sensor, "light": emitter, **parts})
 
 
-def test_picture_and_gradient_equal_mitsubas_own(rng):
+BOTH = pytest.mark.parametrize("bridge", ["frozen", "wrap"])
+
+
+@pytest.mark.parametrize("gloss", [True, False])
+@pytest.mark.parametrize("moving", [("albedo", "normal", "roughness"), ("normal",), tuple(seam.CHANNELS)])
+def test_the_frozen_split_equals_its_twin_behind_wrap(rng, gloss, moving):
+    """Same loss, same gradients, replayed and not recorded again for other values."""
+    device.use()
+    lights = (KEY, Ambient((0.3, 0.2, 0.4)))
+    ways = {b: Path(torus(), [crop(), crop()], lights, gloss=gloss, bridge=b) for b in ("frozen", "wrap")}
+    recordings = []
+    for _ in range(3):
+        values = tables(random_maps(rng, SIZES))
+        found = {}
+        for name, way in ways.items():
+            leaves = way.leaves(values, moving)
+            picture = way.draw(leaves)
+            loss = (picture - 0.2).square().mean()
+            loss.backward()
+            found[name] = picture.detach().numpy(), float(loss.detach()), {k: leaves[k].grad.numpy() for k in moving}
+        picture, loss, gradients = found["frozen"]
+        np.testing.assert_allclose(picture, found["wrap"][0], atol=2e-6, rtol=1e-5)
+        assert loss == pytest.approx(found["wrap"][1], rel=1e-6)
+        for name in moving:
+            theirs = found["wrap"][2][name]
+            assert np.linalg.norm(gradients[name] - theirs) < 2e-5 * np.linalg.norm(theirs) + 1e-9, name
+        recordings.append(ways["frozen"].shader._bridge.recordings)
+    assert recordings[1] == recordings[2]
+
+
+@BOTH
+def test_picture_and_gradient_equal_mitsubas_own(rng, bridge):
     device.use()
     import drjit as dr
     import mitsuba as mi
 
     mesh, maps, camera = torus(), random_maps(rng, SIZES), crop()
-    ours = Path(mesh, [camera], (KEY,))
+    ours = Path(mesh, [camera], (KEY,), bridge=bridge)
     leaves = ours.leaves(tables(maps), tuple(seam.CHANNELS))
     picture = ours.draw(leaves)
     adjoint = rng.normal(size=picture.shape).astype(np.float32)
@@ -158,11 +190,15 @@ def slope(path, values, name, direction, adjoint, step):
     return (ends[0] - ends[1]) / (2 * step)
 
 
+@BOTH
 @pytest.mark.parametrize("name, step", [("albedo", 1e-2), ("normal", 2e-3), ("roughness", 2e-3), ("metallic", 1e-2)])
-def test_gradient_equals_central_differences(rng, name, step):
+def test_gradient_equals_central_differences(rng, name, step, bridge):
     device.use()
     path = Path(
-        torus(bumps=0), [crop(32), orbit(200, 10, distance=4, fov=30, size=(32, 32))], (KEY, Ambient((0.3, 0.3, 0.3)))
+        torus(bumps=0),
+        [crop(32), orbit(200, 10, distance=4, fov=30, size=(32, 32))],
+        (KEY, Ambient((0.3, 0.3, 0.3))),
+        bridge=bridge,
     )
     leaves = path.leaves(tables(random_maps(rng, SIZES, tilt=0.2)), (name,))
     adjoint = torch.from_numpy(rng.normal(size=(64, 32, 3)))
@@ -306,4 +342,4 @@ def test_a_film_of_another_size_is_refused():
     device.use()
     path = Path(torus(8, 8), [crop(8)], (KEY,))
     with pytest.raises(ValueError, match="film has"):
-        seam.Shader((4, 4))(path.lit, {})
+        seam.Shader((4, 4))(path.lit, torch.zeros(64, 8))

@@ -191,7 +191,7 @@ def test_neighbours_agree_with_the_plain_search(dj):
         square = ((goal[:, None] - points.positions) ** 2).sum(2)
         square += 9 * h**2 * ((points.normals[:, None] - points.normals) ** 2).sum(2)
         chosen = square[np.arange(len(goal)), level.neighbours[:, k]]
-        # 40 candidates fill a disc of 3.5 spacings: a corner of the grid on a curved part may lie out.
+        # The candidates fill a disc of 4 spacings: a corner of the grid on a curved part may lie out.
         assert np.mean(chosen > square.min(axis=1) + 1e-5 * h**2) < (0.01 if k != samples.CENTRE else 1e-9)
 
 
@@ -212,7 +212,15 @@ def test_thin_wall_does_not_mix_its_sides(dj):
     centre = np.where(points.normals[:, 2:] > 0, [[4.0, 4.0]], [[12.0, 4.0]]).astype(np.float32)
     zero = np.zeros(len(flat), np.int32)
     solution = lookup.Solution(
-        points.positions, points.normals, level.tangent, zero, centre, points.spacing, (0.5, 0.5), painting
+        points.positions,
+        points.normals,
+        level.tangent,
+        zero,
+        centre,
+        points.spacing,
+        (0.5, 0.5),
+        painting,
+        0 * centre[:, 0],
     )
     rng = np.random.default_rng(3)
     xy = rng.uniform(-0.55, 0.55, (500, 2))
@@ -506,7 +514,7 @@ def test_detail_puts_dark_strokes_into_hollows(dj):
 def test_strokes_keep_their_size_when_samples_change():
     sizes = [synthesis.finest_size(SurfaceSettings(samples=n)) for n in (15_625, 62_500, 250_000)]
     assert sizes == [128, 256, 512]  # the painting spans as many spacings as it has pixels; spacing falls as sqrt(1/n)
-    assert synthesis.finest_size(SurfaceSettings(style_scale=2.0)) == 256
+    assert synthesis.finest_size(SurfaceSettings(style_scale=2.0)) == 1024
     assert [synthesis.level_count(SurfaceSettings(samples=n)) for n in (1000, 62_500, 250_000, 1_000_000)] == [
         2,
         4,

@@ -7,6 +7,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Picture
 from mistyle.core.mesh import Mesh
+from mistyle.surface.guides import Content
 from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import SurfaceSettings
 
@@ -24,8 +25,13 @@ def solve_surface(
     settings: SurfaceSettings,
     seed: int = 0,
     progress: Callable[[float], None] = lambda done: None,
+    *,
+    content: Content | None = None,
 ) -> Solution:
-    """Paint `mesh` in the style of a picture; see `mistyle.surface.synthesis.solve` for what it can and cannot do."""
+    """Paint `mesh` in the style of a picture; see `mistyle.surface.synthesis.solve` for what it can and cannot do.
+
+    `content(positions, normals)` is the lightness (0..1) of a texture that the mesh has already.
+    """
     from mistyle.render.draw import tracer
     from mistyle.render.occlusion import ambient_occlusion
     from mistyle.surface.synthesis import solve
@@ -36,7 +42,9 @@ def solve_surface(
     def occlusion(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
         return ambient_occlusion(traced, positions, normals, seed=seed)
 
-    return solve(mesh, style.rgb, settings, seed, occlusion, progress, alpha=style.alpha, device=module)
+    return solve(
+        mesh, style.rgb, settings, seed, occlusion, progress, alpha=style.alpha, content=content, device=module
+    )
 
 
 def surface_colour(
@@ -46,3 +54,13 @@ def surface_colour(
     from mistyle.surface.lookup import colour
 
     return colour(solution, positions, normals, footprint=footprint, device=array_module())
+
+
+def surface_relief(
+    solution: Solution, positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], footprint: float = 0.0
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Gradient of the painted height along the surface (root mean square about 1) and what the paint adds to the
+    roughness; `footprint` as in `surface_colour`."""
+    from mistyle.surface.lookup import relief
+
+    return relief(solution, positions, normals, footprint=footprint, device=array_module())

@@ -42,6 +42,15 @@ def inpainter(colours: Colours | None = None) -> Inpainter:
     return paint
 
 
+def from_paint(painted: Float[np.ndarray, "h w 3"]) -> Inpainter:
+    """An Inpainter that knows what the whole surface looks like (linear, finite wherever texels are covered)."""
+
+    def paint(albedo: np.ndarray, hole: np.ndarray, texels: Texels, rng: np.random.Generator) -> np.ndarray:
+        return np.where((hole & texels.covered)[..., None], painted, albedo)
+
+    return paint
+
+
 def grow(
     albedo: Float[np.ndarray, "h w 3"], hole: Bool[np.ndarray, "h w"], texels: Texels
 ) -> Float[np.ndarray, "h w 3"]:

@@ -23,7 +23,9 @@ class RigSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    kind: Literal["paper", "turntable", "file"] = "paper"
+    kind: Literal["paper", "turntable", "nbv", "file"] = Field(
+        default="paper", description="'nbv': as few views as the mesh needs (next best view)"
+    )
     file: Path | None = Field(
         default=None, description="for kind 'file': a camera.json or transforms.json in working units"
     )
@@ -31,6 +33,17 @@ class RigSettings(BaseModel):
     distance: float = Field(default=4.0, gt=1.0, description="camera distance; the mesh has bounding-sphere radius 1")
     fov: float = Field(default=30.0, gt=1.0, lt=120.0, description="vertical and horizontal field of view, degrees")
     resolution: int = Field(default=1024, ge=16, le=8192, description="pixels along each side")
+    most_views: int = Field(default=32, ge=1, le=256, description="for kind 'nbv': the most views")
+    facing: float = Field(
+        default=0.4,
+        gt=0.0,
+        lt=1.0,
+        description="for kind 'nbv': the face-on weight (cosine) with which some view must see every place",
+    )
+    overlap: float = Field(
+        default=0.4, ge=0.0, lt=1.0, description="for kind 'nbv': the share that neighbouring views have in common"
+    )
+    candidates: int = Field(default=500, ge=4, le=4096, description="for kind 'nbv': cameras to choose from")
 
 
 @dataclass(frozen=True)
@@ -109,10 +122,13 @@ PAPER_ANGLES = tuple((30.0 * k, 0.0) for k in range(1, 13)) + tuple((30.0, e) fo
 def rig(settings: RigSettings) -> list[Camera]:
     """The cameras of a job in visiting order; 'paper' gives the 16 views of section 4.1.1, 'turntable' a ring.
 
-    Cameras of kind 'file' are read by `files/views.py`, since this floor opens no files.
+    Cameras of kind 'file' are read by `files/cameras.py`, since this floor opens no files; those of kind 'nbv' hang on
+    the mesh (`stages/rigs.py`).
     """
     if settings.kind == "file":
-        raise ValueError("cameras from a file are read by mistyle.files.views.read_cameras")
+        raise ValueError("cameras from a file are read by mistyle.files.cameras.read_cameras")
+    if settings.kind == "nbv":
+        raise ValueError("cameras of kind 'nbv' are chosen for a mesh by mistyle.stages.rigs.next_best_views")
     size = (settings.resolution, settings.resolution)
     angles = (
         PAPER_ANGLES
@@ -126,6 +142,21 @@ def rig(settings: RigSettings) -> list[Camera]:
 def visiting_order(cameras: Sequence[Camera]) -> list[Camera]:
     """Ascending |azimuth| + |elevation| (paper 4.1.3); ties keep their order."""
     return sorted(cameras, key=lambda c: abs(c.azimuth) + abs(c.elevation))
+
+
+def angular_order(cameras: Sequence[Camera]) -> list[int]:
+    """Indices of `cameras` from the first on, each time the one least turned from any already taken.
+
+    Angles are those between camera positions seen from the origin; of equals (within 0.01 degrees) the one least turned
+    from the first comes first, then the earlier. The paper's rig is so walked both ways round and closes at the back.
+    """
+    towards = np.array([c.position / np.linalg.norm(c.position) for c in cameras])
+    turned = np.round(np.degrees(np.arccos(np.clip(towards @ towards.T, -1, 1))), 2)
+    order, left = [0], list(range(1, len(cameras)))
+    while left:
+        order.append(min(left, key=lambda k: (turned[k, order].min(), turned[k, order[0]], k)))
+        left.remove(order[-1])
+    return order[: len(cameras)]
 
 
 def px_from_world(

@@ -153,6 +153,32 @@ def distance_to(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     return np.asarray(cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
 
 
+def match_histogram(
+    values: Float[np.ndarray, "n c"], target: Float[np.ndarray, "m c"], strength: float = 1.0, knots: int = 1024
+) -> Float[np.ndarray, "n c"]:
+    """Values moved, channel by channel, until their distribution is that of `target`; `strength` 0 leaves them alone.
+
+    A monotone map through `knots` quantiles; equal values stay equal (a single one goes to the target's mean). Empty
+    sets change nothing.
+    """
+    if len(values) == 0 or len(target) == 0 or strength == 0:
+        return values.copy()
+    share = np.linspace(0, 1, knots)
+    result = values.astype(np.float32, copy=True)
+    for channel in range(values.shape[1]):
+        here, which = np.unique(np.quantile(values[:, channel], share), return_inverse=True)
+        there = np.bincount(which, np.quantile(target[:, channel], share)) / np.bincount(which)
+        moved = np.interp(values[:, channel], here, there)
+        result[:, channel] += np.float32(strength) * (moved.astype(np.float32) - result[:, channel])
+    return result
+
+
+def overlap(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
+    """Intersection over union of two masks; 1 where both are empty."""
+    either = int((a | b).sum())
+    return int((a & b).sum()) / either if either else 1.0
+
+
 def canny(encoded: Float[np.ndarray, "h w 3"], low: float = 100, high: float = 200) -> Bool[np.ndarray, "h w"]:
     """Canny edges of the 8-bit grey picture, thresholds 100 and 200 as in the paper's 4.1.1; `encoded` is sRGB 0..1."""
     grey = cv2.cvtColor(np.round(np.clip(encoded, 0, 1) * 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)

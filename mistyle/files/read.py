@@ -15,12 +15,15 @@ from jaxtyping import Float
 from mistyle.core.asset import Asset, Picture
 from mistyle.files.bounds import refuse
 from mistyle.files.gltf_check import load_gltf, read_json
+from mistyle.files.layers import Frame
 from mistyle.files.pictures import read_picture
 
 __all__ = [
+    "Frame",
     "Picture",
     "load_gltf",
     "read_exr",
+    "read_frame",
     "read_hdr",
     "read_json",
     "read_mesh",
@@ -84,6 +87,17 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
     all are read, their names before the channels'. Deep files and subsampled channels are refused.
     """
     from mistyle.files.hdr import read_exr as read
+
+    return read(Path(path))
+
+
+def read_frame(path: Path) -> Frame:
+    """A picture to compare: the layers of an .exr (of all its parts, whatever their windows) by name, or the one layer
+    of an .hdr, PNG, JPEG, WebP or TIFF; linear Rec.709, premultiplied, NaN and infinities kept.
+
+    Checked like `read_exr` and `read_picture`: header first, bounded. Two layers of one name are refused.
+    """
+    from mistyle.files.layers import read_frame as read
 
     return read(Path(path))
 

@@ -5,7 +5,7 @@ pixels is NaN. Higher is better for psnr, ssim, detail_correlation, edge_recall 
 """
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import cv2
@@ -139,19 +139,20 @@ def gram_distance(
     masks: Sequence[Bool[np.ndarray, "h w"]],
     style: Sequence[Float[np.ndarray, "i j 3"]],
     style_masks: Sequence[Bool[np.ndarray, "i j"]] | None = None,
+    features: Callable[[Any], list[Any]] | None = None,
 ) -> float:
-    """Relative distance |G - G_style| / |G_style| (Frobenius) of the filter bank's Gram matrices, mean over its levels.
+    """Relative distance |G - G_style| / |G_style| (Frobenius) of the features' Gram matrices, mean over levels.
 
-    Gram matrices are pooled over pictures by the pixels in their masks; the masked picture's outside is the mask's
-    mean colour, so that the silhouette adds little.
+    `features` as in `measure.features` (None: the filter bank). Gram matrices are pooled over pictures by the pixels in
+    their masks; the masked picture's outside is the mask's mean colour, so that the silhouette adds little.
     """
     inside = style_masks or [np.ones(s.shape[:2], bool) for s in style]
-    mine, theirs = _pooled_gram(pictures, masks), _pooled_gram(style, inside)
+    mine, theirs = _pooled_gram(pictures, masks, features), _pooled_gram(style, inside, features)
     ratios = [np.linalg.norm(a - b) / np.linalg.norm(b) for a, b in zip(mine, theirs, strict=True)]
     return float(np.mean(ratios))
 
 
-def _pooled_gram(pictures, masks) -> list[np.ndarray]:
+def _pooled_gram(pictures, masks, features) -> list[np.ndarray]:
     import torch
 
     from mistyle.measure.features import filter_bank
@@ -166,7 +167,9 @@ def _pooled_gram(pictures, masks) -> list[np.ndarray]:
         image = torch.from_numpy(np.ascontiguousarray(filled.transpose(2, 0, 1), np.float32))[None]
         inside = torch.from_numpy(erode(mask, 3).astype(np.float32))[None, None]
         with torch.no_grad():
-            grams = [gram(maps, inside)[0].numpy() * (weight / sum(weights)) for maps in filter_bank(image)]
+            grams = [
+                gram(maps, inside)[0].numpy() * (weight / sum(weights)) for maps in (features or filter_bank)(image)
+            ]
         totals = grams if not totals else [a + b for a, b in zip(totals, grams, strict=True)]
     if not totals:
         raise ValueError("no picture has a pixel in its mask")
@@ -232,16 +235,27 @@ def warp_error(
     Every pixel of `view` is lifted by its depth, looked up (bilinear) in `other`, and counted where the depths agree
     and both are three pixels inside their masks. Bilinear lookups of fine strokes leave a few units.
     """
+    carried, both = carried_over(view, other, other_picture)
+    if not both.any():
+        return float("nan")
+    return float(np.abs(lab(picture[both]) - lab(carried[both])).sum(axis=1).mean())
+
+
+def carried_over(
+    view: View, other: View, other_picture: Float[np.ndarray, "h w c"]
+) -> tuple[Float[np.ndarray, "h w c"], Bool[np.ndarray, "h w"]]:
+    """The other view's picture as `view` sees it, and which of the view's pixels both see, as in `warp_error`; zero
+    elsewhere."""
     chosen = erode(view.mask, 3)
     px = pixel_centres(view.camera.size)[chosen]
     points = world_from_px(view.camera, px, view.depth[chosen].astype(np.float64))
     there, z = px_from_world(other.camera, points)
     seen = _sees(other, there, z)
-    if not seen.any():
-        return float("nan")
-    a = lab(picture[chosen][seen])
-    b = lab(bilinear(other_picture.astype(np.float32), there[seen]))
-    return float(np.abs(a - b).sum(axis=1).mean())
+    both = np.zeros(chosen.shape, bool)
+    both[chosen] = seen
+    carried = np.zeros((*chosen.shape, other_picture.shape[2]), np.float32)
+    carried[both] = bilinear(other_picture.astype(np.float32), there[seen])
+    return carried, both
 
 
 def _sees(view: View, px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:

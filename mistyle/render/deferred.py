@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.camera import Camera, pixel_centres
+from mistyle.core.camera import Camera
 from mistyle.core.light import Ambient, Directional, Lights, direction_in_world
 from mistyle.render import device
 from mistyle.render.draw import Tracer
@@ -77,10 +77,7 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
     device.use()
     if len({camera.size for camera in cameras}) != 1:
         raise ValueError(f"cameras of one size are needed, not {sorted({camera.size for camera in cameras})}")
-    rays = [_directions(camera) for camera in cameras]
-    origins = np.repeat(np.stack([camera.position for camera in cameras]), [len(r) for r in rays], axis=0)
-    ray = mi.Ray3f(_points(mi.Point3f, origins), _points(mi.Vector3f, np.concatenate(rays)))
-    point, frame = intersect(traced, ray, tangents)
+    point, frame = intersect(traced, ray := _rays(cameras), tangents)
     valid = point.is_valid()
     towards = -ray.d
     u, v = dr.select(valid, point.uv.x, 0), dr.select(valid, 1 - point.uv.y, 0)
@@ -148,16 +145,17 @@ def _lit(
 
     height, width = surface.cameras[0].size
     valid = surface.point.is_valid()
+    camera_of = dr.arange(mi.UInt32, len(surface.mask)) // (height * width)
     wi = surface.frame.to_local(surface.towards)
     directional = []
     for row in beams:
         towards = [direction_in_world(beam, camera) for beam, camera in zip(row, surface.cameras, strict=True)]
-        world = _points(mi.Vector3f, np.repeat(np.stack(towards), height * width, axis=0))
-        strength = np.repeat(np.array([beam.irradiance for beam in row]), height * width, axis=0)
+        world = _each(mi.Vector3f, np.stack(towards), camera_of)
+        strength = _each(mi.Color3f, np.array([beam.irradiance for beam in row]), camera_of)
         seen = mi.Bool(valid)
         if shadows:
             seen &= ~traced.scene.ray_test(surface.point.spawn_ray(world), active=valid)
-        directional.append((surface.frame.to_local(world), dr.select(seen, _points(mi.Color3f, strength), 0)))
+        directional.append((surface.frame.to_local(world), dr.select(seen, strength, 0)))
     dr.eval(wi, directional, valid)
     return Lit((height * len(surface.cameras), width), wi, valid, tuple(directional), ambient)
 
@@ -244,16 +242,30 @@ def _integrator_class() -> type:
     return Deferred
 
 
-def _directions(camera: Camera) -> Float[np.ndarray, "n 3"]:
-    """Unit world directions through the pixel centres, row by row."""
-    xy = (pixel_centres(camera.size).reshape(-1, 2) - np.asarray(camera.centre)) / camera.focal
-    right, down, forward = camera.world_from_cam[:3, :3].T
-    world = xy[:, :1] * right + xy[:, 1:] * down + forward
-    return world / np.sqrt((world * world) @ np.ones((3, 1)))
+def _rays(cameras: Sequence[Camera]) -> Any:
+    """Rays with unit directions through the pixel centres of equal cameras, camera after camera, row by row."""
+    import drjit as dr
+    import mitsuba as mi
+
+    height, width = cameras[0].size
+    lane = dr.arange(mi.UInt32, len(cameras) * height * width)
+    camera_of, pixel = lane // (height * width), lane % (height * width)
+    # (column + 0.5 - centre) / focal = column · a + b, with b from float64: a crop's centre may lie far outside it.
+    scales = np.array([[1 / c.focal, (0.5 - c.centre[0]) / c.focal, (0.5 - c.centre[1]) / c.focal] for c in cameras])
+    scale = _each(mi.Vector3f, scales, camera_of)
+    x, y = dr.fma(pixel % width, scale.x, scale.y), dr.fma(pixel // width, scale.x, scale.z)
+    axes = np.stack([camera.world_from_cam[:3, :3].T for camera in cameras])
+    right, down, forward = (_each(mi.Vector3f, axes[:, k], camera_of) for k in range(3))
+    origin = _each(mi.Point3f, np.stack([camera.position for camera in cameras]), camera_of)
+    return mi.Ray3f(origin, dr.normalize(x * right + y * down + forward))
 
 
-def _points(kind: Any, values: Float[np.ndarray, "n 3"]) -> Any:
-    return kind(np.ascontiguousarray(values.T, np.float32))
+def _each(kind: Any, values: Float[np.ndarray, "c 3"], camera_of: Any) -> Any:
+    """A vector per camera, for each of its pixels."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return dr.gather(kind, mi.Float(np.ascontiguousarray(values, np.float32).ravel()), camera_of)
 
 
 def _tangent_frame(point: Any, barycentric: Any, tangents: Float[np.ndarray, "f 3 4"]) -> Any:

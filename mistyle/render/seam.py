@@ -1,29 +1,30 @@
-"""Where torch's gradients meet Mitsuba's: maps (torch) ⇄ image (torch), through `mi.render` and one `dr.wrap`.
+"""Where torch's gradients meet Dr.Jit's: maps (torch) ⇄ image (torch), by a frozen split or through one `dr.wrap`.
 
 Torch owns the maps of every texture set, as one table of texels. A picture is made in two steps, each with a
 gradient whose bytes are the same in every run at any thread count:
 
 1. `taps` finds, once per traced surface, the four texels and weights of every pixel's bilinear fetch; `fetch` is a
    sparse matrix product, its gradient the product with the transpose, summed in a fixed order.
-2. A `Shader` renders the pixels' own materials: textures as large as the film, one texel per pixel, on the BSDF of
-   `render/scene.py`, by the integrator of `render/deferred.py`.
+2. A `Shader` shades the pixels' own materials, one texel per pixel: by the recorded functions of `render/split.py`,
+   or as textures as large as the film on the BSDF of `render/scene.py`, by the integrator of `render/deferred.py`.
 
 Mitsuba's own gradient of a shared texture adds up with atomics, in another order each run.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
 from mistyle.core.maps import flat_maps
-from mistyle.render import deferred, device
+from mistyle.render import deferred, device, split
 from mistyle.render import scene as scenery
 
 CHANNELS = {"albedo": 3, "normal": 3, "roughness": 1, "metallic": 1}
+Bridge = Literal["frozen", "wrap"]
 
 
 @dataclass(frozen=True)
@@ -68,17 +69,43 @@ def taps(surface: deferred.Surface, sizes: Sequence[tuple[int, int]]) -> Taps:
 
 def fetch(values: Any, where: Taps) -> Any:
     """Texel values (t, c), in the order of `where.texels`, to pixel values (n, c), torch to torch with a gradient."""
-    return _sparse_product().apply(values, where.matrix)
+    return _functions()["sparse"].apply(values, where.matrix)
 
 
 class Shader:
-    """A Mitsuba scene that shades a film of `size` pixels; reused, because building one costs more than rendering it.
+    """Shades a film of `size` pixels by one of two bridges between torch and Dr.Jit that give the same numbers.
 
-    One picture at a time: its gradient must be taken before the next call.
+    "frozen" replays a recorded forward and a recorded backward (`render/split.py`); "wrap" is its plain twin, Mitsuba's
+    own BSDF and `mi.render` behind one `dr.wrap`, traced anew at each call. Reused, because building one costs more
+    than rendering it. One picture at a time: its gradient must be taken before the next call.
     """
 
-    def __init__(self, size: tuple[int, int], *, gloss: bool = True) -> None:
+    def __init__(self, size: tuple[int, int], *, gloss: bool = True, bridge: Bridge = "frozen") -> None:
         """`gloss` False leaves out the reflection at the surface of dielectrics: what remains is the paint's colour."""
+        if bridge not in ("frozen", "wrap"):
+            raise ValueError(f"bridge is {bridge!r}; expected 'frozen' or 'wrap'")
+        self.size = size
+        self._bridge: Any = _Wrapped(size, gloss) if bridge == "wrap" else split.Split(gloss=gloss)
+
+    def __call__(self, lit: deferred.Lit, pixels: Any, moving: Sequence[str] = ()) -> Any:
+        """Linear radiance (rows, columns, 3) of the lit film, a torch tensor, with a gradient for the maps `moving`.
+
+        `pixels` (n, 8) holds the maps of CHANNELS side by side: albedo 3 and metallic linear 0..1, normal 3 a
+        tangent-space vector of any length, roughness.
+        """
+        if lit.size != self.size:
+            raise ValueError(f"the film has {self.size} pixels, the lit surface {lit.size}")
+        if isinstance(self._bridge, _Wrapped):
+            return self._bridge(lit, pixels, moving)
+        if not moving:
+            pixels = pixels.detach()
+        return _functions()["shaded"].apply(pixels, self._bridge, lit, tuple(moving)).reshape(*self.size, 3)
+
+
+class _Wrapped:
+    """A Mitsuba scene with textures as large as the film, differentiated through `dr.wrap`."""
+
+    def __init__(self, size: tuple[int, int], gloss: bool) -> None:
         import drjit as dr
         import mitsuba as mi
 
@@ -105,31 +132,24 @@ class Shader:
         self.parameters.keep(list(self.names.values()))
         self._render = dr.wrap(source="torch", target="drjit")(self._draw)
 
-    def __call__(self, lit: deferred.Lit, materials: Mapping[str, Any]) -> Any:
-        """Linear radiance (rows, columns, 3) of the lit film, a torch tensor with a gradient.
-
-        `materials` holds a tensor (n, c) per name of CHANNELS: albedo and metallic linear 0..1, normal a tangent-space
-        vector of any length, roughness. Gradients flow to those that ask for them.
-        """
+    def __call__(self, lit: deferred.Lit, pixels: Any, moving: Sequence[str]) -> Any:
         import mitsuba as mi
 
-        if lit.size != self.size:
-            raise ValueError(f"the film has {self.size} pixels, the lit surface {lit.size}")
         self.integrator.lit = lit
-        moving = {}
-        for name, channels in CHANNELS.items():
-            image = materials[name].reshape(*self.size, channels)
+        wanted = {}
+        for name, values in zip(CHANNELS, pixels.split(list(CHANNELS.values()), dim=1), strict=True):
+            image = values.reshape(*self.size, -1)
             if name == "normal":
                 image = image * 0.5 + 0.5
-            if image.requires_grad:
+            if name in moving:
                 # A fresh tensor: Dr.Jit works on torch's memory, and does not recognise nn.Parameter.
-                moving[name] = image.clone()
+                wanted[name] = image.clone()
             else:
                 self.parameters[self.names[name]] = mi.TensorXf(image.detach().contiguous().numpy())
-        if not moving:
+        if not wanted:
             return self._still()
         # Dr.Jit's wrapper makes every float argument ask for gradients, so only those that move are arguments.
-        return self._render(moving).clone()
+        return self._render(wanted).clone()
 
     def _draw(self, moving: dict[str, Any]) -> Any:
         import mitsuba as mi
@@ -161,10 +181,10 @@ def _each(description: Any, plugin: str, changes: Mapping[str, Any]) -> None:
             _each(value, plugin, changes)
 
 
-def _sparse_product() -> Any:
-    """torch's Function for `matrix @ values`; built at the first use, because importing torch takes seconds."""
-    global _product
-    if _product is None:
+def _functions() -> dict[str, Any]:
+    """torch's Functions for `matrix @ values` and for the frozen split; built at the first use, because importing torch
+    takes seconds."""
+    if not _made:
         import torch
 
         class SparseProduct(torch.autograd.Function):
@@ -177,8 +197,20 @@ def _sparse_product() -> Any:
             def backward(ctx: Any, *grads: Any) -> Any:
                 return torch.from_numpy(ctx.matrix.T @ grads[0].numpy()), None
 
-        _product = SparseProduct
-    return _product
+        class Shaded(torch.autograd.Function):
+            @staticmethod
+            def forward(ctx: Any, packed: Any, split: Any, lit: Any, moving: Any) -> Any:
+                ctx.arguments = split, lit, packed.detach().numpy(), moving
+                return torch.from_numpy(split.image(lit, ctx.arguments[2]))
+
+            @staticmethod
+            def backward(ctx: Any, *grads: Any) -> Any:
+                split, lit, packed, moving = ctx.arguments
+                gradient = split.pull(lit, packed, grads[0].contiguous().numpy(), moving)
+                return torch.from_numpy(gradient), None, None, None
+
+        _made.update(sparse=SparseProduct, shaded=Shaded)
+    return _made
 
 
-_product: Any = None
+_made: dict[str, Any] = {}

@@ -14,8 +14,20 @@ from typing import Any
 
 from mistyle import __version__
 from mistyle.core.errors import MistyleError, Stopped, UsageError
+from mistyle.run.cli_batch import add_batch
+from mistyle.run.cli_compare import add_compare, add_converge
+from mistyle.run.cli_export import add_export
 from mistyle.run.cli_fit import add_fit
-from mistyle.run.options import add_job_options, add_mesh_options, examples, said_settings
+from mistyle.run.cli_models import GENERATIVE_OPTIONS, add_generative_options, add_models
+from mistyle.run.cli_train import add_train
+from mistyle.run.options import (
+    PAINT_OPTIONS,
+    add_job_options,
+    add_mesh_options,
+    add_paint_options,
+    examples,
+    said_settings,
+)
 
 Command = Callable[[argparse.Namespace], int]
 
@@ -33,6 +45,8 @@ def parser() -> argparse.ArgumentParser:
             mistyle render bunny.obj -o views/                      the 16 views of the paper, with depth and normals
             mistyle bake bunny.obj views/ -o baked/                 edited views back onto the texture
             mistyle fit chair.glb photographs/ -o fitted/           albedo, normal and roughness from pictures
+            mistyle batch jobs.toml -o OUT/                         hundreds of them, resumable, on a farm too
+            mistyle compare a.exr b.exr -o diff/                    how two renders differ, to look at and as a gate
             mistyle doctor                                          what this machine has, what is missing
             """
         ),
@@ -44,6 +58,12 @@ def parser() -> argparse.ArgumentParser:
     _add_render(verbs)
     _add_bake(verbs)
     add_fit(verbs)
+    add_train(verbs)
+    add_models(verbs)
+    add_compare(verbs)
+    add_converge(verbs)
+    add_batch(verbs)
+    add_export(verbs)
     doctor = verbs.add_parser(
         "doctor", help="what was found on this machine, what is missing, and the command that fixes it"
     )
@@ -56,7 +76,9 @@ def parser() -> argparse.ArgumentParser:
 
 
 def _add_view_options(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("--rig", help="paper (16 views), turntable, or a camera.json / transforms.json")
+    verb.add_argument(
+        "--rig", help="paper (16 views), nbv (as few as the mesh needs), turntable, or a camera.json / transforms.json"
+    )
     verb.add_argument("--resolution", type=int, metavar="N", help="pixels along each side of a view")
     verb.add_argument("--spp", type=int, metavar="N", help="samples per pixel of the rendered views")
     verb.add_argument(
@@ -69,6 +91,12 @@ def _add_view_options(verb: argparse.ArgumentParser) -> None:
 
 def _add_style_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--name", help="name of the asset (default MESH_STYLE)")
+    verb.add_argument(
+        "--stylizer",
+        choices=["embedded", "embedded-view", "diffusion"],
+        help="embedded (default) paints the surface once; embedded-view paints view after view, each from those "
+        "before; diffusion does so with SDXL (needs models)",
+    )
     verb.add_argument("--atlas", type=int, metavar="N", help="texture size")
     verb.add_argument(
         "--samples", type=int, metavar="N", help="surface samples of the stylizer: more means finer strokes"
@@ -76,6 +104,8 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--stroke-scale", type=float, metavar="X", help="size of the strokes on the surface, 1 is the default"
     )
+    add_paint_options(verb)
+    add_generative_options(verb)
     verb.add_argument(
         "--refine", choices=["off", "normal-roughness", "all"], help="which maps the differentiable fit may change"
     )
@@ -84,6 +114,9 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
         "--vgg", type=Path, metavar="FILE", help="VGG-19 weights (.safetensors or .pth) for the style loss"
     )
     verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
+    verb.add_argument(
+        "--variations", type=int, metavar="N", help="only try N seeds and stroke sizes, quickly, on one contact sheet"
+    )
     verb.add_argument("--dry-run", action="store_true", help="print the plan with estimated time and disk, and stop")
 
 
@@ -95,6 +128,8 @@ def _add_stylize(verbs: Any) -> None:
             """
             mistyle stylize bunny.obj starry_night.jpg -o out/
             mistyle stylize chair.glb great_wave.jpg -o out/ --preset draft --atlas 1024
+            mistyle stylize spot.obj great_wave.jpg -o out/ --variations 4
+            mistyle stylize chair.glb great_wave.jpg -o out/ --style seat=gold.jpg --stroke-size 3cm
             mistyle stylize helmet.glb woodcut.jpg -o out/ --uv keep --metallic keep --refine normal-roughness
             mistyle stylize bunny.obj starry_night.jpg -o out/ --from fit --set fit.iterations2=100
             mistyle stylize --preset paper --print-config > job.toml
@@ -129,6 +164,7 @@ def _add_render(verbs: Any) -> None:
             """
             mistyle render bunny.obj -o views/
             mistyle render bunny.obj -o turn/ --rig turntable --resolution 512 --spp 64
+            mistyle render chair.glb -o views/ --rig nbv --set rig.most_views=16
             mistyle render chair.glb -o views/ --rig transforms.json --paper-files
             """
         ),
@@ -173,8 +209,11 @@ OPTIONS = {
     "scene": "draw.scene",
     "paper_files": "draw.paper_files",
     "atlas": "atlas.size",
+    "stylizer": "stylizer",
     "samples": "surface.samples",
     "stroke_scale": "surface.style_scale",
+    **PAINT_OPTIONS,
+    **GENERATIVE_OPTIONS,
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",
@@ -192,7 +231,7 @@ def _rig(options: argparse.Namespace) -> dict[str, Any]:
     rig = getattr(options, "rig", None)
     if rig is None:
         return {}
-    if rig in ("paper", "turntable"):
+    if rig in ("paper", "nbv", "turntable"):
         return {"rig": {"kind": rig}}
     return {"rig": {"kind": "file", "file": rig}}
 
@@ -234,6 +273,12 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     if options.dry_run:
         estimate = plan(job)
         print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
+        return 0
+    if options.variations:
+        from mistyle.run.variations import sheet
+
+        made = sheet(mesh, style, options.out, settings, options.variations, Progress())
+        print(json.dumps(made) if options.json else "\n".join([f"sheet     {made['sheet']}", *made["variations"]]))
         return 0
     summary = stylize(job, Progress())
     if options.json:

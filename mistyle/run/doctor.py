@@ -195,7 +195,10 @@ def _weights() -> Row:
     path = os.environ.get("MISTYLE_VGG", "")
     if path and Path(path).is_file():
         return Row("VGG-19 weights", path, "ok")
-    fix = "mistyle stylize … --vgg FILE (.safetensors or .pth)"
+    fix = (
+        "put VGG-19 anywhere (.safetensors or .pth, in torchvision's layer order or the normalised one of Li et al.) "
+        "and name it: export MISTYLE_VGG=FILE, or mistyle stylize … --vgg FILE"
+    )
     if path:
         return Row("VGG-19 weights", f"MISTYLE_VGG names {path}, which is not there", "optional", fix)
     return Row("VGG-19 weights", "none; the embedded features are used, which need none", "optional", fix)

@@ -39,6 +39,64 @@ def add_job_options(
     verb.add_argument("--print-config", action="store_true", help="print every setting as TOML and stop")
 
 
+# Option -> dotted setting, for `add_paint_options`.
+PAINT_OPTIONS = {
+    "style_slot": "coat.slots",
+    "style_mask": "coat.style_mask",
+    "protect": "coat.protect",
+    "stroke_size": "coat.stroke_size",
+    "keep_content": "surface.keep_content",
+    "palette_mix": "surface.palette_mix",
+    "direction": "surface.direction",
+}
+UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "": 1.0}
+
+
+def length(text: str) -> float:
+    """'3cm', '30mm', '0.03m' in metres; a bare number is in the mesh's own units, which are taken for metres."""
+    number = text.rstrip("cm")
+    unit = text[len(number) :]
+    try:
+        return float(number) * UNITS[unit]
+    except (ValueError, KeyError):
+        raise argparse.ArgumentTypeError(f"'{text}' is no length; write 3cm, 30mm, 0.03m or a bare number") from None
+
+
+def add_paint_options(verb: argparse.ArgumentParser) -> None:
+    """What a person may say about the paint itself."""
+    verb.add_argument(
+        "--style",
+        dest="style_slot",
+        action="append",
+        metavar="SLOT=PICTURE",
+        help="another picture for a material of the mesh, or for the light parts of a mask in its UVs (repeatable)",
+    )
+    verb.add_argument(
+        "--style-mask", type=Path, metavar="MASK", help="use only the parts of the style where this picture is light"
+    )
+    verb.add_argument(
+        "--protect", type=Path, metavar="MASK", help="picture in the mesh's UVs: light parts keep their own look"
+    )
+    verb.add_argument(
+        "--stroke-size",
+        type=length,
+        metavar="3cm",
+        help="width of a stroke (a 32nd of the picture) on the mesh, so that a set of props matches",
+    )
+    verb.add_argument(
+        "--keep-content", type=float, metavar="0..1", help="how much the mesh's own texture rules light and dark"
+    )
+    verb.add_argument(
+        "--palette-mix",
+        type=float,
+        metavar="0..1",
+        help="1 gives rare colours of the picture as much room as common ones",
+    )
+    verb.add_argument(
+        "--direction", choices=["curvature", "up", "around"], help="what strokes follow (default: the form)"
+    )
+
+
 def add_mesh_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--uv",

@@ -131,7 +131,9 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
     )
     stylized = Step(
         "Stylized views",
-        "The surface is painted once, so the views agree by construction.",
+        "The surface is painted once, so the views agree by construction."
+        if made.job.settings.stylizer == "embedded"
+        else "Views are painted one after another; what earlier ones show of a view is kept in it.",
         "4.1.3",
         shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.stylized),
         columns=8,

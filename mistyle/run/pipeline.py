@@ -4,7 +4,7 @@ Each stage is kept in the run folder under a key made of its inputs, its setting
 so that a killed run goes on from the last finished stage and a changed setting redoes only what depends on it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,15 +12,21 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset, Picture
-from mistyle.core.camera import Camera, resized, rig
+from mistyle.core.camera import Camera, rig
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.maps import Maps, Texels
-from mistyle.core.mesh import face_areas
+from mistyle.core.mesh import Mesh, face_areas
 from mistyle.core.view import View
+from mistyle.run.generative import check as check_generative
+from mistyle.run.generative import inpainter_inputs, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import ReadSettings, Settings, thread_count
 from mistyle.run.stages import Job, Run
+from mistyle.stages.coat import Coats
+from mistyle.surface.guides import Content
+from mistyle.surface.lookup import Solution
+from mistyle.surface.settings import CoatSettings
 
 
 @dataclass(frozen=True)
@@ -90,6 +96,11 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
 
     files = input_files(job.mesh)
     style = read_picture(job.style)
+    check_generative(job.settings, progress.say)
+    if job.settings.stylizer != "embedded":
+        from mistyle.run.sweep import refuse_what_is_not_kept
+
+        refuse_what_is_not_kept(job.settings)
     with Run(job, progress) as run:
         start_engines(job.settings)
         made = _stages(run, files, style)
@@ -111,21 +122,40 @@ def _stages(run: Run, files: Sequence[Path], style: Picture) -> Made:
     )
     atlas = run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
     views = views_stage(run, asset, atlas)
-    solution = run.record(
-        "surface", ["mesh"], [style.rgb, style.alpha, s.surface, seed], lambda r: paint(asset, style, s, r)
-    )
-    baked = run.record(
-        "bake", ["texels", "views", "surface"], [s.bake], lambda r: bake(asset, solution, atlas, views, s, r)
-    )
-    stylized = stylized_stage(run, asset, baked, views)
+    baked, stylized = painted_stages(run, asset, style, atlas, views)
     fitted = run.record("fit", ["bake", "stylized"], [s.fit, seed], lambda r: fit(asset, atlas, baked, stylized, s, r))
     repaired = run.record(
-        "repair", ["fit"], [s.repair, seed], lambda r: repair(asset, atlas, baked, views, solution, fitted, s, r)
+        "repair",
+        ["fit"],
+        [s.repair, seed, *inpainter_inputs(s, style)],
+        lambda r: repair(asset, style, atlas, baked, views, fitted, s, r),
     )
     folder = run.stage(
         "asset", ["repair"], [run.job.name], lambda f, r: write_asset(f, run.job, asset, atlas, repaired.maps, r)
     )
     return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder)
+
+
+def painted_stages(
+    run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
+) -> tuple[Baked, list[View]]:
+    """From the style to the painted texture and its views: the stages 'surface', 'bake' and 'stylized'."""
+    s, seed = run.job.settings, run.job.settings.seed
+    if s.stylizer != "embedded":
+        from mistyle.run.sweep import swept_stages
+
+        return swept_stages(run, asset, style, atlas, views)
+    coats = run.record(
+        "surface",
+        ["texels"],
+        [style.rgb, style.alpha, s.surface, s.coat, coat_files(s.coat), seed],
+        lambda r: coat(asset, style, atlas, s, r),
+    )
+    baked = run.record(
+        "bake", ["views", "surface"], [s.bake, s.fit.refine], lambda r: bake(asset, coats, atlas, views, s, r)
+    )
+    stylized = stylized_stage(run, asset, baked, views)
+    return baked, stylized
 
 
 def read(path: Path, chosen: ReadSettings, size: int, report: Report) -> Asset:
@@ -148,8 +178,14 @@ def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:
     return Atlas(tuple(texels), tuple(start))
 
 
-def cameras_of(settings: Settings) -> list[Camera]:
-    """The rig in visiting order, from the settings or from a file."""
+def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> list[Camera]:
+    """The rig in visiting order, from the settings, from a file, or made for the mesh (then it says what it sees)."""
+    if settings.rig.kind == "nbv":
+        from mistyle.stages.rigs import next_best_views
+
+        planned = next_best_views(mesh, settings.rig)
+        say(planned.sentence())
+        return list(planned.cameras)
     if settings.rig.kind != "file":
         return rig(settings.rig)
     from mistyle.files.cameras import read_cameras
@@ -164,27 +200,63 @@ def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:
 
     s = run.job.settings
     inputs = [s.rig, s.rig.file, s.draw, s.draw.scene, s.seed]
-    folder = run.stage("views", ["texels"], inputs, lambda f, r: draw(f, asset, atlas.start, s, r))
+    folder = run.stage("views", ["texels"], inputs, lambda f, r: draw(f, asset, atlas.start, s, r, run.progress.say))
     return read_views(folder)
 
 
-def draw(folder: Path, asset: Asset, maps: Sequence[Maps], settings: Settings, report: Report) -> None:
+def draw(
+    folder: Path, asset: Asset, maps: Sequence[Maps], settings: Settings, report: Report, say: Callable[[str], None]
+) -> None:
     """Render the views and write them with their cameras and lights."""
     from mistyle.core.light import lights
     from mistyle.files.views import write_views
     from mistyle.render.draw import draw_views
 
     template = settings.draw.scene or "paper_views"
-    views = draw_views(asset.mesh, maps, cameras_of(settings), template, settings.draw.spp, settings.seed, report)
+    cameras = cameras_of(settings, asset.mesh, say)
+    views = draw_views(asset.mesh, maps, cameras, template, settings.draw.spp, settings.seed, report)
     # What lit these very views, so that they can be fitted to.
     write_views(folder, views, lights(str(template)), paper_files=settings.draw.paper_files)
 
 
-def paint(asset: Asset, style: Picture, settings: Settings, report: Report) -> Any:
-    """The embedded stylizer: the whole surface painted once."""
+def coat_files(chosen: CoatSettings) -> list[Path]:
+    """The files that a coat names: their contents count, not their names."""
+    named = [chosen.style_mask, chosen.protect]
+    for slot in chosen.slots:
+        name, _, picture = slot.rpartition("=")
+        named += [Path(name), Path(picture)]
+    return [path for path in named if path is not None and path.is_file()]
+
+
+def paint(asset: Asset, style: Picture, settings: Settings, report: Report, content: Content | None = None) -> Solution:
+    """The surface painted once with one picture; `content` is the lightness of a texture that it has already."""
     from mistyle.backends.embedded import solve_surface
 
-    return solve_surface(asset.mesh, style, settings.surface, settings.seed, progress=report)
+    return solve_surface(asset.mesh, style, settings.surface, settings.seed, progress=report, content=content)
+
+
+def coat(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Coats:
+    """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
+    from mistyle.files.read import read_picture
+    from mistyle.stages.coat import content, masked_style, scaled, slot_masks
+
+    surface = scaled(settings.surface, asset, settings.coat.stroke_size)
+    settings = settings.model_copy(update={"surface": surface})
+    paths, masks = slot_masks(asset, atlas.texels, settings.coat.slots)
+    pictures = [masked_style(style, settings.coat.style_mask), *(read_picture(path) for path in paths)]
+    choice = [np.zeros(texels.covered.shape, np.int32) for texels in atlas.texels]
+    for number, chosen in enumerate(masks, start=1):
+        for texels_of, mask in zip(choice, chosen, strict=True):
+            texels_of[mask] = number
+    found = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
+    solutions = []
+    for k, picture in enumerate(pictures):
+
+        def part_done(done: float, k: int = k) -> None:
+            report((k + done) / len(pictures))
+
+        solutions.append(paint(asset, picture, settings, part_done, found))
+    return Coats(tuple(solutions), tuple(choice))
 
 
 def texel_side(asset: Asset, part: int, texels: Texels) -> float:
@@ -193,24 +265,54 @@ def texel_side(asset: Asset, part: int, texels: Texels) -> float:
     return float(np.sqrt(area / max(int(texels.covered.sum()), 1)))
 
 
-def bake(asset: Asset, solution: Any, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report) -> Baked:
+def bake(asset: Asset, coats: Coats, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report) -> Baked:
     """Section 4.1.4 for a painted surface: texels look the painting up directly; the views say who sees what."""
-    from mistyle.backends.embedded import surface_colour
     from mistyle.stages.backproject import backproject
-    from mistyle.stages.texels import pad
 
-    maps, seen = [], []
-    for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
-        albedo = np.zeros_like(start.albedo)
-        at = texels.covered
-        albedo[at] = linear_from_srgb(
-            surface_colour(solution, texels.position[at], texels.normal[at], footprint=texel_side(asset, part, texels))
-        )
-        albedo = pad(albedo, texels, settings.atlas.padding)
-        maps.append(replace(start, albedo=albedo, known=texels.covered))
+    maps, seen = painted(asset, coats, atlas, settings), []
+    for part, texels in enumerate(atlas.texels):
         seen.append(backproject(views, texels, settings.bake, mesh=asset.mesh).seen)
         report((part + 1) / len(atlas.texels))
     return Baked(tuple(maps), tuple(seen))
+
+
+# Slope of the painting's relief and share of its gloss in maps that nothing refines.
+FINAL_HEIGHT, FINAL_GLOSS = 0.15, 1.0
+
+
+def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings) -> list[Maps]:
+    """The start maps with the painting's colours in place of the albedo, looked up for every covered texel, and where
+    asked for with its relief upon normal and roughness. A single solution paints everything."""
+    from mistyle.backends.embedded import surface_colour, surface_relief
+    from mistyle.stages.coat import first_maps, painted_mask, protected
+    from mistyle.stages.texels import pad
+
+    unfitted = settings.fit.refine == "off"
+    height, gloss = (
+        (full if unfitted else 0.0) if given is None else given
+        for given, full in ((settings.coat.height, FINAL_HEIGHT), (settings.coat.gloss, FINAL_GLOSS))
+    )
+    if isinstance(coats, Solution):
+        coats = Coats((coats,), tuple(np.zeros(texels.covered.shape, np.int32) for texels in atlas.texels))
+    maps = []
+    for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
+        side = texel_side(asset, part, texels)
+        albedo, gradient = np.zeros_like(start.albedo), np.zeros_like(start.albedo)
+        dull = np.zeros_like(start.roughness)
+        for number, solution in enumerate(coats.solutions):
+            at = texels.covered & (coats.choice[part] == number)
+            place = texels.position[at], texels.normal[at]
+            albedo[at] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
+            if height > 0 or gloss > 0:
+                gradient[at], dull[at] = surface_relief(solution, *place, footprint=side)
+        coated = replace(start, albedo=pad(albedo, texels, settings.atlas.padding), known=texels.covered)
+        if height > 0 or gloss > 0:
+            at = texels.covered
+            coated = first_maps(asset, coated, texels, gradient[at], dull[at], height, gloss)
+        if settings.coat.protect is not None:
+            coated = protected(coated, start, painted_mask(settings.coat.protect, texels))
+        maps.append(coated)
+    return maps
 
 
 def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) -> list[View]:
@@ -226,25 +328,10 @@ def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) 
 
 def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report, fine: int = 2) -> list[View]:
     """Each view with its rgb replaced by the albedo seen there, `fine` x `fine` samples a pixel, premultiplied."""
-    from mistyle.core.image import bilinear
-    from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.unlit import unlit
 
-    traced = tracer(asset.mesh)
-    result = []
-    for k, view in enumerate(views):
-        height, width = view.camera.size
-        hits = gbuffer(traced, resized(view.camera, (height * fine, width * fine)))
-        rgb = np.zeros((*hits.mask.shape, 3), np.float32)
-        for part, chosen in enumerate(maps):
-            at = hits.mask & (hits.part == part)
-            uv, (rows, columns) = hits.uv[at], chosen.roughness.shape
-            px = np.stack([uv[:, 0] * columns, (1 - uv[:, 1]) * rows], axis=1)
-            rgb[at] = bilinear(chosen.albedo, px, "repeat")
-        rgb = rgb.reshape(height, fine, width, fine, 3).mean(axis=(1, 3))
-        coverage = hits.mask.reshape(height, fine, width, fine).mean(axis=(1, 3), dtype=np.float32)
-        result.append(replace(view, rgb=rgb, coverage=coverage))
-        report((k + 1) / len(views))
-    return result
+    drawn = unlit(asset.mesh, maps, [view.camera for view in views], fine, report)
+    return [replace(view, rgb=rgb, coverage=share) for view, (rgb, share) in zip(views, drawn, strict=True)]
 
 
 def fit(asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View], settings: Settings, report: Report) -> Any:
@@ -256,33 +343,34 @@ def fit(asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View], sett
 
 def repair(
     asset: Asset,
+    style: Picture,
     atlas: Atlas,
     baked: Baked,
     views: Sequence[View],
-    solution: Any,
     fitted: Any,
     settings: Settings,
     report: Report,
 ) -> Repaired:
-    """Section 4.3: where the fit struggled or nothing was seen, ask the surface again and blend at the edges."""
-    from mistyle.backends.embedded import surface_colour
-    from mistyle.backends.fill import inpainter
+    """Section 4.3: where the fit struggled or nothing was seen, take the painting again, or let Paint3D paint; blend
+    at the edges."""
+    from mistyle.backends.fill import from_paint
+    from mistyle.stages.coat import painted_mask, protected
     from mistyle.stages.inpaint import repair as repair_part
     from mistyle.stages.inpaint import struggle_mask
 
+    network = texture_inpainter(settings, asset, style) if settings.inpainter == "paint3d" else None
     maps, masks = [], []
     for part, texels in enumerate(atlas.texels):
-        side = texel_side(asset, part, texels)
-
-        def colours(positions: np.ndarray, normals: np.ndarray, side: float = side) -> np.ndarray:
-            return linear_from_srgb(surface_colour(solution, positions, normals, footprint=side))
-
         mask = struggle_mask(fitted.struggle[part], fitted.touched[part], baked.seen[part], texels, settings.repair)
         rng = np.random.default_rng([settings.seed, part])
-        maps.append(repair_part(fitted.maps[part], mask, texels, inpainter(colours), settings.repair, rng))
+        again = network or from_paint(baked.maps[part].albedo)
+        maps.append(repair_part(fitted.maps[part], mask, texels, again, settings.repair, rng))
         masks.append(mask)
         report(0.3 * (part + 1) / len(atlas.texels))
     maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
+    if settings.coat.protect is not None:
+        own = [painted_mask(settings.coat.protect, texels) for texels in atlas.texels]
+        maps = [protected(m, start, mask) for m, start, mask in zip(maps, atlas.start, own, strict=True)]
     return Repaired(tuple(maps), tuple(masks))
 
 
@@ -355,7 +443,7 @@ def render_views(mesh: Path, out: Path, settings: Settings, progress: Progress) 
         asset = read(mesh, settings.read, settings.atlas.size, report)
         atlas = lay_out(asset, settings, lambda done: None)
     with progress.stage("views", "render the views") as report:
-        atomic_folder(out, lambda folder: draw(folder, asset, atlas.start, settings, report))
+        atomic_folder(out, lambda folder: draw(folder, asset, atlas.start, settings, report, progress.say))
     return sorted(out.iterdir())
 
 

@@ -14,13 +14,15 @@ from typing import Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, Paint3dSettings, TrainSettings
 from mistyle.core.camera import RigSettings
 from mistyle.core.errors import UsageError
 from mistyle.stages.backproject import BakeSettings
 from mistyle.stages.fit import FitSettings
 from mistyle.stages.inpaint import RepairSettings
+from mistyle.stages.mvst import SweepSettings
 from mistyle.stages.texels import AtlasSettings
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.surface.settings import CoatSettings, SurfaceSettings
 
 
 class ReadSettings(BaseModel):
@@ -67,16 +69,29 @@ class Settings(BaseModel):
         default=0, ge=0, le=1024, description="threads of the renderer and of torch; 0 takes all cores"
     )
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
-    stylizer: Literal["embedded"] = "embedded"
+    stylizer: Literal["embedded", "embedded-view", "diffusion"] = Field(
+        default="embedded",
+        description="embedded paints the surface once; embedded-view paints one view after another, each going on from "
+        "those before; diffusion does so with SDXL (needs models)",
+    )
+    inpainter: Literal["fill", "paint3d"] = Field(
+        default="fill", description="fill takes the painting again; paint3d is Stable Diffusion (needs models)"
+    )
     read: ReadSettings = ReadSettings()
     rig: RigSettings = RigSettings()
     draw: DrawSettings = DrawSettings()
     surface: SurfaceSettings = SurfaceSettings()
+    coat: CoatSettings = CoatSettings()
+    sweep: SweepSettings = SweepSettings()
     atlas: AtlasSettings = AtlasSettings()
     bake: BakeSettings = BakeSettings()
     fit: FitSettings = FitSettings()
     repair: RepairSettings = RepairSettings()
     report: ReportSettings = ReportSettings()
+    models: ModelSettings = ModelSettings()
+    train: TrainSettings = TrainSettings()
+    diffusion: DiffusionSettings = DiffusionSettings()
+    paint3d: Paint3dSettings = Paint3dSettings()
 
 
 # The three ways to run a job; the defaults of the records are the standard ones.
@@ -94,7 +109,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "draw": {"paper_files": True},
         "surface": {"samples": 1_000_000},
         "atlas": {"size": 4096},
-        "fit": {"iterations1": 400, "iterations2": 600, "crops": 8},
+        "fit": {"iterations1": 400, "iterations2": 600, "crops": 8, "lights": "together"},
+        "diffusion": {"content": "per-view"},
     },
 }
 # The demo has three minutes: the draft with finer strokes and a larger texture.

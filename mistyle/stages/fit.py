@@ -29,6 +29,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.core import memory
 from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.light import Lights, lights
 from mistyle.core.maps import Maps, Texels
@@ -99,7 +100,8 @@ def two_phase(
     for phase, rng in zip(phases, np.random.default_rng(seed).spawn(len(phases)), strict=True):
         if phase.iterations:
             share = (done / total, phase.iterations / total)
-            fit = _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress)
+            with memory.kept():
+                fit = _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress)
             done += phase.iterations
     return fit
 
@@ -181,7 +183,7 @@ def _phases(settings: FitSettings, directional: Lights, targets: Sequence[View])
     first = Phase(
         name="phase1",
         lights=directional,
-        one_by_one=flat,
+        one_by_one=flat and settings.lights == "one-per-view",
         clay=flat,
         gloss=True,
         rates=moving | ({"metallic": settings.rate_roughness} if settings.metallic == "fit" else {}),
@@ -230,7 +232,8 @@ def _relief_loss(settings: FitSettings) -> Loss:
         maps, wanted = losses.masked_features(features, shading, expected, mask, mask)
         result = {"style": settings.style1 * losses.style_aligned(maps, wanted, mask)}
         if settings.statistics:
-            result["statistics"] = settings.statistics * losses.style_statistics(maps, wanted, mask, mask)
+            distance = losses.style_statistics(maps, wanted, mask, mask, kind=settings.statistic, rng=rng)
+            result["statistics"] = settings.statistics * distance
         return result
 
     return loss
@@ -250,7 +253,7 @@ def _lit_loss(settings: FitSettings) -> Loss:
 
 
 def _colour_loss(settings: FitSettings) -> Loss:
-    """Phase 2: 15 style + 5 sliced Wasserstein in RGB (total variation is added by the table)."""
+    """Phase 2: 15 style + 5 sliced Wasserstein in RGB (total variation is added by the table; statistics on demand)."""
     from mistyle.measure import losses
 
     def loss(shot: Shot, features, rng):
@@ -259,9 +262,11 @@ def _colour_loss(settings: FitSettings) -> Loss:
         mine, theirs = colour.permute(0, 2, 3, 1)[chosen], shot.target.permute(0, 2, 3, 1)[chosen]
         distance = losses.sliced_wasserstein(mine, theirs, rng, settings.projections, settings.colour_samples)
         maps, wanted = losses.masked_features(features, colour, shot.target, shot.mask, shot.mask)
-        return {
-            "style": settings.style2 * losses.style_aligned(maps, wanted, shot.mask),
-            "colour": settings.colour2 * distance,
-        }
+        result = {"style": settings.style2 * losses.style_aligned(maps, wanted, shot.mask)}
+        result["colour"] = settings.colour2 * distance
+        if settings.statistics2:
+            distance = losses.style_statistics(maps, wanted, shot.mask, shot.mask, kind=settings.statistic, rng=rng)
+            result["statistics"] = settings.statistics2 * distance
+        return result
 
     return loss

@@ -138,8 +138,7 @@ def _draw(where: Bench, table: tuple, camera: Camera, lights: Lights, gloss: boo
     sizes, values = table
     pixels = torch.from_numpy(seam.bilinear(values, seam.taps(surface, sizes)))
     lit = deferred.light(where.traced, surface, lights, shadows=False)
-    split = pixels.split(list(seam.CHANNELS.values()), dim=1)
-    return where.shaders[gloss](lit, dict(zip(seam.CHANNELS, split, strict=True))).numpy()
+    return where.shaders[gloss](lit, pixels).numpy()
 
 
 def _exposed(picture: Float[np.ndarray, "h w 3"], view: View) -> Float[np.ndarray, "h w 3"]:

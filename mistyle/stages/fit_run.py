@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.camera import Camera, zoom
-from mistyle.core.light import Lights, direction_in_world
+from mistyle.core.image import luminance
+from mistyle.core.light import Directional, Lights, direction_in_world
 from mistyle.stages import fit_table
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.fit_table import Table
@@ -29,8 +30,8 @@ class Shot:
 
     render linear, target sRGB (n, 3, s, s); `plain` the same render with the normals and roughness of before the fit,
     where the phase asks for it; mask (n, 1, s, s) 0 or 1; position and normal (n, 3, s, s) world; `light`
-    (n, 3) the direction to the only light of each crop, where each has its own; `zoomed` crop pixels per pixel of the
-    view.
+    (n, 3) the direction to each crop's light, or to where the mean of its lights stands, None under ambient light;
+    `zoomed` crop pixels per pixel of the view.
     """
 
     render: Any
@@ -65,8 +66,8 @@ class Phase:
 
     name: str
     lights: Lights
-    one_by_one: bool  # each crop under one of the lights alone, in turn, and without shadows
-    clay: bool
+    one_by_one: bool  # each crop under one of the lights alone, in turn
+    clay: bool  # compared with a relief's shading under the crop's lights, so without shadows
     gloss: bool
     rates: Mapping[str, float]
     variation: Mapping[str, float]
@@ -93,9 +94,9 @@ class Run:
         """One step of Adam; where something is not a number nothing moves, and the note says which texel."""
         crops = self._crops()
         texels, pure, looks, crop_of = self._gradients(crops)
-        gradients = dict(pure)
+        gradients, near = dict(pure), fit_table.pairs(self.table, texels)
         for name, weight in self.phase.variation.items():
-            value, slope = fit_table.variation(self.table, name, texels)
+            value, slope = fit_table.variation(self.table, name, near)
             self._note(f"tv_{name}", weight * value)
             gradients[name] = gradients[name] + np.float32(weight) * slope * fit_table.nonzero(gradients[name])[:, None]
         bad = self._not_a_number(texels, gradients)
@@ -141,8 +142,9 @@ class Run:
 
         def picture(values: Mapping[str, np.ndarray], moving: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
             leaves = {n: torch.from_numpy(v[where.texels]).requires_grad_(n in moving) for n, v in values.items()}
-            pixels = {n: seam.fetch(v, where) for n, v in materials(leaves, self.phase.clay).items()}
-            return self.shader(lit, pixels).reshape(count, size, size, 3).permute(0, 3, 1, 2), leaves
+            pixels = seam.fetch(materials(leaves, self.phase.clay), where)
+            names = tuple("normal" if name == "tilt" else name for name in moving)
+            return self.shader(lit, pixels, names).reshape(count, size, size, 3).permute(0, 3, 1, 2), leaves
 
         plain = picture(self.table.start, {})[0] if self.phase.clay else None
         render, leaves = picture(self.table.values, self.phase.rates)
@@ -170,15 +172,18 @@ class Run:
 
         from mistyle.render import deferred
 
+        beams = [light for light in self.phase.lights if isinstance(light, Directional)]
         if not self.phase.one_by_one:
-            return deferred.light(self.world.traced, surface, self.phase.lights), None
-        beams = []
-        for _ in surface.cameras:
-            beams.append(self.phase.lights[self.beam % len(self.phase.lights)])
-            self.beam += 1
-        towards = [direction_in_world(beam, camera) for beam, camera in zip(beams, surface.cameras, strict=True)]
-        lit = deferred.light_each(self.world.traced, surface, beams, shadows=False)
-        return lit, torch.from_numpy(np.stack(towards).astype(np.float32))
+            lit = deferred.light(self.world.traced, surface, self.phase.lights, shadows=not self.phase.clay)
+            rows = [beams] * len(surface.cameras)
+        else:
+            first, self.beam = self.beam, self.beam + len(surface.cameras)
+            alone = [beams[k % len(beams)] for k in range(first, self.beam)]
+            lit, rows = deferred.light_each(self.world.traced, surface, alone, shadows=False), [[b] for b in alone]
+        if not beams:
+            return lit, None
+        towards = [_mean_direction(row, camera) for row, camera in zip(rows, surface.cameras, strict=True)]
+        return lit, torch.from_numpy(np.stack(towards))
 
     def _note(self, name: str, value: float) -> None:
         self.trace.setdefault(name, []).append(value)
@@ -208,23 +213,25 @@ class Run:
         )
 
 
+def _mean_direction(beams: Sequence[Directional], camera: Camera) -> Float[np.ndarray, "3"]:
+    """Where one light would stand that shades a matt surface as all of these do, up to its strength."""
+    strength = luminance(np.array([beam.irradiance for beam in beams], np.float32))
+    total = strength @ np.stack([direction_in_world(beam, camera) for beam in beams])
+    return (total / np.linalg.norm(total)).astype(np.float32)
+
+
 def shader(settings: FitSettings, gloss: bool) -> Any:
     """The film of one step's crops, one below the other."""
     from mistyle.render.seam import Shader
 
-    return Shader((settings.crops * settings.crop_size, settings.crop_size), gloss=gloss)
+    return Shader((settings.crops * settings.crop_size, settings.crop_size), gloss=gloss, bridge=settings.bridge)
 
 
-def materials(leaves: "Mapping[str, torch.Tensor]", clay: bool = False) -> "dict[str, torch.Tensor]":
-    """Texel values as the shader wants them: tilt becomes a unit normal, clay a constant albedo."""
+def materials(leaves: "Mapping[str, torch.Tensor]", clay: bool = False) -> "torch.Tensor":
+    """Texel values side by side as the shader wants them: tilt becomes a unit normal, clay a constant albedo."""
     import torch
 
     tilt = leaves["tilt"]
     z = (1 - tilt.square().sum(dim=1, keepdim=True)).clamp_min(1e-4).sqrt()
     albedo = torch.full_like(leaves["albedo"], CLAY) if clay else leaves["albedo"]
-    return {
-        "albedo": albedo,
-        "normal": torch.cat([tilt, z], dim=1),
-        "roughness": leaves["roughness"],
-        "metallic": leaves["metallic"],
-    }
+    return torch.cat([albedo, tilt, z, leaves["roughness"], leaves["metallic"]], dim=1)

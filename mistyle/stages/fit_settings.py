@@ -15,10 +15,18 @@ class FitSettings(BaseModel):
     painted: Literal["without-light", "with-light"] = Field(
         default="without-light", description="whether the stylized views show lit objects"
     )
+    lights: Literal["together", "one-per-view"] = Field(
+        default="one-per-view",
+        description="phase 1's lights, without light in the views: all at once (the paper's), or one a crop, in turn",
+    )
     metallic: Literal["keep", "zero", "fit"] = Field(
         default="keep", description="the asset's own metallic map (0 without one), 0, or moved by phase 1"
     )
     features: Path | None = Field(default=None, description="weights of VGG-19; none: the embedded filter bank")
+    bridge: Literal["frozen", "wrap"] = Field(
+        default="frozen",
+        description="between torch and Dr.Jit: recorded functions, or dr.wrap around mi.render (slower, same numbers)",
+    )
     iterations1: int = Field(default=200, ge=0, le=100_000, description="steps of phase 1: normal and roughness")
     iterations2: int = Field(default=300, ge=0, le=100_000, description="steps of phase 2: albedo")
     crops: int = Field(default=4, ge=1, le=64, description="crops per step")
@@ -33,7 +41,10 @@ class FitSettings(BaseModel):
     )
     style1: float = Field(default=1.0, ge=0, description="weight of the style loss in phase 1")
     statistics: float = Field(
-        default=0.001, ge=0, description="weight of the features' Gram matrices beside it, without light"
+        default=0.001, ge=0, description="weight of the features' statistics beside it, without light"
+    )
+    statistic: Literal["gram", "mean-std", "swd"] = Field(
+        default="gram", description="which: Gram matrices, mean and deviation, or sliced Wasserstein distance"
     )
     relief: float = Field(
         default=0.15, ge=0, le=1, description="slope of the strokes' flanks (root mean square), without light"
@@ -48,6 +59,7 @@ class FitSettings(BaseModel):
     tv_normal: float = Field(default=0.02, ge=0, description="weight of the normal's total variation")
     tv_roughness: float = Field(default=0.01, ge=0, description="weight of the roughness's total variation")
     style2: float = Field(default=15.0, ge=0, description="weight of the style loss in phase 2 (the paper's)")
+    statistics2: float = Field(default=0.0, ge=0, description="weight of the features' statistics in phase 2")
     tv_albedo: float = Field(
         default=0.05, ge=0, description="largest weight of the albedo's total variation, for a flat style"
     )

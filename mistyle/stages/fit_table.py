@@ -32,6 +32,7 @@ class Table:
 
     tilt is the tangent-space normal's x and y. `start` keeps the values before the fit. `right` and `below` say
     whether a texel's neighbour in the same set belongs to the same UV island. `steps` counts Adam's steps per texel.
+    `place` is -1 everywhere, scratch of `pairs`.
     """
 
     sizes: tuple[tuple[int, int], ...]
@@ -41,6 +42,7 @@ class Table:
     below: Bool[np.ndarray, " t"]
     columns: Int[np.ndarray, " t"]
     still: Bool[np.ndarray, " t"]
+    place: Int[np.ndarray, " t"]
     first: dict[str, Float[np.ndarray, "t c"]] = field(default_factory=dict)
     second: dict[str, Float[np.ndarray, "t c"]] = field(default_factory=dict)
     steps: dict[str, Int[np.ndarray, " t"]] = field(default_factory=dict)
@@ -96,6 +98,7 @@ def build(
         np.concatenate(below),
         np.concatenate(columns),
         np.concatenate(still),
+        np.full(len(start["albedo"]), -1, np.int64),
     )
 
 
@@ -114,23 +117,38 @@ def step(
 
     The step is rate · m / (sqrt(v) + DAMPING · root mean square of all gradients of this map so far).
     """
+    import torch
+
     if name not in table.first:
         shape = table.values[name].shape
         table.first[name], table.second[name] = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         table.steps[name] = np.zeros(shape[0], np.int32)
-    moving = nonzero(gradient) & ~table.still[texels]
-    rows, g = (texels, gradient) if moving.all() else (texels[moving], gradient[moving])
-    total, count = table.squares.get(name, (0.0, 0))
-    total, count = total + float(np.square(g, dtype=np.float64).sum()), count + g.size
+    moving = np.flatnonzero(nonzero(gradient) & ~table.still[texels])
+    # By torch, because it does such sums in place and on all cores.
+    slope = torch.from_numpy(np.ascontiguousarray(gradient)).index_select(0, torch.from_numpy(moving))
+    rows, count = texels[moving], slope.numel()
+    before = table.squares.get(name, (0.0, 0))
+    total, count = before[0] + float(torch.sum(slope * slope, dtype=torch.float64)), before[1] + count
     table.squares[name] = total, count
-    typical = np.float32(DAMPING * np.sqrt(total / max(count, 1)) + EPSILON)
-    table.steps[name][rows] += 1
-    age = table.steps[name][rows, None].astype(np.float32)
-    first = BETA1 * table.first[name][rows] + (1 - BETA1) * g
-    second = BETA2 * table.second[name][rows] + (1 - BETA2) * g * g
-    table.first[name][rows], table.second[name][rows] = first, second
-    size = first / (1 - BETA1**age) / (np.sqrt(second / (1 - BETA2**age)) + typical)
-    table.values[name][rows] = project(name, table.values[name][rows] - np.float32(rate) * size)
+    typical = DAMPING * np.sqrt(total / max(count, 1)) + EPSILON
+    at, age = torch.from_numpy(rows), table.steps[name][rows] + 1
+    table.steps[name][rows] = age
+    first, second, values = (torch.from_numpy(part[name]) for part in (table.first, table.second, table.values))
+    m = first.index_select(0, at).mul_(BETA1).add_(slope, alpha=1 - BETA1)
+    v = second.index_select(0, at).mul_(BETA2).addcmul_(slope, slope, value=1 - BETA2)
+    first.index_copy_(0, at, m)
+    second.index_copy_(0, at, v)
+    unbiased = [torch.from_numpy(_unbiased(beta, age)) for beta in (BETA1, BETA2)]
+    moved = m.mul_(unbiased[0]).div_(v.mul_(unbiased[1]).sqrt_().add_(typical)).mul_(-rate)
+    moved.add_(values.index_select(0, at))
+    values.index_copy_(0, at, torch.from_numpy(project(name, moved.numpy())))
+
+
+def _unbiased(beta: float, age: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 1"]:
+    """1 / (1 - beta^age): what makes a running mean of `age` numbers, begun at zero, a mean."""
+    powers = beta ** np.arange(int(age.max(initial=1)) + 1)
+    powers[0] = 0
+    return (1 / (1 - powers)).astype(np.float32)[age][:, None]
 
 
 def nonzero(gradient: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " n"]:
@@ -141,33 +159,59 @@ def nonzero(gradient: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " n"]:
     return result
 
 
-def variation(table: Table, name: str, texels: Int[np.ndarray, " n"]) -> tuple[float, Float[np.ndarray, "n c"]]:
-    """Total variation among the given texels (sorted) and its gradient: means of |difference| to the right and below.
+@dataclass(frozen=True)
+class Pairs:
+    """Neighbours among n texels of a step. Per direction (right, below): where each texel's next and previous one
+    stands among them, its own place where there is none in the same island; and how many pairs there are."""
+
+    texels: Int[np.ndarray, " n"]
+    next: tuple[Int[np.ndarray, " n"], ...]
+    previous: tuple[Int[np.ndarray, " n"], ...]
+    count: tuple[int, ...]
+
+
+def pairs(table: Table, texels: Int[np.ndarray, " n"]) -> Pairs:
+    """Which of the given texels (sorted) are neighbours in the same island."""
+    own = np.arange(len(texels))
+    table.place[texels] = own
+    following, preceding, count = [], [], []
+    for joined, stride in ((table.right, None), (table.below, table.columns)):
+        here = np.flatnonzero(joined[texels])
+        at = texels[here]
+        there = table.place[at + (1 if stride is None else stride[at])]
+        here, there = here[there >= 0], there[there >= 0]
+        ahead, behind = own.copy(), own.copy()
+        ahead[here], behind[there] = there, here
+        following.append(ahead)
+        preceding.append(behind)
+        count.append(len(here))
+    table.place[texels] = -1
+    return Pairs(texels, tuple(following), tuple(preceding), tuple(count))
+
+
+def variation(table: Table, name: str, near: Pairs) -> tuple[float, Float[np.ndarray, "n c"]]:
+    """Total variation among the texels of `near` and its gradient: means of |difference| to the right and below.
 
     Of the albedo as it is (the paper's L_TV(A)); of the other maps what the fit changed, or an asset's own normal map
     would be flattened. Only neighbours in the same island count. Written out instead of differentiated by torch, whose
     gradient of an indexed read adds up in any order.
     """
-    local = np.full(len(table.right), -1, np.int32)
-    local[texels] = np.arange(len(texels), dtype=np.int32)
-    values = table.values[name][texels]
+    import torch
+
+    at = torch.from_numpy(near.texels)
+    values = torch.from_numpy(table.values[name]).index_select(0, at)
     if name != "albedo":
-        values = values - table.start[name][texels]
-    gradient, total = np.zeros_like(values), 0.0
-    for joined in (table.right, table.below):
-        here = np.flatnonzero(joined[texels])
-        at = texels[here]
-        there = local[at + (1 if joined is table.right else table.columns[at])]
-        here, there = here[there >= 0], there[there >= 0]
-        if len(here) == 0:
+        values -= torch.from_numpy(table.start[name]).index_select(0, at)
+    gradient, total = torch.zeros_like(values), 0.0
+    for ahead, behind, count in zip(near.next, near.previous, near.count, strict=True):
+        if count == 0:
             continue
-        difference = values[there] - values[here]
-        total += float(np.abs(difference).mean(dtype=np.float64))
-        share = np.sign(difference) / np.float32(difference.size)
-        # In each direction a texel is at most once the first and at most once the second of a pair.
-        gradient[here] -= share
-        gradient[there] += share
-    return total, gradient
+        size = count * values.shape[1]
+        onward = values.index_select(0, torch.from_numpy(ahead)).sub_(values)
+        total += float(onward.abs().sum(dtype=torch.float64)) / size
+        backward = values.index_select(0, torch.from_numpy(behind)).sub_(values)
+        gradient.sub_(onward.sign_().add_(backward.sign_()), alpha=1 / size)
+    return total, gradient.numpy()
 
 
 def finished(table: Table, maps: Sequence[Maps], only: Sequence[Bool[np.ndarray, "h w"]] | None = None) -> list[Maps]:

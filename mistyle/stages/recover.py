@@ -19,7 +19,7 @@ from mistyle.core.capture import Captures
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.stages import recover_solve as solving
-from mistyle.stages.recover_check import usable, without
+from mistyle.stages.recover_check import trust, usable, without
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.recover_texels import Found, Work, solve_level
 
@@ -89,7 +89,7 @@ def recover(
     work = Work(traced, tangents_of(mesh, settings.frame), texels, where, captures, settings, notes)
     shade = Shade(
         traced, captures, where.sizes, model=settings.model, frame=settings.frame, subsamples=settings.subsamples,
-        shadows=settings.shadows, memory=settings.memory * 1e9,
+        shadows=settings.shadows, memory=settings.memory * 1e9, weights=trust(captures, indirect),
     )  # fmt: skip
     trace: dict[str, list[float]] = {}
     found = solve_level(work, shade, start, indirect, seed, trace, lambda done: progress(0.5 * done))

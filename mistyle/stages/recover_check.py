@@ -1,6 +1,9 @@
 """Which reference pictures say something, and what is taken off them."""
 
+from collections.abc import Callable
+
 import numpy as np
+from jaxtyping import Float
 
 from mistyle.core.camera import Camera, in_frame, px_from_world
 from mistyle.core.capture import Captures, Loaded, subset
@@ -10,6 +13,7 @@ from mistyle.core.light import Lights
 from mistyle.core.mesh import Mesh
 
 LEAST_VIEWS = 3
+DISTRUST = 10.0  # of indirect light: what a pixel counts is halved by one tenth of the direct light
 
 
 def usable(mesh: Mesh, captures: Captures, notes: list[str]) -> Captures:
@@ -66,3 +70,17 @@ def without(captures: Captures, indirect: dict[int, np.ndarray]) -> Captures:
         return rgb, mask
 
     return Captures(captures.cameras, captures.lights, load)
+
+
+def trust(captures: Captures, indirect: dict[int, np.ndarray]) -> Callable[[int], np.ndarray]:
+    """Weights of a picture's pixels, 0..1: a half where a tenth of what came directly was taken off as indirect."""
+
+    def weights(k: int) -> Float[np.ndarray, "h w"]:
+        size = captures.cameras[k].size
+        if k not in indirect:
+            return np.ones(size, np.float32)
+        taken = resize(indirect[k], size).max(axis=-1)
+        direct = np.maximum(np.nan_to_num(captures.load(k)[0]).max(axis=-1), 0)
+        return (direct / np.maximum(direct + DISTRUST * taken, 1e-9)).astype(np.float32)
+
+    return weights

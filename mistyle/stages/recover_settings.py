@@ -19,7 +19,10 @@ class RecoverSettings(BaseModel):
     frame: Literal["mikkt", "mitsuba"] = Field(
         default="mikkt", description="frame of the normal map: MikkTSpace as engines have it, or Mitsuba 3.9's per face"
     )
-    metallic: bool = Field(default=False, description="fit metallic too; without it the start's is kept (0 if none)")
+    metallic: bool = Field(
+        default=False,
+        description="fit metallic too, as 0 or 1 where little speaks for between; else the start's is kept (0 if none)",
+    )
     solver: Literal["both", "texels", "pictures"] = Field(
         default="both",
         description="texel by texel (Levenberg-Marquardt), then whole pictures (Adam), or one of them alone",

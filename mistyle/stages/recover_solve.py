@@ -9,7 +9,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels
@@ -19,7 +19,11 @@ from mistyle.stages.recover_settings import RecoverSettings
 
 # Where a texel is thought to be before anything was seen, and how far from there (standard deviations).
 PRIOR_MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.5, 0.0)
-PRIOR_SPREAD = (1.0, 1.0, 1.0, 0.6, 0.6, 0.8, 0.8)
+PRIOR_SPREAD = (1.0, 1.0, 1.0, 0.6, 0.6, 0.8, 0.2)
+METAL_SPREAD = 0.1  # of metallic about 0 or 1: surfaces are metal or not, and few are in between
+# What having no colour at all costs what is no metal, from which albedo on it costs nothing, and after how many looks.
+BLACK_COST, PALEST_BLACK, OFTEN = 20.0, 0.02, 8
+METAL_COST = 10.0  # what being a metal costs: twice the logarithm of how much rarer metals are
 STARTS = (0.25, 0.7)  # roughness has local minima
 RESTARTS = 3  # rounds in which texels also try what their neighbours found
 MISFIT = 0.1  # cost per observation above which a texel has less to say to its neighbours
@@ -100,32 +104,49 @@ def neighbourhood(
 
 
 def first_solve(
-    problem: Problem, start: Values, mean: Values, settings: RecoverSettings, progress: Callable[[float], None]
+    problem: Problem,
+    start: Values,
+    mean: Values,
+    seen: Int[np.ndarray, " t"],
+    settings: RecoverSettings,
+    progress: Callable[[float], None],
 ) -> Solution:
-    """The best of several starts: `start` itself, and every roughness (and metallic) of a coarse grid."""
+    """The best of several starts: `start` itself, and every roughness of a coarse grid, as paint and as metal."""
     prior = np.tile(1 / np.array(PRIOR_SPREAD, np.float32) ** 2, (len(mean), 1)).astype(np.float32)
-    tries = [start]
-    for metal in (0.1, 0.9) if settings.metallic else (None,):
+    tries = [(start, mean)]
+    for metal in (0.0, 1.0) if settings.metallic else (None,):
         for roughness in STARTS:
-            other = mean.copy()
+            other, around = mean.copy(), mean.copy()
             other[:, 5] = roughness
             if metal is not None:
-                other[:, 6] = metal
-            tries.append(other)
+                other[:, 6], around[:, 6] = abs(metal - 0.1), metal
+            tries.append((other, around))
     tries = tries if not np.array_equal(start, mean) else tries[1:]
     solved = []
-    for k, each in enumerate(tries):
+    for k, (each, around) in enumerate(tries):
         done = lambda share, k=k: progress((k + share) / len(tries))  # noqa: E731
-        solved.append(problem.solve(each, mean, prior, settings.solver_iterations, done))
-    return best(solved, mean, prior)
+        solution = problem.solve(each, around, prior, settings.solver_iterations, done)
+        extra = unlikely(solution.values, seen) if settings.metallic else 0
+        solved.append((solution, penalty(solution.values, around, prior) + extra))
+    return best(solved)
 
 
-def best(solutions: Sequence[Solution], mean: Values, prior: Values) -> Solution:
-    """Texel by texel the solution of least cost with its prior; the first of equals."""
-    result = solutions[0]
-    least = result.cost + ((result.values - mean) ** 2 * prior).sum(axis=1)
-    for other in solutions[1:]:
-        cost = other.cost + ((other.values - mean) ** 2 * prior).sum(axis=1)
+def penalty(values: Values, mean: Values, prior: Values) -> Float[np.ndarray, " t"]:
+    """What a prior adds to the cost."""
+    return ((values - mean) ** 2 * prior).sum(axis=1)
+
+
+def unlikely(values: Values, seen: Int[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """What being a metal costs, and what looking black often and yet being none costs: paint is never that black."""
+    black = np.maximum(1 - values[:, :3].max(axis=1) / PALEST_BLACK, 0) * np.minimum(seen / OFTEN, 1)
+    return np.where(values[:, 6] > 0.5, METAL_COST, BLACK_COST * black).astype(np.float32)
+
+
+def best(solutions: Sequence[tuple[Solution, Float[np.ndarray, " t"]]]) -> Solution:
+    """Texel by texel the solution of least cost with its penalty; the first of equals."""
+    result, least = solutions[0][0], solutions[0][0].cost + solutions[0][1]
+    for other, extra in solutions[1:]:
+        cost = other.cost + extra
         better = cost < least
         least = np.where(better, cost, least)
         result = Solution(
@@ -164,11 +185,35 @@ def another_round(
     sure[gathered.seen == 0] = 1e-6
     mean = neighbourhood(solution.values, sure, gathered, where, BLUR)
     prior = np.full(mean.shape, 1 / settings.neighbours**2, np.float32)
-    solved = [problem.solve(solution.values, mean, prior, 5)]
+
+    def tried(start: Values, steps: int, metal: Float[np.ndarray, " t"]) -> tuple[Solution, Float[np.ndarray, " t"]]:
+        if not settings.metallic:
+            solved = problem.solve(start, mean, prior, steps)
+            return solved, penalty(solved.values, mean, prior)
+        around, weight, constant = _both(mean, prior, metal)
+        solved = problem.solve(start, around, weight, steps)
+        return solved, penalty(solved.values, around, weight) + constant + unlikely(solved.values, gathered.seen)
+
+    solved = [tried(solution.values, 5, _nearest(solution.values))]
     if number < RESTARTS:
         for roughness in (None, 0.15, 0.4, 0.8):
             other = mean.copy()
             if roughness is not None:
                 other[:, 5] = roughness
-            solved.append(problem.solve(other, mean, prior, 8))
-    return best(solved, mean, prior)
+            solved.append(tried(other, 8, _nearest(mean)))
+    return best(solved)
+
+
+def _nearest(values: Values) -> Float[np.ndarray, " t"]:
+    """Metal or not."""
+    return (values[:, 6] > 0.5).astype(np.float32)
+
+
+def _both(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) -> tuple[Values, Values, np.ndarray]:
+    """A prior and the belief that a texel is a metal or not as one prior, and the constant that this leaves."""
+    mean, prior = mean.copy(), prior.copy()
+    own, belief = prior[:, 6].copy(), np.float32(1 / METAL_SPREAD**2)
+    constant = (mean[:, 6] - metal) ** 2 * own * belief / (own + belief)
+    mean[:, 6] = (mean[:, 6] * own + metal * belief) / (own + belief)
+    prior[:, 6] = own + belief
+    return mean, prior, constant

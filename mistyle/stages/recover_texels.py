@@ -12,8 +12,12 @@ from mistyle.core.image import resize
 from mistyle.core.light import Directional, Point
 from mistyle.core.maps import Maps, Texels
 from mistyle.stages import recover_solve as solving
+from mistyle.stages.recover_check import trust
+from mistyle.stages.recover_observe import Gathered, fetch
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
+
+DOUBT = 0.3  # standard deviation of an estimate of indirect light, relative to it
 
 
 @dataclass(frozen=True)
@@ -58,6 +62,7 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
     small = Shade(
         shade.traced, work.captures, where.sizes, model=settings.model, frame=settings.frame,
         subsamples=settings.subsamples, shadows=settings.shadows, memory=settings.memory * 1e9,
+        weights=trust(work.captures, indirect),
     )  # fmt: skip
     if start is not None:
         start = [_shrunk(maps, size) for maps, size in zip(start, where.sizes, strict=True)]
@@ -117,12 +122,15 @@ def solve_texels(
             gathered.points, gathered.rig, gathered.observations,
             Options(settings.model, settings.metallic, floor=settings.roughness_floor),
         )  # fmt: skip
-        solution = solving.first_solve(problem, first, mean, settings, lambda done: progress(0.3 + 0.2 * done))
+        solution = solving.first_solve(
+            problem, first, mean, gathered.seen, settings, lambda done: progress(0.3 + 0.2 * done)
+        )
         total = settings.rounds * (1 + settings.bounces)
         for number in range(total):
             table = solving.spread_out(solution.values, gathered, where)
             if number and number % settings.rounds == 0:
                 take_off_indirect(work, shade, table, indirect, seed)
+                problem.reweight(doubted(gathered, work.captures, indirect))
             shade.table = table
             lost: list[float] = []
 
@@ -159,13 +167,23 @@ def take_off_indirect(work: Work, shade, table: np.ndarray, indirect: dict[int, 
     from mistyle.render.indirect import Indirect, retarget
     from mistyle.render.shade import unpack
 
-    settings = work.settings
+    settings, weights = work.settings, trust(work.captures, indirect)
     maps = unpack(table, work.where.sizes)
     scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for k, (camera, lights) in enumerate(zip(work.captures.cameras, work.captures.lights, strict=True)):
         if all(isinstance(light, Directional | Point) for light in lights):
             indirect[k] = scene.picture(camera, lights, settings.bounce_samples, seed + k)
-            retarget(shade, k, work.captures.load(k)[0])
+            retarget(shade, k, work.captures.load(k)[0], weights(k))
+
+
+def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> np.ndarray:
+    """Weights of the observations with the doubt about the indirect light that was taken off them."""
+    weight = gathered.observations.weight.copy()
+    for k, light in indirect.items():
+        sighting = gathered.sightings[k]
+        taken = fetch(resize(light, captures.cameras[k].size), sighting).max(axis=1)
+        weight[sighting.rows] /= 1 + weight[sighting.rows] * DOUBT * taken
+    return weight
 
 
 def _placed(values: np.ndarray, texel: np.ndarray, where: solving.Atlas, otherwise) -> np.ndarray:

@@ -14,12 +14,14 @@ from mistyle.surface.linefield import KEY
 from mistyle.surface.samples import Level, Points, carry, drop, smooth, workers
 
 Occlusion = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Content = Callable[[np.ndarray, np.ndarray], np.ndarray]  # positions, normals -> lightness 0..1 of the asset's texture
 ROTATIONS = 30
 LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, while colours are transported
 UNDULATION = 0.02  # low waves added to the tone, so that flat areas of equal tone get areas of colour and not noise
 LEAST_RELIEF = 0.03  # mean height of a 5x5 neighbourhood, in spacings, that counts as a full hollow or ridge
 LEAST_DETAIL = 0.05  # difference of tone between two smoothings that counts as full detail
 CONVEX = 0.4  # how much of a ridge or bulge counts, against a hollow
+LEAST_CONTENT = 0.02  # standard deviation of a texture's lightness from which on it counts in full
 HIDDEN = 0.05  # share of open sky under which a place is taken for invisible
 STANDING = -0.85  # height of the normal under which a place is taken for what the thing stands on
 
@@ -39,12 +41,20 @@ def guides(
     occlusion: Occlusion,
     bake_light: float,
     rng: np.random.Generator,
+    content: Content | None = None,
+    keep: float = 0.0,
 ) -> list[Guide]:
-    """Guides of all levels, coarse to fine. `palette` is Lab/100 of the blurred painting, a few thousand colours."""
+    """Guides of all levels, coarse to fine. `palette` is Lab/100 of the blurred painting, a few thousand colours.
+
+    `content` is the lightness of a texture that the surface has already; `keep` is its share in tone and detail.
+    """
     middle = max(len(levels) - 2, 0)
     base = levels[middle].points
     openness = smooth(levels[middle], occlusion(base.positions, base.normals).astype(np.float32), 1)
     tone, cavity = tones(levels, openness, bake_light)
+    if content is not None and keep > 0:
+        found = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
+        tone, cavity = with_content(tone, cavity, found, keep)
     details = detail(levels, tone, cavity)
     shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
     colour = colour_field(base, tone[middle], shown, palette, rng)
@@ -97,6 +107,23 @@ def tones(
         tone.append((bake_light * key + (1 - bake_light) * top).astype(np.float32))
         cavity.append(hollow_here.astype(np.float32))
     return tone, cavity
+
+
+def with_content(
+    tone: Sequence[Float[np.ndarray, " _"]],
+    cavity: Sequence[Float[np.ndarray, " _"]],
+    content: Sequence[Float[np.ndarray, " _"]],
+    keep: float,
+) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
+    """Tone and cavity with the share `keep` given over to the lightness of the asset's own texture, at its contrast.
+
+    The texture's lightness is brought to the tone's mean; a texture of one colour says nothing and changes nothing.
+    """
+    spread = float(content[-1].std())
+    said = keep * min(spread / LEAST_CONTENT, 1.0)
+    middle, own = float(content[-1].mean()), float(tone[-1].mean())
+    mixed = [(1 - said) * t + said * (c - middle + own) for t, c in zip(tone, content, strict=True)]
+    return mixed, [(1 - said) * c for c in cavity]
 
 
 def detail(

@@ -93,15 +93,18 @@ def tables(
     return Tables(len(neighbours), whole(dj, index), floats(dj, offsets), floats(dj, weight))
 
 
-def choose_neighbours(
-    dj: ModuleType,
-    positions: Float[np.ndarray, "n 3"],
-    normals: Float[np.ndarray, "n 3"],
-    tangent: Float[np.ndarray, "n 3"],
-    across: Float[np.ndarray, "n 3"],
-    spacing: float,
-    near: Int[np.ndarray, "n k"],
-) -> Int[np.ndarray, "n 25"]:
+@dataclass(frozen=True)
+class Frames:
+    """Samples on the device, flat (n 3): positions, normals, tangents, and `across` them; `spacing` is h."""
+
+    position: Any
+    normal: Any
+    tangent: Any
+    across: Any
+    spacing: float
+
+
+def choose_neighbours(dj: ModuleType, frame: Frames, near: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n 25"]:
     """For every grid position (row by row, x fastest) the sample of `near` that lies nearest to it.
 
     Nearest means smallest |p_j - p_i - h (dx t + dy s)|^2 + (3 h)^2 |n_j - n_i|^2; the first of equals is taken.
@@ -109,22 +112,21 @@ def choose_neighbours(
     import drjit as dr
 
     count, reach = near.shape
-    at, nrm = floats(dj, positions), floats(dj, normals)
     candidates = whole(dj, near)
     i = dr.arange(dj.UInt, count)
-    own_p, own_n = dr.gather(dj.Array3f, at, i), dr.gather(dj.Array3f, nrm, i)
+    own_p, own_n = dr.gather(dj.Array3f, frame.position, i), dr.gather(dj.Array3f, frame.normal, i)
     # Opaque: a literal would be compiled in, one kernel for every mesh.
-    scale = dr.opaque(dj.Float, 1 / spacing)
-    x_axis = dr.gather(dj.Array3f, floats(dj, tangent), i) * scale
-    y_axis = dr.gather(dj.Array3f, floats(dj, across), i) * scale
+    scale = dr.opaque(dj.Float, 1 / frame.spacing)
+    x_axis = dr.gather(dj.Array3f, frame.tangent, i) * scale
+    y_axis = dr.gather(dj.Array3f, frame.across, i) * scale
     grid = [(dx, dy) for dy in range(-2, 3) for dx in range(-2, 3)]
 
     def body(k: Any, *state: Any) -> tuple[Any, ...]:
         best, which = state[:25], state[25:]
         j = dr.gather(dj.UInt, candidates, i * reach + k)
-        step = dr.gather(dj.Array3f, at, j) - own_p
+        step = dr.gather(dj.Array3f, frame.position, j) - own_p
         u, v = dr.dot(step, x_axis), dr.dot(step, y_axis)
-        turn = dr.squared_norm(dr.gather(dj.Array3f, nrm, j) - own_n)
+        turn = dr.squared_norm(dr.gather(dj.Array3f, frame.normal, j) - own_n)
         # |step|^2 - u^2 - v^2 is the squared height over the tangent plane.
         rest = dr.squared_norm(step * scale) - u * u - v * v + 9 * turn
         new_best, new_which = [], []
@@ -143,6 +145,24 @@ def choose_neighbours(
     result = chosen.numpy().reshape(count, 25).astype(np.int32)
     result[:, 12] = np.arange(count)
     return result
+
+
+def offsets(
+    dj: ModuleType, frame: Frames, neighbours: Int[np.ndarray, "n 25"]
+) -> tuple[Bool[np.ndarray, "n 25"], Float[np.ndarray, "n 25 2"]]:
+    """For every table entry: whether the neighbour's tangent points the other way, and where (x, y) the sample lies in
+    the neighbour's frame, in spacings, cut at +-4."""
+    import drjit as dr
+
+    entry = dr.arange(dj.UInt, neighbours.size)
+    i, j = entry // 25, whole(dj, neighbours)
+    step = dr.gather(dj.Array3f, frame.position, i) - dr.gather(dj.Array3f, frame.position, j)
+    step *= dr.opaque(dj.Float, 1 / frame.spacing)
+    along = dr.gather(dj.Array3f, frame.tangent, j)
+    turned: Any = dr.dot(dr.gather(dj.Array3f, frame.tangent, i), along) < 0
+    x, y = dr.dot(step, along), dr.dot(step, dr.gather(dj.Array3f, frame.across, j))
+    place: Any = dr.ravel(dj.Array2f(dr.clip(x, -4, 4), dr.clip(y, -4, 4)))
+    return turned.numpy().reshape(neighbours.shape), place.numpy().reshape(*neighbours.shape, 2)
 
 
 def describe(dj: ModuleType, table: Tables, colour: Any, basis: Any, mean: Any) -> Any:

@@ -28,12 +28,16 @@ class LineField:
     tensors: Float[np.ndarray, "n 3 3"]
 
 
-def line_field(points: Points) -> LineField:
-    """The field at `points` (5,000 to 10,000 are enough; the diffusion reaches some tens of spacings)."""
+def line_field(points: Points, follow: str = "curvature") -> LineField:
+    """The field at `points` (5,000 to 10,000 are enough; the diffusion reaches some tens of spacings).
+
+    `follow` "curvature" asks the form; "up" makes strokes run up and down, "around" level, wherever the surface is not
+    level itself.
+    """
     index = nearest(points, points, AROUND)[1]
     normals = points.normals.astype(np.float64)
     weight = ((normals[index] * normals[:, None]).sum(axis=2) > 0.1).astype(np.float64)
-    data = observed(points, normals, index, weight)
+    data = observed(points, normals, index, weight) if follow == "curvature" else asked(normals, follow)
     project = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     share = weight / weight.sum(axis=1, keepdims=True)
     tensors = data
@@ -41,6 +45,13 @@ def line_field(points: Points) -> LineField:
         mean = np.einsum("nk,nkij->nij", share, tensors[index])
         tensors = HOLD * data + (1 - HOLD) * project @ mean @ project
     return LineField(points, tensors.astype(np.float32))
+
+
+def asked(normals: Float[np.ndarray, "n 3"], follow: str) -> Float[np.ndarray, "n 3 3"]:
+    """Lines along the vertical or around it, surer the steeper the surface stands."""
+    level = np.cross(normals, UP)
+    steep = (level**2).sum(axis=1)
+    return lines(np.cross(level, normals) if follow == "up" else level, np.ones(len(normals))) * steep[:, None, None]
 
 
 def observed(

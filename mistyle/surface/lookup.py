@@ -1,5 +1,6 @@
 """The painted surface: any point of it answers with a colour of the painting, at the painting's own resolution."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from types import ModuleType
 from typing import Any
@@ -8,6 +9,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.surface import kernels, style
+from mistyle.surface import relief as reliefs
 from mistyle.surface.samples import Level, as_points, lifted, workers
 
 CHUNK = 1 << 19
@@ -26,6 +28,7 @@ class Solution:
     spacing             mean distance h of samples
     scale               pixels of the painting per spacing, along its x and y
     painting            encoded sRGB, 0..1
+    glaze               what is added to the painting's lightness at this sample (Lab / 100), smooth over the surface
     """
 
     positions: Float[np.ndarray, "n 3"]
@@ -36,6 +39,7 @@ class Solution:
     spacing: float
     scale: tuple[float, float]
     painting: Float[np.ndarray, "h w 3"]
+    glaze: Float[np.ndarray, " n"]
 
 
 @dataclass(frozen=True)
@@ -60,6 +64,7 @@ def solution(
     y: Float[np.ndarray, " n"],
     size: tuple[int, int],
     painting: Float[np.ndarray, "h w 3"],
+    glaze: Float[np.ndarray, " n"] | None = None,
 ) -> Solution:
     """A solution from places on the turned pages of a smaller painting of `size` (height, width)."""
     height, width = size
@@ -77,6 +82,7 @@ def solution(
         spacing=level.points.spacing,
         scale=scale,
         painting=painting,
+        glaze=np.zeros(len(page), np.float32) if glaze is None else glaze,
     )
 
 
@@ -95,26 +101,63 @@ def colour(
     pixel) in working units: the painting is blurred to it, 0 leaves it sharp. A point off the surface gets the colour
     of the nearest sample's tangent plane.
     """
+    glazed = bool(solution.glaze.any())
+    out = np.empty((len(positions), 3), np.float32)
+    for part, found, index, weight in looked_up(solution, positions, normals, solution.painting, footprint, device):
+        values = np.clip(found[:, :3], 0, 1)
+        if glazed:
+            values = style.lightened(values, (solution.glaze[index] * weight).sum(axis=1, dtype=np.float32))
+        out[part] = values
+    return out
+
+
+def relief(
+    solution: Solution,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    *,
+    footprint: float = 0.0,
+    device: str = "llvm",
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """The gradient of the painted height along the surface (world vectors, root mean square about 1), and what the
+    painting adds to the roughness. A height h bends the unit normal n to that of n - grad h."""
+    found = reliefs.relief(solution.painting)
+    picture = np.concatenate([found.slope, found.dull[..., None]], axis=2)
+    gradient, dull = np.empty((len(positions), 3), np.float32), np.empty(len(positions), np.float32)
+    for part, values, _, _ in looked_up(solution, positions, normals, picture, footprint, device, slopes=True):
+        gradient[part], dull[part] = values[:, :3], values[:, 3]
+    return gradient, dull
+
+
+def looked_up(
+    solution: Solution,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    picture: Float[np.ndarray, "h w 3"],
+    footprint: float,
+    device: str,
+    *,
+    slopes: bool = False,
+) -> Iterator[tuple[slice, Float[np.ndarray, "m 4"], Int[np.ndarray, "m k"], Float[np.ndarray, "m k"]]]:
+    """What a picture as large as the painting shows at surface points, in chunks: which points, values, nearest samples
+    and their weights. `slopes` takes the first two channels for a vector along the picture's x and y."""
     dj = kernels.module(device)
     tree = as_points(solution.positions, solution.normals, solution.spacing).tree
     pixel = solution.spacing / max(solution.scale)  # one pixel of the painting on the surface
-    painting = solution.painting
     if footprint > pixel:
-        painting = style.blurred(painting, 0.4 * footprint / pixel)
+        picture = style.blurred(picture, 0.4 * footprint / pixel)
     across = np.cross(solution.tangent, solution.normals)
     per_unit = np.array(solution.scale) / solution.spacing
     canvas = on_canvas(
-        dj, solution.positions, solution.tangent, across, solution.turn, solution.centre, per_unit, painting
+        dj, solution.positions, solution.tangent, across, solution.turn, solution.centre, per_unit, picture
     )
-    out = np.empty((len(positions), 3), np.float32)
     for low in range(0, len(positions), CHUNK):
         p, n = positions[low : low + CHUNK], normals[low : low + CHUNK]
         count = min(NEAREST, len(solution.positions))
         distance, index = tree.query(lifted(p, n, solution.spacing), k=np.arange(1, count + 1), workers=workers())
         weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * (BLEND * solution.spacing) ** 2))
         weight /= weight.sum(axis=1, keepdims=True)
-        out[low : low + CHUNK] = paint(dj, canvas, p, index, weight)
-    return out
+        yield slice(low, low + len(p)), paint(dj, canvas, p, index, weight, slopes), index, weight
 
 
 def on_canvas(
@@ -149,8 +192,12 @@ def paint(
     positions: Float[np.ndarray, "n 3"],
     index: Int[np.ndarray, "n k"],
     weight: Float[np.ndarray, "n k"],
-) -> Float[np.ndarray, "n 3"]:
-    """Blend what the samples `index` show at `positions`: bilinear in the painting, coordinates kept inside it."""
+    slopes: bool = False,
+) -> Float[np.ndarray, "n 4"]:
+    """Blend what the samples `index` show at `positions`: bilinear in the painting, coordinates kept inside it.
+
+    Three channels and 0; with `slopes` the first two as a vector in the world and the third.
+    """
     import drjit as dr
 
     count, reach = index.shape
@@ -181,10 +228,19 @@ def paint(
 
         upper = dr.lerp(texel(first_row + first), texel(first_row + next_x), x - left)
         lower = dr.lerp(texel(next_row + first), texel(next_row + next_x), x - left)
-        return k + 1, total + dr.lerp(upper, lower, y - top) * dr.gather(dj.Float, weights, i * reach + k)
+        shown = dr.lerp(upper, lower, y - top)
+        value = dj.Array4f(shown[0], shown[1], shown[2], 0)
+        if slopes:
+            # The turns above, the other way round.
+            sx, sy = shown[0], shown[1]
+            gu = dr.select(turn == 0, sx, dr.select(turn == 1, sy, dr.select(turn == 2, -sx, -sy)))
+            gv = dr.select(turn == 0, sy, dr.select(turn == 1, -sx, dr.select(turn == 2, -sy, sx)))
+            world = dr.gather(dj.Array3f, canvas.tangent, j) * gu + dr.gather(dj.Array3f, canvas.across, j) * gv
+            value = dj.Array4f(world[0], world[1], world[2], shown[2])
+        return k + 1, total + value * dr.gather(dj.Float, weights, i * reach + k)
 
-    _, total = dr.while_loop((dj.UInt(0), dj.Array3f(0)), lambda k, *rest: k < reach, body)
-    return np.clip(np.array(dr.ravel(total)).reshape(count, 3), 0, 1)
+    _, total = dr.while_loop((dj.UInt(0), dj.Array4f(0)), lambda k, *rest: k < reach, body)
+    return np.array(dr.ravel(total)).reshape(count, 4)
 
 
 def to_arrays(solution: Solution) -> dict[str, np.ndarray]:
@@ -195,5 +251,5 @@ def to_arrays(solution: Solution) -> dict[str, np.ndarray]:
 def from_arrays(arrays: dict[str, np.ndarray]) -> Solution:
     """The inverse of `to_arrays`, bit for bit."""
     x, y = arrays["scale"]
-    names = ("positions", "normals", "tangent", "turn", "centre", "painting")
+    names = ("positions", "normals", "tangent", "turn", "centre", "painting", "glaze")
     return Solution(**{n: arrays[n] for n in names}, spacing=float(arrays["spacing"]), scale=(float(x), float(y)))

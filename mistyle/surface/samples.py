@@ -14,15 +14,16 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
 from mistyle.core.normals import crease_normals, same_points
-from mistyle.surface import kernels
+from mistyle.surface import cells, kernels
 
 OVERSAMPLING = 5  # candidates per sample asked for
 YIELD = 0.8  # points that stay, per one asked for
 COINCIDENT_ROUNDS = 4
 SPACING = 0.8  # least distance of two samples, in sqrt(area per sample asked for)
 NORMAL_REACH = 3.0  # a turn of the normal by one radian counts as this many sample spacings
-NEAR = 40  # neighbours among which the 5 x 5 table is chosen: they fill a disc of 3.5 spacings
-CROWDED = 40.0  # mean number of candidates in reach above which coincident layers are thinned on a grid first
+NEAR_REACH = 4.0  # spacings within which the 5 x 5 table is chosen, turns of the normal counted as above
+NEAR = 60  # and how many samples are looked at: such a disc holds 50
+CROWDED = 25.0  # candidates in a cell, on average, above which coincident layers are thinned on a grid first
 GRID = np.array([(dx, dy) for dy in range(-2, 3) for dx in range(-2, 3)], np.float32)  # (25 2): row by row, x fastest
 CENTRE = 12
 
@@ -81,12 +82,19 @@ def sample_normals(mesh: Mesh) -> Float[np.ndarray, "f 3 3"]:
     return np.where(inward[..., None], found[:, ::-1], found)
 
 
-def spread(mesh: Mesh, corner_normals: Float[np.ndarray, "f 3 3"], count: int, rng: np.random.Generator) -> Points:
+def spread(
+    mesh: Mesh,
+    corner_normals: Float[np.ndarray, "f 3 3"],
+    count: int,
+    rng: np.random.Generator,
+    dj: ModuleType | None = None,
+) -> Points:
     """Blue-noise points on the mesh: about 0.8 `count` of them, no two of one side nearer than 0.8 sqrt(area / count).
 
     Stratified candidates by area, thinned by random priority (a parallel form of dart throwing). `corner_normals`
-    come from `sample_normals`. Refuses a mesh without area.
+    come from `sample_normals`; `dj` is Dr.Jit's array module (None: the CPU's). Refuses a mesh without area.
     """
+    dj = dj or kernels.module("llvm")
     areas = face_areas(mesh)
     area = float(areas.sum())
     if not area > 0 or not np.isfinite(area):
@@ -98,21 +106,32 @@ def spread(mesh: Mesh, corner_normals: Float[np.ndarray, "f 3 3"], count: int, r
     # side="right" passes over faces without area: their share equals that of the face before.
     face = np.searchsorted(share, (np.arange(candidates) + rng.random(candidates)) / candidates, side="right")
     face = np.minimum(face, np.flatnonzero(areas > 0)[-1])
-    root, v = np.sqrt(rng.random(candidates)), rng.random(candidates)
+    root, v = np.sqrt(rng.random(candidates, np.float32)), rng.random(candidates, np.float32)
     bary = np.stack([1 - root, root * (1 - v), root * v], axis=1)
-    positions = np.einsum("nk,nkc->nc", bary, mesh.positions[mesh.faces[face]].astype(np.float64))
-    normals = unit(np.einsum("nk,nkc->nc", bary, corner_normals[face].astype(np.float64)))
+    positions = combined(bary, mesh.positions.astype(np.float32), mesh.faces[face])
+    normals = unit(combined(bary, corner_normals.astype(np.float32).reshape(-1, 3), 3 * face[:, None] + np.arange(3)))
+    order = in_order(positions)
+    positions, normals = positions[order], normals[order]
     radius = SPACING * float(np.sqrt(area / count))
-    kept = thin(positions, normals, radius, rng)
+    kept = thin(positions, normals, radius, rng, dj)
     # Layers that coincide count several times in the area but hold the points of one: draw nearer until enough stay.
     for _ in range(COINCIDENT_ROUNDS):
         if len(kept) > count / 2:
             break
         radius *= max(0.25, float(np.sqrt(len(kept) / (YIELD * count))))
-        kept = thin(positions, normals, radius, rng)
-    kept = kept[np.argsort(morton(positions[kept]), kind="stable")]
+        kept = thin(positions, normals, radius, rng, dj)
     own_area = radius**2 / SPACING**2 * len(kept) / YIELD
     return as_points(positions[kept], normals[kept], float(np.sqrt(min(area, 1.1 * own_area) / len(kept))))
+
+
+def combined(
+    weights: Float[np.ndarray, "n 3"], values: Float[np.ndarray, "m 3"], index: Int[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Weighted sums of three rows each."""
+    result = values[index[:, 0]] * weights[:, :1]
+    for k in (1, 2):
+        result += values[index[:, k]] * weights[:, k : k + 1]
+    return result
 
 
 def as_points(positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], spacing: float) -> Points:
@@ -131,44 +150,19 @@ def lifted(
 
 
 def thin(
-    positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], radius: float, rng: np.random.Generator
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    radius: float,
+    rng: np.random.Generator,
+    dj: ModuleType,
 ) -> Int[np.ndarray, " m"]:
-    """Which points stay when a point removes all others of its side within `radius`, taken in random order.
-
-    The result is that of visiting the points one by one by falling rank, found in a few parallel rounds: a point
-    that outranks all living neighbours stays and removes them.
-    """
-    from scipy.spatial import KDTree
-
-    count = len(positions)
-    rank = rng.permutation(count)
-    alive = np.ones(count, bool)
-    tree = KDTree(positions)
-    probe = positions[:: max(count // 1000, 1)]
-    if tree.query_ball_point(probe, radius, return_length=True).mean() > CROWDED:
-        alive = first_per_cell(positions, normals, radius / 3)
-        tree = KDTree(positions[alive])
-    index = np.flatnonzero(alive)
-    pairs = index[tree.query_pairs(radius, output_type="ndarray")]
-    # Row by row, since a float64 gather of all pairs at once would be the largest array of the whole synthesis.
-    side = np.zeros(len(pairs), np.float32)
-    slim = normals.astype(np.float32)
-    for axis in range(3):
-        side += slim[pairs[:, 0], axis] * slim[pairs[:, 1], axis]
-    pairs = pairs[side > 0]
-    ahead = rank[pairs[:, 0]] > rank[pairs[:, 1]]
-    high, low = np.where(ahead, pairs[:, 0], pairs[:, 1]), np.where(ahead, pairs[:, 1], pairs[:, 0])
-    chosen = np.zeros(count, bool)
-    while len(high):
-        beaten = np.zeros(count, bool)
-        beaten[low] = True
-        winner = alive & ~beaten
-        chosen |= winner
-        alive[low[winner[high]]] = False
-        alive &= ~winner
-        keep = alive[high] & alive[low]
-        high, low = high[keep], low[keep]
-    return np.flatnonzero(chosen | alive)
+    """Which points stay when a point removes all others of its side within `radius`, taken in random order."""
+    found = cells.cells(dj, positions, normals, radius, rng.permutation(len(positions)))
+    if found.crowd <= CROWDED:
+        return np.flatnonzero(cells.thin(dj, found, radius))
+    index = np.flatnonzero(first_per_cell(positions, normals, radius / 3))
+    found = cells.cells(dj, positions[index], normals[index], radius, rng.permutation(len(index)))
+    return index[cells.thin(dj, found, radius)]
 
 
 def first_per_cell(
@@ -186,12 +180,20 @@ def first_per_cell(
 def morton(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     """Z-order codes of 10 bits an axis: sorted by them, neighbours in space are neighbours in memory."""
     low, high = positions.min(axis=0), positions.max(axis=0)
-    cell = ((positions - low) / max(float((high - low).max()), 1e-20) * 1023).astype(np.int64)
+    cell = ((positions - low) * (1023 / max(float((high - low).max()), 1e-20))).astype(np.int64)
     code = np.zeros(len(positions), np.int64)
-    for bit in range(10):
-        for axis in range(3):
-            code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
+    for axis in range(3):
+        # Two zero bits between every two of the ten bits.
+        bits = cell[:, axis]
+        for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
+            bits = (bits | (bits << shift)) & mask
+        code |= bits << axis
     return code
+
+
+def in_order(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """The points' indices sorted along a Z-order curve, equals by index."""
+    return np.sort((morton(positions) << 32) | np.arange(len(positions))) & 0xFFFFFFFF
 
 
 def nearest(source: Points, target: Points, count: int) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]:
@@ -223,17 +225,17 @@ def with_tables(
     Seen from outside with x along the tangent, `across` = tangent x normal points down, as y does in a picture.
     """
     across = unit(np.cross(tangent, points.normals))
-    near = nearest(points, points, NEAR)[1]
-    neighbours = kernels.choose_neighbours(dj, points.positions, points.normals, tangent, across, points.spacing, near)
-    offsets = np.empty((len(near), 25, 2), np.float32)
-    turned = np.empty((len(near), 25), bool)
-    for k in range(25):
-        other = neighbours[:, k]
-        step = (points.positions - points.positions[other]) / np.float32(points.spacing)
-        offsets[:, k, 0] = np.einsum("nc,nc->n", step, tangent[other])
-        offsets[:, k, 1] = np.einsum("nc,nc->n", step, across[other])
-        turned[:, k] = np.einsum("nc,nc->n", tangent, tangent[other]) < 0
-    np.clip(offsets, -4, 4, out=offsets)
+    h = points.spacing
+    near = cells.near(dj, points.positions, points.normals, NEAR_REACH * h, NORMAL_REACH * h, NEAR)
+    frame = kernels.Frames(
+        kernels.floats(dj, points.positions),
+        kernels.floats(dj, points.normals),
+        kernels.floats(dj, tangent),
+        kernels.floats(dj, across),
+        h,
+    )
+    neighbours = kernels.choose_neighbours(dj, frame, near)
+    turned, offsets = kernels.offsets(dj, frame, neighbours)
     return Level(points, tangent, across, directed, neighbours, turned, offsets)
 
 

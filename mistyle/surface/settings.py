@@ -1,5 +1,8 @@
 """What a user may choose about the painting of the surface."""
 
+from pathlib import Path
+from typing import Literal
+
 from pydantic import BaseModel, ConfigDict, Field
 
 
@@ -24,13 +27,26 @@ class SurfaceSettings(BaseModel):
         description="stroke size: 2 paints with strokes twice as wide, whatever `samples` says",
     )
     detail: float = Field(
-        default=2.0, ge=0.0, le=8.0, description="how strongly cavities and ridges demand dark and light strokes"
+        default=4.0, ge=0.0, le=16.0, description="how strongly cavities and ridges demand dark and light strokes"
     )
     relief: float = Field(
-        default=1.8,
+        default=2.4,
         ge=0.0,
-        le=4.0,
+        le=6.0,
         description="contrast of those strokes, in standard deviations of the painting's own",
+    )
+    glaze: float = Field(
+        default=0.8,
+        ge=0.0,
+        le=1.0,
+        description="share of what the strokes still lack in light and dark that is laid over them, where the painting "
+        "has middle tones; 0 leaves the painting's own colours untouched",
+    )
+    keep_content: float = Field(
+        default=0.5,
+        ge=0.0,
+        le=1.0,
+        description="how much the light and dark of the asset's own texture count, against those of its shape",
     )
     palette: float = Field(
         default=1.0, ge=0.0, le=8.0, description="how strictly a place takes the colour that optimal transport gave it"
@@ -41,8 +57,14 @@ class SurfaceSettings(BaseModel):
         le=1.0,
         description="0 uses colours as often as the painting does, 1 prefers where it has strokes",
     )
+    palette_mix: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="0 leaves colours the areas they have in the painting, 1 gives rare ones as much as common ones",
+    )
     stroke_coherence: float = Field(
-        default=0.005,
+        default=0.01,
         ge=0.0,
         le=0.05,
         description="price of leaving a stroke: higher copies larger pieces of the painting",
@@ -53,6 +75,10 @@ class SurfaceSettings(BaseModel):
     orientation: float = Field(
         default=0.02, ge=0.0, le=0.5, description="how strictly strokes follow the line field of the surface"
     )
+    direction: Literal["curvature", "up", "around"] = Field(
+        default="curvature",
+        description="what strokes follow: the form, the vertical, or level lines around the object",
+    )
     bake_light: float = Field(
         default=0.0,
         ge=0.0,
@@ -61,4 +87,32 @@ class SurfaceSettings(BaseModel):
     )
     crop: float = Field(
         default=0.0, ge=0.0, le=0.4, description="share of the picture left out along each border (frames, signatures)"
+    )
+
+
+class CoatSettings(BaseModel):
+    """Where the paint goes and what it leaves."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    slots: tuple[str, ...] = Field(
+        default=(),
+        description="further pictures: SLOT=PICTURE, SLOT being a material of the mesh or a mask picture in its UVs",
+    )
+    style_mask: Path | None = Field(default=None, description="picture as large as the style: dark parts are not used")
+    protect: Path | None = Field(default=None, description="picture in the mesh's UVs: light parts keep their own look")
+    stroke_size: float | None = Field(
+        default=None,
+        gt=0,
+        description="width of a stroke in the mesh's own units, a 32nd of the picture's long side; sets style_scale",
+    )
+    height: float | None = Field(
+        default=None,
+        ge=0,
+        le=1,
+        description="slope (root mean square) of the painting's relief in the first normal map; by default 0.15 where "
+        "nothing is fitted, and 0 where the fit gives strokes their relief",
+    )
+    gloss: float | None = Field(
+        default=None, ge=0, le=2, description="how much grooves and crests change the first roughness; as height"
     )

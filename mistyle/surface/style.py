@@ -13,9 +13,13 @@ from mistyle.surface import kernels
 LONGEST = 2048  # pixels along the longer side that are kept
 SLIMMEST = 3  # a picture longer than this many times its width is mirrored until it is not
 BROAD = 1 / 48  # blur that leaves only the large areas of colour, in long sides
+FORM = 0.12  # of that: the blur under which strokes still show the form
 BASIS_PATCHES = 10_000
 PALETTE_SIZE = 256
 PALETTE_COLOURS = 20_000
+TWO_TONED = 0.95  # share of the variance of lightness between two tones from which on a painting has no others
+RARITY_CELL = 0.05  # Lab / 100
+RAREST = 0.01  # share of the most common colour's pixels below which a colour is no rarer
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,13 @@ class Basis:
 def lab_from_srgb(rgb: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """CIE Lab (D65) divided by 100 from encoded sRGB 0..1."""
     return cv2.cvtColor(np.ascontiguousarray(rgb, np.float32), cv2.COLOR_RGB2Lab) / np.float32(100)
+
+
+def lightened(rgb: Float[np.ndarray, "n 3"], by: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """Encoded sRGB with `by` added to its lightness (Lab / 100), cut to what a screen shows."""
+    lab = lab_from_srgb(rgb[None])[0]
+    lab[:, 0] = np.clip(lab[:, 0] + by, 0, 1)
+    return np.clip(cv2.cvtColor(lab[None] * np.float32(100), cv2.COLOR_Lab2RGB)[0], 0, 1)
 
 
 def prepare(
@@ -120,14 +131,14 @@ def grain(lightness: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
     return np.stack([yy - xx, -2 * xy], axis=2) / (xx + yy + 1e-5)[..., None]
 
 
-def pages(painting: Painting, long: float, liveliness: float) -> Pages:
-    """The painting with its longer side at `long` pixels, in four quarter turns; `liveliness` as in `demand`."""
+def pages(painting: Painting, long: float, liveliness: float, mix: float = 0.0) -> Pages:
+    """The painting with its longer side at `long` pixels, in four quarter turns; the rest as in `palette`."""
     size = long_side(painting.opaque.shape, long)
     lab = lab_from_srgb(resized(painting.rgb, size))
     height, width = lab.shape[:2]
     sigma = max(0.6, max(height, width) * BROAD)
     broad = blurred(lab, sigma)
-    band = blurred(lab[..., 0], max(0.6, 0.22 * sigma)) - broad[..., 0]
+    band = blurred(lab[..., 0], max(0.6, FORM * sigma)) - broad[..., 0]
     rim = kernels.BORDER
     inner = np.zeros((height, width), bool)
     inner[rim:-rim, rim:-rim] = True
@@ -151,7 +162,7 @@ def pages(painting: Painting, long: float, liveliness: float) -> Pages:
         origin=turned(origin),
         # Where nothing is opaque at this size, transparent pixels (filled from their neighbours) must do.
         allowed=turned(opaque if opaque.any() else inner),
-        wanted=demand(lab, broad, sigma, liveliness).reshape(-1),
+        wanted=(demand(lab, broad, sigma, liveliness) * rarity(broad, mix)).reshape(-1),
     )
 
 
@@ -164,7 +175,7 @@ def page(book: Pages, values: np.ndarray, k: int) -> np.ndarray:
 def patch_basis(book: Pages, rng: np.random.Generator) -> Basis:
     """The 16 leading principal components of the painting's patches."""
     chosen = np.flatnonzero(book.allowed)
-    chosen = np.sort(rng.choice(chosen, min(BASIS_PATCHES, len(chosen)), replace=False))
+    chosen = np.sort(rng.choice(chosen, min(BASIS_PATCHES, len(chosen)), replace=False, shuffle=False))
     sample = []
     for k in range(kernels.PAGES):
         height, width = book.shapes[k]
@@ -178,6 +189,23 @@ def patch_basis(book: Pages, rng: np.random.Generator) -> Basis:
     return Basis(mean.astype(np.float32), np.ascontiguousarray(axes, np.float32))
 
 
+def middle_tones(lightness: Float[np.ndarray, "..."]) -> float:
+    """0 for a picture of two tones or one, 1 for one that has middle tones too.
+
+    By the share of the variance of lightness that the best single threshold explains (Otsu 1979): 1 for two values,
+    0.75 for evenly spread ones.
+    """
+    values = np.sort(lightness.reshape(-1).astype(np.float64))
+    values = values[:: max(len(values) // 4096, 1)]
+    variance = values.var()
+    if variance < 1e-6:
+        return 0.0
+    count = np.arange(1, len(values))
+    low = np.cumsum(values)[:-1]
+    between = (low * len(values) - values.sum() * count) ** 2 / (count * (len(values) - count)) / len(values) ** 2
+    return float(np.clip((TWO_TONED - between.max() / variance) / 0.15, 0, 1))
+
+
 def demand(
     lab: Float[np.ndarray, "h w 3"], broad: Float[np.ndarray, "h w 3"], sigma: float, liveliness: float
 ) -> Float[np.ndarray, "h w"]:
@@ -186,11 +214,32 @@ def demand(
     return (1 - liveliness) + liveliness * busy / max(float(busy.mean()), 1e-6)
 
 
-def palette(painting: Painting, liveliness: float, rng: np.random.Generator) -> Float[np.ndarray, "n 3"]:
+def rarity(colours: Float[np.ndarray, "*n 3"], mix: float) -> Float[np.ndarray, "*n"]:
+    """Weights by which a pixel of a rare colour counts more: how many pixels share its cell of Lab space, to the -mix.
+
+    Cells are RARITY_CELL wide and blurred, so that a colour's neighbours count too; with mix 1 every cell that is not
+    nearly empty gets the same total. 1 on average.
+    """
+    if mix == 0:
+        return np.ones(colours.shape[:-1], np.float32)
+    bins = round(1.5 / RARITY_CELL)
+    cell = np.clip((colours.reshape(-1, 3) + np.array([0.25, 0.75, 0.75])) / RARITY_CELL, 0, bins - 1).astype(np.int64)
+    flat = (cell[:, 0] * bins + cell[:, 1]) * bins + cell[:, 2]
+    count = np.bincount(flat, minlength=bins**3).reshape(bins, bins, bins).astype(np.float64)
+    for axis in range(3):
+        count = (np.roll(count, 1, axis) + 2 * count + np.roll(count, -1, axis)) / 4
+    common = count.reshape(-1)[flat]
+    weight = np.maximum(common, common.max() * RAREST) ** -mix
+    return (weight / weight.mean()).reshape(colours.shape[:-1]).astype(np.float32)
+
+
+def palette(
+    painting: Painting, liveliness: float, rng: np.random.Generator, mix: float = 0.0
+) -> Float[np.ndarray, "n 3"]:
     """Large-area colours (Lab / 100) in the proportions in which the surface shall have them.
 
     `liveliness` 0 takes them as the painting has them, 1 by how much is going on where they are: a large empty sky or
-    paper ground then no longer fills the surface.
+    paper ground then no longer fills the surface. `mix` as in `rarity`.
     """
     size = long_side(painting.opaque.shape, PALETTE_SIZE)
     small = lab_from_srgb(resized(painting.rgb, size))
@@ -198,6 +247,7 @@ def palette(painting: Painting, liveliness: float, rng: np.random.Generator) -> 
     broad = blurred(small, sigma)
     # Never quite zero, so that a picture with a single opaque pixel still has a palette.
     opaque = np.maximum(resized(painting.opaque.astype(np.float32), size), 1e-6)
-    share = np.cumsum((demand(small, broad, sigma, liveliness) * opaque).reshape(-1).astype(np.float64))
+    wanted = demand(small, broad, sigma, liveliness) * opaque * rarity(broad, mix)
+    share = np.cumsum(wanted.reshape(-1).astype(np.float64))
     at = (np.arange(PALETTE_COLOURS) + rng.random(PALETTE_COLOURS)) / PALETTE_COLOURS * share[-1]
     return broad.reshape(-1, 3)[np.minimum(np.searchsorted(share, at), len(share) - 1)]

@@ -21,11 +21,12 @@ from types import ModuleType
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mistyle.core.mesh import Mesh
 from mistyle.surface import kernels, style
-from mistyle.surface.guides import Guide, Occlusion, guides
+from mistyle.surface.glaze import glaze
+from mistyle.surface.guides import Content, Guide, Occlusion, guides
 from mistyle.surface.linefield import directions, line_field
 from mistyle.surface.lookup import Solution, solution
 from mistyle.surface.samples import Level, nearest, sample_normals, spread, with_tables
@@ -44,6 +45,7 @@ CHUNK_PAIRS = 8_000_000
 INITIAL_JITTER = 0.004
 CHROMA = 0.6
 LEAST_WANTED = 0.1
+TYPICAL_LOAD = 0.35  # mean urgency of detail at which its weight is the setting's
 UNREACHABLE = 1e3  # descriptor of pixels that must not be used: farther than anything else
 
 
@@ -56,6 +58,14 @@ class Choice:
     y: Float[np.ndarray, " n"]
 
 
+@dataclass(frozen=True)
+class Pins:
+    """Colours (Lab / 100) that samples have already: where `known`, they stand in the place of the vote's."""
+
+    known: Bool[np.ndarray, " n"]
+    colour: Float[np.ndarray, "n 3"]
+
+
 def solve(
     mesh: Mesh,
     picture_rgb: Float[np.ndarray, "h w 3"],
@@ -65,6 +75,7 @@ def solve(
     progress: Callable[[float], None] = lambda done: None,
     *,
     alpha: Float[np.ndarray, "h w"] | None = None,
+    content: Content | None = None,
     device: str = "llvm",
 ) -> Solution:
     """Paint `mesh` in the style of `picture_rgb` (encoded sRGB, 0..1), of whose transparent parts nothing is used.
@@ -78,11 +89,12 @@ def solve(
     painting = style.prepare(picture_rgb, settings.crop, alpha)
     levels = hierarchy(mesh, settings, seed, dj, lambda done: progress(0.25 * done))
     rng = np.random.default_rng([seed, 2])
-    palette = style.palette(painting, settings.liveliness, rng)
-    wanted = guides(levels, palette, occlusion, settings.bake_light, rng)
+    palette = style.palette(painting, settings.liveliness, rng, settings.palette_mix)
+    wanted = guides(levels, palette, occlusion, settings.bake_light, rng, content, settings.keep_content)
     progress(0.35)
     choice, book = synthesise(levels, wanted, painting, settings, seed, dj, lambda done: progress(0.35 + 0.65 * done))
-    return solution(levels[-1], choice.page, choice.x, choice.y, book.size, painting.rgb)
+    laid = glaze(levels, wanted[-1], book.lab[pixels(book, choice), 0], book, settings)
+    return solution(levels[-1], choice.page, choice.x, choice.y, book.size, painting.rgb, laid)
 
 
 def level_count(settings: SurfaceSettings) -> int:
@@ -95,7 +107,8 @@ def level_count(settings: SurfaceSettings) -> int:
 
 def finest_size(settings: SurfaceSettings) -> float:
     """Long side of the painting on the finest level: one pixel a sample, so strokes keep their size on the surface."""
-    return float(np.clip(FULL_SIZE * np.sqrt(settings.samples / 250_000) / settings.style_scale, 32, style.LONGEST))
+    least, most = 32, style.LONGEST
+    return float(np.clip(FULL_SIZE * np.sqrt(settings.samples / 250_000) * settings.style_scale, least, most))
 
 
 def hierarchy(
@@ -108,13 +121,13 @@ def hierarchy(
     """Samples, frames along the strokes and neighbour tables, coarse to fine, four times as many each level."""
     normals = sample_normals(mesh)
     rng = np.random.default_rng([seed, 1])
-    field = line_field(spread(mesh, normals, LINE_POINTS, rng))
+    field = line_field(spread(mesh, normals, LINE_POINTS, rng, dj), settings.direction)
     progress(0.15)
     count = level_count(settings)
     levels = []
     for index in range(count):
         share = 4.0 ** (index - count + 1)
-        points = spread(mesh, normals, max(64, round(settings.samples * share)), rng)
+        points = spread(mesh, normals, max(64, round(settings.samples * share)), rng, dj)
         levels.append(with_tables(points, *directions(field, points), dj))
         progress(0.15 + 0.85 * share)
     return levels
@@ -128,18 +141,24 @@ def synthesise(
     seed: int,
     dj: ModuleType,
     progress: Callable[[float], None] = lambda done: None,
+    *,
+    pins: Sequence[Pins] | None = None,
 ) -> tuple[Choice, style.Pages]:
-    """The place each sample of the finest level takes, and the pages it refers to."""
+    """The place each sample of the finest level takes, and the pages it refers to; `pins`, one per level, hold colours
+    that the painting shall go on from."""
     rng = np.random.default_rng([seed, 3])
     work = np.cumsum([0.02 + 4.0 ** (k - len(levels) + 1) for k in range(len(levels))])
     choice, book = None, None
     for index, (level, guide) in enumerate(zip(levels, wanted, strict=True)):
-        finer = style.pages(painting, finest_size(settings) / 2 ** (len(levels) - 1 - index), settings.liveliness)
+        finer = style.pages(
+            painting, finest_size(settings) / 2 ** (len(levels) - 1 - index), settings.liveliness, settings.palette_mix
+        )
         start = None
         if choice is not None and book is not None:
             start = refined(levels[index - 1], level, choice, book, finer)
+        pin = pins[index] if pins is not None else None
         rounds = ROUNDS[index] if index < len(ROUNDS) else FINE_ROUNDS
-        choice, book = paint_level(level, guide, finer, start, rounds, settings, rng, dj), finer
+        choice, book = paint_level(level, guide, finer, start, rounds, settings, rng, dj, pin), finer
         progress(float(work[index] / work[-1]))
     assert choice is not None and book is not None
     return choice, book
@@ -180,6 +199,7 @@ def paint_level(
     settings: SurfaceSettings,
     rng: np.random.Generator,
     dj: ModuleType,
+    pins: Pins | None = None,
 ) -> Choice:
     """Search and vote, `rounds` times over, from `start` or (None) from what the guides alone ask for."""
     basis = style.patch_basis(pages, rng)
@@ -207,6 +227,8 @@ def paint_level(
     complete = min(rounds, int(ALL_PAIRS // (len(asked) * len(described))))
     for turn in range(rounds):
         colour = kernels.vote(dj, table, book, place)
+        if pins is not None:
+            colour = kernels.floats(dj, np.where(pins.known[:, None], pins.colour, colour.numpy().reshape(-1, 3)))
         asked[:, : kernels.PATCH] = kernels.describe(dj, table, colour, axes, mean).numpy().reshape(-1, kernels.PATCH)
         wanted = kernels.Wanted(kernels.floats(dj, asked), weight)
         also = None
@@ -243,8 +265,16 @@ def described_guide(
     out[:, 16:19] = guide.colour * guide_scale[:3]
     out[:, 19] = guide.directed * guide_scale[3]
     out[:, 21] = guide.detail * np.float32(settings.relief * pages.band.std())
-    weight = settings.detail * np.minimum(np.abs(guide.detail), 1.5) ** 1.5
+    weight = urgency(guide.detail)
+    # A scan that is bumpy all over would leave no stroke free: the more of it asks, the less each place may.
+    load = max(float(weight.mean()), 1e-6)
+    weight = weight * (settings.detail * np.clip(np.sqrt(TYPICAL_LOAD / load), 0.6, 1.6))
     return out, weight.astype(np.float32)
+
+
+def urgency(detail: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """How much a detail guide matters at its own size, 0..1.84."""
+    return np.minimum(np.abs(detail), 1.5) ** 1.5
 
 
 def exhaustive(
@@ -302,12 +332,16 @@ def places(pages: style.Pages, pixel: Int[np.ndarray, " n"]) -> Choice:
     return Choice(page.astype(np.int32), (rest % width).astype(np.float32), (rest // width).astype(np.float32))
 
 
+def pixels(pages: style.Pages, choice: Choice) -> Int[np.ndarray, " n"]:
+    """The flat index of the pixel in which each place lies; the inverse of `places`."""
+    row = np.rint(choice.y).astype(np.int64)
+    return pages.starts[choice.page] + row * pages.shapes[choice.page, 1] + np.rint(choice.x).astype(np.int64)
+
+
 def usage(pages: style.Pages, choice: Choice) -> Float[np.ndarray, " k"]:
     """How often each pixel of the unturned picture is in use, over its 5x5 neighbourhood; 1 is as often as wanted."""
-    pixel = pages.starts[choice.page] + np.rint(choice.y).astype(np.int64) * pages.shapes[choice.page, 1]
-    pixel += np.rint(choice.x).astype(np.int64)
     height, width = pages.size
-    count = np.bincount(pages.origin[pixel], minlength=height * width).reshape(height, width)
+    count = np.bincount(pages.origin[pixels(pages, choice)], minlength=height * width).reshape(height, width)
     mean = len(choice.page) / (height * width)
     around = cv2.blur(count.astype(np.float32), (5, 5), borderType=cv2.BORDER_CONSTANT) / np.float32(mean)
     return around.reshape(-1) / np.maximum(pages.wanted, LEAST_WANTED)

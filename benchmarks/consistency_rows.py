@@ -1,0 +1,143 @@
+"""The rows of `benchmarks.consistency`: one function each, from a scene to one picture a view, timed.
+
+A row runs in a process of its own, so that its peak of memory is its own; kernels come from Dr.Jit's cache on disk
+once any run has compiled them.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.common import peak_gb
+from benchmarks.consistency_scene import Scene, blank_maps, encoded, load
+from mistyle.core.image import linear_from_srgb, srgb_from_linear
+from mistyle.stages.texels import pad
+
+
+@dataclass(frozen=True)
+class Row:
+    """Encoded pictures, one per view of the scene; wall seconds of all of them; linear albedos where the row paints
+    the texture itself, and the same views painted without an atlas; GB that an outside program held at most."""
+
+    pictures: list[np.ndarray]
+    seconds: float
+    albedo: list[np.ndarray] | None = None
+    blind: list[np.ndarray] | None = None
+    outside_gb: float = 0.0
+
+
+def surface(scene: Scene) -> Row:
+    """The embedded surface stylizer: the surface is painted once and baked to the atlas, and the views are drawn."""
+    from mistyle.backends.embedded import solve_surface, surface_colour
+    from mistyle.run.pipeline import texel_side, unlit_views
+
+    start, asset = time.perf_counter(), scene.asset
+    solution = solve_surface(asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
+    albedos = [np.zeros((*t.covered.shape, 3), np.float32) for t in scene.texels]
+    for part, (albedo, t) in enumerate(zip(albedos, scene.texels, strict=True)):
+        at, side = t.covered, texel_side(asset, part, t)
+        albedo[at] = linear_from_srgb(surface_colour(solution, t.position[at], t.normal[at], footprint=side))
+    padded = [pad(a, t, scene.settings.atlas.padding) for a, t in zip(albedos, scene.texels, strict=True)]
+    drawn = unlit_views(asset, blank_maps(scene, padded), scene.views, lambda done: None)
+    seconds = time.perf_counter() - start
+    return Row([encoded(view) for view in drawn], seconds, albedos, without_atlas(scene, solution))
+
+
+def without_atlas(scene: Scene, solution: Any, fine: int = 2) -> list[np.ndarray]:
+    """Views of a painted surface that asks it for the colour of every hit, `fine` x `fine` a pixel."""
+    from mistyle.backends.embedded import surface_colour
+    from mistyle.core.camera import resized
+    from mistyle.render.draw import gbuffer, tracer
+
+    traced, pictures = tracer(scene.asset.mesh), []
+    for view in scene.views:
+        height, width = view.camera.size
+        hits = gbuffer(traced, resized(view.camera, (height * fine, width * fine)))
+        rgb = np.zeros((*hits.mask.shape, 3), np.float32)
+        side = scene.settings.rig.distance / view.camera.focal / fine
+        at = hits.mask
+        rgb[at] = linear_from_srgb(surface_colour(solution, hits.position[at], hits.normal[at], footprint=side))
+        rgb = rgb.reshape(height, fine, width, fine, 3).mean(axis=(1, 3))
+        share = at.reshape(height, fine, width, fine).mean(axis=(1, 3), dtype=np.float32)
+        pictures.append(encoded(replace(view, rgb=rgb, coverage=share)))
+    return pictures
+
+
+def colour_field(scene: Scene) -> Row:
+    """A floor: the smooth colours that the guides ask for, without a stroke."""
+    return Row(list(scene.colour), 0.0)
+
+
+def per_view(scene: Scene) -> Row:
+    """The same synthesis on every view's own pixels, no view knowing of another."""
+    start, seed = time.perf_counter(), scene.settings.seed
+    paint = view_stylizer(scene)
+    drawn = [
+        paint(view, None, np.random.default_rng([seed, k])) * view.mask[..., None] for k, view in enumerate(scene.views)
+    ]
+    seconds = time.perf_counter() - start
+    return Row([srgb_from_linear(rgb) * v.mask[..., None] for rgb, v in zip(drawn, scene.views, strict=True)], seconds)
+
+
+def swept(scene: Scene) -> Row:
+    """The same, each view from what the earlier ones show of its surface (paper 4.1.3)."""
+    from mistyle.stages.mvst import SweepSettings, sweep
+
+    start = time.perf_counter()
+    done = sweep(scene.views, view_stylizer(scene), SweepSettings(), scene.settings.seed, keeps_outlines=True)
+    seconds = time.perf_counter() - start
+    found = zip(done.painted, scene.views, strict=True)
+    return Row([srgb_from_linear(p.rgb) * v.mask[..., None] for p, v in found], seconds)
+
+
+def view_stylizer(scene: Scene):
+    """The embedded stylizer view by view."""
+    from mistyle.backends.embedded_view import stylizer
+
+    return stylizer(scene.asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
+
+
+ROWS: dict[str, Callable[[Scene], Row]] = {
+    "per_view": per_view,
+    "sweep": swept,
+    "default": surface,
+    "colour_field": colour_field,
+}
+
+
+def run(name: str, folder: Path, work: Callable[[Scene], Row] | None = None) -> None:
+    """Compute a row of the scene in `folder` and leave it there."""
+    from mistyle.run.pipeline import start_engines
+
+    scene = load(folder)
+    start_engines(scene.settings)
+    row = (work or ROWS[name])(scene)
+    arrays: dict[str, Any] = {f"picture{k}": p for k, p in enumerate(row.pictures)}
+    arrays |= {f"albedo{k}": a for k, a in enumerate(row.albedo or [])}
+    arrays |= {f"blind{k}": p for k, p in enumerate(row.blind or [])}
+    # The views of the scene are part of what a view-by-view stylizer needs, so they count; an outside program has its
+    # own.
+    peak = row.outside_gb or peak_gb()
+    partial = folder / f".{name}.npz"
+    np.savez(partial, seconds=row.seconds, peak_gb=peak, **arrays)
+    partial.replace(folder / f"{name}.npz")
+
+
+def texture(scene: Scene, pictures: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray], float]:
+    """The pictures baked to the atlas, as the pipeline would: linear albedos, the view that painted each texel (-1:
+    none), and the share of the texels that any view painted."""
+    from mistyle.stages.backproject import backproject, fill
+
+    views = [
+        # Whole coverage: rim pixels hold pure colour, they are not mixed with a background.
+        replace(view, rgb=linear_from_srgb(p), coverage=view.mask.astype(np.float32))
+        for view, p in zip(scene.views, pictures, strict=True)
+    ]
+    baked = [backproject(views, t, scene.settings.bake, mesh=scene.asset.mesh) for t in scene.texels]
+    known = sum(int(b.known.sum()) for b in baked) / max(sum(int(t.covered.sum()) for t in scene.texels), 1)
+    albedo = [fill(b, t) for b, t in zip(baked, scene.texels, strict=True)]
+    return albedo, [b.view.astype(np.int32) for b in baked], known

@@ -1,0 +1,157 @@
+"""What `benchmarks.consistency` compares on: a mesh, a painting, its views, and what the guides ask for in each."""
+
+import os
+import pickle
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mistyle.core.asset import Asset, Picture
+from mistyle.core.camera import Camera, RigSettings, orbit
+from mistyle.core.image import resize, srgb_from_linear
+from mistyle.core.maps import Maps, Texels, flat_maps
+from mistyle.core.view import View
+from mistyle.run.settings import Settings, resolve
+from mistyle.surface import style as styles
+
+DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+WEIGHTS = DATA / "weights"
+VGG = WEIGHTS / "vgg19_normalised_relu3_1.pth"
+LPIPS = (WEIGHTS / "squeezenet1_1_torchvision_fp16.npz", WEIGHTS / "lpips_v0.1_squeeze_heads.pth")
+
+# Six of the paper's 16, in its visiting order: four neighbours on the ring, one from above, one from below. Pairs of
+# them are 30 and 45 degrees apart (short range) and 54 to 90 (long range).
+ANGLES = ((30, 0), (60, 0), (30, 45), (30, -45), (90, 0), (120, 0))
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A mesh, a painting and views; pictures are sRGB-encoded 0..1, one per view.
+
+    views     geometry, and the bare mesh under the paper's lights
+    clay      that picture, encoded
+    colour    large-area colours that the guides ask for, on the mesh
+    detail    dark and light strokes that the guides ask for, -1.6..1.6, 0 off the mesh
+    painting  the style picture at the size at which the stylizer shows it in the views
+    """
+
+    asset: Asset
+    texels: tuple[Texels, ...]
+    style: Picture
+    settings: Settings
+    views: tuple[View, ...]
+    clay: tuple[np.ndarray, ...]
+    colour: tuple[np.ndarray, ...]
+    detail: tuple[np.ndarray, ...]
+    painting: np.ndarray
+    opaque: np.ndarray
+
+
+def load(folder: Path) -> Scene:
+    """The scene that `make` left."""
+    return pickle.loads((folder / "scene.pickle").read_bytes())
+
+
+def cameras(resolution: int) -> list[Camera]:
+    """The judged views."""
+    rig = RigSettings(resolution=resolution)
+    size = (resolution, resolution)
+    return [orbit(a, e, distance=rig.distance, fov=rig.fov, size=size) for a, e in ANGLES]
+
+
+def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, atlas: int) -> Scene:
+    """Read, draw and guide; the scene is left in `folder` for the rows, which run in processes of their own."""
+    from mistyle.files.read import read_mesh, read_picture
+    from mistyle.render.draw import draw_views
+    from mistyle.run.pipeline import start_engines
+    from mistyle.stages.texels import rasterise
+
+    layers = {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}
+    settings = resolve(None, None, layers)
+    start_engines(settings)
+    asset, picture = read_mesh(mesh, size=atlas), read_picture(style)
+    views = draw_views(asset.mesh, None, cameras(resolution), "paper_views", 8, settings.seed)
+    colour, detail, painting = guided(asset, picture, settings, views)
+    scene = Scene(
+        asset=asset,
+        texels=tuple(rasterise(asset.mesh, part, atlas) for part in range(len(asset.mesh.parts))),
+        style=picture,
+        settings=settings,
+        views=tuple(views),
+        clay=tuple(encoded(view) for view in views),
+        colour=tuple(colour),
+        detail=tuple(detail),
+        painting=painting.rgb,
+        opaque=painting.opaque,
+    )
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "scene.pickle").write_bytes(pickle.dumps(scene))
+    return scene
+
+
+def guided(asset: Asset, picture: Picture, settings: Settings, views: Sequence[View]):
+    """Colour and detail guide of every view's pixels, and the painting at the size at which views show it."""
+    from mistyle.backends.embedded import array_module
+    from mistyle.render.draw import tracer
+    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.surface.synthesis import finest_size
+    from mistyle.surface.view_samples import ground
+
+    module, traced = array_module(), tracer(asset.mesh)
+
+    def occlusion(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        return ambient_occlusion(traced, positions, normals, seed=settings.seed)
+
+    chosen = settings.surface
+    base = ground(asset.mesh, picture.rgb, chosen, settings.seed, occlusion, alpha=picture.alpha, device=module)
+    points, wanted, painting = base.levels[-1].points, base.wanted[-1], base.painting
+    colour, detail = [], []
+    for view in views:
+        index, weight = nearest_samples(points, view)
+        lab = np.einsum("nk,nkc->nc", weight, wanted.colour[index])
+        colour.append(on_mesh(view, cv2.cvtColor((100 * lab)[None].astype(np.float32), cv2.COLOR_Lab2RGB)[0]))
+        detail.append(on_mesh(view, (weight * wanted.detail[index]).sum(axis=1)))
+    long = max(painting.rgb.shape[:2])
+    camera = views[0].camera
+    # Pixels of the view per pixel of the painting: a sample spacing shows one pixel of the painting at `finest_size`.
+    factor = points.spacing / (long / finest_size(chosen)) * camera.focal / settings.rig.distance
+    size = styles.long_side(painting.rgb.shape, long * factor)
+    shown = styles.Painting(resize(painting.rgb, size), resize(painting.opaque.astype(np.float32), size) > 0.99)
+    return colour, detail, shown
+
+
+def nearest_samples(points, view: View) -> tuple[np.ndarray, np.ndarray]:
+    """The four samples nearest to each pixel on the mesh (position and normal), and their weights."""
+    from scipy.spatial import KDTree
+
+    from mistyle.core.camera import pixel_centres, world_from_px
+    from mistyle.surface.samples import lifted
+
+    px = pixel_centres(view.camera.size)[view.mask]
+    place = world_from_px(view.camera, px, view.depth[view.mask].astype(np.float64))
+    tree = KDTree(lifted(points.positions, points.normals, points.spacing))
+    distance, index = tree.query(lifted(place, view.normal[view.mask], points.spacing), k=4, workers=2)
+    weight = 1 / (distance + 0.3 * points.spacing)
+    weight /= weight.sum(axis=1, keepdims=True)
+    return np.asarray(index), weight.astype(np.float32)
+
+
+def on_mesh(view: View, values: np.ndarray) -> np.ndarray:
+    """Values of the pixels on the mesh as a picture, zero elsewhere."""
+    result = np.zeros((*view.mask.shape, *values.shape[1:]), np.float32)
+    result[view.mask] = np.clip(values, -2, 2)
+    return result
+
+
+def encoded(view: View) -> np.ndarray:
+    """The view's picture without the background that its rim pixels hold, encoded; zero off the mesh."""
+    rgb = view.rgb / np.clip(view.coverage, 0.1, 1)[..., None]
+    return np.where(view.mask[..., None], srgb_from_linear(rgb), 0).astype(np.float32)
+
+
+def blank_maps(scene: Scene, albedo: Sequence[np.ndarray]) -> list[Maps]:
+    """Flat maps with these albedos (linear)."""
+    return [replace(flat_maps(a.shape[0]), albedo=a) for a in albedo]

@@ -1,0 +1,78 @@
+"""Pictures of what the settings do, for the README: `python -m benchmarks.settings_strip [--out scenes/strips]`
+
+One strip a setting: the demo mesh painted with the demo picture, everything else at its default, values growing from
+left to right. Writes small JPGs (under 60 kB) and nothing else. --quick: two values of one setting, coarse.
+"""
+
+import argparse
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from mistyle.core.camera import RigSettings, rig
+from mistyle.files.read import read_mesh, read_picture
+from mistyle.run import pipeline
+from mistyle.run.settings import Settings
+from mistyle.run.variations import tile
+
+ROOT = Path(__file__).resolve().parents[1]
+STRIPS: dict[str, tuple[dict[str, Any], ...]] = {
+    "stroke_scale": tuple({"style_scale": v} for v in (0.5, 1.0, 2.0, 3.0)),
+    "detail": ({"detail": 0.0, "glaze": 0.0}, {"detail": 2.0, "glaze": 0.3}, {}, {"detail": 12.0, "relief": 4.0}),
+    "strength": tuple({"stroke_coherence": v} for v in (0.0, 0.01, 0.02, 0.04)),
+    "palette": ({"palette": 0.2}, {"palette": 1.0}, {"palette": 4.0}, {"palette_mix": 1.0}),
+    "direction": ({"orientation": 0.0}, {}, {"direction": "up"}, {"direction": "around"}),
+}
+VIEW = 0  # of the paper's rig: front right
+LARGEST = 60_000  # bytes of a strip
+WHITE = 245  # of 255 and more counts as background where tiles are cropped
+
+
+def strip(asset: Any, picture: Any, base: Settings, variants: tuple[dict[str, Any], ...], side: int) -> Image.Image:
+    """The demo painted with every variant of the surface's settings, side by side."""
+    camera = rig(RigSettings(resolution=side))[VIEW]
+    tiles = []
+    for change in variants:
+        settings = base.model_copy(update={"surface": base.surface.model_copy(update=change)})
+        tiles.append(np.round(tile(asset, picture, settings, [camera], lambda done: None) * 255).astype(np.uint8))
+    used = np.stack([(t < WHITE).any(axis=2) for t in tiles]).any(axis=0)
+    rows, columns = np.flatnonzero(used.any(axis=-1)), np.flatnonzero(used.any(axis=0))
+    window = np.s_[max(rows[0] - 4, 0) : rows[-1] + 5, max(columns[0] - 4, 0) : columns[-1] + 5]
+    return Image.fromarray(np.concatenate([t[window] for t in tiles], axis=1))
+
+
+def save(picture: Image.Image, path: Path) -> int:
+    """Write a JPG of the best quality that stays under LARGEST; returns its bytes."""
+    for quality in range(90, 20, -5):
+        held = io.BytesIO()
+        picture.save(held, "JPEG", quality=quality, optimize=True)
+        if held.tell() < LARGEST:
+            break
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(held.getvalue())
+    return held.tell()
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(prog="python -m benchmarks.settings_strip", description=__doc__)
+    options.add_argument("--out", type=Path, default=ROOT / "scenes" / "strips", metavar="FOLDER")
+    options.add_argument("--only", choices=list(STRIPS), help="one strip")
+    options.add_argument("--quick", action="store_true")
+    chosen = options.parse_args()
+    samples, side, atlas = (8_000, 128, 256) if chosen.quick else (50_000, 360, 1024)
+    base = Settings.model_validate({"surface": {"samples": samples}, "atlas": {"size": atlas}})
+    pipeline.start_engines(base)
+    asset = read_mesh(ROOT / "scenes" / "demo.obj")
+    picture = read_picture(ROOT / "scenes" / "demo_style.png")
+    for name, variants in STRIPS.items():
+        if chosen.only in (None, name) and not (chosen.quick and name != "stroke_scale"):
+            made = strip(asset, picture, base, variants[:2] if chosen.quick else variants, side)
+            size = save(made, chosen.out / f"{name}.jpg")
+            print(f"{chosen.out / name}.jpg  {made.width} x {made.height}  {size} bytes", flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,110 @@
+"""Settings of the generative stages: where models are, how LoRAs are trained, how views and texels are painted."""
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class ModelSettings(BaseModel):
+    """Where the models are and what they run on."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    folder: Path | None = Field(
+        default=None, description="folder of models as `mistyle models` lays it out; else the Hugging Face cache"
+    )
+    checkpoint: Path | None = Field(
+        default=None, description="SDXL or a finetune of it as one .safetensors file, in place of the folder's weights"
+    )
+    style_lora: Path | None = Field(default=None, description="a style LoRA trained elsewhere (.safetensors)")
+    loras: Path | None = Field(default=None, description="where trained LoRAs are kept; else in the run folder")
+    device: Literal["auto", "cpu", "cuda", "mps"] = Field(
+        default="auto", description="auto: a GPU where torch sees one"
+    )
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
+        default="auto",
+        description="of frozen networks; auto: bfloat16 on a GPU, else float32. VAEs stay float32",
+    )
+    offload: bool = Field(
+        default=False,
+        description="keep on the GPU only the network that runs, and decode in tiles: slower",
+    )
+    memory: float = Field(default=0, ge=0, description="GB that may be used; 0 asks the device")
+
+
+class TrainSettings(BaseModel):
+    """ConsisLoRA training (paper 4.1.2); the numbers are those of ConsisLoRA's own scripts."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    rank: int = Field(default=64, ge=1, le=1024, description="rank of the LoRAs; alpha equals it, so the scale is 1")
+    steps: int = Field(default=1500, ge=1, le=100_000, description="steps of a content image and of style stage 1")
+    style_steps: int = Field(default=1000, ge=1, le=100_000, description="steps of style stage 2")
+    switch: int = Field(default=500, ge=0, description="step from which the x0 loss counts")
+    loss_mode: Literal["switch", "sum"] = Field(
+        default="switch", description="from `switch` on: the x0 loss in place of the epsilon loss, or added to it"
+    )
+    rate: float = Field(default=2e-4, gt=0, description="learning rate before `switch`")
+    later_rate: float = Field(default=1e-4, gt=0, description="learning rate from `switch` on, and of style stage 2")
+    noise_offset: float = Field(default=0.03, ge=0, description="noise shared by a channel's pixels, style stage 2")
+    weight_decay: float = Field(default=1e-4, ge=0, description="of AdamW")
+    clip: float = Field(default=1.0, gt=0, description="largest norm of a step's gradient")
+    resolution: int = Field(default=1024, ge=16, le=4096, description="pixels of the picture's short side")
+    save_every: int = Field(default=100, ge=1, description="steps between checkpoints")
+
+
+class DiffusionSettings(BaseModel):
+    """The paper's stylizer (4.1.2, 4.1.3): SDXL with depth and Canny ControlNets, two LoRAs and RePaint."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    content: Literal["auto", "none", "shared", "per-view"] = Field(
+        default="auto",
+        description="content LoRAs: none, shared (one, of the first view), per-view (the paper); auto: shared beside a "
+        "style LoRA, none beside an IP-Adapter",
+    )
+    adapter: Literal["lora", "ip"] = Field(
+        default="lora", description="what carries the style: a trained LoRA, or an IP-Adapter on the style block"
+    )
+    subject: str = Field(default="[c]", description="the prompt's word for the content")
+    look: str = Field(default="[v]", description="the prompt's word for the style")
+    steps: int = Field(default=30, ge=1, le=1000, description="noise levels of the sampler (N)")
+    guidance: float = Field(default=7.5, ge=1, description="classifier-free guidance")
+    depth: float = Field(default=0.8, ge=0, le=2, description="scale of the depth ControlNet")
+    canny: float = Field(default=0.4, ge=0, le=2, description="scale of the Canny ControlNet")
+    block: int = Field(default=10, ge=1, description="steps of a RePaint block (L)")
+    repeats: int = Field(default=10, ge=1, description="passes over a block (r)")
+    refinement: float = Field(default=0.1, ge=0, le=1, description="strength of the refinement after the main pass")
+    content_guidance: float = Field(default=0, ge=0, description="ConsisLoRA's content guidance; 0 is off")
+    style_guidance: float = Field(default=0, ge=0, description="ConsisLoRA's style guidance; 0 is off")
+    adapter_scale: float = Field(default=1.0, ge=0, le=2, description="scale of the IP-Adapter on the style block")
+
+
+LIGHTING = "shadow, shade, shading, highlight, specular reflection, strong light, backlight, dimness, text"
+
+
+class Paint3dSettings(BaseModel):
+    """The paper's texture inpainting (4.3): SD 1.5 with the UV-position ControlNet and an IP-Adapter."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    recipe: Literal["inpaint", "paint3d"] = Field(
+        default="inpaint",
+        description="inpainting UNet (the paper), or SD 1.5 with an inpaint ControlNet (Paint3D)",
+    )
+    prompt: str = Field(
+        default="UV map, texture of an object, even flat lighting, high quality", description="what to paint"
+    )
+    negative: str = Field(default=LIGHTING, description="what not to paint: light and shadow belong to the renderer")
+    size: int = Field(default=1024, ge=16, le=2048, description="pixels of a side that the model paints at once")
+    overlap: int = Field(default=128, ge=0, description="pixels that crops share, and context around holes")
+    detail: float = Field(
+        default=0.5, ge=0, le=1, description="strength of the pass over crops; 0 leaves it out (low frequencies only)"
+    )
+    steps: int = Field(default=0, ge=0, le=1000, description="sampling steps; 0 takes the recipe's (30, Paint3D 20)")
+    guidance: float = Field(default=0, ge=0, description="classifier-free; 0 takes the recipe's (4, Paint3D 3)")
+    position: float = Field(default=1.0, ge=0, le=2, description="scale of the UV-position ControlNet")
+    style: float = Field(default=-1, ge=-1, le=2, description="IP-Adapter; -1 takes the recipe's (0.6, Paint3D 1)")
+    shape_scale: float = Field(default=0.6, gt=0, le=1, description="radius of the mesh in the position map")
+    shape_height: float = Field(default=0.25, ge=-1, le=1, description="how far the position map raises the mesh")

@@ -1,0 +1,52 @@
+"""The weight-free stylizer, one view at a time: what `mistyle.stages.mvst.sweep` asks for, without a network."""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from mistyle.core.asset import Picture
+from mistyle.core.image import linear_from_srgb
+from mistyle.core.mesh import Mesh
+from mistyle.core.view import Prior, View
+from mistyle.stages.mvst import Stylizer
+from mistyle.surface.guides import Content
+from mistyle.surface.settings import SurfaceSettings
+
+DEPTH = 65_535  # steps of the painted colours (sRGB)
+
+
+def stylizer(
+    mesh: Mesh,
+    style: Picture,
+    settings: SurfaceSettings,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda done: None,
+    *,
+    content: Content | None = None,
+) -> Stylizer:
+    """A Stylizer of views of `mesh` in the style of a picture; it keeps outlines.
+
+    The guides are those of the embedded stylizer, found here once. Priors hold where they are known; see
+    `mistyle.surface.view_samples.paint_view`.
+    """
+    from mistyle.backends.embedded import array_module
+    from mistyle.render.draw import tracer
+    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.surface.view_samples import ground, paint_view
+
+    module, traced = array_module(), tracer(mesh)
+
+    def occlusion(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        return ambient_occlusion(traced, positions, normals, seed=seed)
+
+    base = ground(
+        mesh, style.rgb, settings, seed, occlusion, progress, alpha=style.alpha, content=content, device=module
+    )
+
+    def paint(view: View, prior: Prior | None, rng: np.random.Generator) -> np.ndarray:
+        encoded = paint_view(view, prior, base, int(rng.integers(2**31)), module)
+        # 16 bits: sums on several threads may differ in the last bit of a float, and later views build on this one.
+        rgb = linear_from_srgb(np.round(encoded * DEPTH) / np.float32(DEPTH))
+        return rgb if prior is None else np.where((prior.known & view.mask)[..., None], prior.rgb, rgb)
+
+    return paint

@@ -1,0 +1,353 @@
+"""Where models are found and whether they are what they should be; nothing here loads weights or imports torch.
+
+Revisions and hashes are those that other projects' published lock files give; they were not compared with the hub.
+Only safetensors are accepted: a pickle can run code when it is opened.
+"""
+
+import hashlib
+import json
+import os
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
+from mistyle.files.store import sha256_file
+
+LOCK = "mistyle-models.json"
+WEIGHTS = ("diffusion_pytorch_model", "model")
+PACKAGES = ("diffusers", "transformers", "peft", "accelerate", "safetensors", "huggingface_hub")
+BASE = ("tokenizer", "text_encoder", "unet", "vae", "scheduler")  # folders of a Stable Diffusion model
+HEADER_LIMIT = 100_000_000
+PIECES, PIECE = 64, 65536
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model that mistyle can use. `folders` hold networks or tokenizers ('' is the model's own folder), `loose`
+    are single weight files; `patterns` are fetched."""
+
+    name: str
+    repo: str
+    revision: str
+    gigabytes: float
+    licence: str
+    purpose: str
+    folders: tuple[str, ...]
+    patterns: tuple[str, ...]
+    loose: tuple[str, ...] = ()
+    sha256: Mapping[str, str] = field(default_factory=dict)
+
+
+def _network(*folders: str) -> tuple[str, ...]:
+    return tuple(f"{f}/{name}" if f else name for f in folders for name in ("*.json", "*model.fp16.safetensors"))
+
+
+SDXL = (*BASE, "tokenizer_2", "text_encoder_2")
+TOKENS = ("tokenizer*/*", "scheduler/*.json", "model_index.json")
+ENCODER = "models/image_encoder"
+MODELS = {
+    model.name: model
+    for model in (
+        Model(
+            "sdxl",
+            "stabilityai/stable-diffusion-xl-base-1.0",
+            "462165984030d82259a11f4367a4eed129e94a7b",
+            7.1,
+            "CreativeML Open RAIL++-M",
+            "stylizer and LoRA training: the base model",
+            SDXL,
+            (*_network("unet", "text_encoder", "text_encoder_2"), *TOKENS, "vae/*.json", "vae/*model.safetensors"),
+        ),
+        Model(
+            "depth",
+            "diffusers/controlnet-depth-sdxl-1.0",
+            "17bb97973f29801224cd66f192c5ffacf82648b4",
+            2.5,
+            "openrail++",
+            "stylizer: depth ControlNet",
+            ("",),
+            _network(""),
+        ),
+        Model(
+            "canny",
+            "diffusers/controlnet-canny-sdxl-1.0",
+            "eb115a19a10d14909256db740ed109532ab1483c",
+            2.5,
+            "openrail++",
+            "stylizer: Canny ControlNet",
+            ("",),
+            _network(""),
+        ),
+        Model(
+            "ip-adapter",
+            "h94/IP-Adapter",
+            "018e402774aeeddd60609b4ecdb7e298259dc729",
+            3.3,
+            "Apache-2.0",
+            "inpainter: the style picture; stylizer with --style-adapter ip",
+            (ENCODER,),
+            (
+                f"{ENCODER}/config.json",
+                f"{ENCODER}/model.safetensors",
+                "models/ip-adapter_sd15.safetensors",
+                "sdxl_models/ip-adapter_sdxl_vit-h.safetensors",
+            ),
+            ("models/ip-adapter_sd15.safetensors", "sdxl_models/ip-adapter_sdxl_vit-h.safetensors"),
+            {
+                "models/ip-adapter_sd15.safetensors": (
+                    "289b45f16d043d0bf542e45831f971dcdaabe18b656f11e86d9dfba7e9ee3369"
+                ),
+                "sdxl_models/ip-adapter_sdxl_vit-h.safetensors": (
+                    "ebf05d918348aec7abb02a5e9ecef77e0aaea6914a5c4ea13f50d45eb1681831"
+                ),
+                f"{ENCODER}/model.safetensors": "6ca9667da1ca9e0b0f75e46bb030f7e011f44f86cbfb8d5a36590fcd7507b030",
+            },
+        ),
+        Model(
+            "inpaint",
+            "stable-diffusion-v1-5/stable-diffusion-inpainting",
+            "8a4288a76071f7280aedbdb3253bdb9e9d5d84bb",
+            2.2,
+            "CreativeML OpenRAIL-M",
+            "inpainter: the base model (the copy of the deleted runwayml/stable-diffusion-inpainting)",
+            BASE,
+            (*_network("unet", "text_encoder", "vae"), *TOKENS),
+        ),
+        Model(
+            "position",
+            "GeorgeQi/Paint3d_UVPos_Control",
+            "main",
+            1.5,
+            "Apache-2.0 (its training data has licences of its own)",
+            "inpainter: UV-position ControlNet; published as a pickle, converted once",
+            ("",),
+            ("config.json", "diffusion_pytorch_model.bin"),
+        ),
+        Model(
+            "sd15",
+            "stable-diffusion-v1-5/stable-diffusion-v1-5",
+            "451f4fe16113bff5a5d2269ed5ad43b0592e9a14",
+            2.2,
+            "CreativeML OpenRAIL-M",
+            "inpainter with paint3d.recipe=paint3d: the base model",
+            BASE,
+            (*_network("unet", "text_encoder", "vae"), *TOKENS),
+            (),
+            {
+                "unet/diffusion_pytorch_model.fp16.safetensors": (
+                    "c83908253f9a64d08c25fc90874c9c8aef9a329ce1ca5fb909d73b0c83d1ea21"
+                ),
+                "text_encoder/model.fp16.safetensors": (
+                    "77795e2023adcf39bc29a884661950380bd093cf0750a966d473d1718dc9ef4e"
+                ),
+                "vae/diffusion_pytorch_model.fp16.safetensors": (
+                    "4fbcf0ebe55a0984f5a5e00d8c4521d52359af7229bb4d81890039d2aa16dd7c"
+                ),
+            },
+        ),
+        Model(
+            "inpaint-control",
+            "lllyasviel/control_v11p_sd15_inpaint",
+            "c96e03a807e64135568ba8aecb66b3a306ec73bd",
+            0.7,
+            "openrail",
+            "inpainter with paint3d.recipe=paint3d: inpaint ControlNet",
+            ("",),
+            _network(""),
+        ),
+    )
+}
+LOOSE_NEEDED = {"sdxl": "sdxl_models/ip-adapter_sdxl_vit-h.safetensors", "sd15": "models/ip-adapter_sd15.safetensors"}
+
+
+def need_extra() -> None:
+    """Refuse with the command that installs them where the optional packages are missing."""
+    lost = [name for name in PACKAGES if find_spec(name) is None]
+    if lost:
+        raise EnvironmentMissing(
+            f"this needs the optional packages {', '.join(lost)}, which are not installed; "
+            "run: pip install 'mistyle[diffusion]'"
+        )
+
+
+def get(name: str) -> Model:
+    """The model of this name."""
+    if name not in MODELS:
+        raise UsageError(f"there is no model '{name}'; choose one of {', '.join(MODELS)}")
+    return MODELS[name]
+
+
+def cache() -> Path:
+    """The Hugging Face cache, as huggingface_hub places it."""
+    home = os.environ.get("HF_HOME") or os.path.join(os.environ.get("XDG_CACHE_HOME", "~/.cache"), "huggingface")
+    return Path(os.environ.get("HF_HUB_CACHE") or os.path.join(home, "hub")).expanduser()
+
+
+def places(model: Model, folder: Path | None) -> list[Path]:
+    """Where a model is looked for: the models' folder, then the cache (the pinned revision, then `main`)."""
+    found = [folder / model.name] if folder else []
+    cached = cache() / f"models--{model.repo.replace('/', '--')}"
+    main = cached / "refs" / "main"
+    revisions = [model.revision, *([main.read_text().strip()] if main.is_file() else [])]
+    return found + [cached / "snapshots" / revision for revision in revisions]
+
+
+def find(name: str, folder: Path | None, loose: Iterable[str] = (), weightless: Iterable[str] = ()) -> Path:
+    """The folder of a complete model; EnvironmentMissing says where it was looked for and how to get it.
+
+    `loose` are the single files that are needed; `weightless` the folders of which only the configuration is needed,
+    since their weights come from elsewhere.
+    """
+    model = get(name)
+    looked = places(model, folder)
+    for place in looked:
+        if not place.is_dir():
+            continue
+        lost = lacking(model, place, loose, weightless)
+        if not lost:
+            verify(name, place, folder)
+            return place
+        pickles = [p for p in lost if p.with_suffix(".bin").is_file()]
+        if pickles:
+            into = folder or Path("MODELS")
+            raise EnvironmentMissing(
+                f"{pickles[0].with_suffix('.bin')} is a pickle, which can run code when opened; mistyle loads "
+                f"safetensors only. Convert it once: mistyle models convert {name} {place} --models {into}"
+            )
+        if place == looked[0] and folder:
+            raise EnvironmentMissing(f"{place} lacks {_relative(lost, place)}; {how_to_get(model, folder)}")
+    where = f"neither in {folder / name} nor in {cache()}" if folder else f"not in {cache()}"
+    raise EnvironmentMissing(
+        f"the model '{name}' ({model.repo}, {model.gigabytes} GB, {model.licence}) was found {where}; "
+        f"{how_to_get(model, folder)}"
+    )
+
+
+def how_to_get(model: Model, folder: Path | None) -> str:
+    """The sentence that fixes a missing model."""
+    into = folder or Path("models")
+    return f"run: mistyle models fetch {model.name} --models {into} --allow-download (or copy it there yourself)"
+
+
+def _relative(paths: Iterable[Path], place: Path) -> str:
+    return ", ".join(p.relative_to(place).as_posix() for p in paths)
+
+
+def lacking(model: Model, place: Path, loose: Iterable[str], weightless: Iterable[str] = ()) -> list[Path]:
+    """The files that a model's folder lacks, by the names they should have."""
+    lost = [place / name for name in loose if not (place / name).is_file()]
+    for part in model.folders:
+        folder = place / part
+        if part.startswith("tokenizer"):
+            there = (folder / "vocab.json").is_file() or (folder / "tokenizer.json").is_file()
+            lost += [] if there else [folder / "vocab.json"]
+        elif part == "scheduler":
+            lost += [] if (folder / "scheduler_config.json").is_file() else [folder / "scheduler_config.json"]
+        else:
+            lost += [] if (folder / "config.json").is_file() else [folder / "config.json"]
+            if part not in weightless and not weights(folder):
+                stem = "model" if "encoder" in part else "diffusion_pytorch_model"
+                lost.append(folder / f"{stem}.safetensors")
+    return lost
+
+
+def weights(folder: Path) -> list[Path]:
+    """The weight files of a network: full precision before half, shards where it is cut; empty where there are none."""
+    for variant in ("", ".fp16"):
+        for stem in WEIGHTS:
+            whole = folder / f"{stem}{variant}.safetensors"
+            if whole.is_file():
+                return [whole]
+            index = folder / f"{stem}.safetensors.index{variant}.json"
+            if index.is_file():
+                names = sorted(set(read_json(index)["weight_map"].values()))
+                return [folder / n for n in names] if all((folder / n).is_file() for n in names) else []
+    return []
+
+
+def variant(folder: Path) -> str | None:
+    """What diffusers calls the files that `weights` chose."""
+    found = weights(folder)
+    return "fp16" if found and ".fp16" in found[0].name else None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A configuration file."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise InputRefused(f"{path}: {error}; expected a model's JSON file; fetch the model again") from None
+
+
+def header(path: Path) -> dict[str, Any]:
+    """Names, types and shapes of a safetensors file, and '__metadata__', without reading its tensors."""
+    try:
+        with open(path, "rb") as file:
+            length = int.from_bytes(file.read(8), "little")
+            if not 2 <= length <= min(HEADER_LIMIT, path.stat().st_size):
+                raise ValueError(f"a header of {length} bytes")
+            table = json.loads(file.read(length))
+            if not isinstance(table, dict):
+                raise ValueError("a header that is no table")
+            return table
+    except (OSError, ValueError) as error:
+        raise InputRefused(f"{path}: {error}; expected a .safetensors file (pickles are not opened)") from None
+
+
+def shapes(paths: Iterable[Path]) -> dict[str, list[int]]:
+    """Tensor name -> shape over all files of a network."""
+    tables = (header(path) for path in paths)
+    return {name: entry["shape"] for table in tables for name, entry in table.items() if name != "__metadata__"}
+
+
+def fingerprint(files: Iterable[Path]) -> str:
+    """What weight files are, from their sizes and pieces spread over each: reading gigabytes whole takes too long."""
+    total = hashlib.sha256()
+    for path in files:
+        size = path.stat().st_size
+        total.update(f"{path.name} {size}\n".encode())
+        with open(path, "rb") as file:
+            for k in range(PIECES):
+                file.seek(k * max(size - PIECE, 0) // (PIECES - 1))
+                total.update(file.read(PIECE))
+    return total.hexdigest()
+
+
+def read_lock(folder: Path) -> dict[str, Any]:
+    """What was fetched into a models' folder: per model its revision and its files' hashes."""
+    path = folder / LOCK
+    return read_json(path) if path.is_file() else {}
+
+
+def verify(name: str, place: Path, folder: Path | None) -> None:
+    """Compare a fetched model with the hashes of its fetching; files untouched since the last time are not read."""
+    if folder is None or place != folder / name:
+        return
+    lock = read_lock(folder)
+    changed = False
+    for relative, entry in lock.get(name, {}).get("files", {}).items():
+        path = place / relative
+        if not path.is_file():
+            continue  # what is needed was checked; the rest may be removed
+        stat = path.stat()
+        if (stat.st_size, stat.st_mtime_ns) == (entry["bytes"], entry["mtime_ns"]):
+            continue
+        found = sha256_file(path)
+        if found != entry["sha256"]:
+            raise EnvironmentMissing(
+                f"{path}: sha256 is {found}, expected {entry['sha256']} as it was fetched; the file changed or broke. "
+                f"Remove it and {how_to_get(MODELS[name], folder)}"
+            )
+        entry.update(bytes=stat.st_size, mtime_ns=stat.st_mtime_ns)
+        changed = True
+    if changed:
+        write_lock(folder, lock)
+
+
+def write_lock(folder: Path, lock: Mapping[str, Any]) -> None:
+    from mistyle.files.store import atomic_write
+
+    atomic_write(folder / LOCK, (json.dumps(lock, indent=1, sort_keys=True) + "\n").encode())

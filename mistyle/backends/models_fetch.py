@@ -1,0 +1,171 @@
+"""Fetching models on request, through huggingface_hub, and the one conversion of a pickle into safetensors."""
+
+import hashlib
+import os
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlparse
+
+from mistyle.backends import models
+from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
+from mistyle.files.store import atomic_write, sha256_file
+
+PARTIAL = ".partial"
+
+
+def fetch(name: str, folder: Path, allowed: bool) -> Path:
+    """Download a model into `folder/name`, check its hashes, note them in the folder's lock; goes on where it stopped.
+
+    A file's sha256 must be the pinned one, else the one that the hub states for it. `HF_ENDPOINT`, `HF_TOKEN` and the
+    proxies are huggingface_hub's. Raises UsageError unless downloading was allowed.
+    """
+    model = models.get(name)
+    if not allowed:
+        raise UsageError(
+            f"fetching '{name}' downloads about {model.gigabytes} GB from {model.repo} under its licence "
+            f"({model.licence}); say so with --allow-download"
+        )
+    models.need_extra()
+    from huggingface_hub.errors import HfHubHTTPError
+
+    # huggingface_hub has changed its HTTP library more than once; its error's base is that library's own.
+    transport: Any = next(base for base in HfHubHTTPError.__mro__ if base.__name__ == "HTTPError")
+    place = folder / name
+    try:
+        wanted = _download(model, place) | dict(model.sha256)
+    except (transport, OSError) as error:
+        raise EnvironmentMissing(
+            f"{model.repo} could not be fetched: {str(error).splitlines()[0]}; check the network (HF_ENDPOINT, proxy, "
+            "HF_HUB_OFFLINE; HF_TOKEN where the licence must be accepted) and run the same command again: it goes on "
+            "where it stopped"
+        ) from None
+    entries = {path: _checked(place / path, wanted.get(path)) for path in _files(place)}
+    if not entries:
+        raise EnvironmentMissing(f"{model.repo} at {model.revision} holds none of {', '.join(model.patterns)}")
+    if list(place.glob("*.bin")) and not models.weights(place):
+        convert(place / "diffusion_pytorch_model.bin", place)
+        entries = {path: entries.get(path) or _checked(place / path, None) for path in _files(place)}
+    lock = models.read_lock(folder)
+    lock[name] = {"repo": model.repo, "revision": model.revision, "files": entries}
+    models.write_lock(folder, lock)
+    lost = models.lacking(model, place, model.loose)
+    if lost:
+        raise EnvironmentMissing(f"{place}: {model.repo} gave no {lost[0].relative_to(place).as_posix()}")
+    return place
+
+
+def _files(place: Path) -> list[str]:
+    every = (p.relative_to(place) for p in sorted(place.rglob("*")) if p.is_file())
+    return [p.as_posix() for p in every if p.parts[0] != PARTIAL]
+
+
+def _download(model: models.Model, place: Path) -> dict[str, str]:
+    """Fetch what is not there; returns the sha256 that the hub states for its large files.
+
+    Parts of files stay in `place/.partial` when the connection breaks (huggingface_hub's own downloads begin anew in
+    every process).
+    """
+    from huggingface_hub import HfApi, get_hf_file_metadata, hf_hub_url
+    from huggingface_hub.file_download import http_get
+    from huggingface_hub.utils import build_hf_headers, filter_repo_objects
+
+    every = HfApi().list_repo_files(model.repo, revision=model.revision)
+    stated, partial = {}, place / PARTIAL
+    for path in filter_repo_objects(every, allow_patterns=list(model.patterns)):
+        target = _inside(place, path)
+        url = hf_hub_url(model.repo, path, revision=model.revision)
+        found = get_hf_file_metadata(url)
+        tag = found.etag or ""
+        if re.fullmatch("[0-9a-f]{64}", tag):
+            stated[path] = tag
+        if target.is_file() and target.stat().st_size == found.size:
+            continue
+        headers = build_hf_headers()
+        if urlparse(found.location).netloc != urlparse(url).netloc:
+            url = found.location  # a signed address elsewhere, to which the token must not go
+            headers.pop("authorization", None)
+        part = partial / hashlib.sha256(f"{path}\n{tag}".encode()).hexdigest()[:24]
+        part.parent.mkdir(parents=True, exist_ok=True)
+        with open(part, "r+b" if part.is_file() else "wb") as file:
+            have = file.seek(0, os.SEEK_END)
+            http_get(url, file, resume_size=have, headers=headers, expected_size=found.size)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(part, target)
+    shutil.rmtree(partial, ignore_errors=True)
+    return stated
+
+
+def _inside(place: Path, path: str) -> Path:
+    """Where a file of a repository goes; names that lead elsewhere are refused."""
+    target = place / path
+    if not target.resolve().is_relative_to(place.resolve()):
+        raise EnvironmentMissing(f"the repository names a file '{path}' outside its own folder; it was not fetched")
+    return target
+
+
+def _checked(path: Path, wanted: str | None) -> dict[str, Any]:
+    found = sha256_file(path)
+    if wanted is not None and found != wanted:
+        path.unlink()
+        raise EnvironmentMissing(
+            f"{path}: sha256 is {found}, expected {wanted}; the file was removed. Run the same command again; if it "
+            "stays so, the file at its source is not the one that mistyle knows"
+        )
+    stat = path.stat()
+    return {"sha256": found, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
+
+
+def convert(pickle: Path, into: Path) -> Path:
+    """A pickled state dict as safetensors in the folder `into`, beside a copy of its config.json.
+
+    The pickle is opened with `weights_only=True`: tensors and nothing that could run. Anything else is refused.
+    """
+    import pickle as pickles
+
+    import torch
+    from safetensors.torch import save_file
+
+    if not pickle.is_file():
+        raise InputRefused(f"{pickle}: found nothing, expected a pickled state dict (.bin)")
+    try:
+        state = torch.load(pickle, map_location="cpu", weights_only=True)
+    except (pickles.UnpicklingError, RuntimeError, EOFError) as error:
+        raise InputRefused(
+            f"{pickle}: not a plain table of tensors, so it was not opened ({str(error).splitlines()[0]})"
+        ) from None
+    if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
+        raise InputRefused(f"{pickle}: expected a table of tensors")
+    tensors = {str(k): v.detach().clone().contiguous() for k, v in state.items()}
+    target = into / "diffusion_pytorch_model.safetensors"
+    atomic_write(target, lambda path: save_file(tensors, path, {"format": "pt"}))
+    config = pickle.with_name("config.json")
+    if config.is_file() and config.parent != into:
+        atomic_write(into / "config.json", config.read_bytes())
+    return target
+
+
+def listing(folder: Path | None) -> list[dict[str, Any]]:
+    """Every model with what `mistyle models` prints of it."""
+    rows = []
+    lock = models.read_lock(folder) if folder else {}
+    for model in models.MODELS.values():
+        there = next((p for p in models.places(model, folder) if p.is_dir()), None)
+        lost = models.lacking(model, there, ()) if there else []
+        locked = lock.get(model.name, {}).get("files", {})
+        hashes = {k: v["sha256"] for k, v in locked.items() if k.endswith(".safetensors")}
+        rows.append(
+            {
+                "name": model.name,
+                "repo": model.repo,
+                "revision": model.revision,
+                "sha256": hashes | dict(model.sha256),
+                "gigabytes": model.gigabytes,
+                "licence": model.licence,
+                "purpose": model.purpose,
+                "folders": [f or "." for f in model.folders] + list(model.loose),
+                "found": str(there) if there and not lost else None,
+            }
+        )
+    return rows

@@ -1,0 +1,322 @@
+"""The verb `mistyle compare`: pictures against references, or renderers against each other."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import UsageError
+from mistyle.run.options import examples
+
+
+def add_compare(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "compare",
+        help="how two renders, renderers, versions or settings differ: numbers, limits, and a page to look at",
+        **examples(
+            """
+            mistyle compare reference.exr test.exr -o diff/                 all metrics, every layer, diff/index.html
+            mistyle compare frames_old/ frames_new/ -o diff/ --max flip=0.05 --min psnr=35       exit 5 when one fails
+            mistyle compare a.exr b.exr c.exr -o diff/ --metrics flip,psnr --crop 200,120,96,64
+            mistyle compare --baseline golden/ renders/ -o diff/ --limits compare.toml
+            mistyle compare --baseline golden/ renders/ --approve 'shot_01*'
+            mistyle compare --render chair.glb --with mitsuba:path --with blender:cycles -o diff/
+            """
+        ),
+    )
+    verb.add_argument("pictures", type=Path, nargs="*", metavar="PICTURE", help="REFERENCE TEST…: files, or folders")
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="folder for the page and the tables")
+    verb.add_argument("--json", action="store_true", help="compare.json on stdout, logs on stderr")
+    _add_what(verb)
+    _add_limits(verb)
+    _add_render(verb)
+    verb.set_defaults(command=run_compare)
+
+
+def add_converge(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "converge",
+        help="how fast renderers converge on a scene: error against samples and seconds, slopes, efficiency",
+        **examples(
+            """
+            mistyle converge room.xml --with mitsuba:path,mitsuba:direct -o curves/
+            mistyle converge chair.glb --with mitsuba:path --with blender:cycles --max-spp 256 -o curves/
+            """
+        ),
+    )
+    verb.add_argument(
+        "scene", type=Path, metavar="SCENE", help="a Mitsuba XML (trusted like code), a GLB or other mesh"
+    )
+    verb.add_argument("--with", dest="renderers", action="append", default=[], metavar="A,B", help="as for compare")
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="folder for the page and the tables")
+    verb.add_argument("--max-spp", type=int, default=64, metavar="N", help="doubles samples up to N (default 64)")
+    verb.add_argument("--seeds", type=int, default=4, metavar="N", help="independent renders of each (default 4)")
+    verb.add_argument("--reference", type=Path, metavar="FILE.exr", help="the converged picture")
+    verb.add_argument(
+        "--reference-spp", type=int, metavar="N", help="or how many samples of A make it (16 x --max-spp)"
+    )
+    verb.add_argument("--lights", default="studio", metavar="A", help="of a mesh: studio, key, grazing, FILE.hdr")
+    verb.add_argument("--size", type=int, default=256, metavar="N", help="of a mesh: pixels along each side")
+    verb.add_argument("--sensor", type=int, default=0, metavar="K", help="of a scene file: the sensor")
+    verb.add_argument("--blender", metavar="PYTHON", help="Python with bpy, for blender:cycles")
+    verb.add_argument("--threads", type=int, metavar="N", help="threads of blender:cycles (default: all)")
+    verb.add_argument("--json", action="store_true", help="converge.json on stdout, logs on stderr")
+    verb.set_defaults(command=_converge)
+
+
+def _converge(options: argparse.Namespace) -> int:
+    from mistyle.run.converge import run_converge
+
+    return run_converge(options)
+
+
+def _add_what(verb: argparse.ArgumentParser) -> None:
+    what = verb.add_argument_group("what is compared")
+    what.add_argument("--metrics", metavar="A,B", help="only these (default: all; --list-metrics says what they are)")
+    what.add_argument("--list-metrics", action="store_true", help="every metric with its definition, and stop")
+    what.add_argument("--layer", action="append", default=[], metavar="NAME", help="only this layer; may be repeated")
+    what.add_argument("--mask", metavar="alpha|FILE", help="pixels that count: the reference's alpha, or a picture")
+    what.add_argument(
+        "--window", choices=["display", "overlap"], default="display", help="overlap: where both have data"
+    )
+    what.add_argument(
+        "--protocol", choices=["stanford-orb", "tensoir", "idiff"], help="the numbers of that code instead"
+    )
+    what.add_argument("--ppd", type=float, metavar="N", help="pixels per degree for FLIP (default 67.02)")
+    what.add_argument("--peak", type=float, default=1.0, metavar="X", help="peak of the linear PSNR (default 1)")
+    what.add_argument(
+        "--exposures", metavar="FIRST,LAST,N", help="stops for HDR-FLIP (default: what the reference asks for)"
+    )
+    what.add_argument(
+        "--lpips", nargs=2, type=Path, metavar=("BACKBONE", "HEADS"), help="weights of LPIPS-squeeze v0.1"
+    )
+    what.add_argument("--show", type=int, default=48, metavar="N", help="pictures of the N worst rows (default 48)")
+    what.add_argument("--crop", metavar="X,Y,W,H", help="also draw the inset figure: inset.png, inset.pdf")
+
+
+def _add_limits(verb: argparse.ArgumentParser) -> None:
+    limits = verb.add_argument_group("limits; exit code 5 when one is not kept")
+    limits.add_argument("--max", action="append", default=[], metavar="METRIC=X", help="at most X")
+    limits.add_argument("--min", action="append", default=[], metavar="METRIC=X", help="at least X")
+    limits.add_argument("--limits", type=Path, metavar="compare.toml", help="limits from a file, also per image")
+    limits.add_argument("--allow-nonfinite", action="store_true", help="NaN and infinite pixels are no failure")
+    limits.add_argument("--allow-missing", action="store_true", help="pictures that only one folder has are no failure")
+    limits.add_argument("--baseline", type=Path, metavar="DIR", help="the approved pictures: REFERENCE is not given")
+    limits.add_argument("--approve", action="append", default=[], metavar="NAME", help="take TEST's NAME into DIR")
+
+
+def _add_render(verb: argparse.ArgumentParser) -> None:
+    render = verb.add_argument_group("renderers instead of pictures")
+    render.add_argument(
+        "--render", type=Path, metavar="FILE", help="a mesh, a run folder of ours, or a Mitsuba XML (trusted)"
+    )
+    render.add_argument(
+        "--with",
+        dest="renderers",
+        action="append",
+        default=[],
+        metavar="A",
+        help="mitsuba:path, mitsuba:direct, mitsuba@VENV:path, blender:cycles, NAME='command {scene} {out}'; the first "
+        "is the reference",
+    )
+    render.add_argument("--lights", default="studio", metavar="A,B", help="studio, key, grazing, FILE.hdr")
+    render.add_argument("--spp", type=int, default=64, metavar="N", help="samples per pixel (default 64)")
+    render.add_argument("--size", type=int, default=256, metavar="N", help="pixels along each side (default 256)")
+    render.add_argument("--seeds", type=int, default=8, metavar="N", help="independent renders for the z-test")
+    render.add_argument("--blender", metavar="PYTHON", help="Python with bpy, for blender:cycles")
+    render.add_argument("--threads", type=int, metavar="N", help="threads of blender:cycles (default: all)")
+    render.add_argument("--views", type=int, default=1, metavar="N", help="cameras around the asset (default 1)")
+
+
+def run_compare(options: argparse.Namespace) -> int:
+    """Dispatch to pictures, approvals and renderers."""
+    if options.list_metrics:
+        return _list()
+    if options.render is not None:
+        if options.pictures:
+            raise UsageError("give either pictures or --render FILE --with A --with B, not both")
+        from mistyle.run.compare_render import run_render
+
+        return run_render(options)
+    if options.approve:
+        return _approve(options)
+    job = job_of(options)
+    from mistyle.run.compare import compare
+    from mistyle.run.progress import Progress
+
+    return told(options, compare(job, Progress()))
+
+
+def _list() -> int:
+    from mistyle.measure.compare_metrics import METRICS, Viewing, definitions
+    from mistyle.measure.compare_protocols import PROTOCOLS
+
+    for name, text in definitions(Viewing(), list(METRICS)).items():
+        print(f"{name} ({METRICS[name].better} is better): {text}\n")
+    for name, text in PROTOCOLS.items():
+        print(f"--protocol {name}: {text}\n")
+    return 0
+
+
+def _approve(options: argparse.Namespace) -> int:
+    if options.baseline is None or len(options.pictures) != 1:
+        raise UsageError("--approve NAME needs --baseline DIR and one folder of new pictures")
+    from mistyle.run.compare_baseline import approve
+
+    names = approve(options.baseline, options.pictures[0], options.approve)
+    print(json.dumps({"approved": names}) if options.json else "\n".join(f"approved {name}" for name in names))
+    return 0
+
+
+def job_of(options: argparse.Namespace, reference: Path | None = None, tests: tuple[Path, ...] = ()) -> Any:
+    """The job that the command line describes; with `reference`, of those pictures instead of the given ones."""
+    from mistyle.measure.compare_metrics import COLOUR, DATA, METRICS
+    from mistyle.run.compare_limits import checked, parse, read_limits
+    from mistyle.run.compare_records import CompareJob
+
+    if reference is None:
+        reference, tests = _given(options)
+    if options.out is None:
+        raise UsageError("compare needs -o OUT")
+    metrics = COLOUR + DATA
+    if options.metrics:
+        metrics = tuple(checked(n.strip(), list(METRICS), "--metrics") for n in options.metrics.split(",") if n.strip())
+    known = _protocol_names(options.protocol) if options.protocol else [n for n in metrics if _measured(n, options)]
+    file = _limits_file(options, reference)
+    general, some = read_limits(file, known) if file is not None else ([], [])
+    said = [parse(text, "max", known) for text in options.max] + [parse(text, "min", known) for text in options.min]
+    safe(options.out, [reference, *tests])
+    return CompareJob(
+        reference=reference,
+        tests=tests,
+        out=options.out,
+        metrics=metrics,
+        layers=tuple(options.layer),
+        window=options.window,
+        mask=options.mask,
+        viewing=_viewing(options),
+        protocol=options.protocol,
+        limits=(*general, *said, *some),
+        allow_nonfinite=options.allow_nonfinite,
+        allow_missing=options.allow_missing,
+        pictures=options.show,
+        crop=_crop(options.crop),
+    )
+
+
+def _given(options: argparse.Namespace) -> tuple[Path, tuple[Path, ...]]:
+    given = list(options.pictures)
+    if options.baseline is not None:
+        if not given:
+            raise UsageError("--baseline DIR needs the new pictures: mistyle compare --baseline DIR TEST -o OUT")
+        return options.baseline, tuple(given)
+    if len(given) < 2:
+        raise UsageError("compare needs REFERENCE and TEST; see mistyle compare --help")
+    return given[0], tuple(given[1:])
+
+
+def _protocol_names(protocol: str) -> list[str]:
+    return {
+        "stanford-orb": ["psnr_h", "psnr_l", "ssim"],
+        "tensoir": ["psnr", "ssim"],
+        "idiff": ["mean_error", "rms_error", "peak_snr", "max_error", "over"],
+    }[protocol]
+
+
+def _measured(name: str, options: argparse.Namespace) -> bool:
+    return name != "lpips" or options.lpips is not None
+
+
+def _limits_file(options: argparse.Namespace, reference: Path) -> Path | None:
+    """--limits, or the compare.toml that lies in the reference's folder."""
+    if options.limits is not None:
+        return options.limits
+    beside = reference / "compare.toml"
+    return beside if beside.is_file() else None
+
+
+def safe(out: Path, inputs: list[Path]) -> None:
+    """UsageError where writing OUT would replace something that no comparison wrote, or an input."""
+    safe_folder(out, "compare.json")
+    for path in inputs:
+        if path.resolve().is_relative_to(out.resolve()):
+            raise UsageError(f"-o {out}: holds the input {path}, which would be replaced; choose another folder")
+
+
+def safe_folder(out: Path, mark: str) -> None:
+    """UsageError where OUT holds something and not the `mark` of an earlier run."""
+    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / mark).is_file())):
+        raise UsageError(f"-o {out}: found something that this command did not write; choose a new or empty folder")
+
+
+def _viewing(options: argparse.Namespace) -> Any:
+    from mistyle.measure.compare_metrics import PPD, Viewing
+
+    if options.ppd is not None and not 1 <= options.ppd <= 1000:
+        raise UsageError(f"--ppd {options.ppd}: expected 1 to 1000 pixels per degree")
+    if not options.peak > 0:
+        raise UsageError(f"--peak {options.peak}: expected a number above 0")
+    viewing = Viewing(options.ppd or PPD, options.peak, _exposures(options.exposures))
+    if options.lpips is None:
+        return viewing
+    from dataclasses import replace
+
+    from mistyle.measure.lpips import load_lpips
+
+    text = f"SqueezeNet 1.1 backbone, v0.1 heads ({options.lpips[0].name}, {options.lpips[1].name}), mean over the mask"
+    return replace(viewing, lpips=load_lpips(*options.lpips), lpips_text=text)
+
+
+def _exposures(text: str | None) -> tuple[float, float, int] | None:
+    if text is None:
+        return None
+    try:
+        first, last, count = (float(v) for v in text.split(","))
+    except ValueError:
+        first, last, count = 0.0, 0.0, 0.0
+    if not (-32 <= first <= last <= 32 and 2 <= count <= 64 and count == int(count)):
+        raise UsageError(f"--exposures {text}: expected FIRST,LAST,N in stops, N from 2 to 64; for example -2,3,6")
+    return first, last, int(count)
+
+
+def _crop(text: str | None) -> tuple[int, int, int, int] | None:
+    if text is None:
+        return None
+    try:
+        x, y, width, height = (int(v) for v in text.split(","))
+    except ValueError:
+        raise UsageError(f"--crop {text}: expected X,Y,WIDTH,HEIGHT in pixels") from None
+    return x, y, width, height
+
+
+def told(options: argparse.Namespace, record: dict[str, Any]) -> int:
+    """Print what was found, and the exit code: 5 where a limit was not kept."""
+    if options.json:
+        print(json.dumps(record))
+    else:
+        _print(record, options.out)
+    for text in record["failures"][:20]:
+        print(f"mistyle: failed: {text}", file=sys.stderr)
+    if len(record["failures"]) > 20:
+        print(f"mistyle: and {len(record['failures']) - 20} more failures in compare.json", file=sys.stderr)
+    return 0 if record["passed"] else 5
+
+
+def _print(record: dict[str, Any], out: Path) -> None:
+    for part in record["summary"]:
+        if not part["values"]:
+            continue
+        print(f"{part['test']} [{part['layer']}], {part['images']} image(s), {part['failed']} failed")
+        for name, value in part["values"].items():
+            mean, worst = (v if isinstance(v, str) else "n/a" if v is None else f"{v:.5g}" for v in _two(value))
+            several = f"   worst {worst}" if part["images"] > 1 else ""
+            print(f"  {name:<12} {mean:>10}{several}")
+    print("what the metrics are:")
+    for name, text in record["definitions"].items():
+        print(f"  {name}: {text}")
+    print(f"page      {out / 'index.html'}\ntables    {out / 'compare.csv'}, compare.json, junit.xml")
+
+
+def _two(value: dict[str, Any]) -> tuple[Any, Any]:
+    return value["mean"], value["worst"]

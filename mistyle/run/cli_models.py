@@ -1,0 +1,131 @@
+"""`mistyle models`: what models the generative stages use, where they are, and fetching them when told to."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import UsageError
+from mistyle.run.options import examples
+
+# Option -> dotted setting, for `add_generative_options`.
+GENERATIVE_OPTIONS = {
+    "inpainter": "inpainter",
+    "models": "models.folder",
+    "checkpoint": "models.checkpoint",
+    "style_lora": "models.style_lora",
+    "loras": "models.loras",
+    "content": "diffusion.content",
+    "style_adapter": "diffusion.adapter",
+    "prompt": "paint3d.prompt",
+}
+
+
+def add_model_options(verb: Any) -> None:
+    """Where models are found: for a verb, or a group of its options."""
+    verb.add_argument(
+        "--models", type=Path, metavar="DIR", help="folder of models, as `mistyle models` lays it out (else HF's cache)"
+    )
+    verb.add_argument(
+        "--checkpoint", type=Path, metavar="FILE", help="SDXL or a finetune as one .safetensors file, for its weights"
+    )
+
+
+def add_generative_options(verb: argparse.ArgumentParser) -> None:
+    """Options of the generative stylizer and inpainter."""
+    group = verb.add_argument_group("generative stages (need models: see mistyle models)")
+    group.add_argument(
+        "--inpainter", choices=["fill", "paint3d"], help="what repairs the texture: fill needs no models (default)"
+    )
+    add_model_options(group)
+    group.add_argument("--style-lora", type=Path, metavar="FILE", help="a style LoRA trained elsewhere (.safetensors)")
+    group.add_argument("--loras", type=Path, metavar="DIR", help="where trained LoRAs are kept and looked for")
+    group.add_argument(
+        "--content",
+        choices=["auto", "none", "shared", "per-view"],
+        help="content LoRAs: none, one from the first view, one per view as in the paper (hours)",
+    )
+    group.add_argument(
+        "--style-adapter", choices=["lora", "ip"], help="lora: trained on the style; ip: an IP-Adapter, no training"
+    )
+    group.add_argument("--prompt", help="what the texture inpainter paints")
+
+
+def add_models(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "models",
+        help="models of the generative stages: which, where, licences; fetch them",
+        **examples(
+            """
+            mistyle models --models DIR                             what is there, what is missing, and the layout
+            mistyle models fetch sdxl depth canny --models DIR --allow-download
+            mistyle models convert position paint3d.bin --models DIR     a pickle once into safetensors
+            """
+        ),
+    )
+    verb.add_argument("action", nargs="?", choices=["list", "fetch", "convert"], default="list")
+    verb.add_argument("names", nargs="*", metavar="NAME", help="models to fetch; or NAME and the file to convert")
+    verb.add_argument("--models", type=Path, metavar="DIR", help="folder of models (else the Hugging Face cache)")
+    verb.add_argument("--allow-download", action="store_true", help="fetch may use the network")
+    verb.add_argument("--json", action="store_true", help="one JSON object on stdout")
+    verb.set_defaults(command=run_models)
+
+
+def run_models(options: argparse.Namespace) -> int:
+    """List, fetch or convert."""
+    if options.action == "list":
+        return _list(options)
+    if options.models is None:
+        raise UsageError(f"mistyle models {options.action} needs --models DIR, the folder to put them in")
+    if options.action == "convert":
+        return _convert(options)
+    if not options.names:
+        raise UsageError("mistyle models fetch NAME...; `mistyle models` prints the names")
+    from mistyle.backends.models import get
+    from mistyle.backends.models_fetch import fetch
+
+    for name in options.names:
+        get(name)
+    places = {}
+    for name in options.names:
+        places[name] = str(fetch(name, options.models, options.allow_download))
+        print(f"{name}: {places[name]}", file=sys.stderr)
+    if options.json:
+        print(json.dumps(places))
+    return 0
+
+
+def _convert(options: argparse.Namespace) -> int:
+    from mistyle.backends.models import get, need_extra
+    from mistyle.backends.models_fetch import convert
+
+    if len(options.names) != 2:
+        raise UsageError("mistyle models convert NAME FILE.bin --models DIR")
+    name, source = get(options.names[0]).name, Path(options.names[1])
+    need_extra()
+    pickle = source / "diffusion_pytorch_model.bin" if source.is_dir() else source
+    print(convert(pickle, options.models / name))
+    return 0
+
+
+def _list(options: argparse.Namespace) -> int:
+    from mistyle.backends.models_fetch import listing
+
+    rows = listing(options.models)
+    if options.json:
+        print(json.dumps({"models": rows}, indent=1))
+        return 0
+    for row in rows:
+        print(f"{row['name']:<16} {row['found'] or 'not found'}")
+        print(f"  {row['purpose']}")
+        print(f"  {row['repo']} at {row['revision']}, {row['gigabytes']} GB, {row['licence']}")
+        print(f"  in {options.models or 'DIR'}/{row['name']}: {', '.join(row['folders'])}")
+        for file, value in row["sha256"].items():
+            print(f"  sha256 {value}  {file}")
+    print(
+        "\nNothing is downloaded unless you say so: mistyle models fetch NAME --models DIR --allow-download. "
+        "Each model's licence is yours to accept.\nRevisions and hashes come from other projects' lock files; fetch "
+        "compares them with what arrives."
+    )
+    return 0

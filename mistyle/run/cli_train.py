@@ -1,0 +1,116 @@
+"""`mistyle train`: ConsisLoRA's LoRAs from a style picture or from rendered views."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import UsageError
+from mistyle.run.cli_models import add_model_options
+from mistyle.run.options import add_job_options, examples, said_settings
+
+OPTIONS = {
+    "seed": "seed",
+    "threads": "threads",
+    "word": "word",
+    "models": "models.folder",
+    "checkpoint": "models.checkpoint",
+    "steps": "train.steps",
+}
+
+
+def add_train(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "train",
+        help="LoRAs for the diffusion stylizer: of a style picture, or of rendered views",
+        **examples(
+            """
+            mistyle train style starry_night.jpg -o loras/ --models DIR
+            mistyle train content views/ -o loras/ --models DIR          one LoRA per view that `mistyle render` wrote
+            mistyle stylize bunny.obj starry_night.jpg -o out/ --stylizer diffusion --models DIR --loras loras/
+            """
+        ),
+    )
+    verb.add_argument("kind", nargs="?", choices=["style", "content"], help="what to learn")
+    verb.add_argument("source", type=Path, nargs="?", metavar="PICTURE|VIEWS_DIR")
+    verb.add_argument("-o", "--out", type=Path, metavar="DIR", help="where LoRAs are kept; the same command goes on")
+    verb.add_argument("--word", help="the prompt's word for the picture (default [v] for style, [c] for content)")
+    verb.add_argument("--steps", type=int, metavar="N", help="steps of the first phase (default 1500)")
+    add_model_options(verb)
+    add_job_options(verb, ("draft", "standard"), "draft: a third of the steps; standard (default): ConsisLoRA's")
+    verb.set_defaults(command=run_train)
+
+
+def run_train(options: argparse.Namespace) -> int:
+    """Train what is missing and print the files."""
+    from mistyle.run.settings import as_toml, resolve, thread_count
+    from mistyle.run.train_settings import TRAIN_PRESETS, TrainJobSettings
+
+    said = said_settings(options, OPTIONS)
+    settings = resolve(options.preset, options.config, said, root=TrainJobSettings, presets=TRAIN_PRESETS)
+    if options.print_config:
+        sys.stdout.write(as_toml(settings))
+        return 0
+    if options.kind is None or options.source is None or options.out is None:
+        raise UsageError("train needs style PICTURE or content VIEWS_DIR, and -o DIR; see mistyle train --help")
+    from mistyle.backends.models import need_extra
+    from mistyle.run.progress import Progress
+
+    need_extra()
+    wanted = lessons(options.kind, options.source, settings.word)
+    import torch
+
+    from mistyle.backends.consislora_make import check as check_models
+    from mistyle.backends.consislora_make import make_all
+
+    torch.set_num_threads(thread_count(settings))
+    check_models(settings.models, settings.train)
+    progress = Progress()
+    with bar(progress.say) as watch:
+        made = make_all(settings.models, wanted, options.out, settings.train, settings.seed, progress.say, watch)
+    files = [str(halves.style if options.kind == "style" else halves.content) for halves in made]
+    print(json.dumps({"loras": files}) if options.json else "\n".join(files))
+    return 0
+
+
+def lessons(kind: str, source: Path, word: str) -> list[tuple[Any, str, Any, str]]:
+    """(kind, name, sRGB picture, word) of every LoRA that was asked for."""
+    from mistyle.core.image import srgb_from_linear
+
+    if kind == "style":
+        from mistyle.files.read import read_picture
+        from mistyle.run.generative import opaque
+
+        return [("style", source.stem, opaque(read_picture(source)), word or "[v]")]
+    from mistyle.files.views import read_views
+
+    return [("content", v.camera.name, srgb_from_linear(v.rgb), word or "[c]") for v in read_views(source)]
+
+
+@contextmanager
+def bar(say: Callable[[str], None]) -> Iterator[Callable[[int, int, float], None]]:
+    """A progress bar with the mean loss over its weight on a terminal, a line now and then elsewhere."""
+    from mistyle.run.generative import watcher
+
+    if not sys.stderr.isatty():
+        yield watcher(say, lambda share: None)
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import Progress as Bars
+
+    columns = [TextColumn("{task.description:<32}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()]
+    with Bars(*columns, console=Console(stderr=True)) as bars:
+        task = bars.add_task("training", total=None)
+        mean = 0.0
+
+        def watch(step: int, steps: int, loss: float) -> None:
+            nonlocal mean
+            # Single steps' losses jump with their noise levels.
+            mean = loss if mean == 0 else 0.98 * mean + 0.02 * loss
+            bars.update(task, completed=step, total=steps, description=f"loss over weight {mean:.4f}")
+
+        yield watch

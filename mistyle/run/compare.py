@@ -1,0 +1,326 @@
+"""`mistyle compare`: pictures against their references, one pair in memory at a time.
+
+OUT/index.html, OUT/pairs/   a page that works from disk and the pictures beside it
+OUT/compare.json, .csv, junit.xml   the same for machines
+OUT/inset.png, inset.pdf     the figure of --crop
+"""
+
+import heapq
+import json
+import math
+import shutil
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.errors import InputRefused
+from mistyle.files.layers import BEAUTY, Frame
+from mistyle.files.store import atomic_folder, atomic_write
+from mistyle.measure import compare_metrics as metrics
+from mistyle.measure import compare_protocols as protocols
+from mistyle.measure.compare_metrics import METRICS, Measured
+from mistyle.run.compare_inputs import Match, Planes, alpha_mask, chosen_layers, matches, planes, read_mask, reduced
+from mistyle.run.compare_limits import broken, without_effect
+from mistyle.run.compare_pictures import Written, thumbnail, worst_regions, write_pictures
+from mistyle.run.compare_records import CompareJob, Row, columns, csv_text, junit_text, number, row_record
+from mistyle.run.progress import Progress
+from mistyle.run.summary import peak_gb, versions
+
+ALPHA = (
+    "EXR and HDR are taken as premultiplied; straight alpha (PNG, TIFF, WebP) is multiplied in, in linear light. "
+    "Pictures are compared over black; alpha is a layer of its own."
+)
+NONFINITE = (
+    "Pixels with a NaN or infinite channel are left out of every metric, magenta in every picture, and fail their row "
+    "unless --allow-nonfinite; in data layers equal infinities (depth where nothing is) are no failure."
+)
+# What a frame is ranked by: the first of these that it has.
+RANK = ("flip", "hdr_flip", "relmse", "psnr", "psnr_h", "rms_error", "rmse")
+
+
+@dataclass
+class Found:
+    """What has been compared so far (state: rows arrive one by one, and only the worst keep their pictures)."""
+
+    rows: list[Row] = field(default_factory=list)
+    written: dict[str, Written] = field(default_factory=dict)
+    heap: list[tuple[float, int, str]] = field(default_factory=list)
+    exposures: dict[tuple[str, str], tuple[float, float, int]] = field(default_factory=dict)
+
+
+def compare(
+    job: CompareJob,
+    progress: Progress,
+    context: Mapping[str, Any] | None = None,
+    extras: Callable[[Path], list[dict[str, Any]]] | None = None,
+) -> dict[str, Any]:
+    """Compare everything, write the folder, and return what compare.json holds.
+
+    `context` goes into it and onto the page (renderers, seeds, …). `extras` may add files to the folder and returns
+    pictures for the page: title, src (relative) and text. Failures are in the result's "failures"; nothing is raised
+    for them.
+    """
+    pairs = matches(job.reference, job.tests)
+    start, found = time.perf_counter(), Found()
+    result: dict[str, Any] = {}
+
+    def write(folder: Path) -> None:
+        if job.crop is not None:
+            from mistyle.run.compare_figure import inset
+
+            with progress.stage("inset", "draw the inset figure"):
+                inset(job, pairs, folder)
+        with progress.stage("compare", f"compare {len(pairs)} picture{'s' * (len(pairs) != 1)}") as report:
+            for k, match in enumerate(pairs):
+                _one(job, match, folder, found, lambda done, k=k: report((k + done) / len(pairs)), len(pairs) == 1)
+                report((k + 1) / len(pairs))
+        overall = without_effect(job.limits, [(r.image, r.layer, r.values) for r in found.rows if r.size[0]])
+        result.update(_record(job, found, overall, time.perf_counter() - start, context or {}))
+        result["figures"] = extras(folder) if extras is not None else []
+        _write_files(folder, result, found, overall)
+
+    atomic_folder(job.out, write)
+    return result
+
+
+def _one(job: CompareJob, match: Match, folder: Path, found: Found, report: Callable, alone: bool) -> None:
+    """Compare one picture; what is missing or refused becomes a failed row, except where it is all there is."""
+    if match.reference is None or match.test is None:
+        who = "the reference" if match.reference is None else "the test"
+        missing = f"{who} has no picture of this name"
+        failures = () if job.allow_missing else (missing,)
+        found.rows.append(Row(match.name, match.test_name, "", failures=failures, notes=(missing,)))
+        return
+    from mistyle.files.read import read_frame
+
+    try:
+        reference, test = read_frame(match.reference), read_frame(match.test)
+        if job.protocol == "stanford-orb":
+            reference = reduced(reference, test, 4)
+        names, notes = chosen_layers(reference, test, job.layers)
+        mask = _mask(job, reference)
+        for k, name in enumerate(names):
+            both = planes(reference, test, name, job.window, mask)
+            _layer(
+                job, match, (reference, test), both, notes, folder, found, lambda d, k=k: report((k + d) / len(names))
+            )
+            notes = []
+    except InputRefused as error:
+        if alone:
+            raise
+        found.rows.append(Row(match.name, match.test_name, "", failures=(f"refused: {error}",)))
+
+
+def _mask(job: CompareJob, reference: Frame) -> np.ndarray | None:
+    if job.mask is None:
+        return None
+    return alpha_mask(reference) if job.mask == "alpha" else read_mask(Path(job.mask), reference)
+
+
+def _layer(
+    job: CompareJob,
+    match: Match,
+    frames: tuple[Frame, Frame],
+    both: Planes,
+    notes: Sequence[str],
+    folder: Path,
+    found: Found,
+    report: Callable[[float], None],
+) -> None:
+    high = frames[0].high or frames[1].high
+    measured = _measure(job, match, frames, both, high, found, report)
+    odd = int(both.odd.sum())
+    failures = [] if job.allow_nonfinite or not odd else [_nonfinite(both)]
+    if not both.mask.any():
+        failures.append("no pixel could be compared")
+    failures += broken(job.limits, match.name, both.layer, measured.values)
+    error = next((measured.maps[n] for n in ("flip", "hdr_flip") if n in measured.maps), None)
+    ranked = error if error is not None else _plain_error(both)
+    row = Row(
+        image=match.name,
+        test=match.test_name,
+        layer=both.layer,
+        kind=both.kind,
+        size=(both.mask.shape[1], both.mask.shape[0]),
+        pixels=int(both.mask.sum()),
+        values=measured.values,
+        bad=both.bad,
+        exposures=measured.exposures,
+        worst=worst_regions(ranked, both.mask),
+        high=high,
+        failures=tuple(failures),
+        notes=(*notes, *frames[0].notes, *frames[1].notes),
+    )
+    place = f"pairs/{len(found.rows):05d}"
+    thumbnail(folder / f"{place}.webp", both, error)
+    if _worth_showing(job, row, place, folder, found):
+        found.written[place] = write_pictures(folder / place, both, measured.maps, high)
+        row = replace(row, folder=place)
+    found.rows.append(row)
+
+
+def _measure(job, match, frames, both: Planes, high: bool, found: Found, report) -> Measured:
+    if job.protocol is not None:
+        return Measured(_protocol(job, frames, both) if both.kind == "colour" else {})
+    if both.kind == "data":
+        return metrics.measure_data(both.reference, both.test, both.mask, job.metrics)
+    names = [n for n in job.metrics if METRICS[n].kind == "colour" and (high or n != "hdr_flip")]
+    if job.viewing.lpips is None:
+        names = [n for n in names if n != "lpips"]
+    viewing = job.viewing
+    if "hdr_flip" in names and viewing.exposures is None:
+        key = (match.name, both.layer)
+        if key not in found.exposures:
+            usable = (both.mask | both.odd) & np.isfinite(both.reference).all(axis=-1)
+            found.exposures[key] = metrics.flip_exposures(both.reference, usable)
+        viewing = replace(viewing, exposures=found.exposures[key])
+    return metrics.measure_colour(both.reference, both.test, both.mask, names, viewing, report)
+
+
+def _protocol(job: CompareJob, frames: tuple[Frame, Frame], both: Planes) -> dict[str, float]:
+    a, b = both.reference, both.test
+    if job.protocol == "idiff":
+        return protocols.idiff(*(_stored(f, both.layer, v) for f, v in zip(frames, (a, b), strict=True)))
+    if job.protocol == "tensoir":
+        return protocols.tensoir(*(_over_white(f, both.layer, v) for f, v in zip(frames, (a, b), strict=True)))
+    alpha = frames[0].layer("alpha")
+    shown = both.mask if job.mask is not None or alpha is None else alpha.values()[..., 0]
+    return protocols.stanford_orb(a, b, np.asarray(shown, np.float32))
+
+
+def _straight(frame: Frame, layer: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """sRGB-encoded colours that are not premultiplied, and alpha of the finished picture."""
+    alpha = frame.layer("alpha") if layer == BEAUTY else None
+    if alpha is None:
+        return metrics.encoded(values), None
+    a = alpha.values()
+    return metrics.encoded(np.where(a > 0, values / np.maximum(a, 1e-6), 0).astype(np.float32)), a
+
+
+def _stored(frame: Frame, layer: str, values: np.ndarray) -> np.ndarray:
+    """What idiff sees: an EXR's values, another picture's encoded ones times alpha; alpha is a channel."""
+    if frame.high:
+        alpha = frame.layer("alpha") if layer == BEAUTY else None
+        return values if alpha is None else np.concatenate([values, alpha.values()], axis=2)
+    straight, alpha = _straight(frame, layer, values)
+    if alpha is None:
+        return straight
+    product = straight * alpha
+    if np.abs(straight * 255 - np.round(straight * 255)).max() < 0.02:
+        product = np.round(product * 255) / np.float32(255)  # idiff multiplies 8-bit pictures in 8 bits
+    return np.concatenate([product, alpha], axis=2)
+
+
+def _over_white(frame: Frame, layer: str, values: np.ndarray) -> np.ndarray:
+    straight, alpha = _straight(frame, layer, values)
+    return straight if alpha is None else straight * alpha + (1 - alpha)
+
+
+def _nonfinite(both: Planes) -> str:
+    said = ", ".join(f"{n} {key.replace('_', ' in the ')}" for key, n in both.bad.items() if n)
+    return f"{int(both.odd.sum())} pixels are not finite ({said})"
+
+
+def _plain_error(both: Planes) -> np.ndarray:
+    gap = np.nan_to_num(both.test, posinf=0, neginf=0) - np.nan_to_num(both.reference, posinf=0, neginf=0)
+    return np.abs(gap).mean(axis=-1).astype(np.float32)
+
+
+def badness(row: Row) -> float:
+    """What rows are ordered by: larger is worse; failures and pixels that are not finite first."""
+    for name in RANK:
+        if name in row.values:
+            value = row.values[name]
+            lower = (
+                name in METRICS and METRICS[name].better == "lower" or protocols.PROTOCOL_BETTER.get(name) == "lower"
+            )
+            score = 1e6 if math.isnan(value) else value if lower else -value
+            return max(-1e9, min(score, 1e9)) + (1e9 if row.failures else 0.0)
+    return 1e9
+
+
+def _worth_showing(job: CompareJob, row: Row, place: str, folder: Path, found: Found) -> bool:
+    """Whether the row is among the worst so far; the least bad of those loses its pictures where there are too many."""
+    if job.pictures <= 0:
+        return False
+    entry = (badness(row), len(found.rows), place)
+    if len(found.heap) < job.pictures:
+        heapq.heappush(found.heap, entry)
+        return True
+    if entry <= found.heap[0]:
+        return False
+    _, index, gone = heapq.heapreplace(found.heap, entry)
+    shutil.rmtree(folder / gone, ignore_errors=True)
+    found.written.pop(gone, None)
+    found.rows[index] = replace(found.rows[index], folder="")
+    return True
+
+
+def _record(job: CompareJob, found: Found, overall: Sequence[str], seconds: float, context: Mapping) -> dict[str, Any]:
+    rows = found.rows
+    failed = [r for r in rows if r.failures]
+    names = columns(rows)
+    if job.protocol is None:
+        exposures = {r.exposures for r in rows if r.exposures}
+        viewing = replace(job.viewing, exposures=next(iter(exposures))) if len(exposures) == 1 else job.viewing
+        definitions = metrics.definitions(viewing, names)
+    else:
+        definitions = {job.protocol: protocols.PROTOCOLS[job.protocol]}
+    return {
+        "reference": job.titles[0] if job.titles else str(job.reference),
+        "tests": list(job.titles[1:]) if job.titles else [str(t) for t in job.tests],
+        "protocol": job.protocol,
+        "definitions": definitions,
+        "conventions": {"alpha": ALPHA, "not finite": NONFINITE, "mask": _mask_text(job), "window": job.window},
+        "limits": [f"{x.side} {x.metric}={x.value:g} of {x.image} [{x.layer}]" for x in job.limits],
+        "summary": summary(rows),
+        "rows": [row_record(r) for r in rows],
+        "failures": [f"{_called(r)}: {text}" for r in failed for text in r.failures] + list(overall),
+        "passed": not failed and not overall,
+        "context": dict(context),
+        "seconds": round(seconds, 3),
+        "peak_gb": round(peak_gb(), 3),
+        "versions": versions(),
+    }
+
+
+def _called(row: Row) -> str:
+    return f"{row.test}: {row.image}" + (f" [{row.layer}]" if row.layer else "")
+
+
+def _mask_text(job: CompareJob) -> str:
+    if job.mask is None:
+        return "all pixels"
+    return "the reference's alpha above 0.5" if job.mask == "alpha" else f"{Path(job.mask).name} above one half"
+
+
+def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+    """Per test and layer: how many rows, how many failed, and the mean and worst of every metric."""
+    result = []
+    for test, layer in dict.fromkeys((r.test, r.layer) for r in rows):
+        own = [r for r in rows if (r.test, r.layer) == (test, layer)]
+        values: dict[str, Any] = {}
+        for name in columns(own):
+            found = np.array([r.values[name] for r in own if name in r.values])
+            better = METRICS[name].better if name in METRICS else protocols.PROTOCOL_BETTER[name]
+            known = found[~np.isnan(found)]
+            worst = (known.max() if better == "lower" else known.min()) if len(known) else math.nan
+            mean = known.mean() if len(known) else math.nan
+            values[name] = {"mean": number(float(mean)), "worst": number(float(worst)), "better": better}
+        failed = sum(bool(r.failures) for r in own)
+        result.append({"test": test, "layer": layer, "images": len(own), "failed": failed, "values": values})
+    return result
+
+
+def _write_files(folder: Path, record: dict[str, Any], found: Found, overall: Sequence[str]) -> None:
+    from mistyle.run.compare_page import page
+
+    text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    atomic_write(folder / "compare.json", text.encode("utf-8", "replace"))
+    atomic_write(folder / "compare.csv", csv_text(found.rows).encode("utf-8", "replace"))
+    atomic_write(folder / "junit.xml", junit_text(found.rows, overall).encode("utf-8", "replace"))
+    atomic_write(folder / "index.html", page(record, found.written).encode("utf-8", "replace"))

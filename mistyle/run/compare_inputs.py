@@ -1,0 +1,236 @@
+"""What is compared with what: files and folders by name, layers by name, windows laid over each other."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.image import resize
+from mistyle.files.layers import BEAUTY, Frame, Layer, Window
+
+ENDINGS = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+
+
+@dataclass(frozen=True)
+class Match:
+    """One picture of one test and its reference; one of the two is None where it is missing."""
+
+    name: str
+    test_name: str
+    reference: Path | None
+    test: Path | None
+
+
+@dataclass(frozen=True)
+class Planes:
+    """One layer of both pictures over the same pixels, float32 (h w c), and which pixels are compared.
+
+    `odd` marks pixels of which a channel is NaN or infinite in one picture (data layers: where the other has another
+    value there); they are not in `mask`. `bad` counts NaN and infinite pixels of the reference and of the test.
+    """
+
+    layer: str
+    kind: Literal["colour", "data"]
+    reference: Float[np.ndarray, "h w c"]
+    test: Float[np.ndarray, "h w c"]
+    mask: Bool[np.ndarray, "h w"]
+    odd: Bool[np.ndarray, "h w"]
+    bad: dict[str, int]
+
+
+def matches(reference: Path, tests: Sequence[Path]) -> list[Match]:
+    """Every pair to compare, test by test; folders match by relative name, with other endings, or by frame number.
+
+    A picture that only one folder has becomes a Match with None. InputRefused where there is nothing at all.
+    """
+    names = labels(tests)
+    if reference.is_dir():
+        wrong = [t for t in tests if not t.is_dir()]
+        if wrong:
+            raise UsageError(f"{reference} is a folder and {wrong[0]} is not: give folders, or one picture each")
+        return [m for name, test in zip(names, tests, strict=True) for m in _folders(reference, test, name)]
+    for path in (reference, *tests):
+        if not path.exists():
+            raise InputRefused(f"{path}: found nothing; expected a picture or a folder of frames. Check the path.")
+    found = []
+    for name, test in zip(names, tests, strict=True):
+        if test.is_dir():
+            raise UsageError(f"{test} is a folder and {reference} is not: give folders, or one picture each")
+        found.append(Match(reference.stem, name, reference, test))
+    return found
+
+
+def labels(tests: Sequence[Path]) -> list[str]:
+    """Short names of the tests that tell them apart: the last parts of their paths."""
+    for depth in (1, 2, 3):
+        names = ["/".join(t.with_suffix("").parts[-depth:]) if t.suffix else "/".join(t.parts[-depth:]) for t in tests]
+        if len(set(names)) == len(names):
+            return names
+    return [f"{k}:{t.name}" for k, t in enumerate(tests)]
+
+
+def _folders(reference: Path, test: Path, label: str) -> list[Match]:
+    left, right = (pictures_of(folder) for folder in (reference, test))
+    if not left:
+        raise InputRefused(f"{reference}: found no pictures ({', '.join(ENDINGS)}); expected frames. Check the path.")
+    if not set(left) & set(right):
+        by_number = {_number(name): name for name in left}, {_number(name): name for name in right}
+        usable = len(by_number[0]) == len(left) and len(by_number[1]) == len(right) and None not in by_number[0]
+        if usable and set(by_number[0]) & set(by_number[1]):
+            right = {by_number[0].get(number, name): right[name] for number, name in by_number[1].items()}
+        else:
+            raise InputRefused(
+                f"{test}: found {len(right)} pictures, none called like one of {reference} "
+                f"({', '.join(sorted(left)[:3])}); expected equal names, or one frame number each. Rename them."
+            )
+    return [Match(name, label, left.get(name), right.get(name)) for name in sorted({*left, *right})]
+
+
+def pictures_of(folder: Path) -> dict[str, Path]:
+    """Relative name without ending -> file; of two files that differ in the ending only, the EXR."""
+    if not folder.is_dir():
+        raise InputRefused(f"{folder}: found no folder; expected one with pictures. Check the path.")
+    found: dict[str, Path] = {}
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in ENDINGS and path.is_file() and not path.name.startswith("."):
+            name = path.relative_to(folder).with_suffix("").as_posix()
+            if name not in found or path.suffix.lower() == ".exr":
+                found[name] = path
+    return found
+
+
+def _number(name: str) -> str | None:
+    digits = re.findall(r"\d+", name.rsplit("/", 1)[-1])
+    return digits[-1].lstrip("0") or "0" if digits else None
+
+
+def chosen_layers(reference: Frame, test: Frame, wanted: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The names of the layers to compare, and sentences about those that only one picture has.
+
+    `wanted` names them (InputRefused where a picture lacks one); empty: all that both have.
+    """
+    names = [layer.name for layer in reference.layers]
+    if wanted:
+        for name in wanted:
+            for frame in (reference, test):
+                if frame.layer(name) is None:
+                    there = ", ".join(layer.name for layer in frame.layers)
+                    raise InputRefused(f"{frame.path}: found layers {there}; expected {name!r}. Name one of them.")
+        return list(wanted), []
+    both = [name for name in names if test.layer(name) is not None]
+    if not both:
+        theirs = ", ".join(layer.name for layer in test.layers)
+        raise InputRefused(f"{test.path}: found layers {theirs}; expected one of {', '.join(names)}. Rename layers.")
+    alone = [f"layer {name!r} is in the reference only" for name in names if test.layer(name) is None]
+    alone += [
+        f"layer {layer.name!r} is in the test only" for layer in test.layers if reference.layer(layer.name) is None
+    ]
+    return both, alone
+
+
+def planes(
+    reference: Frame, test: Frame, name: str, window: Literal["display", "overlap"], mask: np.ndarray | None
+) -> Planes:
+    """One layer of both frames over the same window. InputRefused where sizes, channels or colour spaces differ.
+
+    window  "display": the display window, which must be the same, zero where a file has no data (as OpenEXR means
+            it); "overlap": only the pixels that both files have, in absolute pixel coordinates
+    mask    (h w) of the display window: pixels that count; None: all
+    """
+    a, b = _layer(reference, name), _layer(test, name)
+    if a.channels != b.channels:
+        found, expected = "".join(b.channels), "".join(a.channels)
+        raise InputRefused(f"{test.path}: found channels {found} in layer {name!r}; expected {expected}. Match them.")
+    if a.kind == "colour" and not np.allclose(reference.chromaticities, test.chromaticities, atol=1e-4):
+        found, expected = (" ".join(f"{v:.4f}" for v in f.chromaticities) for f in (test, reference))
+        raise InputRefused(f"{test.path}: found primaries {found}; expected {expected}. Convert one of them.")
+    area = _window(a, b, reference, test, window)
+    left, right = a.values(area), b.values(area)
+    counted = np.ones(left.shape[:2], bool) if mask is None else _cut(mask, a.display, area, test.path)
+    return _sorted_out(name, a.kind, left, right, counted)
+
+
+def _layer(frame: Frame, name: str) -> Layer:
+    layer = frame.layer(name)
+    if layer is None:
+        raise InputRefused(f"{frame.path}: found no layer {name!r}; expected it, as the other picture has it.")
+    return layer
+
+
+def _window(a: Layer, b: Layer, reference: Frame, test: Frame, how: str) -> Window:
+    if how == "display":
+        if a.display == b.display:
+            return a.display
+        same = a.display[2:] == b.display[2:]
+        found, expected = (
+            f"{w} x {h} at ({x}, {y})" if same else f"{w} x {h}" for x, y, w, h in (b.display, a.display)
+        )
+        raise InputRefused(
+            f"{test.path}: found {found} pixels; expected {expected} as {reference.path} has. Nothing is resampled: "
+            "render both at one size, or compare with --window overlap what the files have in common"
+        )
+    x, y = max(a.window[0], b.window[0]), max(a.window[1], b.window[1])
+    right = min(w[0] + w[2] for w in (a.window, b.window))
+    bottom = min(w[1] + w[3] for w in (a.window, b.window))
+    if right <= x or bottom <= y:
+        raise InputRefused(f"{test.path}: found a data window {b.window}; expected one that meets {a.window}.")
+    return x, y, right - x, bottom - y
+
+
+def _cut(mask: np.ndarray, display: Window, area: Window, path: Path) -> np.ndarray:
+    if mask.shape != (display[3], display[2]):
+        found, expected = (f"{s[1]} x {s[0]}" for s in (mask.shape, display[:1:-1]))
+        raise InputRefused(f"{path}: found a mask of {found} pixels; expected {expected} as the picture has.")
+    layer = Layer("mask", ("M",), (mask.astype(np.float32),), "data", display, display)
+    return layer.values(area)[..., 0] > 0.5
+
+
+def _sorted_out(name: str, kind, left: np.ndarray, right: np.ndarray, counted: np.ndarray) -> Planes:
+    bad = {}
+    for who, values in (("reference", left), ("test", right)):
+        bad[f"nan_{who}"] = int((np.isnan(values).any(axis=-1) & counted).sum())
+        bad[f"inf_{who}"] = int((np.isinf(values).any(axis=-1) & counted).sum())
+    broken = ~(np.isfinite(left).all(axis=-1) & np.isfinite(right).all(axis=-1))
+    odd = broken & counted
+    if kind == "data" and odd.any():
+        # Depth is infinite where there is nothing; that is no error where both pictures say so.
+        same = ((left == right) | (np.isfinite(left) & np.isfinite(right))).all(axis=-1)
+        odd &= ~same
+    return Planes(name, kind, left, right, counted & ~broken, odd, bad)
+
+
+def read_mask(path: Path, frame: Frame) -> Bool[np.ndarray, "h w"]:
+    """A mask file: its luminance above one half, or its alpha where it has one that is not everywhere 1."""
+    from mistyle.files.read import read_frame
+
+    given = read_frame(path)
+    layer = given.layer("alpha") or given.layer(BEAUTY) or given.layers[0]
+    values = layer.values()
+    return np.asarray(values.mean(axis=-1) > 0.5 if layer.kind == "data" else values.mean(axis=-1) > 0.2140)
+
+
+def alpha_mask(frame: Frame) -> Bool[np.ndarray, "h w"]:
+    """Where a picture's own alpha is above one half."""
+    alpha = frame.layer("alpha")
+    if alpha is None:
+        raise InputRefused(f"{frame.path}: found no alpha channel; expected one for --mask alpha. Give a mask file.")
+    return np.asarray(alpha.values()[..., 0] > 0.5)
+
+
+def reduced(frame: Frame, test: Frame, factor: int) -> Frame:
+    """The frame at the test's size by means over `factor` x `factor` pixels, where it is exactly so much larger."""
+    wide, high = test.layers[0].display[2:]
+    if any(x.display != (0, 0, wide * factor, high * factor) for x in frame.layers):
+        return frame
+    window = (0, 0, wide, high)
+
+    def small(layer: Layer) -> Layer:
+        values = resize(layer.values(), (high, wide))
+        return replace(layer, planes=tuple(np.moveaxis(values, -1, 0)), window=window, display=window)
+
+    return replace(frame, layers=tuple(small(layer) for layer in frame.layers))

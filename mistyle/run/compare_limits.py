@@ -1,0 +1,122 @@
+"""Limits that a comparison must keep: from the command line and from compare.toml, for all images or for some."""
+
+import math
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any, Literal
+
+from mistyle.core.errors import InputRefused, UsageError
+
+Side = Literal["max", "min"]
+EXPECTED = """expected tables of limits, as
+  [limits.max]
+  flip = 0.05
+  [images."shot_01*".min]
+  psnr = 38
+  [layers.normal.max]
+  angle = 0.5"""
+
+
+@dataclass(frozen=True)
+class Limit:
+    """`metric` may be at most (`max`) or must be at least (`min`) `value`, where both patterns fit."""
+
+    metric: str
+    side: Side
+    value: float
+    image: str = "*"
+    layer: str = "*"
+
+    def kept(self, found: float) -> bool:
+        """NaN keeps no limit."""
+        return found <= self.value if self.side == "max" else found >= self.value
+
+
+def parse(text: str, side: Side, known: Sequence[str]) -> Limit:
+    """`flip=0.05` as a limit; UsageError names the metrics that there are."""
+    name, equals, value = text.partition("=")
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if not equals or math.isnan(number):
+        raise UsageError(f"--{side} {text}: expected METRIC=NUMBER, for example --{side} flip=0.05")
+    return Limit(checked(name.strip(), known, f"--{side} {text}"), side, number)
+
+
+def checked(name: str, known: Sequence[str], where: str) -> str:
+    if name not in known:
+        raise UsageError(f"{where}: {name!r} is not measured here; expected one of {', '.join(known)}")
+    return name
+
+
+def read_limits(path: Path, known: Sequence[str]) -> tuple[list[Limit], list[Limit]]:
+    """Of a compare.toml: the limits for all images, and those for some images or layers, in the file's order."""
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputRefused(f"{path}: found no readable TOML ({error}); {EXPECTED}") from error
+    strange = sorted(set(data) - {"limits", "images", "layers"})
+    if strange:
+        raise InputRefused(f"{path}: found {strange[0]!r}; {EXPECTED}")
+    some: list[Limit] = []
+    for pattern, table in _table(data.get("layers", {}), path, "layers").items():
+        some += _limits(table, path, f"layers.{pattern}", known, layer=pattern)
+    for pattern, table in _table(data.get("images", {}), path, "images").items():
+        some += _limits(table, path, f"images.{pattern}", known, image=pattern)
+    return _limits(data.get("limits", {}), path, "limits", known), some
+
+
+def _table(value: Any, path: Path, where: str) -> Mapping[str, Any]:
+    if not isinstance(value, dict):
+        raise InputRefused(f"{path}: found {value!r} at {where}; {EXPECTED}")
+    return value
+
+
+def _limits(table: Any, path: Path, where: str, known: Sequence[str], **patterns: str) -> list[Limit]:
+    found: list[Limit] = []
+    for side, values in _table(table, path, where).items():
+        if side not in ("max", "min"):
+            raise InputRefused(f"{path}: found {side!r} at {where}; {EXPECTED}")
+        for name, value in _table(values, path, f"{where}.{side}").items():
+            if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+                raise InputRefused(f"{path}: found {value!r} at {where}.{side}.{name}; expected a number")
+            checked(name, known, f"{path}: {where}.{side}")
+            found.append(Limit(name, "max" if side == "max" else "min", float(value), **patterns))
+    return found
+
+
+def broken(limits: Sequence[Limit], image: str, layer: str, values: Mapping[str, float]) -> list[str]:
+    """Sentences about the limits that an image's layer does not keep; of several that fit, the last one counts.
+
+    A limit on a metric that this kind of layer does not have is passed over.
+    """
+    chosen: dict[tuple[str, str], Limit] = {}
+    for limit in limits:
+        if fnmatchcase(image, limit.image) and fnmatchcase(layer, limit.layer):
+            chosen[limit.metric, limit.side] = limit
+    result = []
+    for limit in chosen.values():
+        if limit.metric in values and not limit.kept(values[limit.metric]):
+            word = "above" if limit.side == "max" else "below"
+            found = values[limit.metric]
+            said = "could not be measured" if math.isnan(found) else f"is {found:.5g}, {word} {limit.value:g}"
+            result.append(f"{limit.metric} {said}")
+    return result
+
+
+def without_effect(limits: Sequence[Limit], rows: Sequence[tuple[str, str, Mapping[str, float]]]) -> list[str]:
+    """Sentences about limits that met no row at all: a typing mistake there would pass unseen."""
+    result = []
+    for limit in limits:
+        met = any(
+            fnmatchcase(image, limit.image) and fnmatchcase(layer, limit.layer) and limit.metric in values
+            for image, layer, values in rows
+        )
+        if not met:
+            where = f" of images {limit.image!r}, layers {limit.layer!r}"
+            result.append(f"the limit {limit.side} {limit.metric}={limit.value:g}{where} met nothing that was compared")
+    return result

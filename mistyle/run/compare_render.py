@@ -1,0 +1,124 @@
+"""`mistyle compare --render FILE --with A --with B`: the same asset, camera and light by several renderers.
+
+Each renderer draws every shot with several seeds. The means are compared as pictures are; whether they are noisy
+pictures of the same thing is tested from the seeds. OUT/renders/<renderer>/<shot>.exr are the means.
+"""
+
+import argparse
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.errors import UsageError
+from mistyle.files.images import write_exr
+from mistyle.files.store import atomic_write
+from mistyle.measure.compare_stats import Tested, same_picture
+from mistyle.run.cli_compare import job_of, safe, told
+from mistyle.run.compare import compare
+from mistyle.run.compare_pictures import DIVERGING, mapped, webp
+from mistyle.run.progress import Progress
+from mistyle.run.render_files import Shot
+from mistyle.run.renderers import Rendered, Renderer, left_out, renderer, shots, subject
+
+LEVEL = 0.01
+
+
+def run_render(options: argparse.Namespace) -> int:
+    """The whole verb."""
+    if len(options.renderers) < 2:
+        raise UsageError("--render needs two renderers: --with A --with B; the first one is the reference")
+    if options.out is None:
+        raise UsageError("compare needs -o OUT")
+    if min(options.spp, options.size, options.seeds, options.views) < 1:
+        raise UsageError("--spp, --size, --seeds and --views are 1 at least")
+    chosen = [renderer(text, options.blender) for text in options.renderers]
+    safe(options.out, [])
+    progress = Progress()
+    with TemporaryDirectory(prefix="mistyle-") as work:
+        folders, tests, context = _draw(options, chosen, Path(work), progress)
+        job = job_of(options, folders[0], tuple(folders[1:]))
+        job = replace(job, titles=(f"{options.render.name} by {chosen[0].name}", *(r.name for r in chosen[1:])))
+        record = compare(job, progress, context, lambda folder: _keep(folder, folders, tests))
+    return told(options, record)
+
+
+def _draw(options, chosen: Sequence[Renderer], work: Path, progress: Progress):
+    """Render everything; returns a folder of pictures per renderer, the tests, and what the page says about it."""
+    lights = [name for name in options.lights.split(",") if name]
+    what = subject(options.render, work / "files", chosen, options.threads or 0)
+    what.folder.mkdir(parents=True, exist_ok=True)
+    every = shots(what, lights, options.views, options.size)
+    seeds = list(range(options.seeds))
+    folders = [work / f"{k}_{_plain(r.name)}" for k, r in enumerate(chosen)]
+    drawn: dict[tuple[str, str], Rendered] = {}
+    with progress.stage("render", f"render {len(every)} shot(s) by {len(chosen)} renderers") as report:
+        for k, shot in enumerate(every):
+            for j, (how, folder) in enumerate(zip(chosen, folders, strict=True)):
+                # Seeds of different renderers must not meet: two versions of one renderer would share their noise.
+                own = [1 + 1000 * j + s for s in seeds]
+                drawn[folder.name, shot.name] = how.draw(what, shot, options.spp, own)
+                _save(folder / f"{shot.name}.exr", drawn[folder.name, shot.name])
+                report((k * len(chosen) + j + 1) / (len(every) * len(chosen)))
+    tests = _tests(every, folders, drawn) if options.seeds > 1 else []
+    versions = {r.name: drawn[f.name, every[0].name] for r, f in zip(chosen, folders, strict=True)}
+    context = {
+        "rendered": f"{options.render.name}, {options.spp} samples a pixel, {options.seeds} seed(s), shots "
+        + ", ".join(s.name for s in every),
+        "renderers": "; ".join(f"{n} = {v.version}, {np.mean(v.seconds):.2f} s a picture" for n, v in versions.items()),
+    }
+    missing = left_out(what) if any("mitsuba" in r.kind for r in chosen) else []
+    if missing:
+        context["not drawn by Mitsuba here"] = ", ".join(missing)
+    if tests:
+        context["z-test"] = "; ".join(f"{name}: {said(found)}" for name, found in tests)
+    return folders, tests, context
+
+
+def _plain(name: str) -> str:
+    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[-60:]
+
+
+def _save(path: Path, found: Rendered) -> None:
+    mean = np.mean(np.stack(found.pictures).astype(np.float64), axis=0).astype(np.float32)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_exr(path, dict(zip("RGBA", np.moveaxis(mean, -1, 0), strict=False)))
+
+
+def _tests(every: Sequence[Shot], folders: Sequence[Path], drawn: dict) -> list[tuple[str, Tested]]:
+    result = []
+    for shot in every:
+        first = np.stack(drawn[folders[0].name, shot.name].pictures)[..., :3]
+        for folder in folders[1:]:
+            other = np.stack(drawn[folder.name, shot.name].pictures)[..., :3]
+            if first.shape[1:] == other.shape[1:] and np.isfinite(first).all() and np.isfinite(other).all():
+                result.append((f"{shot.name}, {folder.name}", same_picture(first, other, LEVEL)))
+    return result
+
+
+def said(found: Tested) -> str:
+    """A test's result in a sentence."""
+    where = (
+        f"different in {100 * found.share:.2g} % of the picture" if found.share else "different in no place of its own"
+    )
+    verdict = "same picture" if found.passed else where + (" and in its mean" if found.whole else "")
+    return f"{verdict} at {100 * LEVEL:g} % (Šidák), largest |t| {found.worst:.1f}, mean {100 * found.bias:+.2f} %"
+
+
+def _keep(folder: Path, renders: Sequence[Path], tests: Sequence[tuple[str, Tested]]) -> list[dict[str, Any]]:
+    """Copy the renders into OUT and write the tests' pictures; returns what the page shows of them."""
+    for source in renders:
+        shutil.copytree(source, folder / "renders" / source.name)
+    shown = []
+    for k, (name, found) in enumerate(tests):
+        picture = mapped(found.t / 16 + 0.5, DIVERGING)
+        edge = found.rejected
+        picture[edge] = (0.35 * picture[edge] + 0.65 * np.array([255, 220, 0])).astype(np.uint8)
+        atomic_write(folder / "ztest" / f"{k:03d}.webp", webp(picture, None))
+        text = f"{said(found)}; blue: the test is darker, red: brighter, |t| up to 8; yellow: rejected blocks"
+        shown.append({"title": f"z-test, {name}", "src": f"ztest/{k:03d}.webp", "text": text})
+    return shown

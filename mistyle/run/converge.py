@@ -1,0 +1,279 @@
+"""`mistyle converge SCENE --with A,B`: error against samples and seconds, from independent seeds.
+
+OUT/converge.json and .csv   every measurement; slopes, efficiency and their intervals
+OUT/index.html               the same with plots
+"""
+
+import argparse
+import csv
+import io
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.files.store import atomic_write
+from mistyle.measure.compare_metrics import definitions, measure_colour
+from mistyle.measure.compare_stats import interval, slope
+from mistyle.run.charts import Chart
+from mistyle.run.cli_compare import safe_folder
+from mistyle.run.progress import Progress
+from mistyle.run.render_files import Shot, Subject
+from mistyle.run.renderers import Renderer, renderer, shots, subject
+from mistyle.run.summary import versions
+
+METRICS = ("relmse", "smape", "flip")
+FIRST_SEED = 1_000_003  # of the reference: none of the measured renders shares its samples
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """One render: its renderer, samples a pixel, seed number, wall seconds of the render call, and its errors."""
+
+    renderer: str
+    spp: int
+    seed: int
+    seconds: float
+    values: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Converged:
+    """What is known of one renderer: per spp the mean and 95 % half-width of the error and seconds, the slope of
+    log error over log samples (mean and half-width over seeds), and log efficiency 1 / (relMSE · seconds) per seed."""
+
+    renderer: str
+    spp: tuple[int, ...]
+    errors: dict[str, tuple[tuple[float, float], ...]]
+    seconds: tuple[tuple[float, float], ...]
+    slopes: dict[str, tuple[float, float]]
+    efficiency: tuple[float, ...]
+
+
+def run_converge(options: argparse.Namespace) -> int:
+    """The whole verb."""
+    names = [n.strip() for text in options.renderers for n in _split(text) if n.strip()]
+    if not names or options.out is None:
+        raise UsageError("converge needs SCENE, --with A,B and -o OUT")
+    if options.seeds < 2 or options.max_spp < 2 or options.size < 1:
+        raise UsageError("--seeds and --max-spp are 2 at least: intervals and slopes need two points")
+    chosen = [renderer(text, options.blender) for text in names]
+    safe_folder(options.out, "converge.json")
+    counts = [2**k for k in range(int(math.log2(options.max_spp)) + 1)]
+    progress = Progress()
+    with TemporaryDirectory(prefix="mistyle-") as work:
+        what = subject(options.scene, Path(work), chosen, options.threads or 0)
+        shot = shots(what, [options.lights], 1, options.size)[options.sensor]
+        reference, said = _reference(options, what, shot, chosen[0], progress)
+        found, drew = measure(what, shot, chosen, counts, options.seeds, reference, progress)
+    record = summary(found, [r.name for r in chosen], counts) | {
+        "scene": str(options.scene),
+        "shot": shot.name,
+        "reference": said,
+        "definitions": definitions_of(),
+        "renderers": drew,
+        "versions": versions(),
+    }
+    write(options.out, record, found)
+    _tell(options, record)
+    return 0
+
+
+def _split(text: str) -> list[str]:
+    """A,B at commas; a command, which may hold commas of its own, stands alone."""
+    return [text] if "=" in text else text.split(",")
+
+
+def _reference(options, what: Subject, shot: Shot, first: Renderer, progress: Progress):
+    """The picture that errors are measured against, and a sentence about it."""
+    if options.reference is not None:
+        from mistyle.files.read import read_frame
+
+        layer = read_frame(options.reference).layer("beauty")
+        if layer is None:
+            raise InputRefused(f"{options.reference}: found no R, G and B; expected the converged picture.")
+        return layer.values(), f"{options.reference.name}, as given"
+    spp = options.reference_spp or 16 * options.max_spp
+    with progress.stage("reference", f"reference: {first.name}, {spp} samples a pixel"):
+        parts = max(1, spp // 1024)
+        seeds = [FIRST_SEED + k for k in range(parts)]
+        pictures = first.draw(what, shot, max(1, spp // parts), seeds).pictures
+    mean = np.mean(np.stack(pictures).astype(np.float64), axis=0)[..., :3].astype(np.float32)
+    return mean, f"{first.name} with {spp} samples a pixel and seeds of its own"
+
+
+def measure(
+    what: Subject,
+    shot: Shot,
+    chosen: Sequence[Renderer],
+    counts: Sequence[int],
+    seeds: int,
+    reference: Float[np.ndarray, "h w 3"],
+    progress: Progress,
+) -> tuple[list[Measurement], dict[str, str]]:
+    """Every render and its errors. At every number of samples a first render, which loads and compiles, counts not."""
+    result: list[Measurement] = []
+    drew: dict[str, str] = {}
+    whole = np.ones(reference.shape[:2], bool)
+    with progress.stage("converge", f"{len(chosen)} renderers, {counts[-1]} samples a pixel at most") as report:
+        done, total = 0.0, len(chosen) * sum(counts)
+        for j, how in enumerate(chosen):
+            for spp in counts:
+                numbers = [1 + 1000 * j + s for s in range(seeds)]
+                found = how.draw(what, shot, spp, [FIRST_SEED - 1, *numbers])
+                drew[how.name] = found.version
+                drawn = zip(numbers, found.pictures[1:], found.seconds[1:], strict=True)
+                for seed, picture, seconds in drawn:
+                    test = picture[..., :3]
+                    if test.shape != reference.shape:
+                        raise InputRefused(f"{how.name}: found {test.shape} pixels; expected {reference.shape}.")
+                    counted = whole & np.isfinite(test).all(axis=-1)
+                    values = dict(measure_colour(reference, test, counted, METRICS).values)
+                    result.append(Measurement(how.name, spp, seed, seconds, values))
+                done += spp
+                report(done / total)
+    return result, drew
+
+
+def converged(found: Sequence[Measurement], name: str, counts: Sequence[int]) -> Converged:
+    """The curves, slopes and efficiencies of one renderer."""
+    own = [m for m in found if m.renderer == name]
+    at = {spp: [m for m in own if m.spp == spp] for spp in counts}
+    seeds = sorted({m.seed for m in own})
+    errors = {k: tuple(interval([m.values[k] for m in at[spp]]) for spp in counts) for k in METRICS}
+    slopes = {}
+    for key in METRICS:
+        each = [[next(m.values[key] for m in at[spp] if m.seed == seed) for spp in counts] for seed in seeds]
+        slopes[key] = interval([slope(counts, line) for line in each])
+    last = at[counts[-1]]
+    efficiency = tuple(-math.log(max(m.values["relmse"] * m.seconds, 1e-300)) for m in last)
+    seconds = tuple(interval([m.seconds for m in at[spp]]) for spp in counts)
+    return Converged(name, tuple(counts), errors, seconds, slopes, efficiency)
+
+
+def summary(found: Sequence[Measurement], names: Sequence[str], counts: Sequence[int]) -> dict[str, Any]:
+    """The record: curves by renderer, and how many times as efficient as the first each of the others is."""
+    curves = [converged(found, name, counts) for name in names]
+    ratios = {}
+    for other in curves[1:]:
+        a, b = (np.array(c.efficiency) for c in (curves[0], other))
+        mean = float(b.mean() - a.mean())
+        half = math.hypot(interval(a.tolist())[1], interval(b.tolist())[1])
+        ratios[other.renderer] = {"ratio": math.exp(mean), "low": math.exp(mean - half), "high": math.exp(mean + half)}
+    rows = [
+        {
+            "renderer": c.renderer,
+            "spp": list(c.spp),
+            "seconds": [list(v) for v in c.seconds],
+            **{k: [list(v) for v in c.errors[k]] for k in METRICS},
+            "slope": {k: list(v) for k, v in c.slopes.items()},
+        }
+        for c in curves
+    ]
+    return {"curves": rows, "efficiency": ratios, "first": names[0]}
+
+
+def definitions_of() -> dict[str, str]:
+    from mistyle.measure.compare_metrics import Viewing
+
+    return definitions(Viewing(), METRICS) | {
+        "slope": "least squares of log error over log samples, per seed; mean and 95 % interval over seeds (Student's "
+        "t); a renderer that converges to another picture than the reference levels off",
+        "efficiency": "1 / (relMSE · seconds) at the most samples, over the first renderer's; the interval joins both "
+        "renderers' 95 % intervals of its logarithm",
+        "seconds": "wall time of the render call; loading and compilation happen before",
+    }
+
+
+def write(out: Path, record: dict[str, Any], found: Sequence[Measurement]) -> None:
+    """converge.json, converge.csv and the page."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["renderer", "spp", "seed", "seconds", *METRICS])
+    for m in found:
+        writer.writerow([m.renderer, m.spp, m.seed, repr(m.seconds), *(repr(m.values[k]) for k in METRICS)])
+    atomic_write(out / "converge.csv", text.getvalue().encode())
+    atomic_write(out / "converge.json", (json.dumps(_no_nan(record), indent=1, allow_nan=False) + "\n").encode())
+    atomic_write(out / "index.html", page(record).encode())
+
+
+def _no_nan(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {k: _no_nan(v) for k, v in value.items()}
+    return [_no_nan(v) for v in value] if isinstance(value, list) else value
+
+
+def charts(record: dict[str, Any]) -> list[Chart]:
+    """Each error over samples and over seconds, both by their logarithms."""
+    result = []
+    for key in METRICS:
+        for label, axis in (("samples a pixel, log2", "spp"), ("seconds, log2", "seconds")):
+            result += [_chart(record, key, label, axis)]
+    return result
+
+
+def _chart(record: dict[str, Any], key: str, label: str, axis: str) -> Chart:
+    """Renderers differ in their seconds: every curve is laid onto the union of the axes, with gaps bridged."""
+    places = {}
+    for row in record["curves"]:
+        x = [math.log2(max(v[0] if axis == "seconds" else v, 1e-9)) for v in row[axis]]
+        places[row["renderer"]] = (x, [math.log10(max(v[0], 1e-300)) for v in row[key]])
+    grid = sorted({x for xs, _ in places.values() for x in xs})
+    series = {}
+    for name, (xs, ys) in places.items():
+        order = np.argsort(xs)
+        line = np.interp(grid, np.array(xs)[order], np.array(ys)[order], left=math.nan, right=math.nan)
+        series[name] = [10**v if math.isfinite(v) else math.nan for v in line.tolist()]
+    return Chart(f"{key} over {axis}", series, x=grid, x_label=label, y_label=key, log=True)
+
+
+def page(record: dict[str, Any]) -> str:
+    """The page as text; every text is escaped, scripts and connections are forbidden."""
+    import base64
+    import hashlib
+
+    import jinja2
+    from markupsafe import Markup
+
+    from mistyle.run.charts import svg
+    from mistyle.run.compare_page import figure
+
+    here = Path(__file__).parent
+    env = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(here), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
+    )
+    env.filters |= {"figure": lambda v: figure(None if isinstance(v, float) and not math.isfinite(v) else v)}
+    style = (here / "compare.css").read_text(encoding="utf-8")
+    return env.get_template("converge.html.j2").render(
+        record=record,
+        metrics=METRICS,
+        charts=[Markup(svg(chart)) for chart in charts(record)],  # the chart escapes its own texts
+        style=Markup(style),
+        style_hash=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
+    )
+
+
+def _tell(options: argparse.Namespace, record: dict[str, Any]) -> None:
+    if options.json:
+        print(json.dumps(_no_nan(record)))
+        return
+    for row in record["curves"]:
+        print(f"{row['renderer']}  (against {record['reference']})")
+        for k, spp in enumerate(row["spp"]):
+            cells = "  ".join(f"{m} {row[m][k][0]:.4g} ± {row[m][k][1]:.2g}" for m in METRICS)
+            print(f"  {spp:>6} spp  {row['seconds'][k][0]:8.3f} s  {cells}")
+        print("  slopes  " + "  ".join(f"{m} {v[0]:.3f} ± {v[1]:.2g}" for m, v in row["slope"].items()))
+    for name, ratio in record["efficiency"].items():
+        print(
+            f"{name}: {ratio['ratio']:.3g} ({ratio['low']:.3g} to {ratio['high']:.3g}) times as efficient as the first"
+        )
+    print(f"page      {options.out / 'index.html'}")

@@ -1,0 +1,107 @@
+"""Where a job meets the generative backends: refusals before any rendering, the stylizer of views, the inpainter."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.asset import Asset, Picture
+from mistyle.core.view import View
+from mistyle.run.progress import Report
+from mistyle.run.settings import Settings
+from mistyle.run.stages import Run
+from mistyle.stages.inpaint import Inpainter
+from mistyle.stages.mvst import Stylizer
+
+LORAS = "loras"  # in work/: trained LoRAs outlive the stages that asked for them
+SPOKEN = 20.0  # seconds between two lines about a training
+
+
+def check(settings: Settings, say: Callable[[str], None]) -> None:
+    """Refuse what the generative backends of a job lack, in one sentence, before anything is rendered; say what they
+    cost."""
+    if settings.stylizer == "diffusion":
+        from mistyle.backends.diffusion import announcement
+        from mistyle.backends.diffusion import check as check_stylizer
+
+        check_stylizer(settings.models, settings.diffusion, settings.rig.resolution)
+        if settings.rig.kind in ("paper", "turntable"):
+            views = 16 if settings.rig.kind == "paper" else settings.rig.views
+            say(announcement(settings.models, settings.train, settings.diffusion, views))
+    if settings.inpainter == "paint3d":
+        from mistyle.backends.paint3d import check as check_inpainter
+
+        check_inpainter(settings.models, settings.paint3d)
+
+
+def diffusion_job(settings: Settings, style: Picture, name: str, out: Path) -> Any:
+    """The stylizer's own job: the style picture without its transparent parts' colours."""
+    from mistyle.backends.diffusion import Job
+
+    loras = settings.models.loras or out / "work" / LORAS
+    return Job(settings.models, settings.train, settings.diffusion, opaque(style), name, loras, settings.seed)
+
+
+def opaque(style: Picture) -> np.ndarray:
+    """The style picture on white where it is transparent: the networks know no alpha."""
+    if style.alpha is None:
+        return style.rgb
+    alpha = style.alpha[..., None]
+    return np.asarray(style.rgb * alpha + (1 - alpha), np.float32)
+
+
+def sweep_key(run: Run, style: Picture, views: Sequence[View]) -> str:
+    """What the views painted by diffusion hang on."""
+    from mistyle.backends.diffusion import key
+
+    job = diffusion_job(run.job.settings, style, run.job.style.stem, run.job.out)
+    return key(job, views)
+
+
+def view_stylizer(run: Run, style: Picture, views: Sequence[View], report: Report) -> Stylizer:
+    """The diffusion stylizer, its LoRAs trained; `report` hears the training's share."""
+    from mistyle.backends.diffusion import stylizer
+
+    job = diffusion_job(run.job.settings, style, run.job.style.stem, run.job.out)
+    return stylizer(job, views, run.progress.say, watcher(run.progress.say, report))
+
+
+def watcher(say: Callable[[str], None], report: Report) -> Callable[[int, int, float], None]:
+    """Tells of a training: its share, and now and then a line with the mean loss over its weight."""
+    import time
+
+    losses: list[float] = []
+    last = time.perf_counter()
+
+    def watch(step: int, steps: int, loss: float) -> None:
+        nonlocal last
+        report(step / steps)
+        losses.append(loss)
+        now = time.perf_counter()
+        if now - last >= SPOKEN or step == steps:
+            rate = len(losses) / max(now - last, 1e-9)
+            mean = sum(losses) / len(losses)
+            say(f"  step {step} of {steps}: loss over weight {mean:.4f}, {rate:.1f} steps a second")
+            last = now
+            losses.clear()
+
+    return watch
+
+
+def inpainter_inputs(settings: Settings, style: Picture) -> list[Any]:
+    """What repaired maps hang on besides the fill's own settings; nothing for the weight-free inpainter."""
+    if settings.inpainter == "fill":
+        return []
+    from mistyle.backends.paint3d import identity
+
+    own = settings.models.model_dump(include={"device", "precision", "offload"})
+    networks = identity(settings.models, settings.paint3d)
+    return [settings.inpainter, settings.paint3d, own, networks, style.rgb, style.alpha]
+
+
+def texture_inpainter(settings: Settings, asset: Asset, style: Picture) -> Inpainter:
+    """Paint3D's inpainter, loaded."""
+    from mistyle.backends.paint3d import inpainter
+
+    return inpainter(asset.mesh, opaque(style), settings.models, settings.paint3d)

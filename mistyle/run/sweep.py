@@ -1,0 +1,139 @@
+"""The stages of a job whose stylizer paints one view at a time: sweep over the views, bake them, show them."""
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from mistyle.core.asset import Asset, Picture
+from mistyle.core.errors import UsageError
+from mistyle.core.view import View
+from mistyle.run.pipeline import Atlas, Baked
+from mistyle.run.progress import Report
+from mistyle.run.settings import Settings
+from mistyle.run.stages import Run
+from mistyle.stages.mvst import Masker, Painted, Stylizer, Swept, finished, sweep
+
+KEPT = "sweep"  # the folder in work/ that holds the views of an unfinished sweep
+
+
+def swept_stages(
+    run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
+) -> tuple[Baked, list[View]]:
+    """The stages 'surface', 'bake' and 'stylized' of a stylizer that paints view by view (paper 4.1.3 and 4.1.4)."""
+    from mistyle.files.views import read_views, write_views
+    from mistyle.run.pipeline import coat_files
+
+    s = run.job.settings
+    inputs = [style.rgb, style.alpha, s.stylizer, s.surface, s.coat, coat_files(s.coat), s.sweep, s.seed]
+    if s.stylizer == "diffusion":
+        from mistyle.run.generative import sweep_key
+
+        inputs = [sweep_key(run, style, views), s.coat, s.sweep, s.seed]
+    painted = run.record("surface", ["texels", "views"], inputs, lambda r: swept(run, asset, style, atlas, views, r))
+    shutil.rmtree(run.hidden.root / KEPT, ignore_errors=True)
+    stylized = [finished(view, one) for view, one in zip(views, painted, strict=True)]
+    baked = run.record("bake", ["surface"], [s.bake], lambda r: bake(asset, stylized, painted, atlas, s, r))
+    shown = run.stage("stylized", ["bake"], [], lambda folder, r: write_views(folder, stylized, (), progress=r))
+    return baked, read_views(shown)
+
+
+def refuse_what_is_not_kept(settings: Settings) -> None:
+    """Refuse what only a stylizer of the whole surface can follow, and a segmenter that is not there."""
+    coat = settings.coat
+    named = {"coat.slots": coat.slots, "coat.height": coat.height, "coat.gloss": coat.gloss}
+    wrong = [name for name, value in named.items() if value]
+    if wrong:
+        raise UsageError(
+            f"{', '.join(wrong)}: --stylizer {settings.stylizer} paints views and cannot follow that;"
+            " leave it out, or use --stylizer embedded"
+        )
+    masker_of(settings)
+
+
+def stylizer_of(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Stylizer:
+    """The stylizer that the settings name, ready to paint."""
+    from importlib import import_module
+
+    from mistyle.backends import STYLIZERS
+    from mistyle.stages.coat import content, masked_style, scaled
+
+    surface = scaled(settings.surface, asset, settings.coat.stroke_size)
+    found = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
+    module, _, name = STYLIZERS[settings.stylizer].partition(":")
+    make = getattr(import_module(module), name)
+    return make(
+        asset.mesh, masked_style(style, settings.coat.style_mask), surface, settings.seed, report, content=found
+    )
+
+
+def masker_of(settings: Settings) -> Masker | None:
+    """The segmenter that the settings name; None for the rendered masks."""
+    from mistyle.backends.masks import segmenter
+
+    return None if settings.sweep.segmenter is None else segmenter(settings.sweep.segmenter)
+
+
+def swept(
+    run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View], report: Report
+) -> tuple[Painted, ...]:
+    """Paint the views one after another; what is finished is kept in work/ until all are."""
+    s = run.job.settings
+    network = s.stylizer == "diffusion"
+    if network:
+        from mistyle.run.generative import view_stylizer
+
+        paint = view_stylizer(run, style, views, lambda done: report(0.1 * done))
+    else:
+        paint = stylizer_of(asset, style, atlas, s, lambda done: report(0.1 * done))
+    kept, key = run.hidden.root / KEPT, run.keys["surface"]
+    result = sweep(
+        views,
+        paint,
+        s.sweep,
+        s.seed,
+        lambda done: report(0.1 + 0.9 * done),
+        masker=masker_of(s),
+        keeps_outlines=not network,
+        kept=kept,
+        key=key,
+    )
+    run.progress.say(sentence(result))
+    return result.painted
+
+
+def sentence(result: Swept) -> str:
+    """What a person wants to know of a sweep."""
+    later = [result.painted[k].known for k in result.order[1:]]
+    share = float(np.mean(later)) if later else 0.0
+    text = f"each later view was on average {100 * share:.0f} % known from the views before"
+    drift = min(p.drift for p in result.painted)
+    return text if drift == 1 else f"{text}; the segmenter's masks overlap the rendered ones by at least {drift:.3f}"
+
+
+def bake(
+    asset: Asset,
+    stylized: Sequence[View],
+    painted: Sequence[Painted],
+    atlas: Atlas,
+    settings: Settings,
+    report: Report,
+) -> Baked:
+    """Section 4.1.4: every texel takes the colour of the view that faces it most; what no view saw takes the nearest
+    colour of its island."""
+    from mistyle.stages.backproject import backproject, fill
+    from mistyle.stages.coat import painted_mask, protected
+    from mistyle.stages.texels import pad
+
+    views = [replace(view, mask=view.mask & one.mask) for view, one in zip(stylized, painted, strict=True)]
+    maps, seen = [], []
+    for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
+        found = backproject(views, texels, settings.bake, mesh=asset.mesh)
+        coated = replace(start, albedo=pad(fill(found, texels), texels, settings.atlas.padding), known=found.known)
+        if settings.coat.protect is not None:
+            coated = protected(coated, start, painted_mask(settings.coat.protect, texels))
+        maps.append(coated)
+        seen.append(found.seen)
+        report((part + 1) / len(atlas.texels))
+    return Baked(tuple(maps), tuple(seen))

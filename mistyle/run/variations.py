@@ -1,0 +1,90 @@
+"""`--variations N`: one style picture tried several ways on a mesh, quickly, on one contact sheet to choose from."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.camera import RigSettings, rig
+from mistyle.core.image import srgb_from_linear
+from mistyle.run.progress import Progress
+from mistyle.run.settings import Settings
+
+SAMPLES, ATLAS, RESOLUTION = 40_000, 1024, 384
+VIEWS = (0, 13)  # of the paper's rig: front right and front left
+STROKES = (1.0, 1.6, 0.7)  # sizes of strokes, as factors, that take turns
+COLUMNS = 4
+
+
+@dataclass(frozen=True)
+class Variation:
+    """What one picture of the sheet was made with."""
+
+    label: str
+    settings: Settings
+
+
+def variations(settings: Settings, count: int) -> list[Variation]:
+    """Other seeds, and every second time strokes of another size; the first is the job as it stands."""
+    result = []
+    for k in range(count):
+        factor = STROKES[(k // 2 + 1) % len(STROKES)] if k % 2 else 1.0
+        scale = float(np.clip(settings.surface.style_scale * factor, 0.1, 10))
+        surface = {"samples": min(settings.surface.samples, SAMPLES), "style_scale": scale}
+        changed: Mapping[str, Any] = {
+            "seed": settings.seed + k,
+            "surface": settings.surface.model_copy(update=surface),
+            "atlas": settings.atlas.model_copy(update={"size": min(settings.atlas.size, ATLAS)}),
+        }
+        label = f"--seed {settings.seed + k} --stroke-scale {scale:g}"
+        result.append(Variation(label, settings.model_copy(update=changed)))
+    return result
+
+
+def sheet(mesh: Path, style: Path, out: Path, settings: Settings, count: int, progress: Progress) -> dict[str, Any]:
+    """Write OUT/variations.png; returns its path and, picture by picture, the options that make it."""
+    from mistyle.files.images import write_png
+    from mistyle.files.read import read_picture
+    from mistyle.run import pipeline
+
+    picture = read_picture(style)
+    pipeline.start_engines(settings)
+    cameras = rig(RigSettings(resolution=RESOLUTION))
+    with progress.stage("mesh", "read the mesh") as report:
+        asset = pipeline.read(mesh, settings.read, ATLAS, report)
+    tiles, labels = [], []
+    for variation in variations(settings, count):
+        with progress.stage("surface", f"paint with {variation.label}") as report:
+            tiles.append(tile(asset, picture, variation.settings, [cameras[k] for k in VIEWS], report))
+        labels.append(variation.label)
+    out.mkdir(parents=True, exist_ok=True)
+    target = out / "variations.png"
+    write_png(target, arranged(tiles))
+    return {"sheet": str(target), "variations": labels}
+
+
+def tile(asset: Any, picture: Any, settings: Settings, cameras: Any, report: Any) -> Float[np.ndarray, "h w 3"]:
+    """The painted surface from every camera, side by side, on white, encoded sRGB."""
+    from mistyle.render.unlit import unlit
+    from mistyle.run import pipeline
+
+    atlas = pipeline.lay_out(asset, settings, lambda done: None)
+    coats = pipeline.coat(asset, picture, atlas, settings, report)
+    maps = pipeline.painted(asset, coats, atlas, settings)
+    drawn = unlit(asset.mesh, maps, cameras)
+    return np.concatenate([srgb_from_linear(rgb + 1 - share[..., None]) for rgb, share in drawn], axis=1)
+
+
+def arranged(tiles: list[Float[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "H W 3"]:
+    """Tiles in rows of two, from the top left, the rest white."""
+    columns = min(COLUMNS // len(VIEWS), len(tiles))
+    height, width = tiles[0].shape[:2]
+    rows = -(-len(tiles) // columns)
+    result = np.ones((rows * height, columns * width, 3), np.float32)
+    for k, picture in enumerate(tiles):
+        row, column = divmod(k, columns)
+        result[row * height : (row + 1) * height, column * width : (column + 1) * width] = picture
+    return result

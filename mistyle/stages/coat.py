@@ -1,0 +1,175 @@
+"""The coat of paint on an asset: which picture goes where, what of the asset's own look stays, and what the painting
+says about height and gloss (before the paper's 4.2, which then refines those maps)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.core.asset import Asset, Picture
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.image import nearest_fill, resize, srgb_from_linear
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import face_areas
+from mistyle.core.tangents import corner_tangents
+from mistyle.stages.frames import texel_frames
+from mistyle.surface.lookup import Solution
+from mistyle.surface.settings import SurfaceSettings
+
+PICTURE_STROKES = 32  # strokes side by side along a picture's long side, by which `stroke_size` is turned into a scale
+CONTENT_TEXELS = 200_000  # texels of the asset's own albedo that are asked for content
+PLAIN = 0.004  # standard deviation of lightness (0..1) below which an albedo has no content
+ROUGHEST, SMOOTHEST = 1.0, 0.08
+
+
+@dataclass(frozen=True)
+class Coats:
+    """One solution a picture, and per texture set which of them each texel takes (0: the job's own style)."""
+
+    solutions: tuple[Solution, ...]
+    choice: tuple[np.ndarray, ...]
+
+
+def masked_style(style: Picture, mask: Path | None) -> Picture:
+    """The style with the dark parts of a mask picture (of any size) taken out."""
+    if mask is None:
+        return style
+    from mistyle.files.read import read_picture
+
+    light = resize(read_picture(mask).rgb.mean(axis=2), style.rgb.shape[:2])
+    if not (light > 0.5).any():
+        raise InputRefused(f"{mask}: dark everywhere; a style mask is light where the picture may be used")
+    alpha = np.ones(style.rgb.shape[:2], np.float32) if style.alpha is None else style.alpha
+    return replace(style, alpha=(alpha * (light > 0.5)).astype(np.float32))
+
+
+def scaled(surface: SurfaceSettings, asset: Asset, stroke_size: float | None) -> SurfaceSettings:
+    """`style_scale` such that a stroke (a 32nd of the picture) is `stroke_size` of the mesh's own units wide.
+
+    Refused where that is beyond what the number of samples can show.
+    """
+    if stroke_size is None:
+        return surface
+    from mistyle.surface.samples import YIELD
+    from mistyle.surface.synthesis import finest_size
+
+    area = float(face_areas(asset.mesh).sum())
+    spacing = np.sqrt(area / (YIELD * surface.samples))
+    per_unit = float(np.cbrt(abs(np.linalg.det(asset.source.work_from_user[:3, :3]))))
+
+    def stroke(scale: float) -> float:
+        """Width of a stroke in the mesh's units at a style_scale, as far as that is possible."""
+        size = finest_size(surface.model_copy(update={"style_scale": scale}))
+        return float(size * spacing / PICTURE_STROKES / per_unit)
+
+    scale = stroke_size / stroke(1.0)
+    if not (0.1 <= scale <= 10 and np.isclose(stroke(scale), stroke_size, rtol=1e-3)):
+        raise UsageError(
+            f"strokes of {stroke_size:g} on this mesh would be {scale:.3g} times the usual size; choose from "
+            f"{stroke(0.1):.3g} to {stroke(10):.3g} (in the mesh's own units) with {surface.samples} samples"
+        )
+    return surface.model_copy(update={"style_scale": scale})
+
+
+def slot_masks(
+    asset: Asset, texels: Sequence[Texels], slots: Sequence[str]
+) -> tuple[list[Path], list[list[Bool[np.ndarray, "h w"]]]]:
+    """The pictures of `slots` and, per picture and texture set, the texels that take it.
+
+    SLOT names a material (all of its texels) or is a picture in the mesh's UVs (texels where it is light).
+    """
+    pictures, masks = [], []
+    for slot in slots:
+        name, equals, picture = slot.rpartition("=")
+        if not equals or not name or not picture:
+            raise UsageError(
+                f"'{slot}' is not of the form SLOT=PICTURE, for example wood=bark.jpg or mask.png=gold.jpg"
+            )
+        pictures.append(Path(picture))
+        if name in asset.mesh.parts:
+            own = zip(asset.mesh.parts, texels, strict=True)
+            masks.append([np.full(t.covered.shape, part == name) for part, t in own])
+        elif Path(name).is_file():
+            masks.append([painted_mask(Path(name), t) for t in texels])
+        else:
+            raise UsageError(
+                f"there is neither a material nor a picture called '{name}'; materials: {', '.join(asset.mesh.parts)}"
+            )
+    return pictures, masks
+
+
+def painted_mask(path: Path, texels: Texels) -> Bool[np.ndarray, "h w"]:
+    """A picture in the mesh's UVs (row 0 is v = 1) as a mask at the atlas's size: light (and opaque) is True."""
+    from mistyle.files.read import read_picture
+
+    found = read_picture(path)
+    light = found.rgb.mean(axis=2) * (1 if found.alpha is None else found.alpha)
+    return resize(light.astype(np.float32), texels.covered.shape) > 0.5
+
+
+def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
+    """Lightness (encoded luminance, 0..1) of the asset's own albedo at surface points; None where it is of one colour.
+
+    The nearest of about 200,000 texels of the same side answers.
+    """
+    positions = np.concatenate([t.position[t.covered] for t in texels])
+    normals = np.concatenate([t.normal[t.covered] for t in texels])
+    albedo = np.concatenate([m.albedo[t.covered] for t, m in zip(texels, start, strict=True)])
+    light = srgb_from_linear(albedo @ np.array([0.2126, 0.7152, 0.0722], np.float32))
+    if len(light) == 0 or light.std() < PLAIN:
+        return None
+    from scipy.spatial import KDTree
+
+    every = max(len(light) // CONTENT_TEXELS, 1)
+    reach = np.float32(0.02)  # working units by which a turn of the normal by one radian counts
+    tree = KDTree(np.concatenate([positions, reach * normals], axis=1)[::every])
+    few = light[::every]
+
+    def at(where: np.ndarray, facing: np.ndarray) -> np.ndarray:
+        return few[tree.query(np.concatenate([where, reach * facing], axis=1), workers=-1)[1]]
+
+    return at
+
+
+def first_maps(
+    asset: Asset,
+    start: Maps,
+    texels: Texels,
+    gradient: Float[np.ndarray, "t 3"],
+    dull: Float[np.ndarray, " t"],
+    height: float,
+    gloss: float,
+) -> Maps:
+    """The asset's own normal map with the painting's relief laid upon it, and its roughness with the painting's gloss.
+
+    `gradient` (world, along the surface) and `dull` belong to the covered texels in row order. The normal that the
+    asset's map shows is bent by the relief's slope: nothing of it is overwritten.
+    """
+    at = texels.covered
+    normal, roughness = start.normal.copy(), start.roughness.copy()
+    if height > 0:
+        place = texels.face[at], texels.position[at], texels.normal[at]
+        frames = texel_frames(asset.mesh, *place, corner_tangents(asset.mesh))
+        world = np.einsum("tk,tkx->tx", normal[at], frames) - np.float32(height) * gradient
+        bent = np.einsum("tx,tkx->tk", world, frames)
+        bent[:, 2] = np.maximum(bent[:, 2], 0.05)
+        normal[at] = bent / np.linalg.norm(bent, axis=1, keepdims=True)
+        normal = nearest_fill(normal, at)
+    if gloss > 0:
+        roughness[at] = np.clip(roughness[at] + np.float32(gloss) * dull, SMOOTHEST, ROUGHEST)
+        roughness = nearest_fill(roughness, at)
+    return replace(start, normal=normal.astype(np.float32), roughness=roughness.astype(np.float32))
+
+
+def protected(maps: Maps, start: Maps, mask: Bool[np.ndarray, "h w"]) -> Maps:
+    """The maps with the asset's own look where the mask says so."""
+    chosen = mask[..., None]
+    return replace(
+        maps,
+        albedo=np.where(chosen, start.albedo, maps.albedo),
+        normal=np.where(chosen, start.normal, maps.normal),
+        roughness=np.where(mask, start.roughness, maps.roughness),
+        metallic=np.where(mask, start.metallic, maps.metallic),
+    )

@@ -1,0 +1,86 @@
+"""RePaint as a sampler over any denoiser (paper 4.1.3, equations 1 to 3); it knows of no network.
+
+Variance-exploding coordinates: a latent at level sigma is the clean one plus sigma times standard normal noise, not
+scaled for a network's input (a denoiser that wants x / sqrt(sigma^2 + 1) divides for itself).
+
+The paper re-noises a block "before the final resample". With one re-noising in ten repeats the other eight start from
+latents quieter than the denoiser is told, and the variance of the result falls under half of the true one; here, as in
+RePaint itself, every repeat but the first is re-noised. tests/test_repaint.py holds both against a closed form.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+Array = Any  # a NumPy array, or a torch tensor; then `rng` is a torch.Generator
+Denoiser = Callable[[Array, float], Array]  # (latent, sigma) -> the clean latent it expects
+
+
+def sample(
+    denoise: Denoiser,
+    prior: Array | None,
+    mask: Array | None,
+    sigmas: Sequence[float],
+    L: int = 10,
+    r: int = 10,
+    *,
+    rng: Any,
+    like: Array | None = None,
+    refine: float = 0.1,
+) -> Array:
+    """A latent whose part under `mask` (1: known) is `prior` and whose rest goes with it.
+
+    `sigmas` falls from the noisiest level to 0, one step between neighbours. Steps go in blocks of `L`, each block `r`
+    times over: after every step the known part is set to the prior at the next level (eq. 1 and 2), before every
+    repeat the block's noise is put back (eq. 3). With `prior` None (the first view) nothing is pinned, L and r count
+    as 1, and `like` gives the latent's shape and kind. The result then passes the last int(refine * steps) steps once
+    more without the prior, which smooths the border; refine = 0 leaves that out, and the known part is the prior
+    exactly. Calls `denoise` steps * r + int(refine * steps) times. The same generator state gives the same result.
+    """
+    levels = [float(s) for s in sigmas]
+    if len(levels) < 2 or levels[-1] != 0 or any(a <= b for a, b in zip(levels, levels[1:], strict=False)):
+        raise ValueError("sigmas must fall from step to step and end with 0; pass the sampler's noise levels")
+    if L < 1 or r < 1 or not 0 <= refine <= 1:
+        raise ValueError(f"L = {L} and r = {r} must be at least 1, refine = {refine} within 0..1")
+    template = like if prior is None else prior
+    if template is None or (prior is not None and mask is None):
+        raise ValueError("a first view needs `like` for the shape of the latent, a later one a prior and its mask")
+    block, repeats = (L, r) if prior is not None else (1, 1)
+    x = levels[0] * normal(rng, template)
+    for first in range(0, len(levels) - 1, block):
+        last = min(first + block, len(levels) - 1)
+        for repeat in range(repeats):
+            if repeat > 0:
+                x = x + float(np.sqrt(levels[first] ** 2 - levels[last] ** 2)) * normal(rng, x)
+            for k in range(first, last):
+                x = step(denoise, x, levels[k], levels[k + 1])
+                if prior is not None and mask is not None:
+                    x = mask * (prior + levels[k + 1] * normal(rng, x)) + (1 - mask) * x
+    return refined(denoise, x, levels, refine, rng)
+
+
+def refined(denoise: Denoiser, x: Array, levels: Sequence[float], strength: float, rng: Any) -> Array:
+    """The last int(strength * steps) steps once more, from the finished latent with their noise added."""
+    steps = len(levels) - 1
+    first = steps - int(strength * steps + 1e-9)
+    if first == steps:
+        return x
+    x = x + levels[first] * normal(rng, x)
+    for k in range(first, steps):
+        x = step(denoise, x, levels[k], levels[k + 1])
+    return x
+
+
+def step(denoise: Denoiser, x: Array, sigma: float, following: float) -> Array:
+    """Euler's step of the probability flow dx = (x - D(x, sigma)) / sigma dsigma."""
+    return x + (x - denoise(x, sigma)) * ((following - sigma) / sigma)
+
+
+def normal(rng: Any, like: Array) -> Array:
+    """Standard normal noise of the shape, type and place of `like`."""
+    if isinstance(like, np.ndarray):
+        return rng.standard_normal(like.shape).astype(like.dtype, copy=False)
+    import torch
+
+    return torch.randn(like.shape, generator=rng, device=rng.device, dtype=like.dtype).to(like.device)
