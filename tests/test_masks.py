@@ -105,3 +105,30 @@ def test_a_broken_file_is_refused_by_the_real_runtime(tmp_path):
     expected = InputRefused if importlib.util.find_spec("onnxruntime") else EnvironmentMissing
     with pytest.raises(expected):
         masks.segmenter(tmp_path / "net.onnx")
+
+
+@pytest.mark.parametrize("side", [64, None])
+def test_a_real_onnx_file_is_opened_and_run(tmp_path, side):
+    """A 1 x 1 convolution that says 20 (luma - 0.4), as a file; with its size fixed and left open."""
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    size = [side, side] if side else ["height", "width"]
+    kind = onnx.TensorProto.FLOAT
+    given = onnx.helper.make_tensor_value_info("picture", kind, [1, 3, *size])
+    out = onnx.helper.make_tensor_value_info("logits", kind, [1, 1, *size])
+    weight = (20 / 3 * masks.SPREAD).reshape(1, 3, 1, 1)
+    bias = np.array([20 * (masks.MEAN.mean() - 0.4)], np.float32)
+    graph = onnx.helper.make_graph(
+        [onnx.helper.make_node("Conv", ["picture", "weight", "bias"], ["logits"])],
+        "bright",
+        [given],
+        [out],
+        [onnx.numpy_helper.from_array(weight, "weight"), onnx.numpy_helper.from_array(bias, "bias")],
+    )
+    model = onnx.helper.make_model(graph, opset_imports=[onnx.helper.make_opsetid("", 17)], ir_version=10)
+    onnx.save(model, str(tmp_path / "net.onnx"))
+    view = see(at(0, size=96), [BALL], paint=lambda points, which: np.full((len(points), 3), 0.8, np.float32))
+    assert overlap(masks.segmenter(tmp_path / "net.onnx")(view), view.mask) > 0.97
+    (tmp_path / "broken.onnx").write_bytes((tmp_path / "net.onnx").read_bytes()[:20])
+    with pytest.raises(InputRefused, match="cannot open"):
+        masks.segmenter(tmp_path / "broken.onnx")
