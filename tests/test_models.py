@@ -21,6 +21,7 @@ from safetensors.torch import load_file, save_file
 
 from mistyle.backends import models, models_check, models_fetch, models_load
 from mistyle.backends.diffusion_settings import ModelSettings
+from mistyle.backends.models_list import ENCODER
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
 from mistyle.run.cli import main
 
@@ -300,7 +301,7 @@ def test_pictures_reach_clip_whole(rng):
     """A wide picture is drawn out to the square: its left and right borders count."""
     from transformers import CLIPVisionModelWithProjection
 
-    place = tiny_models.folder() / "ip-adapter" / models.ENCODER
+    place = tiny_models.folder() / "ip-adapter" / ENCODER
     encoder = models_load.network(CLIPVisionModelWithProjection, place, torch.float32)
     wide = rng.random((32, 96, 3)).astype(np.float32)
     other = wide.copy()

@@ -15,6 +15,7 @@ from jaxtyping import Float
 from mistyle.backends import models, models_check
 from mistyle.backends.consislora_make import NETWORKS, Halves, forecast, identity, lora_key, make_all, paths, steps_left
 from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, TrainSettings
+from mistyle.backends.models_list import ENCODER, LOOSE_NEEDED
 from mistyle.core.errors import UsageError
 from mistyle.core.image import linear_from_srgb, resize, srgb_from_linear
 from mistyle.core.view import Prior, View
@@ -54,8 +55,8 @@ def check(settings: ModelSettings, chosen: DiffusionSettings, side: int) -> None
     if settings.style_lora:
         models_check.lora(settings.style_lora, unet)
     if chosen.adapter == "ip":
-        ip = models.find("ip-adapter", settings.folder, [models.LOOSE_NEEDED["sdxl"]])
-        models_check.ip_adapter(ip / models.LOOSE_NEEDED["sdxl"], ip / models.ENCODER, unet, "SDXL")
+        ip = models.find("ip-adapter", settings.folder, [LOOSE_NEEDED["sdxl"]])
+        models_check.ip_adapter(ip / LOOSE_NEEDED["sdxl"], ip / ENCODER, unet, "SDXL")
     device = device_of(settings)
     width = precision_of(settings, device).itemsize
     folders = [*(place / n for n in NETWORKS), *controls]
@@ -114,8 +115,8 @@ def key(job: Job, views: Sequence[View]) -> str:
     _, controls = _places(job.models, job.diffusion)
     files = [file for place in controls for file in models.weights(place)]
     if job.diffusion.adapter == "ip":
-        ip = models.find("ip-adapter", job.models.folder, [models.LOOSE_NEEDED["sdxl"]])
-        files += [ip / models.LOOSE_NEEDED["sdxl"], *models.weights(ip / models.ENCODER)]
+        ip = models.find("ip-adapter", job.models.folder, [LOOSE_NEEDED["sdxl"]])
+        files += [ip / LOOSE_NEEDED["sdxl"], *models.weights(ip / ENCODER)]
     networks = [identity(job.models), models.fingerprint(files)]
     own = job.models.model_dump(include={"device", "precision", "offload"})
     pictures = [view.rgb for view in views]
@@ -186,7 +187,7 @@ def _pipeline(job: Job) -> tuple[Any, list[Any]]:
     )
     picture: list[Any] = []
     if job.diffusion.adapter == "ip":
-        ip, name = models.find("ip-adapter", job.models.folder), models.LOOSE_NEEDED["sdxl"]
+        ip, name = models.find("ip-adapter", job.models.folder), LOOSE_NEEDED["sdxl"]
         # InstantStyle's block of SDXL, the one that the style LoRA sits in.
         scale = {"up": {"block_0": [0.0, job.diffusion.adapter_scale, 0.0]}}
         picture = [e.to(device) for e in add_ip_adapter(pipeline, ip, name, job.style, scale, device)]

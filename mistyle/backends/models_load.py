@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from mistyle.backends import models
 from mistyle.backends.diffusion_settings import ModelSettings
+from mistyle.backends.models_list import ENCODER
 from mistyle.core.errors import EnvironmentMissing
 
 CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.26130258, 0.27577711)
@@ -151,7 +152,7 @@ def add_ip_adapter(
     from transformers import CLIPVisionModelWithProjection
 
     dtype = pipeline.unet.dtype
-    encoder = network(CLIPVisionModelWithProjection, place / models.ENCODER, dtype).to(device)
+    encoder = network(CLIPVisionModelWithProjection, place / ENCODER, dtype).to(device)
     embedding = image_embedding(encoder, rgb)
     del encoder
     folder, _, file = name.rpartition("/")

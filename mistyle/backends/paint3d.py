@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 from mistyle.backends import models, models_check
 from mistyle.backends import paint3d_plan as plan
 from mistyle.backends.diffusion_settings import ModelSettings, Paint3dSettings
+from mistyle.backends.models_list import ENCODER, LOOSE_NEEDED
 from mistyle.core.image import dilate, linear_from_srgb, srgb_from_linear
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
@@ -67,11 +68,11 @@ def check(settings: ModelSettings, chosen: Paint3dSettings) -> None:
     unet = models_check.base(place, "sd15", recipe.channels)
     for control in controls:
         models_check.controlnet(control, unet, "Stable Diffusion 1.5")
-    adapter = ip / models.LOOSE_NEEDED["sd15"]
-    models_check.ip_adapter(adapter, ip / models.ENCODER, unet, "Stable Diffusion 1.5")
+    adapter = ip / LOOSE_NEEDED["sd15"]
+    models_check.ip_adapter(adapter, ip / ENCODER, unet, "Stable Diffusion 1.5")
     device = device_of(settings)
     width = precision_of(settings, device).itemsize
-    folders = [*(place / n for n in ("unet", "vae", "text_encoder")), *controls, ip / models.ENCODER]
+    folders = [*(place / n for n in ("unet", "vae", "text_encoder")), *controls, ip / ENCODER]
     needed = models_check.need("sd15", folders, chosen.size**2, width, settings.offload)
     models_check.memory(f"inpainting {chosen.size}² texels", needed, settings.memory, device, settings.offload)
 
@@ -79,15 +80,15 @@ def check(settings: ModelSettings, chosen: Paint3dSettings) -> None:
 def _places(settings: ModelSettings, recipe: Recipe) -> tuple[Path, list[Path], Path]:
     place = models.find(recipe.base, settings.folder)
     controls = [models.find(name, settings.folder) for name in recipe.controls]
-    return place, controls, models.find("ip-adapter", settings.folder, [models.LOOSE_NEEDED["sd15"]])
+    return place, controls, models.find("ip-adapter", settings.folder, [LOOSE_NEEDED["sd15"]])
 
 
 def identity(settings: ModelSettings, chosen: Paint3dSettings) -> str:
     """Which networks the recipe's are."""
     place, controls, ip = _places(settings, RECIPES[chosen.recipe])
-    folders = [*(place / n for n in ("unet", "vae", "text_encoder")), *controls, ip / models.ENCODER]
+    folders = [*(place / n for n in ("unet", "vae", "text_encoder")), *controls, ip / ENCODER]
     files = [file for folder in folders for file in models.weights(folder)]
-    return models.fingerprint([*files, ip / models.LOOSE_NEEDED["sd15"]])
+    return models.fingerprint([*files, ip / LOOSE_NEEDED["sd15"]])
 
 
 def inpainter(
@@ -131,7 +132,7 @@ def load(settings: ModelSettings, chosen: Paint3dSettings, style: Float[np.ndarr
     parts["controlnet"] = nets if len(nets) > 1 else nets[0]
     pipeline = StableDiffusionControlNetInpaintPipeline(**parts, requires_safety_checker=False)
     scale = chosen.style if chosen.style >= 0 else recipe.style
-    picture = add_ip_adapter(pipeline, ip, models.LOOSE_NEEDED["sd15"], style, scale, device)
+    picture = add_ip_adapter(pipeline, ip, LOOSE_NEEDED["sd15"], style, scale, device)
     pipeline = settle(pipeline, settings, device)
     text, negative = pipeline.encode_prompt(
         chosen.prompt, device, 1, do_classifier_free_guidance=True, negative_prompt=chosen.negative

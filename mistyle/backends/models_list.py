@@ -1,0 +1,148 @@
+"""The models that the generative stages use: their names here, where they are published, licences, what they are for.
+
+Revisions and hashes are those that other projects' published lock files give; they were not compared with the hub.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+BASE = ("tokenizer", "text_encoder", "unet", "vae", "scheduler")  # folders of a Stable Diffusion model
+
+
+@dataclass(frozen=True)
+class Model:
+    """One model that mistyle can use. `folders` hold networks or tokenizers ('' is the model's own folder), `loose`
+    are single weight files; `patterns` are fetched."""
+
+    name: str
+    repo: str
+    revision: str
+    gigabytes: float
+    licence: str
+    purpose: str
+    folders: tuple[str, ...]
+    patterns: tuple[str, ...]
+    loose: tuple[str, ...] = ()
+    sha256: Mapping[str, str] = field(default_factory=dict)
+
+
+def _network(*folders: str) -> tuple[str, ...]:
+    return tuple(f"{f}/{name}" if f else name for f in folders for name in ("*.json", "*model.fp16.safetensors"))
+
+
+SDXL = (*BASE, "tokenizer_2", "text_encoder_2")
+TOKENS = ("tokenizer*/*", "scheduler/*.json", "model_index.json")
+ENCODER = "models/image_encoder"
+MODELS = {
+    model.name: model
+    for model in (
+        Model(
+            "sdxl",
+            "stabilityai/stable-diffusion-xl-base-1.0",
+            "462165984030d82259a11f4367a4eed129e94a7b",
+            7.1,
+            "CreativeML Open RAIL++-M",
+            "stylizer and LoRA training: the base model",
+            SDXL,
+            (*_network("unet", "text_encoder", "text_encoder_2"), *TOKENS, "vae/*.json", "vae/*model.safetensors"),
+        ),
+        Model(
+            "depth",
+            "diffusers/controlnet-depth-sdxl-1.0",
+            "17bb97973f29801224cd66f192c5ffacf82648b4",
+            2.5,
+            "openrail++",
+            "stylizer: depth ControlNet",
+            ("",),
+            _network(""),
+        ),
+        Model(
+            "canny",
+            "diffusers/controlnet-canny-sdxl-1.0",
+            "eb115a19a10d14909256db740ed109532ab1483c",
+            2.5,
+            "openrail++",
+            "stylizer: Canny ControlNet",
+            ("",),
+            _network(""),
+        ),
+        Model(
+            "ip-adapter",
+            "h94/IP-Adapter",
+            "018e402774aeeddd60609b4ecdb7e298259dc729",
+            3.3,
+            "Apache-2.0",
+            "inpainter: the style picture; stylizer with --style-adapter ip",
+            (ENCODER,),
+            (
+                f"{ENCODER}/config.json",
+                f"{ENCODER}/model.safetensors",
+                "models/ip-adapter_sd15.safetensors",
+                "sdxl_models/ip-adapter_sdxl_vit-h.safetensors",
+            ),
+            ("models/ip-adapter_sd15.safetensors", "sdxl_models/ip-adapter_sdxl_vit-h.safetensors"),
+            {
+                "models/ip-adapter_sd15.safetensors": (
+                    "289b45f16d043d0bf542e45831f971dcdaabe18b656f11e86d9dfba7e9ee3369"
+                ),
+                "sdxl_models/ip-adapter_sdxl_vit-h.safetensors": (
+                    "ebf05d918348aec7abb02a5e9ecef77e0aaea6914a5c4ea13f50d45eb1681831"
+                ),
+                f"{ENCODER}/model.safetensors": "6ca9667da1ca9e0b0f75e46bb030f7e011f44f86cbfb8d5a36590fcd7507b030",
+            },
+        ),
+        Model(
+            "inpaint",
+            "stable-diffusion-v1-5/stable-diffusion-inpainting",
+            "8a4288a76071f7280aedbdb3253bdb9e9d5d84bb",
+            2.2,
+            "CreativeML OpenRAIL-M",
+            "inpainter: the base model (the copy of the deleted runwayml/stable-diffusion-inpainting)",
+            BASE,
+            (*_network("unet", "text_encoder", "vae"), *TOKENS),
+        ),
+        Model(
+            "position",
+            "GeorgeQi/Paint3d_UVPos_Control",
+            "main",
+            1.5,
+            "Apache-2.0 (its training data has licences of its own)",
+            "inpainter: UV-position ControlNet; published as a pickle, converted once",
+            ("",),
+            ("config.json", "diffusion_pytorch_model.bin"),
+        ),
+        Model(
+            "sd15",
+            "stable-diffusion-v1-5/stable-diffusion-v1-5",
+            "451f4fe16113bff5a5d2269ed5ad43b0592e9a14",
+            2.2,
+            "CreativeML OpenRAIL-M",
+            "inpainter with paint3d.recipe=paint3d: the base model",
+            BASE,
+            (*_network("unet", "text_encoder", "vae"), *TOKENS),
+            (),
+            {
+                "unet/diffusion_pytorch_model.fp16.safetensors": (
+                    "c83908253f9a64d08c25fc90874c9c8aef9a329ce1ca5fb909d73b0c83d1ea21"
+                ),
+                "text_encoder/model.fp16.safetensors": (
+                    "77795e2023adcf39bc29a884661950380bd093cf0750a966d473d1718dc9ef4e"
+                ),
+                "vae/diffusion_pytorch_model.fp16.safetensors": (
+                    "4fbcf0ebe55a0984f5a5e00d8c4521d52359af7229bb4d81890039d2aa16dd7c"
+                ),
+            },
+        ),
+        Model(
+            "inpaint-control",
+            "lllyasviel/control_v11p_sd15_inpaint",
+            "c96e03a807e64135568ba8aecb66b3a306ec73bd",
+            0.7,
+            "openrail",
+            "inpainter with paint3d.recipe=paint3d: inpaint ControlNet",
+            ("",),
+            _network(""),
+        ),
+    )
+}
+LOOSE_NEEDED = {"sdxl": "sdxl_models/ip-adapter_sdxl_vit-h.safetensors", "sd15": "models/ip-adapter_sd15.safetensors"}
