@@ -100,7 +100,9 @@ def run(words: Sequence[object]) -> Taken:
     if done.returncode != 0:
         raise SystemExit(done.stderr[-2000:])
     cpu = after.children_user + after.children_system - before.children_user - before.children_system
-    return Taken(wall, cpu, float(done.stderr.split("PEAK")[-1]))
+    taken = Taken(wall, cpu, float(done.stderr.split("PEAK")[-1]))
+    print(f"{taken.wall:.1f} s, {taken.cpu:.1f} s of processors, {taken.gb:.2f} GB: {words[0]}", file=sys.stderr)
+    return taken
 
 
 def peak() -> float:

@@ -79,7 +79,7 @@ def measure(mesh: Path, style: Path, chosen: argparse.Namespace, out: Path) -> d
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(chosen.keep or scratch) / f"{mesh.stem}_{style.stem}_{sizes[0]}"
-        scene = load(folder) if (folder / "scene.pickle").exists() else make(folder, mesh, style, *sizes)
+        scene = load(folder) if (folder / "scene").is_dir() else make(folder, mesh, style, *sizes)
         pictures: dict[str, list[np.ndarray]] = {}
         for name in names:
             if name == "ebsynth" and chosen.quick:

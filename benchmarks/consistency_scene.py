@@ -1,7 +1,6 @@
 """What `benchmarks.consistency` compares on: a mesh, a painting, its views, and what the guides ask for in each."""
 
 import os
-import pickle
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,6 +13,7 @@ from mistyle.core.camera import Camera, RigSettings, orbit
 from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels, flat_maps
 from mistyle.core.view import View
+from mistyle.files.records import load_record, save_record
 from mistyle.run.settings import Settings, resolve
 from mistyle.surface import style as styles
 
@@ -52,7 +52,8 @@ class Scene:
 
 def load(folder: Path) -> Scene:
     """The scene that `make` left."""
-    return pickle.loads((folder / "scene.pickle").read_bytes())
+    kept = load_record(folder / "scene")
+    return Scene(**kept | {"settings": Settings.model_validate_json(kept["settings"])})
 
 
 def cameras(resolution: int) -> list[Camera]:
@@ -88,7 +89,7 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
         opaque=painting.opaque,
     )
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "scene.pickle").write_bytes(pickle.dumps(scene))
+    save_record(folder / "scene", vars(scene) | {"settings": settings.model_dump_json()})
     return scene
 
 

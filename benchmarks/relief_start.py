@@ -8,7 +8,6 @@ and paint under a raking light: flat maps, painted start, both fits.
 """
 
 import argparse
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ from mistyle.core.view import View
 from mistyle.files.read import read_mesh, read_picture
 from mistyle.run import pipeline
 from mistyle.run.settings import Settings
-from mistyle.stages import fit, fit_table
+from mistyle.stages import fit
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 WINDOW = 10
@@ -31,24 +30,6 @@ WINDOW = 10
 
 def silent(done: float) -> None:
     pass
-
-
-@contextmanager
-def beginning_at(maps: Any):
-    """Within it the fit's table starts at other maps than those that count as unfitted."""
-    build = fit_table.build
-
-    def started(unfitted: Any, texels: Any, shrink: int, *rest: Any, **more: Any) -> Any:
-        table, begun = (build(m, texels, shrink, *rest, **more) for m in (unfitted, maps))
-        for name in ("tilt", "roughness"):
-            table.values[name] = begun.values[name]
-        return table
-
-    fit_table.build = started
-    try:
-        yield
-    finally:
-        fit_table.build = build
 
 
 def views_of(asset: Any, maps: Any, resolution: int) -> list[View]:
@@ -83,23 +64,22 @@ def main() -> None:
     size = 512 if chosen.quick else 1024
     base: dict[str, Any] = {"surface": {"samples": samples}, "atlas": {"size": size}}
     base["fit"] = {"iterations1": steps, "crops": 2, "crop_size": crop, "refine": "normal-roughness", "judge": False}
-    plain = Settings.model_validate(base | {"coat": {"height": 0.0, "gloss": 0.0}})
-    raised = Settings.model_validate(base | {"coat": {"height": 0.15, "gloss": 0.5}})
+    plain = Settings.model_validate(base)
     pipeline.start_engines(plain)
     asset = read_mesh(SCENES / "demo.obj")
     atlas = pipeline.lay_out(asset, plain, silent)
     coats = pipeline.coat(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
-    flat, begun = (pipeline.painted(asset, coats, atlas, settings) for settings in (plain, raised))
+    flat = pipeline.painted(asset, coats, atlas, plain)
+    begun = pipeline.raised(asset, coats, atlas, plain, flat)
     targets = views_of(asset, flat, resolution)
     figures: dict[str, float] = {}
     results: dict[str, Any] = {}
-    for name, start in (("flat", flat), ("painted", begun)):
-        with beginning_at(start):
-            results[name] = timed(
-                figures,
-                f"{name}.seconds",
-                lambda: fit.two_phase(asset.mesh, flat, targets, atlas.texels, plain.fit, seed=0),
-            )
+    for name, begin in (("flat", None), ("painted", begun)):
+        results[name] = timed(
+            figures,
+            f"{name}.seconds",
+            lambda begin=begin: fit.two_phase(asset.mesh, flat, targets, atlas.texels, plain.fit, 0, begin=begin),
+        )
     losses = {name: loss(found.trace, steps) for name, found in results.items()}
     for name, course in losses.items():
         for step in (0, steps // 8, steps // 4, steps // 2, steps - WINDOW):

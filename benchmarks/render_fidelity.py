@@ -10,6 +10,7 @@
 
 import argparse
 import os
+import sys
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -190,6 +191,7 @@ def cycles(data: Path, blender: str, quick: bool, pictures: Path | None, only: s
                 found = measure_colour(theirs, ours, whole, ["flip", "psnr"]).values
                 figures |= {f"{k}.{name}.{shot.name}".replace("psnr", "db"): v for k, v in found.items()}
                 figures[f"bias.{name}.{shot.name}"] = float(ours.mean() / theirs.mean() - 1)
+                print(f"{name} {shot.name}: FLIP {found['flip']:.4f}", file=sys.stderr)
                 if pictures is not None:
                     from mistyle.files.images import write_png
 

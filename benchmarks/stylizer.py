@@ -23,14 +23,13 @@ COUNTS = {"250k": 250_000, "1m": 1_000_000}
 
 def paint(asset_file: Path, style_file: Path, samples: int, views: int, resolution: int, atlas: int) -> dict:
     """The parts of one stylization, timed; runs in the process that is measured."""
-    import pickle
-
     import numpy as np
 
     from mistyle.backends.embedded import solve_surface
     from mistyle.core.camera import RigSettings, rig
     from mistyle.core.view import View
     from mistyle.files.read import read_picture
+    from mistyle.files.records import load_record
     from mistyle.run import pipeline
     from mistyle.run.settings import resolve
 
@@ -39,7 +38,7 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     )
     variant = pipeline.start_engines(settings)
     assert "llvm" in variant or "cuda" in variant
-    asset = pickle.loads(asset_file.read_bytes())
+    asset = load_record(asset_file)
     style = read_picture(style_file)
     parts: dict[str, float] = {"faces": len(asset.mesh.faces), "before_gb": peak_gb()}
 
@@ -88,7 +87,7 @@ def main() -> None:
     style = chosen.style or (SCENES / "demo_style.png" if chosen.quick else DATA / "styles/starry_night.jpg")
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as scratch:
-        asset = chosen.asset or Path(scratch) / "asset.pickle"
+        asset = chosen.asset or Path(scratch) / "asset"
         if not asset.exists():
             unwrap(mesh, asset)
         if chosen.quick:
@@ -105,8 +104,9 @@ def main() -> None:
 def unwrap(mesh: Path, target: Path) -> None:
     """Read a mesh and give it UVs where it has none, out of the measured process."""
     code = (
-        "import pickle, sys; from pathlib import Path; from mistyle.files.read import read_mesh;"
-        "Path(sys.argv[2]).write_bytes(pickle.dumps(read_mesh(Path(sys.argv[1]))))"
+        "import sys; from pathlib import Path; from mistyle.files.read import read_mesh;"
+        "from mistyle.files.records import save_record;"
+        "save_record(Path(sys.argv[2]), read_mesh(Path(sys.argv[1])))"
     )
     subprocess.run([sys.executable, "-c", code, str(mesh), str(target)], check=True)
 

@@ -270,7 +270,9 @@ def test_a_coat_of_two_pictures_with_a_protected_part(painted_sheet, tmp_path):
     )
     atlas = pipeline.lay_out(asset, settings, lambda done: None)
     coats = pipeline.coat(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)
-    maps = pipeline.painted(asset, coats, atlas, settings)[0]
+    flat = pipeline.painted(asset, coats, atlas, settings)
+    assert (flat[0].normal[..., 2] == 1).all()
+    maps = pipeline.raised(asset, coats, atlas, settings, flat)[0]
     assert len(coats.solutions) == 2
     np.testing.assert_allclose(maps.albedo[:5], atlas.start[0].albedo[:5])
     assert (maps.albedo[8:, :15, 2] > 0.1).all() and (maps.albedo[8:, :15, 0] < 0.02).all()

@@ -224,7 +224,7 @@ def inpaint(
         num_inference_steps=chosen.steps or recipe.steps,
         guidance_scale=chosen.guidance or recipe.guidance,
         controlnet_conditioning_scale=scales,
-        ip_adapter_image_embeds=brush.picture,
+        ip_adapter_image_embeds=brush.picture or None,
         generator=generator,
         output_type="np",
     )

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset, Picture
+from mistyle.core.errors import UsageError
 from mistyle.core.view import View
 from mistyle.run.progress import Report
 from mistyle.run.settings import Settings
@@ -25,6 +26,8 @@ def check(settings: Settings, say: Callable[[str], None]) -> None:
         from mistyle.backends.diffusion import announcement
         from mistyle.backends.diffusion import check as check_stylizer
 
+        if settings.coat.style_mask is not None:
+            raise UsageError("--style-mask: the diffusion stylizer learns whole pictures; crop the picture instead")
         check_stylizer(settings.models, settings.diffusion, settings.rig.resolution)
         if settings.rig.kind in ("paper", "turntable"):
             views = 16 if settings.rig.kind == "paper" else settings.rig.views

@@ -39,10 +39,14 @@ class Atlas:
 
 @dataclass(frozen=True)
 class Baked:
-    """Per texture set: the maps with the painted albedo, and by how many views each texel is seen."""
+    """Per texture set: the maps with the painted albedo, and by how many views each texel is seen.
+
+    `begin` are the same maps with the painting's relief, where the fit starts at them (else empty).
+    """
 
     maps: tuple[Maps, ...]
     seen: tuple[np.ndarray, ...]
+    begin: tuple[Maps, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -152,7 +156,7 @@ def painted_stages(
         lambda r: coat(asset, style, atlas, s, r),
     )
     baked = run.record(
-        "bake", ["views", "surface"], [s.bake, s.fit.refine], lambda r: bake(asset, coats, atlas, views, s, r)
+        "bake", ["views", "surface"], [s.bake, s.fit.refine, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
     )
     stylized = stylized_stage(run, asset, baked, views)
     return baked, stylized
@@ -270,49 +274,71 @@ def bake(asset: Asset, coats: Coats, atlas: Atlas, views: Sequence[View], settin
     from mistyle.stages.backproject import backproject
 
     maps, seen = painted(asset, coats, atlas, settings), []
+    with_relief = raised(asset, coats, atlas, settings, maps)
     for part, texels in enumerate(atlas.texels):
         seen.append(backproject(views, texels, settings.bake, mesh=asset.mesh).seen)
         report((part + 1) / len(atlas.texels))
-    return Baked(tuple(maps), tuple(seen))
+    if settings.fit.refine == "off":
+        return Baked(tuple(with_relief), tuple(seen))
+    return Baked(tuple(maps), tuple(seen), tuple(with_relief))
 
 
-# Slope of the painting's relief and share of its gloss in maps that nothing refines.
-FINAL_HEIGHT, FINAL_GLOSS = 0.15, 1.0
+# Slope of the painting's relief, and share of its gloss: in maps that nothing refines, and where the fit begins.
+HEIGHT = 0.15
+FINAL_GLOSS, FIRST_GLOSS = 1.0, 0.5
 
 
 def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings) -> list[Maps]:
-    """The start maps with the painting's colours in place of the albedo, looked up for every covered texel, and where
-    asked for with its relief upon normal and roughness. A single solution paints everything."""
-    from mistyle.backends.embedded import surface_colour, surface_relief
-    from mistyle.stages.coat import first_maps, painted_mask, protected
+    """The start maps with the painting's colours in place of the albedo, looked up for every covered texel.
+
+    A single solution paints everything.
+    """
+    from mistyle.backends.embedded import surface_colour
+    from mistyle.stages.coat import painted_mask, protected
     from mistyle.stages.texels import pad
 
-    unfitted = settings.fit.refine == "off"
-    height, gloss = (
-        (full if unfitted else 0.0) if given is None else given
-        for given, full in ((settings.coat.height, FINAL_HEIGHT), (settings.coat.gloss, FINAL_GLOSS))
-    )
-    if isinstance(coats, Solution):
-        coats = Coats((coats,), tuple(np.zeros(texels.covered.shape, np.int32) for texels in atlas.texels))
     maps = []
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
-        side = texel_side(asset, part, texels)
-        albedo, gradient = np.zeros_like(start.albedo), np.zeros_like(start.albedo)
-        dull = np.zeros_like(start.roughness)
-        for number, solution in enumerate(coats.solutions):
-            at = texels.covered & (coats.choice[part] == number)
+        side, albedo = texel_side(asset, part, texels), np.zeros_like(start.albedo)
+        for solution, at in whose(coats, part, texels):
             place = texels.position[at], texels.normal[at]
             albedo[at] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
-            if height > 0 or gloss > 0:
-                gradient[at], dull[at] = surface_relief(solution, *place, footprint=side)
         coated = replace(start, albedo=pad(albedo, texels, settings.atlas.padding), known=texels.covered)
-        if height > 0 or gloss > 0:
-            at = texels.covered
-            coated = first_maps(asset, coated, texels, gradient[at], dull[at], height, gloss)
         if settings.coat.protect is not None:
             coated = protected(coated, start, painted_mask(settings.coat.protect, texels))
         maps.append(coated)
     return maps
+
+
+def raised(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings, maps: Sequence[Maps]) -> list[Maps]:
+    """Painted maps with the painting's relief laid upon their normals, and its gloss upon their roughness."""
+    from mistyle.backends.embedded import surface_relief
+    from mistyle.stages.coat import first_maps, painted_mask, protected
+
+    full = FINAL_GLOSS if settings.fit.refine == "off" else FIRST_GLOSS
+    height = HEIGHT if settings.coat.height is None else settings.coat.height
+    gloss = full if settings.coat.gloss is None else settings.coat.gloss
+    if height == gloss == 0:
+        return list(maps)
+    result = []
+    for part, (texels, flat) in enumerate(zip(atlas.texels, maps, strict=True)):
+        side, gradient = texel_side(asset, part, texels), np.zeros_like(flat.albedo)
+        dull = np.zeros_like(flat.roughness)
+        for solution, at in whose(coats, part, texels):
+            gradient[at], dull[at] = surface_relief(solution, texels.position[at], texels.normal[at], footprint=side)
+        covered = texels.covered
+        made = first_maps(asset, flat, texels, gradient[covered], dull[covered], height, gloss)
+        if settings.coat.protect is not None:
+            made = protected(made, flat, painted_mask(settings.coat.protect, texels))
+        result.append(made)
+    return result
+
+
+def whose(coats: Coats | Solution, part: int, texels: Texels) -> list[tuple[Solution, np.ndarray]]:
+    """Each solution with the covered texels of a set that it paints."""
+    if isinstance(coats, Solution):
+        return [(coats, texels.covered)]
+    return [(one, texels.covered & (coats.choice[part] == k)) for k, one in enumerate(coats.solutions)]
 
 
 def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) -> list[View]:
@@ -338,7 +364,8 @@ def fit(asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View], sett
     """Section 4.2: normal and roughness, then albedo."""
     from mistyle.stages.fit import two_phase
 
-    return two_phase(asset.mesh, baked.maps, stylized, atlas.texels, settings.fit, seed=settings.seed, progress=report)
+    begin = baked.begin or None
+    return two_phase(asset.mesh, baked.maps, stylized, atlas.texels, settings.fit, settings.seed, report, begin=begin)
 
 
 def repair(

@@ -73,7 +73,7 @@ def tile(asset: Any, picture: Any, settings: Settings, cameras: Any, report: Any
 
     atlas = pipeline.lay_out(asset, settings, lambda done: None)
     coats = pipeline.coat(asset, picture, atlas, settings, report)
-    maps = pipeline.painted(asset, coats, atlas, settings)
+    maps = pipeline.painted(asset, coats, atlas, settings)  # pictures without light show no relief
     drawn = unlit(asset.mesh, maps, cameras)
     return np.concatenate([srgb_from_linear(rgb + 1 - share[..., None]) for rgb, share in drawn], axis=1)
 

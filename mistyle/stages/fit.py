@@ -79,12 +79,15 @@ def two_phase(
     *,
     phase1_lights: Lights | None = None,
     only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
+    begin: Sequence[Maps] | None = None,
 ) -> Fit:
     """Fit `maps` (one per texture set, as baked) so that renders look like `targets` (linear rgb, stylized).
 
     `phase1_lights` replaces those of `scenes/phase1_directional.xml`; `only` names the texels that may change, all
-    others keep their bytes. The same inputs, settings, seed and thread count give the same bytes. A gradient that is
-    not a number ends its phase at the last good state, and a note says where.
+    others keep their bytes. Phase 1 starts at the normal and roughness of `begin`, where given; what counts as unfitted
+    is `maps` all the same, and they are what stays where the phase is undone. The same inputs, settings, seed and
+    thread count give the same bytes. A gradient that is not a number ends its phase at the last good state, and a note
+    says where.
     """
     if settings.metallic == "zero":
         maps = [replace(m, metallic=np.zeros_like(m.metallic)) for m in maps]
@@ -92,7 +95,9 @@ def two_phase(
     if settings.refine == "off" or not any(view.mask.any() for view in targets):
         return Fit(tuple(maps), nothing, nothing, {}, {}, {}, ())
     world = _world(mesh, targets, settings)
-    table = fit_table.build(maps, texels, shrinkage(mesh, texels, targets, settings.texels_per_pixel), only)
+    shrink = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
+    table = fit_table.build(maps, texels, shrink, only)
+    begun = {} if begin is None else fit_table.build(begin, texels, shrink, only).values
     phases = _phases(settings, phase1_lights or lights("phase1"), targets)
     judge = fit_judge.bench(world.traced, world.tangents, targets) if settings.judge else None
     total, done = max(sum(phase.iterations for phase in phases), 1), 0
@@ -101,14 +106,19 @@ def two_phase(
         if phase.iterations:
             share = (done / total, phase.iterations / total)
             with memory.kept():
-                fit = _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress)
+                first = begun if phase is phases[0] else {}
+                fit = _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress, first)
             done += phase.iterations
     return fit
 
 
-def _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress) -> Fit:
-    """Run a phase and keep its result unless a figure got worse; `share` is (begin, length) of the whole progress."""
+def _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress, begun) -> Fit:
+    """Run a phase and keep its result unless a figure got worse; `share` is (begin, length) of the whole progress.
+
+    `begun` are values by name at which normal and roughness start instead of where they are.
+    """
     saved = {name: table.values[name].copy() for name in phase.rates}
+    table.values.update({name: begun[name] for name in ("tilt", "roughness") if name in begun})
     run, notes = Run(world, table, phase, settings, rng), list(fit.notes)
     for iteration in range(phase.iterations):
         note = run.step(iteration)
