@@ -292,7 +292,7 @@ def ciede_map(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"]) -> F
 
 def _inside(reference, test, mask) -> tuple[np.ndarray, np.ndarray]:
     """Both pictures with the test equal to the reference outside the mask, and both 0 where that is not finite."""
-    a, b = reference.astype(np.float32), test.astype(np.float32)
+    a, b = (picture.astype(np.float32, copy=False) for picture in (reference, test))
     if mask.all():
         return a, b
     a = np.where(mask[..., None] | np.isfinite(a).all(axis=-1, keepdims=True), a, np.float32(0))

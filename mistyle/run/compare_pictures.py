@@ -59,6 +59,7 @@ def write_pictures(folder: Path, planes: Planes, maps: Mapping[str, np.ndarray],
     looks = shown(planes)
     for name, picture in zip(("reference", "test"), looks, strict=True):
         save(folder / f"{name}.webp", picture, odd)
+    del looks  # of large pictures two more would not fit
     wide = 0.0
     if high and planes.kind == "colour":
         wide = _most(planes)
