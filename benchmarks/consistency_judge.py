@@ -93,7 +93,7 @@ def halves(scene: Scene) -> dict[str, float]:
 
 def seams(scene: Scene, albedo: list[np.ndarray]) -> float:
     """`metrics.seam_ratio` of the texture drawn in every view, mean over the views that show a seam."""
-    from mistyle.run.pipeline import unlit_views
+    from mistyle.run.painting import unlit_views
     from mistyle.stages.texels import pad
 
     padded = [pad(a, t, scene.settings.atlas.padding) for a, t in zip(albedo, scene.texels, strict=True)]

@@ -33,7 +33,7 @@ class Row:
 def surface(scene: Scene) -> Row:
     """The embedded surface stylizer: the surface is painted once and baked to the atlas, and the views are drawn."""
     from mistyle.backends.embedded import solve_surface, surface_colour
-    from mistyle.run.pipeline import texel_side, unlit_views
+    from mistyle.run.painting import texel_side, unlit_views
 
     start, asset = time.perf_counter(), scene.asset
     solution = solve_surface(asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
@@ -111,7 +111,7 @@ ROWS: dict[str, Callable[[Scene], Row]] = {
 
 def run(name: str, folder: Path, work: Callable[[Scene], Row] | None = None) -> None:
     """Compute a row of the scene in `folder` and leave it there."""
-    from mistyle.run.pipeline import start_engines
+    from mistyle.run.start import start_engines
 
     scene = load(folder)
     start_engines(scene.settings)

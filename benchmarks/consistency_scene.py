@@ -67,7 +67,7 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
     """Read, draw and guide; the scene is left in `folder` for the rows, which run in processes of their own."""
     from mistyle.files.read import read_mesh, read_picture
     from mistyle.render.draw import draw_views
-    from mistyle.run.pipeline import start_engines
+    from mistyle.run.start import start_engines
     from mistyle.stages.texels import rasterise
 
     layers = {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}

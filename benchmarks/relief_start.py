@@ -20,7 +20,7 @@ from mistyle.core.camera import RigSettings, rig
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.view import View
 from mistyle.files.read import read_mesh, read_picture
-from mistyle.run import pipeline
+from mistyle.run import painting, start
 from mistyle.run.settings import Settings
 from mistyle.stages import fit
 
@@ -41,7 +41,7 @@ def views_of(asset: Any, maps: Any, resolution: int) -> list[View]:
         hits = gbuffer(traced, camera)
         cover = hits.mask.astype(np.float32)
         blank.append(View(camera, hits.position, hits.depth, hits.normal, hits.uv, hits.part, hits.mask, cover))
-    return pipeline.unlit_views(asset, maps, blank, silent)
+    return painting.unlit_views(asset, maps, blank, silent)
 
 
 def lit(asset: Any, maps: Any, resolution: int) -> np.ndarray:
@@ -65,12 +65,12 @@ def main() -> None:
     base: dict[str, Any] = {"surface": {"samples": samples}, "atlas": {"size": size}}
     base["fit"] = {"iterations1": steps, "crops": 2, "crop_size": crop, "refine": "normal-roughness", "judge": False}
     plain = Settings.model_validate(base)
-    pipeline.start_engines(plain)
+    start.start_engines(plain)
     asset = read_mesh(SCENES / "demo.obj")
-    atlas = pipeline.lay_out(asset, plain, silent)
-    coats = pipeline.coat(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
-    flat = pipeline.painted(asset, coats, atlas, plain)
-    begun = pipeline.raised(asset, coats, atlas, plain, flat)
+    atlas = start.lay_out(asset, plain, silent)
+    coats = painting.coat(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
+    flat = painting.painted(asset, coats, atlas, plain)
+    begun = painting.raised(asset, coats, atlas, plain, flat)
     targets = views_of(asset, flat, resolution)
     figures: dict[str, float] = {}
     results: dict[str, Any] = {}

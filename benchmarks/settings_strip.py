@@ -14,7 +14,7 @@ from PIL import Image
 
 from mistyle.core.camera import RigSettings, rig
 from mistyle.files.read import read_mesh, read_picture
-from mistyle.run import pipeline
+from mistyle.run import start
 from mistyle.run.settings import Settings
 from mistyle.run.variations import tile
 
@@ -64,7 +64,7 @@ def main() -> None:
     chosen = options.parse_args()
     samples, side, atlas = (8_000, 128, 256) if chosen.quick else (50_000, 360, 1024)
     base = Settings.model_validate({"surface": {"samples": samples}, "atlas": {"size": atlas}})
-    pipeline.start_engines(base)
+    start.start_engines(base)
     asset = read_mesh(ROOT / "scenes" / "demo.obj")
     picture = read_picture(ROOT / "scenes" / "demo_style.png")
     for name, variants in STRIPS.items():

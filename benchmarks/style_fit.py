@@ -61,29 +61,29 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
     from mistyle.core.image import linear_from_srgb
     from mistyle.files.read import read_picture
     from mistyle.render.draw import gbuffer, tracer
-    from mistyle.run import pipeline
+    from mistyle.run import painting, start
 
     def silent(done: float) -> None:
         pass
 
     settings = resolve(preset, None, changes)
-    pipeline.start_engines(settings)
-    asset = pipeline.read(DATA / mesh, settings.read, settings.atlas.size, silent)
-    atlas = pipeline.lay_out(asset, settings, silent)
-    solution = pipeline.paint(asset, read_picture(DATA / style), settings, silent)
+    start.start_engines(settings)
+    asset = start.read(DATA / mesh, settings.read, settings.atlas.size, silent)
+    atlas = start.lay_out(asset, settings, silent)
+    solution = painting.paint(asset, read_picture(DATA / style), settings, silent)
     maps = []
-    for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
-        albedo, at = np.zeros_like(start.albedo), texels.covered
-        side = pipeline.texel_side(asset, part, texels)
+    for part, (texels, own) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
+        albedo, at = np.zeros_like(own.albedo), texels.covered
+        side = painting.texel_side(asset, part, texels)
         painted = surface_colour(solution, texels.position[at], texels.normal[at], footprint=side)
         albedo[at] = linear_from_srgb(painted)
-        maps.append(replace(start, albedo=albedo, known=texels.covered))
+        maps.append(replace(own, albedo=albedo, known=texels.covered))
     traced, views = tracer(asset.mesh), []
     for camera in rig(settings.rig):
         hits = gbuffer(traced, camera)
         rgb, inside = np.zeros((*hits.mask.shape, 3), np.float32), hits.mask.astype(np.float32)
         views.append(View(camera, rgb, hits.depth, hits.normal, hits.uv, hits.part, hits.mask, inside))
-    return Problem(asset.mesh, maps, list(atlas.texels), pipeline.unlit_views(asset, maps, views, silent), settings)
+    return Problem(asset.mesh, maps, list(atlas.texels), painting.unlit_views(asset, maps, views, silent), settings)
 
 
 def whole(where: Problem, figures: dict[str, float]) -> None:

@@ -30,13 +30,13 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     from mistyle.core.view import View
     from mistyle.files.read import read_picture
     from mistyle.files.records import load_record
-    from mistyle.run import pipeline
+    from mistyle.run import painting, start
     from mistyle.run.settings import resolve
 
     settings = resolve(
         None, None, {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}
     )
-    variant = pipeline.start_engines(settings)
+    variant = start.start_engines(settings)
     assert "llvm" in variant or "cuda" in variant
     asset = load_record(asset_file)
     style = read_picture(style_file)
@@ -47,14 +47,14 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
 
     solution = timed(parts, "surface", lambda: solve_surface(asset.mesh, style, settings.surface, 0))
     parts["surface_gb"] = peak_gb()
-    laid = timed(parts, "rasterise", lambda: pipeline.lay_out(asset, settings, nothing))
-    maps = timed(parts, "bake", lambda: pipeline.painted(asset, solution, laid, settings))
+    laid = timed(parts, "rasterise", lambda: start.lay_out(asset, settings, nothing))
+    maps = timed(parts, "bake", lambda: painting.painted(asset, solution, laid, settings))
     blank = []
     for camera in rig(RigSettings(resolution=resolution))[:views]:
         empty = np.zeros((*camera.size, 3), np.float32)
         part = np.zeros(camera.size, np.int32)
         blank.append(View(camera, empty, empty[..., 0], empty, empty[..., :2], part, part > 0, empty[..., 0]))
-    timed(parts, "views", lambda: pipeline.unlit_views(asset, maps, blank, nothing))
+    timed(parts, "views", lambda: painting.unlit_views(asset, maps, blank, nothing))
     parts["seconds"] = sum(parts[name] for name in ("surface", "rasterise", "bake", "views"))
     parts["peak_gb"] = peak_gb()
     return parts

@@ -12,8 +12,8 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh
 from mistyle.render.draw import tracer
 from mistyle.render.visible import face_on
-from mistyle.run.pipeline import cameras_of
 from mistyle.run.settings import resolve
+from mistyle.run.start import cameras_of
 from mistyle.stages.rigs import next_best_views, sample_surface
 
 

@@ -19,7 +19,7 @@ from mistyle.core.mesh import face_areas
 from mistyle.files.images import write_png
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.render.unlit import unlit
-from mistyle.run import options, pipeline, variations
+from mistyle.run import options, variations
 from mistyle.run.settings import Settings
 from mistyle.stages import coat
 from mistyle.stages.texels import rasterise
@@ -268,11 +268,11 @@ def test_a_coat_of_two_pictures_with_a_protected_part(painted_sheet, tmp_path):
     settings = Settings.model_validate(
         {"surface": {"samples": 700}, "atlas": {"size": 32}, "coat": chosen | {"height": 0.2, "gloss": 1.0}}
     )
-    atlas = pipeline.lay_out(asset, settings, lambda done: None)
-    coats = pipeline.coat(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)
-    flat = pipeline.painted(asset, coats, atlas, settings)
+    atlas = start.lay_out(asset, settings, lambda done: None)
+    coats = painting.coat(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)
+    flat = painting.painted(asset, coats, atlas, settings)
     assert (flat[0].normal[..., 2] == 1).all()
-    maps = pipeline.raised(asset, coats, atlas, settings, flat)[0]
+    maps = painting.raised(asset, coats, atlas, settings, flat)[0]
     assert len(coats.solutions) == 2
     np.testing.assert_allclose(maps.albedo[:5], atlas.start[0].albedo[:5])
     assert (maps.albedo[8:, :15, 2] > 0.1).all() and (maps.albedo[8:, :15, 0] < 0.02).all()

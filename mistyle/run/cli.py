@@ -293,8 +293,8 @@ def _render(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
     settings = _settings(options)
-    from mistyle.run.pipeline import render_views
     from mistyle.run.progress import Progress
+    from mistyle.run.verbs import render_views
 
     written = render_views(options.mesh, options.out, settings, Progress())
     print(json.dumps({"views": [str(p) for p in written]}) if options.json else f"views     {options.out}")
@@ -305,8 +305,8 @@ def _bake(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
     settings = _settings(options)
-    from mistyle.run.pipeline import bake_views
     from mistyle.run.progress import Progress
+    from mistyle.run.verbs import bake_views
 
     summary = bake_views(
         options.mesh, options.views, options.out, settings, options.name or options.mesh.stem, Progress()

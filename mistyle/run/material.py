@@ -21,9 +21,9 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.run import checkpoint
 from mistyle.run.inputs import input_files
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
-from mistyle.run.pipeline import ambient, read, start_engines
 from mistyle.run.progress import Progress, Report
 from mistyle.run.stages import MATERIAL_STAGES, Run
+from mistyle.run.start import ambient, read, start_engines
 
 
 @dataclass(frozen=True)

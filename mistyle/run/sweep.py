@@ -9,7 +9,7 @@ import numpy as np
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import UsageError
 from mistyle.core.view import View
-from mistyle.run.pipeline import Atlas, Baked
+from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
@@ -23,7 +23,7 @@ def swept_stages(
 ) -> tuple[Baked, list[View]]:
     """The stages 'surface', 'bake' and 'stylized' of a stylizer that paints view by view (paper 4.1.3 and 4.1.4)."""
     from mistyle.files.views import read_views, write_views
-    from mistyle.run.pipeline import coat_files
+    from mistyle.run.painting import coat_files
 
     s = run.job.settings
     inputs = [style.rgb, style.alpha, s.stylizer, s.surface, s.coat, coat_files(s.coat), s.sweep, s.seed]

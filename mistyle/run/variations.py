@@ -48,13 +48,13 @@ def sheet(mesh: Path, style: Path, out: Path, settings: Settings, count: int, pr
     """Write OUT/variations.png; returns its path and, picture by picture, the options that make it."""
     from mistyle.files.images import write_png
     from mistyle.files.read import read_picture
-    from mistyle.run import pipeline
+    from mistyle.run import start
 
     picture = read_picture(style)
-    pipeline.start_engines(settings)
+    start.start_engines(settings)
     cameras = rig(RigSettings(resolution=RESOLUTION))
     with progress.stage("mesh", "read the mesh") as report:
-        asset = pipeline.read(mesh, settings.read, ATLAS, report)
+        asset = start.read(mesh, settings.read, ATLAS, report)
     tiles, labels = [], []
     for variation in variations(settings, count):
         with progress.stage("surface", f"paint with {variation.label}") as report:
@@ -69,11 +69,11 @@ def sheet(mesh: Path, style: Path, out: Path, settings: Settings, count: int, pr
 def tile(asset: Any, picture: Any, settings: Settings, cameras: Any, report: Any) -> Float[np.ndarray, "h w 3"]:
     """The painted surface from every camera, side by side, on white, encoded sRGB."""
     from mistyle.render.unlit import unlit
-    from mistyle.run import pipeline
+    from mistyle.run import painting, start
 
-    atlas = pipeline.lay_out(asset, settings, lambda done: None)
-    coats = pipeline.coat(asset, picture, atlas, settings, report)
-    maps = pipeline.painted(asset, coats, atlas, settings)  # pictures without light show no relief
+    atlas = start.lay_out(asset, settings, lambda done: None)
+    coats = painting.coat(asset, picture, atlas, settings, report)
+    maps = painting.painted(asset, coats, atlas, settings)  # pictures without light show no relief
     drawn = unlit(asset.mesh, maps, cameras)
     return np.concatenate([srgb_from_linear(rgb + 1 - share[..., None]) for rgb, share in drawn], axis=1)
 

@@ -1,0 +1,35 @@
+"""What the stages of a job hand on to one another."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mistyle.core.maps import Maps, Texels
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """Per texture set: where each texel lies and the material that the asset brought along."""
+
+    texels: tuple[Texels, ...]
+    start: tuple[Maps, ...]
+
+
+@dataclass(frozen=True)
+class Baked:
+    """Per texture set: the maps with the painted albedo, and by how many views each texel is seen.
+
+    `begin` are the same maps with the painting's relief, where the fit starts at them (else empty).
+    """
+
+    maps: tuple[Maps, ...]
+    seen: tuple[np.ndarray, ...]
+    begin: tuple[Maps, ...] = ()
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """Per texture set: the final maps and which texels were repaired."""
+
+    maps: tuple[Maps, ...]
+    mask: tuple[np.ndarray, ...]

@@ -1,0 +1,160 @@
+"""The embedded stylizer in a job: the surface painted once, laid into the texture, and drawn from every camera."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mistyle.core.asset import Asset, Picture
+from mistyle.core.image import linear_from_srgb
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import face_areas
+from mistyle.core.view import View
+from mistyle.run.made import Atlas, Baked
+from mistyle.run.progress import Report
+from mistyle.run.settings import Settings
+from mistyle.run.stages import Run
+from mistyle.stages.coat import Coats
+from mistyle.surface.guides import Content
+from mistyle.surface.lookup import Solution
+from mistyle.surface.settings import CoatSettings
+
+
+def coat_files(chosen: CoatSettings) -> list[Path]:
+    """The files that a coat names: their contents count, not their names."""
+    named = [chosen.style_mask, chosen.protect]
+    for slot in chosen.slots:
+        name, _, picture = slot.rpartition("=")
+        named += [Path(name), Path(picture)]
+    return [path for path in named if path is not None and path.is_file()]
+
+
+def paint(asset: Asset, style: Picture, settings: Settings, report: Report, content: Content | None = None) -> Solution:
+    """The surface painted once with one picture; `content` is the lightness of a texture that it has already."""
+    from mistyle.backends.embedded import solve_surface
+
+    return solve_surface(asset.mesh, style, settings.surface, settings.seed, progress=report, content=content)
+
+
+def coat(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Coats:
+    """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
+    from mistyle.files.read import read_picture
+    from mistyle.stages.coat import content, masked_style, scaled, slot_masks
+
+    surface = scaled(settings.surface, asset, settings.coat.stroke_size)
+    settings = settings.model_copy(update={"surface": surface})
+    paths, masks = slot_masks(asset, atlas.texels, settings.coat.slots)
+    pictures = [masked_style(style, settings.coat.style_mask), *(read_picture(path) for path in paths)]
+    choice = [np.zeros(texels.covered.shape, np.int32) for texels in atlas.texels]
+    for number, chosen in enumerate(masks, start=1):
+        for texels_of, mask in zip(choice, chosen, strict=True):
+            texels_of[mask] = number
+    found = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
+    solutions = []
+    for k, picture in enumerate(pictures):
+
+        def part_done(done: float, k: int = k) -> None:
+            report((k + done) / len(pictures))
+
+        solutions.append(paint(asset, picture, settings, part_done, found))
+    return Coats(tuple(solutions), tuple(choice))
+
+
+def texel_side(asset: Asset, part: int, texels: Texels) -> float:
+    """The mean side of a texel on the surface, working units: what the painting is averaged over."""
+    area = face_areas(asset.mesh)[asset.mesh.part == part].sum()
+    return float(np.sqrt(area / max(int(texels.covered.sum()), 1)))
+
+
+def bake(asset: Asset, coats: Coats, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report) -> Baked:
+    """Section 4.1.4 for a painted surface: texels look the painting up directly; the views say who sees what."""
+    from mistyle.stages.backproject import backproject
+
+    maps, seen = painted(asset, coats, atlas, settings), []
+    with_relief = raised(asset, coats, atlas, settings, maps)
+    for part, texels in enumerate(atlas.texels):
+        seen.append(backproject(views, texels, settings.bake, mesh=asset.mesh).seen)
+        report((part + 1) / len(atlas.texels))
+    if settings.fit.refine == "off":
+        return Baked(tuple(with_relief), tuple(seen))
+    return Baked(tuple(maps), tuple(seen), tuple(with_relief))
+
+
+# Slope of the painting's relief, and share of its gloss: in maps that nothing refines, and where the fit begins.
+HEIGHT = 0.15
+
+
+FINAL_GLOSS, FIRST_GLOSS = 1.0, 0.5
+
+
+def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings) -> list[Maps]:
+    """The start maps with the painting's colours in place of the albedo, looked up for every covered texel.
+
+    A single solution paints everything.
+    """
+    from mistyle.backends.embedded import surface_colour
+    from mistyle.stages.coat import painted_mask, protected
+    from mistyle.stages.texels import pad
+
+    maps = []
+    for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
+        side, albedo = texel_side(asset, part, texels), np.zeros_like(start.albedo)
+        for solution, at in whose(coats, part, texels):
+            place = texels.position[at], texels.normal[at]
+            albedo[at] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
+        coated = replace(start, albedo=pad(albedo, texels, settings.atlas.padding), known=texels.covered)
+        if settings.coat.protect is not None:
+            coated = protected(coated, start, painted_mask(settings.coat.protect, texels))
+        maps.append(coated)
+    return maps
+
+
+def raised(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings, maps: Sequence[Maps]) -> list[Maps]:
+    """Painted maps with the painting's relief laid upon their normals, and its gloss upon their roughness."""
+    from mistyle.backends.embedded import surface_relief
+    from mistyle.stages.coat import first_maps, painted_mask, protected
+
+    full = FINAL_GLOSS if settings.fit.refine == "off" else FIRST_GLOSS
+    height = HEIGHT if settings.coat.height is None else settings.coat.height
+    gloss = full if settings.coat.gloss is None else settings.coat.gloss
+    if height == gloss == 0:
+        return list(maps)
+    result = []
+    for part, (texels, flat) in enumerate(zip(atlas.texels, maps, strict=True)):
+        side, gradient = texel_side(asset, part, texels), np.zeros_like(flat.albedo)
+        dull = np.zeros_like(flat.roughness)
+        for solution, at in whose(coats, part, texels):
+            gradient[at], dull[at] = surface_relief(solution, texels.position[at], texels.normal[at], footprint=side)
+        covered = texels.covered
+        made = first_maps(asset, flat, texels, gradient[covered], dull[covered], height, gloss)
+        if settings.coat.protect is not None:
+            made = protected(made, flat, painted_mask(settings.coat.protect, texels))
+        result.append(made)
+    return result
+
+
+def whose(coats: Coats | Solution, part: int, texels: Texels) -> list[tuple[Solution, np.ndarray]]:
+    """Each solution with the covered texels of a set that it paints."""
+    if isinstance(coats, Solution):
+        return [(coats, texels.covered)]
+    return [(one, texels.covered & (coats.choice[part] == k)) for k, one in enumerate(coats.solutions)]
+
+
+def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) -> list[View]:
+    """The stylized views, drawn from the painted texture so that all agree by construction."""
+    from mistyle.files.views import read_views, write_views
+
+    def write(folder: Path, report: Report) -> None:
+        drawn = unlit_views(asset, baked.maps, views, report)
+        write_views(folder, drawn, (), paper_files=False)
+
+    return read_views(run.stage("stylized", ["bake", "views"], [], write))
+
+
+def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report, fine: int = 2) -> list[View]:
+    """Each view with its rgb replaced by the albedo seen there, `fine` x `fine` samples a pixel, premultiplied."""
+    from mistyle.render.unlit import unlit
+
+    drawn = unlit(asset.mesh, maps, [view.camera for view in views], fine, report)
+    return [replace(view, rgb=rgb, coverage=share) for view, (rgb, share) in zip(views, drawn, strict=True)]

@@ -1,0 +1,96 @@
+"""What every kind of job begins with: engines, the mesh, its atlas, the cameras and the views."""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.asset import Asset
+from mistyle.core.camera import Camera, rig
+from mistyle.core.maps import Maps
+from mistyle.core.mesh import Mesh
+from mistyle.run.made import Atlas
+from mistyle.run.progress import Report
+from mistyle.run.settings import ReadSettings, Settings, thread_count
+
+
+def start_engines(settings: Any) -> str:
+    """Choose the Mitsuba variant and set the thread counts of Dr.Jit, torch and OpenCV; returns the variant.
+
+    `settings` is the root record of any kind of job: its `threads` and `variant` count.
+    """
+    import cv2
+    import torch
+
+    from mistyle.render import device
+
+    threads = thread_count(settings)
+    torch.set_num_threads(threads)
+    cv2.setNumThreads(threads)
+    return device.use(None if settings.variant == "auto" else settings.variant, threads)
+
+
+def read(path: Path, chosen: ReadSettings, size: int, report: Report) -> Asset:
+    """The mesh, normalised and with UVs usable for an atlas of `size`."""
+    from mistyle.files.read import read_mesh
+
+    return read_mesh(path, uv=chosen.uv, up=chosen.up, max_faces=chosen.max_faces, size=size, progress=report)
+
+
+def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:
+    """Rasterise every texture set and lay the asset's own material into it."""
+    from mistyle.stages.texels import rasterise, start_maps
+
+    texels, start = [], []
+    for part in range(len(asset.mesh.parts)):
+        texels.append(rasterise(asset.mesh, part, settings.atlas.size))
+        metallic = "zero" if settings.fit.metallic == "zero" else "keep"
+        start.append(start_maps(asset.materials[part], texels[-1], settings.atlas.size, metallic))
+        report((part + 1) / len(asset.mesh.parts))
+    return Atlas(tuple(texels), tuple(start))
+
+
+def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> list[Camera]:
+    """The rig in visiting order, from the settings, from a file, or made for the mesh (then it says what it sees)."""
+    if settings.rig.kind == "nbv":
+        from mistyle.stages.rigs import next_best_views
+
+        planned = next_best_views(mesh, settings.rig)
+        say(planned.sentence())
+        return list(planned.cameras)
+    if settings.rig.kind != "file":
+        return rig(settings.rig)
+    from mistyle.files.cameras import read_cameras
+
+    assert settings.rig.file is not None
+    return read_cameras(settings.rig.file)
+
+
+def draw(
+    folder: Path, asset: Asset, maps: Sequence[Maps], settings: Settings, report: Report, say: Callable[[str], None]
+) -> None:
+    """Render the views and write them with their cameras and lights."""
+    from mistyle.core.light import lights
+    from mistyle.files.views import write_views
+    from mistyle.render.draw import draw_views
+
+    template = settings.draw.scene or "paper_views"
+    cameras = cameras_of(settings, asset.mesh, say)
+    views = draw_views(asset.mesh, maps, cameras, template, settings.draw.spp, settings.seed, report)
+    # What lit these very views, so that they can be fitted to.
+    write_views(folder, views, lights(str(template)), paper_files=settings.draw.paper_files)
+
+
+def ambient(asset: Asset, part: int, size: int, seed: int, report: Report) -> np.ndarray:
+    """Ambient occlusion of a texture set, computed at a quarter of the atlas: it has no finer detail than the mesh."""
+    from mistyle.core.image import resize
+    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.stages.texels import pad, rasterise
+
+    coarse = rasterise(asset.mesh, part, max(size // 4, 64))
+    values = np.ones(coarse.covered.shape, np.float32)
+    at = coarse.covered
+    values[at] = ambient_occlusion(asset.mesh, coarse.position[at], coarse.normal[at], seed=seed)
+    report((part + 1) / len(asset.mesh.parts))
+    return np.clip(resize(pad(values, coarse, 8), (size, size)), 0, 1)
