@@ -19,7 +19,7 @@ from mistyle.core.mesh import face_areas
 from mistyle.files.images import write_png
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.render.unlit import unlit
-from mistyle.run import options, variations
+from mistyle.run import options, painting, start, variations
 from mistyle.run.settings import Settings
 from mistyle.stages import coat
 from mistyle.stages.texels import rasterise

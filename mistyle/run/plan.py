@@ -37,8 +37,7 @@ def plan(job: Job) -> dict[str, Any]:
     if not job.style.is_file():
         raise InputRefused(f"{job.style}: found nothing, expected a picture; check the path")
     s = job.settings
-    views = 16 if s.rig.kind == "paper" else s.rig.views
-    pixels = views * s.rig.resolution**2
+    pixels = view_pixels(s)
     texels = s.atlas.size**2
     faces = sum(f.stat().st_size for f in files if f.suffix.lower() in (*BYTES_PER_FACE, ".bin"))
     faces = faces // BYTES_PER_FACE.get(job.mesh.suffix.lower(), 50)
@@ -72,9 +71,15 @@ def plan(job: Job) -> dict[str, Any]:
 
 def memory_gb(settings: Settings) -> float:
     """Peak memory of a job with one texture set, GB: what the program itself takes, the atlas, and the views."""
-    views = 16 if settings.rig.kind == "paper" else settings.rig.views
-    texels, pixels = settings.atlas.size**2, views * settings.rig.resolution**2
-    return round(BASE_GB + GB_PER_TEXEL * texels + GB_PER_VIEW_PIXEL * pixels, 1)
+    texels = settings.atlas.size**2
+    return round(BASE_GB + GB_PER_TEXEL * texels + GB_PER_VIEW_PIXEL * view_pixels(settings), 1)
+
+
+def view_pixels(settings: Settings) -> int:
+    """Pixels of all views together; of a rig made for the mesh, which is not known yet, or of a file: of 16 at most."""
+    rig = settings.rig
+    views = {"paper": 16, "turntable": rig.views, "nbv": min(16, rig.most_views)}.get(rig.kind, 16)
+    return views * rig.resolution**2
 
 
 def _existing(folder: Path) -> Path:
