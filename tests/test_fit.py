@@ -202,6 +202,26 @@ def test_a_phase_that_makes_things_worse_is_undone(scene):
     assert not np.array_equal(fit.maps[0].normal, maps.normal)
 
 
+def test_phase_1_goes_on_from_a_given_relief_and_gives_it_up_where_it_is_undone(scene, monkeypatch):
+    """A given relief is nearly what one step ends with; where the phase is undone, the maps are flat."""
+    mesh, maps, texels, views = scene
+    only = QUICK.model_copy(update={"refine": "normal-roughness", "iterations1": 1})
+    tilt = np.zeros((SIZE, SIZE, 3), np.float32)
+    tilt[..., 0], tilt[..., 2] = 0.3, np.sqrt(1 - 0.09)
+    raised = replace(maps, normal=tilt, roughness=np.full_like(maps.roughness, 0.4))
+    from_flat, from_relief = (
+        two_phase(mesh, [maps], views, [texels], only, 0, begin=begin).maps[0] for begin in (None, [raised])
+    )
+    covered = texels.covered
+    assert np.abs(from_flat.normal[covered, 0]).mean() < 0.06
+    assert np.abs(from_relief.normal[covered, 0] - 0.3).mean() < 0.06
+    assert np.abs(from_relief.roughness[covered] - 0.4).mean() < 0.06
+    assert np.array_equal(from_relief.albedo, from_flat.albedo)
+    monkeypatch.setattr(fit_judge, "worse", lambda old, new: ["style"])
+    judged = two_phase(mesh, [maps], views, [texels], only.model_copy(update={"judge": True}), 0, begin=[raised])
+    assert not judged.kept["phase1"] and np.array_equal(judged.maps[0].normal, maps.normal)
+
+
 def test_refine_off_changes_nothing_and_metallic_zero_only_that(scene):
     mesh, maps, texels, views = scene
     metal = replace(maps, metallic=np.full_like(maps.metallic, 0.4))
