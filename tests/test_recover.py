@@ -16,7 +16,8 @@ from mistyle.core.maps import Maps
 from mistyle.render import device, draw
 from mistyle.render import hits as collecting
 from mistyle.render import scene as scenery
-from mistyle.render.indirect import Indirect, averaged, emitter
+from mistyle.render.emitters import emitters
+from mistyle.render.indirect import Indirect, averaged
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
@@ -70,7 +71,7 @@ def photographs(mesh, maps, cameras, lights, frame, integrator, spp=64):
     pictures = []
     for camera, own in zip(cameras, lights, strict=True):
         described = {"type": "scene", "integrator": integrator, "sensor": scenery.sensor_dict(camera, spp), **shapes}
-        described |= {f"light{k}": emitter(light, camera) for k, light in enumerate(own)}
+        described |= {f"light{k}": light for k, light in enumerate(emitters(own, camera))}
         drawn = mi.render(mi.load_dict(described, optimize=False), spp=scenery.samples(spp), seed=1)
         pictures.append(np.array(drawn)[..., :3].astype(np.float32))
     return pictures

@@ -24,7 +24,7 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
         headers = [part.header for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts]
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise refuse(path, f"a header that cannot be read ({str(error)[:120]})", "an OpenEXR file", AGAIN) from error
-    _check(headers, path)
+    check_headers(headers, path)
     try:
         parts = OpenEXR.File(str(path), separate_channels=True).parts
     except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
@@ -52,18 +52,18 @@ def size_of_exr(path: Path) -> tuple[int, int]:
         headers = [part.header for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts]
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise refuse(path, f"a header that cannot be read ({str(error)[:120]})", "an OpenEXR file", AGAIN) from error
-    _check(headers, path)
-    width, height = _window(headers[0], "displayWindow")[2:]
+    check_headers(headers, path)
+    width, height = window_of(headers[0], "displayWindow")[2:]
     return height, width
 
 
-def _window(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
+def window_of(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:
     """x0, y0, width and height."""
     low, high = header[name]
     return int(low[0]), int(low[1]), int(high[0]) - int(low[0]) + 1, int(high[1]) - int(low[1]) + 1
 
 
-def _check(headers: list[dict[str, Any]], path: Path) -> None:
+def check_headers(headers: list[dict[str, Any]], path: Path) -> None:
     samples = 0
     if not headers:
         raise refuse(path, "no image", "an OpenEXR image", AGAIN)
@@ -77,7 +77,7 @@ def _check(headers: list[dict[str, Any]], path: Path) -> None:
         if any(c.xSampling != 1 or c.ySampling != 1 for c in channels):
             raise refuse(path, "subsampled channels", "all channels at full resolution", "Convert it to RGB")
         for name in ("dataWindow", "displayWindow"):
-            width, height = _window(header, name)[2:]
+            width, height = window_of(header, name)[2:]
             if width < 1 or height < 1 or width * height > MAX_PIXELS:
                 found, most = f"a {name} of {width} x {height}", f"1 to {MAX_PIXELS / 1e6:.0f} million texels"
                 raise refuse(path, found, most, "Scale it down, or write it again if it is damaged")
@@ -88,8 +88,8 @@ def _check(headers: list[dict[str, Any]], path: Path) -> None:
 
 def _shown(pixels: Float[np.ndarray, "h w"], header: dict[str, Any], path: Path) -> Float[np.ndarray, "h2 w2"]:
     """The display window: zero where there are no data."""
-    x, y, width, height = _window(header, "dataWindow")
-    sx, sy, shown_width, shown_height = _window(header, "displayWindow")
+    x, y, width, height = window_of(header, "dataWindow")
+    sx, sy, shown_width, shown_height = window_of(header, "displayWindow")
     if pixels.shape != (height, width):
         raise refuse(path, f"{pixels.shape} texels", f"{(height, width)} as its header says", AGAIN)
     if (x, y, width, height) == (sx, sy, shown_width, shown_height):

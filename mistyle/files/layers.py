@@ -114,7 +114,7 @@ def _read_exr(path: Path) -> Frame:
         headers = [part.header for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts]
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise refuse(path, f"a header that cannot be read ({str(error)[:120]})", "an OpenEXR file", AGAIN) from error
-    hdr._check(headers, path)
+    hdr.check_headers(headers, path)
     try:
         parts = OpenEXR.File(str(path), separate_channels=True).parts
     except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
@@ -134,7 +134,7 @@ def _read_exr(path: Path) -> Frame:
 
 def _groups(part: Any, several: bool, path: Path) -> list[tuple[str, dict[str, np.ndarray], Window, Window]]:
     """A part's channels by layer: the layer's full name, its planes by short name, data and display window."""
-    window, display = hdr._window(part.header, "dataWindow"), hdr._window(part.header, "displayWindow")
+    window, display = hdr.window_of(part.header, "dataWindow"), hdr.window_of(part.header, "displayWindow")
     called = str(part.header.get("name") or "") if several else ""
     groups: dict[str, dict[str, np.ndarray]] = {}
     for name, channel in part.channels.items():

@@ -15,11 +15,12 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera, resized
 from mistyle.core.image import nearest_fill
-from mistyle.core.light import Directional, Light, Lights, Point, direction_in_world, position_in_world
+from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device
 from mistyle.render import scene as scenery
+from mistyle.render.emitters import emitters
 
 COARSER = 2  # pixels along a side of the picture that one pixel of the estimate covers, at most
 LEAST = 128  # pixels along a side of the estimate, at least, where the picture has so many
@@ -53,7 +54,7 @@ class Indirect:
         """Indirect radiance, linear Rec.709, of a coarser picture of the camera, to be enlarged; beside the object
         that of the nearest pixel on it.
 
-        `lights` are directional or point lights, others raise ValueError. `samples` are those of a pixel of the coarse
+        Lights of a scene file raise ValueError. `samples` are those of a pixel of the coarse
         picture.
         """
         import mitsuba
@@ -65,7 +66,7 @@ class Indirect:
         small = resized(camera, (camera.size[0] // by, camera.size[1] // by))
         count = scenery.samples(samples)
         described = {"type": "scene", "sensor": scenery.sensor_dict(small, count), **self.shapes}
-        described |= {f"light{k}": emitter(light, camera) for k, light in enumerate(lights)}
+        described |= {f"light{k}": light for k, light in enumerate(emitters(lights, camera))}
         scene = mi.load_dict(described, optimize=False)
         direct, whole = (
             np.array(mi.render(scene, integrator=integrator, spp=count, seed=seed)) for integrator in self.integrators
@@ -117,18 +118,6 @@ def averaged(
 def _overlap(size: int, step: int) -> tuple[slice, slice]:
     """Rows that have another one `step` further on, and those others."""
     return slice(max(0, -step), size - max(0, step)), slice(max(0, step), size + min(0, step))
-
-
-def emitter(light: Light, camera: Camera) -> dict[str, Any]:
-    """A delta light as Mitsuba describes it."""
-    if isinstance(light, Directional):
-        towards = direction_in_world(light, camera)
-        colour = {"type": "rgb", "value": list(light.irradiance)}
-        return {"type": "directional", "direction": (-towards).tolist(), "irradiance": colour}
-    if isinstance(light, Point):
-        colour = {"type": "rgb", "value": list(light.intensity)}
-        return {"type": "point", "position": position_in_world(light, camera).tolist(), "intensity": colour}
-    raise ValueError(f"the indirect light of {type(light).__name__} cannot be estimated")
 
 
 def retarget(shade: Any, picture: int, rgb: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"]) -> None:
