@@ -12,7 +12,7 @@ from PIL import Image
 
 import mistyle
 from mistyle.core.errors import Stopped, UsageError
-from mistyle.run import pipeline
+from mistyle.run import painting, pipeline
 from mistyle.run.progress import Progress
 from mistyle.run.settings import resolve
 from mistyle.run.stages import STAGES, Job
@@ -93,13 +93,15 @@ def test_the_fit_moved_the_maps(whole):
 @pytest.mark.parametrize("stage", ["surface", "fit", "asset"])
 def test_a_stopped_run_resumes_to_the_same_bytes(inputs, whole, tmp_path, monkeypatch, stage):
     """Stopped in the middle of a stage, then run again: asset, stylized views and maps have the same bytes."""
-    function = {"surface": "paint", "fit": "fit", "asset": "write_asset"}[stage]
+    module, function = {
+        "surface": (painting, "paint"), "fit": (pipeline, "fit"), "asset": (pipeline, "write_asset")
+    }[stage]  # fmt: skip
     with monkeypatch.context() as patch:
 
         def stop(*arguments, **keywords):
             raise Stopped("on request")
 
-        patch.setattr(pipeline, function, stop)
+        patch.setattr(module, function, stop)
         with pytest.raises(Stopped):
             pipeline.stylize(job(inputs, tmp_path), Progress(quiet=True))
     assert not (tmp_path / "asset").exists()

@@ -171,7 +171,7 @@ def test_recover_ends_with_it_when_asked(room):
 
     mesh, truth, captures = room
     texels = rasterise(mesh, 0, SIZE)
-    quick = RecoverSettings(rounds=1, iterations=0, bounces=1, polish=24, rate=0.02)
+    quick = RecoverSettings(rounds=1, iterations=0, bounces=1, polish=24, polish_rate=0.02)
     found = recover(mesh, [texels], captures, quick, 0)
     before, after = found.trace["polish.whole"]
     assert after < before and len(found.trace["polish.loss"]) == 24

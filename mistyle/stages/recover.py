@@ -173,7 +173,7 @@ def polished(
     s = work.settings
     done = polish(
         work.traced.mesh, unpack(table, work.where.sizes), captures, s.polish, model=s.model, frame=s.frame,
-        metallic=s.metallic, loss=s.loss, rate=s.rate, depth=s.polish_depth, seed=seed, progress=progress,
+        metallic=s.metallic, loss=s.loss, rate=s.polish_rate, depth=s.polish_depth, seed=seed, progress=progress,
     )  # fmt: skip
     trace["polish.loss"], trace["polish.whole"] = list(done.trace), list(done.loss)
     if not done.loss[1] < done.loss[0]:

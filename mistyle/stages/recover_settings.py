@@ -68,6 +68,9 @@ class RecoverSettings(BaseModel):
         le=100_000,
         description="steps at the end through Mitsuba's prb, with light between surfaces in picture and gradient: slow",
     )
+    polish_rate: float = Field(
+        default=0.0005, gt=0, le=1, description="their first rate; their gradients are noisy, so it is small"
+    )
     polish_depth: int = Field(default=6, ge=2, le=64, description="path segments that those steps follow")
     shadows: bool = Field(default=True, description="whether the object shadows itself")
     memory: float = Field(default=4.0, gt=0, description="GB for what is kept of the pictures' samples")
