@@ -16,10 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common import finish
-from mistyle.core.asset import Asset, Material
+from mistyle.core.asset import Asset
 from mistyle.core.camera import OPENGL_FROM_OPENCV, Camera, orbit
 from mistyle.core.image import srgb_from_linear
-from mistyle.core.maps import Maps
 
 SUN = {"direction": [0.5, 0.7, 0.6], "irradiance": 2.0}
 SKY = 0.4
@@ -74,34 +73,12 @@ def compare(path: Path, blender: str, size: int, samples: int, pictures: Path | 
     return figures
 
 
-def material_maps(material: Material) -> Maps:
-    """The maps of a material as a renderer wants them: factors applied, constants where the file has no texture."""
-
-    def full(texture: np.ndarray | None, factor: float | np.ndarray, channels: int) -> np.ndarray:
-        constant = (
-            np.broadcast_to(np.asarray(factor, np.float32), (2, 2, channels))
-            if channels
-            else np.full((2, 2), factor, np.float32)
-        )
-        return constant if texture is None else (texture * factor).astype(np.float32)
-
-    normal = np.zeros((2, 2, 3), np.float32) + np.array([0, 0, 1], np.float32)
-    # Maps may differ in size here: each becomes a texture of its own.
-    with_any_size = dict(
-        albedo=full(material.albedo, material.albedo_factor, 3),
-        normal=normal if material.normal is None else material.normal,
-        roughness=full(material.roughness, material.roughness_factor, 0),
-        metallic=full(material.metallic, material.metallic_factor, 0),
-        known=np.ones((2, 2), bool),
-    )
-    return Maps(**with_any_size)
-
-
 def draw(asset: Asset, camera: Camera, samples: int) -> np.ndarray:
     """Our side: linear rgb and alpha."""
     import mitsuba as mi
 
     from mistyle.render import device
+    from mistyle.render.lookdev import material_maps
     from mistyle.render.scene import object_shapes, sensor_dict
     from mistyle.render.scene import samples as allowed
 

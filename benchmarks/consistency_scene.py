@@ -95,17 +95,11 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
 
 def guided(asset: Asset, picture: Picture, settings: Settings, views: Sequence[View]):
     """Colour and detail guide of every view's pixels, and the painting at the size at which views show it."""
-    from mistyle.backends.embedded import array_module
-    from mistyle.render.draw import tracer
-    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.backends.embedded import array_module, open_sky
     from mistyle.surface.synthesis import finest_size
     from mistyle.surface.view_samples import ground
 
-    module, traced = array_module(), tracer(asset.mesh)
-
-    def occlusion(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return ambient_occlusion(traced, positions, normals, seed=settings.seed)
-
+    module, occlusion = array_module(), open_sky(asset.mesh, settings.seed)
     chosen = settings.surface
     base = ground(asset.mesh, picture.rgb, chosen, settings.seed, occlusion, alpha=picture.alpha, device=module)
     points, wanted, painting = base.levels[-1].points, base.wanted[-1], base.painting

@@ -7,7 +7,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Picture
 from mistyle.core.mesh import Mesh
-from mistyle.surface.guides import Content
+from mistyle.surface.guides import Content, Occlusion
 from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import SurfaceSettings
 
@@ -17,6 +17,15 @@ def array_module() -> str:
     from mistyle.render import device
 
     return device.use().split("_")[0]
+
+
+def open_sky(mesh: Mesh, seed: int) -> Occlusion:
+    """The share of open sky at points of a mesh, as the guides ask for it; the mesh is made ready for tracing once."""
+    from mistyle.render.draw import tracer
+    from mistyle.render.occlusion import ambient_occlusion
+
+    traced = tracer(mesh)
+    return lambda positions, normals: ambient_occlusion(traced, positions, normals, seed=seed)
 
 
 def solve_surface(
@@ -32,16 +41,9 @@ def solve_surface(
 
     `content(positions, normals)` is the lightness (0..1) of a texture that the mesh has already.
     """
-    from mistyle.render.draw import tracer
-    from mistyle.render.occlusion import ambient_occlusion
     from mistyle.surface.synthesis import solve
 
-    module = array_module()
-    traced = tracer(mesh)
-
-    def occlusion(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return ambient_occlusion(traced, positions, normals, seed=seed)
-
+    module, occlusion = array_module(), open_sky(mesh, seed)
     return solve(
         mesh, style.rgb, settings, seed, occlusion, progress, alpha=style.alpha, content=content, device=module
     )

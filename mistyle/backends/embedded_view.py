@@ -29,16 +29,10 @@ def stylizer(
     The guides are those of the embedded stylizer, found here once. Priors hold where they are known; see
     `mistyle.surface.view_samples.paint_view`.
     """
-    from mistyle.backends.embedded import array_module
-    from mistyle.render.draw import tracer
-    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.backends.embedded import array_module, open_sky
     from mistyle.surface.view_samples import ground, paint_view
 
-    module, traced = array_module(), tracer(mesh)
-
-    def occlusion(positions: np.ndarray, normals: np.ndarray) -> np.ndarray:
-        return ambient_occlusion(traced, positions, normals, seed=seed)
-
+    module, occlusion = array_module(), open_sky(mesh, seed)
     base = ground(
         mesh, style.rgb, settings, seed, occlusion, progress, alpha=style.alpha, content=content, device=module
     )

@@ -16,24 +16,7 @@ AGAIN = "Write or copy it again"
 
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
     """See files/read.py."""
-    import OpenEXR
-
-    if read_bytes(path)[:4] != b"\x76\x2f\x31\x01":
-        raise refuse(path, "no OpenEXR header", "an .exr file", "Check that it is the right file")
-    try:
-        headers = [part.header for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts]
-    except (RuntimeError, ValueError, TypeError, KeyError) as error:
-        raise refuse(path, f"a header that cannot be read ({str(error)[:120]})", "an OpenEXR file", AGAIN) from error
-    check_headers(headers, path)
-    try:
-        parts = OpenEXR.File(str(path), separate_channels=True).parts
-    except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
-        raise refuse(
-            path, f"pixels that cannot be read ({str(error)[:120]})", "a complete OpenEXR file", AGAIN
-        ) from error
-    # Where decoding fails the library drops the part and prints a warning instead of raising.
-    if len(parts) != len(headers):
-        raise refuse(path, f"{len(parts)} of {len(headers)} parts whose pixels can be read", "a complete file", AGAIN)
+    parts = parts_of_exr(path)
     planes: dict[str, np.ndarray] = {}
     for part in parts:
         prefix = f"{part.header['name']}." if len(parts) > 1 and part.header.get("name") else ""
@@ -46,6 +29,31 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
 
 def size_of_exr(path: Path) -> tuple[int, int]:
     """See `read_size` in files/read.py."""
+    width, height = window_of(headers_of_exr(path)[0], "displayWindow")[2:]
+    return height, width
+
+
+def parts_of_exr(path: Path) -> list[Any]:
+    """The decoded parts of a file whose headers have passed; every part that the file announces is there."""
+    import OpenEXR
+
+    if read_bytes(path)[:4] != b"\x76\x2f\x31\x01":
+        raise refuse(path, "no OpenEXR header", "an .exr file", "Check that it is the right file")
+    headers = headers_of_exr(path)
+    try:
+        parts = OpenEXR.File(str(path), separate_channels=True).parts
+    except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
+        raise refuse(
+            path, f"pixels that cannot be read ({str(error)[:120]})", "a complete OpenEXR file", AGAIN
+        ) from error
+    # Where decoding fails the library drops the part and prints a warning instead of raising.
+    if len(parts) != len(headers):
+        raise refuse(path, f"{len(parts)} of {len(headers)} parts whose pixels can be read", "a complete file", AGAIN)
+    return parts
+
+
+def headers_of_exr(path: Path) -> list[dict[str, Any]]:
+    """The headers of all parts, checked before anything is decoded."""
     import OpenEXR
 
     try:
@@ -53,8 +61,7 @@ def size_of_exr(path: Path) -> tuple[int, int]:
     except (RuntimeError, ValueError, TypeError, KeyError) as error:
         raise refuse(path, f"a header that cannot be read ({str(error)[:120]})", "an OpenEXR file", AGAIN) from error
     check_headers(headers, path)
-    width, height = window_of(headers[0], "displayWindow")[2:]
-    return height, width
+    return headers
 
 
 def window_of(header: dict[str, Any], name: str) -> tuple[int, int, int, int]:

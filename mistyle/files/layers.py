@@ -13,7 +13,7 @@ from jaxtyping import Float, Shaped
 
 from mistyle.core.image import linear_from_srgb
 from mistyle.files import hdr
-from mistyle.files.bounds import read_bytes, refuse
+from mistyle.files.bounds import refuse
 from mistyle.files.pictures import read_picture
 
 BEAUTY = "beauty"
@@ -106,22 +106,7 @@ def _planes(rgb: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, ...]:
 
 
 def _read_exr(path: Path) -> Frame:
-    import OpenEXR
-
-    if read_bytes(path)[:4] != b"\x76\x2f\x31\x01":
-        raise refuse(path, "no OpenEXR header", "an .exr file", "Check that it is the right file")
-    try:
-        headers = [part.header for part in OpenEXR.File(str(path), separate_channels=True, header_only=True).parts]
-    except (RuntimeError, ValueError, TypeError, KeyError) as error:
-        raise refuse(path, f"a header that cannot be read ({str(error)[:120]})", "an OpenEXR file", AGAIN) from error
-    hdr.check_headers(headers, path)
-    try:
-        parts = OpenEXR.File(str(path), separate_channels=True).parts
-    except (RuntimeError, ValueError, TypeError, KeyError, MemoryError) as error:
-        raise refuse(path, f"pixels that cannot be read ({str(error)[:120]})", "a complete file", AGAIN) from error
-    # Where decoding fails the library drops the part and prints a warning instead of raising.
-    if len(parts) != len(headers):
-        raise refuse(path, f"{len(parts)} of {len(headers)} parts whose pixels can be read", "a complete file", AGAIN)
+    parts = hdr.parts_of_exr(path)
     groups = [group for part in parts for group in _groups(part, len(parts) > 1, path)]
     beauty = next((name for name, *_ in groups if name.rpartition(".")[2].casefold() in BEAUTY_NAMES), None)
     layers = [layer for group in groups for layer in _split(*group, group[0] == beauty)]
@@ -129,7 +114,7 @@ def _read_exr(path: Path) -> Frame:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise refuse(path, f"two layers called {twice[0]!r}", "names that tell layers apart", "Rename one of them")
-    return Frame(path, tuple(layers), True, _chromaticities(headers[0], path))
+    return Frame(path, tuple(layers), True, _chromaticities(parts[0].header, path))
 
 
 def _groups(part: Any, several: bool, path: Path) -> list[tuple[str, dict[str, np.ndarray], Window, Window]]:

@@ -72,7 +72,7 @@ def polish(
     for step in range(steps):
         turn, place = divmod(step, len(captures))
         k = int(np.random.default_rng([seed, turn]).permutation(len(captures))[place])
-        value, gradient = job.gradient(values, k, (spp, spp_grad), _seeds(seed, step))
+        value, gradient = job.gradient(values, k, (spp, spp_grad), scene_grad.seeds(seed, step))
         falling = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * step / steps))
         for p, name in zip(job.chosen, job.names, strict=True):
             usable = np.where(np.isfinite(gradient[p.key]), gradient[p.key], 0)
@@ -177,7 +177,7 @@ class _Job:
         for k in pictures:
             scene = self.scene(k)
             scene_grad.put(self._table(scene), self.chosen, values)
-            shown, view = self._look(scene, k, 4 * spp, _seeds(seed, 2**31 + k)[0])
+            shown, view = self._look(scene, k, 4 * spp, scene_grad.seeds(seed, 2**31 + k)[0])
             losses.append(scene_grad.compare(shown, view, self.loss)[0])
         return float(np.mean(losses))
 
@@ -185,9 +185,3 @@ class _Job:
         table = self.mi.traverse(scene)
         table.properties = {p.key: table.properties[p.key] for p in self.chosen}
         return table
-
-
-def _seeds(seed: int, step: int) -> tuple[int, int]:
-    """Of picture and gradient, never the same."""
-    first, second = (int(n) for n in np.random.SeedSequence([seed, step]).generate_state(2))
-    return first, second if second != first else first ^ 1

@@ -153,7 +153,7 @@ def _step(job: scene_job.Job, state: scene_job.State) -> None:
     total = 0.0
     for slot in range(plan.sensors_per_step):
         k = _turn(plan.seed, step * plan.sensors_per_step + slot, len(job.views))
-        value, found, broken = _gradients(job, state, k, _seeds(plan.seed, step, slot))
+        value, found, broken = _gradients(job, state, k, scene_grad.seeds(plan.seed, step, slot))
         total += value / plan.sensors_per_step
         state.broken[k] = state.broken.get(k, 0) + broken
         _add(gradient, found, state, 1 / plan.sensors_per_step, k)
@@ -201,12 +201,6 @@ def _turn(seed: int, place: int, views: int) -> int:
     return int(np.random.default_rng([seed, place // views]).permutation(views)[place % views])
 
 
-def _seeds(seed: int, step: int, slot: int) -> tuple[int, int]:
-    """Seeds of picture and gradient, never the same."""
-    first, second = (int(n) for n in np.random.SeedSequence([seed, step, slot]).generate_state(2))
-    return first, second if second != first else first ^ 1
-
-
 def _residuals(
     job: scene_job.Job, values: Mapping[str, np.ndarray], progress: Any, begin: float, end: float
 ) -> np.ndarray:
@@ -215,7 +209,9 @@ def _residuals(
     rows = []
     for k, view in enumerate(job.views):
         # The same seeds before and after: no difference comes from the noise alone.
-        shown = scene_grad.picture(job.scene, job.engine, view.sensor, job.plan.spp, _seeds(job.plan.seed, k, 2**31)[0])
+        shown = scene_grad.picture(
+            job.scene, job.engine, view.sensor, job.plan.spp, scene_grad.seeds(job.plan.seed, k, 2**31)[0]
+        )
         rows.append((scene_grad.compare(shown, view, job.loss)[0], scene_grad.psnr(shown, view)))
         progress(begin + (end - begin) * (k + 1) / len(job.views))
     return np.array(rows)

@@ -146,6 +146,12 @@ def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str
     )
 
 
+def seeds(*numbers: int) -> tuple[int, int]:
+    """Seeds of a picture and of its gradient, never the same; they follow from the numbers."""
+    first, second = (int(n) for n in np.random.SeedSequence(numbers).generate_state(2))
+    return first, second if second != first else first ^ 1
+
+
 def picture(scene: Any, integrator: Any, sensor: Any, spp: int, seed: int) -> Any:
     """The linear picture, a tensor without gradient; memory is that of at most 64 samples a pixel."""
     import drjit as dr

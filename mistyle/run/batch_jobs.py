@@ -31,7 +31,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.run.inputs import input_files
-from mistyle.run.settings import assignments, merge, validate
+from mistyle.run.settings import merge, validate
 
 MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -275,8 +275,3 @@ def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int) -> 
         settings = resolve(preset, None, said)
     values = settings.model_dump(mode="json")
     return values | {"threads": values["threads"] or threads}
-
-
-def said_on_command_line(pairs: Sequence[str]) -> dict[str, Any]:
-    """`--set KEY=VALUE` of a batch."""
-    return assignments(pairs, "--set")

@@ -20,7 +20,7 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import linear_from_srgb
 from mistyle.files.materialx import Look, write_materialx
 from mistyle.files.obj_write import write_obj
-from mistyle.files.packing import FINE, TARGETS, Target, TextureSet, write_slot
+from mistyle.files.packing import TARGETS, Target, TextureSet, write_slot
 from mistyle.files.store import atomic_folder, atomic_write, sha256_file
 from mistyle.files.textures import safe_name
 
@@ -147,7 +147,7 @@ def _fill(
     slots = [*target.slots] if "maps" in formats or referring else []
     if referring:
         there = {slot.map for slot in slots if slot.map != "normal" or target.normal == "+Y"}
-        extra = {s.map: s for s in (*TARGETS["blender"].slots, *FINE)}
+        extra = {s.map: s for s in TARGETS["blender"].slots}
         slots += [extra[m] for m in SINGLE if m not in there]
     for chosen in finished.sets:
         for slot in slots:

@@ -9,9 +9,8 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -63,7 +62,7 @@ def local(plan: Plan, todo: Sequence[int], workers: int, watch: Watch, timeout: 
 
     def one(index: int) -> Ended:
         watch(index, None)
-        ended = _tried(lambda plain: children.run(plan, index, plain, timeout), index)
+        ended = Ended(index, *_tried(lambda plain: children.run(plan, index, plain, timeout)))
         watch(index, ended)
         return ended
 
@@ -78,11 +77,10 @@ def local(plan: Plan, todo: Sequence[int], workers: int, watch: Watch, timeout: 
             raise
 
 
-def _tried(run: Callable[[bool], int], index: int) -> Ended:
+def _tried(run: Callable[[bool], int]) -> tuple[int, int]:
+    """Exit code and number of tries: a crash is followed by another try on the plain path."""
     code = run(False)
-    if not crashed(code):
-        return Ended(index, code, 1)
-    return Ended(index, run(True), 2)
+    return (run(True), 2) if crashed(code) else (code, 1)
 
 
 @dataclass
@@ -97,15 +95,10 @@ class _Children:
         with self.lock:
             if self.stopping:
                 return STOPPED
-            with _log(plan, index, plain) as log:
-                child = subprocess.Popen(
-                    command(plan, index), stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=_environment(plain)
-                )
+            child = _started(command(plan, index), log_of(plan, index), plain)
             self.running.add(child)
         try:
-            return child.wait(timeout)
-        except subprocess.TimeoutExpired:
-            return _ended(child)
+            return _waited(child, timeout)
         finally:
             self.running.discard(child)
 
@@ -129,19 +122,23 @@ def _ended(child: subprocess.Popen) -> int:
         return child.wait()
 
 
-@contextmanager
-def _log(plan: Plan, index: int, plain: bool) -> Iterator:
-    path = log_of(plan, index)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with open(path, "ab" if plain else "wb") as log:
+def _started(line: list[str], log: Path, plain: bool) -> subprocess.Popen:
+    """A shard's process, its words in the log; a second try goes on in the log of the first."""
+    log.parent.mkdir(parents=True, exist_ok=True)
+    environment = os.environ | ({"MISTYLE_PLAIN": "1"} if plain else {})
+    with open(log, "ab" if plain else "wb") as out:
         if plain:
-            log.write(b"\n--- the process crashed; once more, on the plain path ---\n")
-            log.flush()
-        yield log
+            out.write(b"\n--- the process crashed; once more, on the plain path ---\n")
+            out.flush()
+        return subprocess.Popen(line, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=environment)
 
 
-def _environment(plain: bool) -> dict[str, str]:
-    return os.environ | ({"MISTYLE_PLAIN": "1"} if plain else {})
+def _waited(child: subprocess.Popen, timeout: float | None) -> int:
+    """Its exit code; one that takes longer is asked to stop."""
+    try:
+        return child.wait(timeout)
+    except subprocess.TimeoutExpired:
+        return _ended(child)
 
 
 def last_lines(plan: Plan, index: int, count: int = 5) -> str:
@@ -230,21 +227,9 @@ def _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout) -> list[En
 
 def _ray_shard(line: list[str], log: str, begun: str, timeout: float | None) -> tuple[int, int]:
     """What a Ray worker does: the same process as everywhere, and once more where it crashes."""
-    Path(log).parent.mkdir(parents=True, exist_ok=True)
+    Path(begun).parent.mkdir(parents=True, exist_ok=True)
     Path(begun).touch()
-
-    def run(plain: bool) -> int:
-        with open(log, "ab" if plain else "wb") as out:
-            try:
-                done = subprocess.run(
-                    line, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=_environment(plain), timeout=timeout
-                )
-            except subprocess.TimeoutExpired:
-                return STOPPED
-            return done.returncode
-
-    ended = _tried(run, 0)
-    return ended.code, ended.tries
+    return _tried(lambda plain: _waited(_started(line, Path(log), plain), timeout))
 
 
 def _begun(plan: Plan, index: int) -> Path:

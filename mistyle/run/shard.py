@@ -53,10 +53,10 @@ def outcome(plan: Plan, job: Record) -> Outcome:
     return Outcome("open", {})
 
 
-def finished(plan: Plan, job: Record) -> dict[str, Any] | None:
+def finished(plan: Plan, job: Record, key: str | None = None) -> dict[str, Any] | None:
     """The marker of a job that is done under its present key, with every file as it was written; else None."""
     told = _read(marker(plan, job))
-    if told is None or told.get("key") != key_of(job):
+    if told is None or told.get("key") != (key or key_of(job)):
         return None
     files = told.get("files", {})
     whole = all((plan.out / p).is_file() and sha256_file(plan.out / p) == h for p, h in files.items())
@@ -66,7 +66,8 @@ def finished(plan: Plan, job: Record) -> dict[str, Any] | None:
 def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
     """Run job `index` unless it is done; returns its marker's content. Raises what the job raises."""
     job = plan.jobs[index]
-    told = finished(plan, job)
+    key = key_of(job)  # of the files as they are now: one that changes meanwhile makes another job
+    told = finished(plan, job, key)
     if told is not None:
         progress.say(f"{job.name}: done before, taken over")
         return told | {"reused": True}
@@ -86,7 +87,7 @@ def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
     made += [p for p in (plan.out / job.name / "report").glob("*.html")]
     told = {
         "name": job.name,
-        "key": key_of(job),
+        "key": key,
         "files": {p.relative_to(plan.out).as_posix(): sha256_file(p) for p in made},
         "seconds": round(time.monotonic() - start, 2),
         "peak_gb": round(float(summary["peak_gb"]), 3),

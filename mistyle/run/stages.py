@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
@@ -69,8 +70,9 @@ class Kept(Protocol):
 Work = TypeVar("Work", bound=Kept)
 
 
+@cache
 def program() -> str:
-    """A hash of mistyle itself: all of its files that could change a result."""
+    """A hash of mistyle itself: all of its files that could change a result, as they were when first asked for."""
     files = sorted(p for p in PACKAGE.rglob("*") if p.suffix in (".py", ".j2", ".css", ".js"))
     return digest({str(p.relative_to(PACKAGE)): p.read_bytes() for p in files})
 

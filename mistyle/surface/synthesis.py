@@ -86,15 +86,32 @@ def solve(
     the painting: recognisable objects in it (a star, an eye) may appear on the surface.
     """
     dj = kernels.module(device)
-    painting = style.prepare(picture_rgb, settings.crop, alpha)
-    levels = hierarchy(mesh, settings, seed, dj, lambda done: progress(0.25 * done))
-    rng = np.random.default_rng([seed, 2])
-    palette = style.palette(painting, settings.liveliness, rng, settings.palette_mix)
-    wanted = guides(levels, palette, occlusion, settings.bake_light, rng, content, settings.keep_content)
+    begun = lambda done: progress(0.25 * done)  # noqa: E731
+    painting, levels, wanted = prepared(mesh, picture_rgb, settings, seed, occlusion, begun, alpha, content, dj)
     progress(0.35)
     choice, book = synthesise(levels, wanted, painting, settings, seed, dj, lambda done: progress(0.35 + 0.65 * done))
     laid = glaze(levels, wanted[-1], book.lab[pixels(book, choice), 0], book, settings)
     return solution(levels[-1], choice.page, choice.x, choice.y, book.size, painting.rgb, laid)
+
+
+def prepared(
+    mesh: Mesh,
+    picture_rgb: Float[np.ndarray, "h w 3"],
+    settings: SurfaceSettings,
+    seed: int,
+    occlusion: Occlusion,
+    progress: Callable[[float], None],
+    alpha: Float[np.ndarray, "h w"] | None,
+    content: Content | None,
+    dj: ModuleType,
+) -> tuple[style.Painting, list[Level], list[Guide]]:
+    """What the search begins from: the painting, the samples coarse to fine, and what each of them asks for."""
+    painting = style.prepare(picture_rgb, settings.crop, alpha)
+    levels = hierarchy(mesh, settings, seed, dj, progress)
+    rng = np.random.default_rng([seed, 2])
+    palette = style.palette(painting, settings.liveliness, rng, settings.palette_mix)
+    wanted = guides(levels, palette, occlusion, settings.bake_light, rng, content, settings.keep_content)
+    return painting, levels, wanted
 
 
 def level_count(settings: SurfaceSettings) -> int:

@@ -17,10 +17,10 @@ from mistyle.core.image import distance_to, gaussian, srgb_from_linear
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
 from mistyle.surface import kernels, lookup, style
-from mistyle.surface.guides import Content, Guide, Occlusion, guides
+from mistyle.surface.guides import Content, Guide, Occlusion
 from mistyle.surface.samples import CENTRE, GRID, Level, Points, as_points, carry, drop, unit
 from mistyle.surface.settings import SurfaceSettings
-from mistyle.surface.synthesis import Pins, hierarchy, synthesise
+from mistyle.surface.synthesis import Pins, prepared, synthesise
 
 STEEP = 4.0  # depth per width of a surface seen at 76 degrees
 LEAST_STEP = 0.05  # a depth difference that may be one surface at any resolution
@@ -71,11 +71,7 @@ def ground(
 ) -> Ground:
     """The guides of `mesh` for a painting (encoded sRGB, 0..1); as in `mistyle.surface.synthesis.solve`."""
     dj = kernels.module(device)
-    painting = style.prepare(picture_rgb, settings.crop, alpha)
-    levels = hierarchy(mesh, settings, seed, dj, progress)
-    rng = np.random.default_rng([seed, 2])
-    palette = style.palette(painting, settings.liveliness, rng, settings.palette_mix)
-    wanted = guides(levels, palette, occlusion, settings.bake_light, rng, content, settings.keep_content)
+    painting, levels, wanted = prepared(mesh, picture_rgb, settings, seed, occlusion, progress, alpha, content, dj)
     return Ground(tuple(levels), tuple(wanted), painting, settings)
 
 
