@@ -3,7 +3,7 @@
 Twelve jobs (real meshes and paintings of MISTYLE_DATA; with --quick four small ones), each a process of about half a
 minute. Every row begins with an empty folder and the same plan, except that threads of a job are what the row says:
 `overhead_*` compare rows of one job at a time with all cores each, `speedup_2_workers` two jobs at a time with half of
-the cores each against one job at a time with half of the cores.
+the cores each against one job at a time with half of the cores (half of the jobs).
 """
 
 import os
@@ -20,22 +20,30 @@ from mistyle.run.batch import Choices, cores, planned, run_batch
 from mistyle.run.batch_plan import Plan, write_plan
 from mistyle.run.shard import outcome
 
-MESHES, STYLES = ("spot.obj", "teapot.obj", "armadillo.obj"), ("starry_night", "great_wave", "mosaic", "woodcut")
+MESHES, STYLES = ("spot.obj", "teapot.obj"), ("starry_night", "great_wave", "mosaic", "woodcut")
+# Drafts that take about half a minute.
+USUAL = (
+    "report = { frames = 6, resolution = 160 }, fit = { iterations1 = 24, iterations2 = 24 }, atlas = { size = 512 }"
+)
 QUICK = """report = { frames = 4, resolution = 64, spp = 1 }, fit = { refine = "off" }, atlas = { size = 256 }, \
 rig = { kind = "turntable", views = 4, resolution = 128 }, surface = { samples = 8000 }, draw = { spp = 1 }"""
 
 
-def jobs(folder: Path, quick: bool) -> Path:
-    """The jobs file."""
+def jobs(folder: Path, quick: bool, most: int = 4) -> Path:
+    """The jobs file: every mesh in at most `most` styles (with --quick: seeds)."""
     data = Path(os.environ.get("MISTYLE_DATA") or Path(__file__).resolve().parents[2] / "shared" / "data")
     meshes = [p for name in MESHES for p in sorted((data / "meshes").rglob(name))[:1]]
-    styles = [p for name in STYLES for p in sorted((data / "styles").glob(f"{name}*"))[:1]]
+    styles = [p for name in STYLES for p in sorted((data / "styles").glob(f"{name}*"))[:1]][:most]
+    demo = scenes() / "demo.obj"
     if quick or not meshes or not styles:
-        meshes, styles = [scenes() / "demo.obj"], [scenes() / "demo_style.png"]
-    variants = "[{ seed = 0 }, { seed = 1 }, { seed = 2 }, { seed = 3 }]" if len(meshes) == 1 else "[]"
-    settings = f"settings = {{ {QUICK} }}\n" if quick else ""
+        meshes, styles = [demo], [scenes() / "demo_style.png"]
+    else:
+        meshes.append(demo)
+    seeds = ", ".join(f"{{ seed = {k} }}" for k in range(most))
+    variants = f"[{seeds}]" if len(meshes) == 1 else "[]"
+    settings = f"settings = {{ {QUICK if quick else USUAL} }}\n"
     grid = f"[[grid]]\nmeshes = {_list(meshes)}\nstyles = {_list(styles)}\nvariants = {variants}\n"
-    path = folder / "jobs.toml"
+    path = folder / f"jobs_{most}.toml"
     path.write_text(f'preset = "draft"\n{settings}{grid}', encoding="utf-8")
     return path
 
@@ -72,7 +80,7 @@ def main() -> None:
     all_cores, half = cores(), max(1, cores() // 2)
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory(prefix="mistyle-batch-") as folder:
-        file = jobs(Path(folder), options.quick)
+        file, half_of_them = jobs(Path(folder), options.quick), jobs(Path(folder), options.quick, 2)
         rows = {
             "loop": (None, all_cores),
             "local": (Choices(workers=1, threads=all_cores), all_cores),
@@ -80,10 +88,11 @@ def main() -> None:
             "one_worker": (Choices(workers=1, threads=half), half),
             "two_workers": (Choices(workers=2, threads=half), half),
         }
-        # Once without the clock, so that no row alone pays for the kernel cache.
-        row(file, "warm", None, all_cores)
+        # Without the clock, so that no row alone pays for the kernel cache.
+        row(jobs(Path(folder), options.quick, 1), "warm", None, all_cores)
         for name, (choices, threads) in rows.items():
-            figures[f"{name}.seconds"], figures[f"{name}.peak_gb_of_a_job"] = row(file, name, choices, threads)
+            chosen = half_of_them if name.endswith(("worker", "workers")) else file
+            figures[f"{name}.seconds"], figures[f"{name}.peak_gb_of_a_job"] = row(chosen, name, choices, threads)
             print(f"{name}: {figures[f'{name}.seconds']:.1f} s", file=sys.stderr, flush=True)
     figures["overhead_local"] = figures["local.seconds"] / figures["loop.seconds"] - 1
     figures["overhead_ray"] = figures["ray.seconds"] / figures["loop.seconds"] - 1

@@ -6,7 +6,7 @@ usual way is `mi.render` with `direct` (one emitter sample, no BSDF sample: the 
 `prb` of the same depth, unfrozen and frozen. Figures, each the worst over resolutions and integrators:
 
 step_speedup_1spp         seconds of mi.render's step / ours, at one sample a pixel each
-step_speedup_equal_error  seconds that mi.render needs for the gradient error of ours with 4 samples a pixel / ours;
+step_speedup_equal_error  seconds that mi.render needs for the gradient error of ours at its default samples / ours;
                           error: relative L2 over the texels seen, per map, the map that favours mi.render most, against
                           a gradient with a fine grid of samples; mi.render's error falls with 1 / sqrt(samples) and its
                           time grows with them from where both were measured last (`…_spp`)
@@ -34,6 +34,7 @@ from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device, draw, shade
 from mistyle.render import scene as scenery
+from mistyle.stages.recover_settings import RecoverSettings
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MESH = "meshes/pbr/Avocado/Avocado.gltf"
@@ -193,15 +194,15 @@ def steps(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     speedups, at_equal_error, repeats = [], [], 5 if quick else 15
     for size in (128, 256) if quick else (512, 1024):
         where = problem(mesh, size, size)
-        one, four = where.shade(1), where.shade(4)
+        one, usual = where.shade(1), where.shade(RecoverSettings().subsamples)
         ours_1 = figures[f"ours_1spp_{size}_seconds"] = seconds(lambda s=one: s.step([0], "l2"), repeats)
-        ours_4 = figures[f"ours_4spp_{size}_seconds"] = seconds(lambda s=four: s.step([0], "l2"), repeats)
+        ours_usual = figures[f"ours_default_{size}_seconds"] = seconds(lambda s=usual: s.step([0], "l2"), repeats)
         figures[f"ours_1spp_{size}_floor_ratio"] = ours_1 / floor(one)
-        figures[f"ours_4spp_{size}_floor_ratio"] = ours_4 / floor(four)
+        figures[f"ours_default_{size}_floor_ratio"] = ours_usual / floor(usual)
         grid = 256 if quick else 1024
         exact = np.array(where.shade(grid, memory=0).step([0], "l2")[1], np.float64)[:, :6]
-        mine = errors(np.array(four.step([0], "l2")[1], np.float64)[:, :6], exact)
-        figures |= {f"ours_4spp_{size}_error_{name}": e for name, e in zip(MAPS, mine, strict=True)}
+        mine = errors(np.array(usual.step([0], "l2")[1], np.float64)[:, :6], exact)
+        figures |= {f"ours_default_{size}_error_{name}": e for name, e in zip(MAPS, mine, strict=True)}
         figures[f"ours_{size}_peak_gb"] = peak_gb()
         for name, integrator in INTEGRATORS.items():
             naive = Naive(where, integrator)
@@ -214,7 +215,7 @@ def steps(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
             cost = figures[f"{name}_{size}_16spp_seconds"] = seconds(lambda n=naive: n.step(16), max(3, repeats // 3))
             needed = 16 * (theirs / mine).min() ** 2
             figures[f"{name}_{size}_spp_for_equal_error"] = needed
-            at_equal_error.append(max(taken, cost * needed / 16) / ours_4)
+            at_equal_error.append(max(taken, cost * needed / 16) / ours_usual)
             del naive
     figures["step_speedup_1spp"] = min(speedups)
     figures["step_speedup_equal_error"] = min(at_equal_error)
@@ -257,7 +258,7 @@ def growth(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     for name, points in series.items():
         counts, taken = [], []
         for count, where, chosen in points:
-            ours = where.shade(4)
+            ours = where.shade(RecoverSettings().subsamples)
             taken.append(seconds(lambda s=ours, c=chosen: s.step(c, "l2"), repeats))
             counts.append(count)
             figures[f"ours_{name}_{count}_seconds"] = taken[-1]

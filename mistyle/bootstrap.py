@@ -80,8 +80,10 @@ def _help(arguments: list[str]) -> int:
 
 
 def _command_line(arguments: list[str]) -> int:
-    from mistyle.run.cli import main
-
+    try:
+        from mistyle.run.cli import main
+    except KeyboardInterrupt:
+        return 130
     return main(arguments)
 
 

@@ -4,6 +4,7 @@ import os
 
 import numpy as np
 import pytest
+from browser import NO_BROWSER
 from helpers import NO_DATA
 from hypothesis import settings
 
@@ -13,10 +14,13 @@ from mistyle import bootstrap
 # other skip fails the run: a test that never runs proves nothing.
 ALLOWED_SKIPS = {
     NO_DATA: "real meshes and paintings stand under other people's licences and are not in the repository",
+    NO_BROWSER: "a browser comes with the system, and .ci/run installs one where it may",
 }
 skipped: list[tuple[str, str]] = []
 
 bootstrap.use_llvm()
+# Read when Ray is imported: the engine sets it, but here tests may import Ray before the engine does.
+os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
 settings.register_profile("mistyle", deadline=None, derandomize=True, database=None)
 settings.load_profile("mistyle")
 

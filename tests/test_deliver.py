@@ -1,7 +1,9 @@
 """Delivered files, opened by readers that are not ours: Pillow, trimesh, MaterialX, USD."""
 
 import json
+import shutil
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,7 +15,15 @@ from PIL import Image
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.files.packing import TARGETS
-from mistyle.run.deliver import FORMATS, export, read_finished
+from mistyle.run.batch_jobs import Record
+from mistyle.run.batch_plan import Plan
+from mistyle.run.cli import main, parser
+from mistyle.run.deliver import deliver, export, with_delivery
+from mistyle.run.deliver_settings import FORMATS
+from mistyle.run.finished import read_finished
+from mistyle.run.options import DELIVERY_OPTIONS, asset_name, said_settings
+from mistyle.run.progress import Progress
+from mistyle.run.settings import Settings, resolve
 from mistyle.stages.export import write_asset
 
 OCCLUSION = np.linspace(0.2, 1, 256, dtype=np.float32).reshape(16, 16)
@@ -57,8 +67,6 @@ def test_what_was_written_is_read_back(made):
 
 
 def test_an_edited_albedo_is_what_is_delivered(single, tmp_path):
-    import shutil
-
     shutil.copytree(single, tmp_path / "edited")
     picture = tmp_path / "edited" / "asset" / "textures" / "tile_albedo.png"
     Image.new("RGB", (16, 16), (255, 0, 0)).save(picture)
@@ -102,7 +110,7 @@ def test_names_follow_the_pattern_and_tell_sets_apart(made, tmp_path):
     named = export(made, tmp_path / "b", formats=["maps"], target="arnold", names="x_{asset}-{map}_v003.{udim}.{ext}")
     assert "x_ball_lower_half-albedo_v003.1001.exr" in [p.name for p in named]
     for wrong in ("{asset}.{ext}", "{map}.{ext}/..", "{map}.{ext}{0}", "{asset}_{map}"):
-        with pytest.raises(UsageError, match="--name"):
+        with pytest.raises(UsageError, match="--texture-name"):
             export(made, tmp_path / "c", formats=["maps"], names=wrong)
 
 
@@ -209,3 +217,109 @@ def test_what_cannot_be_delivered_is_refused(made, tmp_path):
     with pytest.raises(InputRefused, match="not the list"):
         export(tmp_path / "broken.json", tmp_path / "out", formats=["glb"])
     assert not (tmp_path / "out").exists()
+
+
+def test_versions_go_up_and_nothing_delivered_is_overwritten(single, tmp_path):
+    run, out = Path(shutil.copytree(single, tmp_path / "run")), tmp_path / "out"
+    first = export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}")
+    assert {p.name for p in first} >= {"thing_look_v001.glb", "thing_look_v001_albedo.png"}
+    kept = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    # The same asset again is the same delivery.
+    assert export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}") == first
+    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == kept
+    # Another program, or an edited texture, is a new one; the earlier files stay as they are.
+    export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}", target="unreal")
+    Image.new("RGB", (16, 16), (255, 0, 0)).save(run / "asset" / "textures" / "tile_albedo.png")
+    third = export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}")
+    assert "thing_look_v003.glb" in {p.name for p in third}
+    assert all(p.read_bytes() == content for p, content in kept.items())
+    # A gap is not filled, and a file without its list counts too.
+    (out / "thing_look_v003.export.json").unlink()
+    assert "thing_look_v004.glb" in {p.name for p in export(run, out, formats=["glb"], name="{mesh}_{style}_v{v:03}")}
+
+
+def test_other_deliveries_in_the_folder_stay_and_are_not_replaced(made, single, tmp_path):
+    out = tmp_path / "out"
+    export(made, out, formats=["glb", "maps"])
+    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    export(single, out, formats=["glb", "maps"])
+    assert all(p.read_bytes() == content for p, content in before.items())
+    # The same name again replaces its own files only.
+    export(made, out, formats=["glb"])
+    left = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert "textures/tile_albedo.png" in left and "textures/ball_lower_half_albedo.png" not in left
+    export(single, tmp_path / "plain", formats=["maps"], names="{map}.{ext}")
+    with pytest.raises(UsageError, match="another delivery's file"):
+        export(single, tmp_path / "plain", formats=["maps"], names="{map}.{ext}", name="second")
+    assert (tmp_path / "plain" / "textures" / "albedo.png").is_file()
+
+
+@pytest.mark.parametrize("name", ["{x}", "{v.__class__}", "a/{v}", "", "{asset!r}", "{v:>9999}", "{0}", "{"])
+def test_names_are_plain_patterns(single, tmp_path, name):
+    with pytest.raises(UsageError, match="--name"):
+        export(single, tmp_path / "out", formats=["glb"], name=name)
+    with pytest.raises(UsageError, match="cut off before its version"):
+        export(single, tmp_path / "out", formats=["glb"], name="x" * 90 + "_v{v}")
+
+
+def settings_of(deliver: dict[str, Any], environment=None) -> Settings:
+    return resolve("draft", None, {"deliver": deliver}, environment or {})
+
+
+def test_a_job_delivers_what_its_settings_say(single, tmp_path):
+    run = Path(shutil.copytree(single, tmp_path / "run"))
+    quiet = Progress(quiet=True)
+
+    def job(**deliver):
+        return SimpleNamespace(settings=settings_of(deliver), out=run, mesh=Path("thing.obj"))
+
+    assert deliver(job(), quiet) == {} and not (run / "delivered").exists()
+    told = deliver(job(formats="maps,glb", target=["unreal,blender"], name="{asset}_v{v}"), quiet)["delivered"]
+    assert set(told) == {"unreal", "blender"}
+    assert (run / "delivered" / "unreal" / "tile_v1.glb").is_file()
+    assert (run / "delivered" / "unreal" / "textures" / "tile_v1_orm.png").is_file()
+    assert str(run / "delivered" / "blender" / "textures" / "tile_v1_roughness.png") in told["blender"]
+    assert deliver(job(target="unreal", name="{asset}_v{v}"), quiet)["delivered"]["unreal"] == told["unreal"]
+
+
+def options_of(*arguments: str):
+    return parser().parse_args(["stylize", "m.obj", "s.png", "-o", "out", *arguments])
+
+
+def test_the_command_line_says_it_for_stylize_fit_and_batch(tmp_path):
+    from mistyle.run.cli import _settings
+    from mistyle.run.cli_fit import material_settings
+
+    said = _settings(options_of("--formats", "glb,usd", "--target", "unreal,houdini", "--colorspace", "ACEScg"))
+    assert said.deliver.chosen_formats == ("glb", "usd") and said.deliver.chosen_targets == ("unreal", "houdini")
+    assert said.colour.space == "ACEScg" and not _settings(options_of()).deliver.wanted
+    only = _settings(options_of("--target", "unreal")).deliver
+    assert (only.chosen_formats, only.chosen_targets) == (("maps", "glb"), ("unreal",))
+    # A pattern names what is delivered, a plain name the asset.
+    options = options_of("--name", "{mesh}_{style}_v{v:03}")
+    assert _settings(options).deliver.name == "{mesh}_{style}_v{v:03}" and asset_name(options, "m_s") == "m_s"
+    plain = options_of("--name", "chair")
+    assert not _settings(plain).deliver.wanted and asset_name(plain, "m_s") == "chair"
+    with pytest.raises(UsageError, match="fbx"):
+        _settings(options_of("--formats", "glb,fbx"))
+    fit = parser().parse_args(["fit", "m.obj", "r", "-o", "out", "--target", "arnold", "--formats", "maps"])
+    assert material_settings(fit).deliver.chosen_targets == ("arnold",)
+    batch = parser().parse_args(["batch", "jobs.toml", "-o", "out", "--target", "arnold", "--name", "x_v{v}"])
+    said = said_settings(batch, DELIVERY_OPTIONS)
+    jobs = (Record(name="a", kind="stylize", mesh=Path("m.obj"), settings=settings_of({}).model_dump(mode="json")),)
+    changed = with_delivery(Plan(tmp_path, jobs), said)
+    assert changed.jobs[0].settings["deliver"]["target"] == ["arnold"]
+    assert Settings.model_validate(changed.jobs[0].settings).deliver.name == "x_v{v}"
+    plan = Plan(tmp_path, jobs)
+    assert with_delivery(plan, {}) is plan
+    with pytest.raises(SystemExit):
+        parser().parse_args(["batch", "jobs.toml", "--name", "alike"])
+
+
+def test_the_verb_export_takes_commas_and_several_targets(single, tmp_path, capsys):
+    arguments = ["export", str(single), "-o", str(tmp_path / "out"), "--formats", "maps,glb", "--json"]
+    assert main([*arguments, "--target", "unreal,unity-urp"]) == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert {Path(f).relative_to(tmp_path / "out").parts[0] for f in files} == {"unreal", "unity-urp"}
+    assert main([*arguments[:-1], "--name", "{nothing}"]) == 2
+    assert "--name" in capsys.readouterr().err

@@ -1,11 +1,15 @@
-"""Memory that stays with the process inside `memory.kept`."""
+"""Memory that stays with the process inside `memory.kept`, peaks of stages, and budgets that are kept."""
 
 import ctypes
+import errno
 import sys
 
+import numpy as np
 import pytest
 
 from mistyle.core import memory
+from mistyle.core.maps import Texels
+from mistyle.files.records import load_record, save_record
 
 BLOCK = 48_000_000  # larger than any that glibc keeps of its own accord
 
@@ -37,3 +41,62 @@ def test_freed_blocks_are_not_mapped_again_inside_and_are_given_back_afterwards(
     assert inside < 0.05 * outside
     assert resident() < held - 4000  # pages: half of a block at least
     assert faults() > 0.5 * outside
+
+
+LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the kernel's mark of the peak is Linux's")
+
+
+@LINUX
+def test_the_peak_of_a_block_is_its_own():
+    large = np.ones(40_000_000, np.uint8)
+    before = memory.highest()
+    del large
+    with memory.watched() as most:
+        held = memory.resident()
+        np.ones(20_000_000, np.uint8)
+        assert 19_000_000 < most() - held < 30_000_000
+    assert memory.highest() >= before
+
+
+@LINUX
+def test_arrays_within_a_budget_lie_in_files_and_what_is_held_stays_near_it(tmp_path):
+    held = memory.resident()
+    with memory.within(held + 250e6, tmp_path / "work"), memory.watched() as most:
+        arrays = [memory.empty((1000, 4, 5000)) for _ in range(12)]  # 960 MB in all
+        for number, array in enumerate(arrays):
+            for rows in array:
+                rows[...] = number
+        assert [float(a[-1, -1, -1] + a[0, 0, 0]) for a in arrays] == [2.0 * n for n in range(12)]
+        assert most() - held < 500e6
+        assert list((tmp_path / "work").iterdir()) == []
+    assert [float(a.sum(dtype=np.float64)) for a in arrays] == [n * 2e7 for n in range(12)]
+    assert not memory.tight() and type(memory.empty(2_000_000)) is np.ndarray
+
+
+def test_a_record_goes_to_a_file_as_it_is(tmp_path, rng):
+    texels = Texels(
+        rng.random((300, 310, 3), np.float32),
+        rng.random((300, 310, 3), np.float32),
+        rng.random((300, 310)) < 0.5,
+        rng.integers(0, 9, (300, 310)).astype(np.int32),
+        rng.integers(0, 9, (300, 310)).astype(np.int32),
+    )
+    assert memory.away(texels) is texels
+    with memory.within(1e9, tmp_path):
+        moved = memory.away(texels)
+        save_record(tmp_path / "record", moved)
+        again = load_record(tmp_path / "record")
+    for name, values in vars(texels).items():
+        for other in (getattr(moved, name), getattr(again, name)):
+            assert other.dtype == values.dtype and np.array_equal(other, values)
+    assert moved.position is not texels.position and not again.position.flags.writeable
+
+
+@LINUX
+def test_a_full_disk_is_an_error_and_no_signal(tmp_path, monkeypatch):
+    def full(file: int, start: int, count: int) -> None:
+        raise OSError(errno.ENOSPC, "no space")
+
+    monkeypatch.setattr("os.posix_fallocate", full)
+    with memory.within(1e9, tmp_path), pytest.raises(OSError, match="no space"):
+        memory.zeros(10_000_000)

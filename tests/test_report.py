@@ -18,6 +18,7 @@ from mistyle.run.report import (
     File,
     MapSet,
     Note,
+    Overlay,
     Pair,
     Report,
     Setting,
@@ -72,6 +73,7 @@ def sample(rng: np.random.Generator, text: str = "word") -> Report:
     def shot(*shape: int, sharp: bool = False) -> Shot:
         return Shot(rng.random(shape).astype(np.float32), text, text, sharp)
 
+    overlays = (Overlay(text, rng.random((64, 64, 4)).astype(np.float32), text),)
     frames = tuple(rng.integers(0, 256, (40, 40, 4)).astype(np.uint8) for _ in range(6))
     return Report(
         title=text,
@@ -87,7 +89,7 @@ def sample(rng: np.random.Generator, text: str = "word") -> Report:
             Step(text, text, text, (Pair(shot(30, 30, 3), shot(30, 30, 4), text),), (shot(20, 20),), ((text, text),)),
             Step("Second", shots=(shot(20, 20, sharp=True), shot(9, 21, 3)), columns=2),
         ),
-        maps=(MapSet(text, (shot(64, 64, 3), shot(64, 64))), MapSet("other", (shot(64, 64, 3),))),
+        maps=(MapSet(text, (shot(64, 64, 3), shot(64, 64)), overlays), MapSet("other", (shot(64, 64, 3),))),
         timings=(Timing(text, 0.2), Timing("fit", 212.0, reused=True)),
         figures=(Figure(text, text, text, "higher"), Figure("plain", "3", "a meaning")),
         settings={text: (Setting(text, text, text, chosen=True),), "other": (Setting("a", "b"),)},
@@ -147,7 +149,7 @@ def test_every_picture_decodes_and_has_its_size(tmp_path, rng):
     report = sample(rng)
     _, page = page_of(tmp_path / "r.html", report)
     images = page.all("img")
-    shots = 1 + 2 + 1 + 2 + 3
+    shots = 1 + 2 + 1 + 2 + 3 + 1
     assert len(images) == shots + len(report.turntable) + len(report.plain)
     for attributes in images:
         image = decoded(attributes["src"])
@@ -172,7 +174,7 @@ def test_controls_can_be_reached_and_named_without_a_mouse(tmp_path, rng):
     _, page = page_of(tmp_path / "r.html", sample(rng))
     ranges = [a for a in page.all("input") if a.get("type") == "range"]
     assert len(ranges) == 2 and all(a.get("aria-label") for a in ranges)
-    assert all(a.get("aria-label") or a.get("class") == "swap" for a in page.all("button"))
+    assert all(a.get("aria-label") or a.get("class") == "swap" or "aria-pressed" in a for a in page.all("button"))
     assert "Before" in page.text("button")
     assert [a for a in page.all("span") if a.get("class") == "term" and a.get("tabindex") == "0"]
 

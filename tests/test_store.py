@@ -5,6 +5,7 @@ import errno
 import hashlib
 import json
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -15,8 +16,11 @@ import pytest
 from pydantic import BaseModel
 
 from mistyle.core.errors import MistyleError, UsageError
-from mistyle.files import lock, store
-from mistyle.files.store import Keeper, atomic_folder, atomic_write, digest, load_arrays, save_arrays, sha256_file
+from mistyle.files import faults, lock, store
+from mistyle.files.store import Keeper, atomic_folder, atomic_write, digest, sha256_file
+from mistyle.run import checkpoint
+
+ROOT = Path(__file__).parents[1]
 
 
 def names(folder: Path) -> list[str]:
@@ -77,7 +81,7 @@ def test_full_disk_is_a_sentence_and_leaves_nothing(tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full is a Linux device")
 def test_real_full_device():
     with pytest.raises(MistyleError, match="disk is full"):
-        with store._sentence_when_full(Path("x")), open("/dev/full", "wb") as file:
+        with faults.told(Path("x")), open("/dev/full", "wb") as file:
             file.write(b"x" * 100_000)
 
 
@@ -226,6 +230,161 @@ def test_lock_of_a_living_process_another_host_and_the_dead(tmp_path):
     assert names(tmp_path) == []
 
 
+HOLDS = """
+import sys, time
+from pathlib import Path
+from mistyle.files.store import Keeper
+keeper = Keeper(Path(sys.argv[1]))
+print("holds", flush=True)
+time.sleep(60)
+"""
+
+
+def test_a_living_holder_is_known_from_another_container_and_a_killed_one_gives_way_at_once(tmp_path):
+    """Another host's name and another process's number on the same kernel: the kernel's own lock decides."""
+    child = subprocess.Popen([sys.executable, "-c", HOLDS, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE)
+    assert child.stdout is not None and child.stdout.readline() == b"holds\n"
+    owner = json.loads((tmp_path / store.LOCK).read_text())
+    assert owner["flock"]
+    with open(tmp_path / store.LOCK, "r+") as file:  # in place: the file that the child has locked
+        file.write(json.dumps(owner | {"host": "elsewhere", "pid": dead_pid()}))
+        file.truncate()
+    assert lock.busy(tmp_path / store.LOCK)
+    with pytest.raises(UsageError, match="has been working in this folder"):
+        Keeper(tmp_path)
+    child.kill()  # and not yet collected: a zombie holds nothing
+    until = time.monotonic() + 5
+    while lock.busy(tmp_path / store.LOCK) and time.monotonic() < until:
+        time.sleep(0.02)
+    Keeper(tmp_path).close()
+    child.wait()
+    assert names(tmp_path) == []
+
+
+def test_a_zombie_is_not_alive():
+    child = subprocess.Popen([sys.executable, "-c", ""])
+    until = time.monotonic() + 5
+    while lock.alive(child.pid) and time.monotonic() < until:
+        time.sleep(0.02)
+    assert child.returncode is None and not lock.alive(child.pid)
+    child.wait()
+
+
+TAKES = """
+import sys
+from pathlib import Path
+from mistyle.core.errors import UsageError
+from mistyle.files.store import Keeper
+root, mark = Path(sys.argv[1]), Path(sys.argv[2])
+for turn in range(60):
+    try:
+        with Keeper(root):
+            mark.mkdir()  # fails where another is inside
+            mark.rmdir()
+    except UsageError:
+        pass
+"""
+
+
+def test_a_dead_lock_is_taken_over_by_one_only(tmp_path):
+    """Four processes that take the folder again and again, a dead lock in it each time it is free."""
+    root, mark = tmp_path / "run", tmp_path / "inside"
+    root.mkdir()
+    line = [sys.executable, "-c", TAKES, str(root), str(mark)]
+    children = [subprocess.Popen(line, cwd=ROOT, stderr=subprocess.PIPE, text=True) for _ in range(4)]
+    dead = dead_pid()
+    while any(child.poll() is None for child in children):
+        if not (root / store.LOCK).exists():
+            lock_of(tmp_path, pid=dead)
+            try:
+                os.link(tmp_path / store.LOCK, root / store.LOCK)
+            except FileExistsError:
+                pass
+        time.sleep(0.001)
+    for child in children:
+        assert child.communicate()[1] == "" and child.returncode == 0
+
+
+REPLACES = """
+import sys
+from pathlib import Path
+from mistyle.core.errors import UsageError
+from mistyle.files.store import atomic_folder
+name, target = sys.argv[1], Path(sys.argv[2])
+def write(folder):
+    for k in range(3):
+        (folder / f"{k}.txt").write_text(name)
+for turn in range(100):
+    try:
+        atomic_folder(target, write)
+    except UsageError as error:
+        assert "another run is in the way" in str(error)
+"""
+
+
+def test_two_that_replace_one_folder_never_mix(tmp_path):
+    line = [sys.executable, "-c", REPLACES]
+    children = [
+        subprocess.Popen([*line, name, str(tmp_path / "out")], cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        for name in "ab"
+    ]
+    for child in children:
+        assert child.communicate()[1] == "" and child.returncode == 0
+    assert len({p.read_text() for p in (tmp_path / "out").iterdir()}) == 1
+    assert len(list((tmp_path / "out").iterdir())) == 3
+    atomic_folder(tmp_path / "out", text("alone"))
+    assert names(tmp_path) == ["out"] and names(tmp_path / "out") == ["a.txt"]
+
+
+def test_a_folder_that_is_taken_away_ends_the_run_and_is_not_made_again(tmp_path):
+    root = tmp_path / "run"
+    with Keeper(root) as keeper:
+        keeper.put("mesh", "k", text("kept"))
+
+        def write(folder: Path) -> None:
+            shutil.rmtree(root)
+            (folder / "a.txt").write_text("late")
+
+        with pytest.raises(MistyleError, match="removed while it was being written"):
+            keeper.put("fit", "k", write)
+        assert not root.exists()
+        with pytest.raises(MistyleError, match="was removed while a run worked there"):
+            keeper.get("mesh", "k")
+        with Keeper(root) as second, pytest.raises(MistyleError, match="was removed while a run worked there"):
+            second.put("mesh", "k2", text("another run's"))
+            keeper.put("mesh", "k", text("mixed"))
+        assert (root / "mesh" / "a.txt").read_text() == "another run's"
+
+
+def test_what_is_set_aside_is_said(tmp_path):
+    said: list[str] = []
+    with Keeper(tmp_path, said.append) as keeper:
+        (keeper.put("mesh", "k", text("whole")) / "a.txt").write_text("torn")
+        assert keeper.get("mesh", "k") is None
+    assert len(said) == 1 and "set aside as mesh.broken-1" in said[0]
+
+
+@pytest.mark.parametrize("damage", ["cut", "empty", "gone", "unsealed"])
+def test_a_damaged_checkpoint_is_not_taken_up(tmp_path, damage):
+    place, said = checkpoint.place(tmp_path, "k" * 64), []
+    assert checkpoint.load(place, said.append) is None and not said, "none there yet"
+    checkpoint.save(place, {"table": np.arange(100.0), "iteration": np.array(3)})
+    loaded = checkpoint.load(place)
+    assert loaded is not None and loaded["iteration"] == 3
+    array = next(p for p in sorted((place / "record").glob("*.npy")) if p.stat().st_size > 500)
+    match damage:
+        case "cut":
+            array.write_bytes(array.read_bytes()[:300])
+        case "empty":
+            array.write_bytes(b"")
+        case "gone":
+            array.unlink()
+        case "unsealed":
+            (place / store.DONE).unlink()
+    assert checkpoint.load(place, said.append) is None
+    assert len(said) == 1 and "damaged" in said[0]
+
+
 @pytest.mark.skipif(lock.started_at(os.getpid()) is None, reason="this system does not tell when a process began")
 def test_a_process_number_used_again_is_another_process(tmp_path):
     lock_of(tmp_path, started="another boot 1")
@@ -279,17 +438,3 @@ def test_digest_is_the_same_in_another_process(tmp_path):
             capture_output=True, text=True, check=True,
         )  # fmt: skip
         assert out.stdout.strip() == digest({"a": {"x", "y", "z"}, "b": 0.1})
-
-
-def test_arrays_come_back(tmp_path, rng):
-    arrays = {"a": rng.normal(size=(3, 4)), "b": np.arange(5), "c": np.array([True, False])}
-    save_arrays(tmp_path, "solution", gone=np.zeros(1), **arrays)
-    save_arrays(tmp_path, "solution", **arrays)
-    back = load_arrays(tmp_path, "solution")
-    assert list(back) == ["a", "b", "c"]
-    for key, array in arrays.items():
-        np.testing.assert_array_equal(back[key], array, strict=True)
-    with pytest.raises(ValueError, match="pickle"):
-        save_arrays(tmp_path, "objects", a=np.array([object()]))
-    with pytest.raises(MistyleError, match="found none"):
-        load_arrays(tmp_path, "absent")

@@ -14,8 +14,9 @@ from mistyle.core.asset import Asset, Material, Picture, Source
 from mistyle.core.camera import RigSettings, resized, rig
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import bilinear
-from mistyle.core.maps import flat_maps
+from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import face_areas
+from mistyle.core.tangents import corner_tangents
 from mistyle.files.images import write_png
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.render.unlit import unlit
@@ -203,12 +204,19 @@ def test_existing_normals_are_composed_and_roughness_moved(painted_sheet, rng):
     start = replace(maps, normal=own.astype(np.float32))
     count = int(texels.covered.sum())
     nothing, dull = np.zeros((count, 3), np.float32), np.full(count, 0.2, np.float32)
-    same = coat.first_maps(asset, start, texels, nothing, dull, 0.15, 1.0)
+
+    def laid(slope: np.ndarray, height: float, gloss: float) -> Maps:
+        made = replace(start, normal=start.normal.copy(), roughness=start.roughness.copy())
+        rows, tangents = slice(0, 32), corner_tangents(mesh)
+        coat.lay_relief(asset, made, texels, rows, texels.covered, slope, dull, height, gloss, tangents)
+        return made
+
+    same = laid(nothing, 0.15, 1.0)
     np.testing.assert_allclose(same.normal[texels.covered], start.normal[texels.covered], atol=1e-5)
     np.testing.assert_allclose(same.roughness[texels.covered], 0.7, atol=1e-6)
     # A slope along +x tilts the normal towards -x, which is -u here, and adds to the tilt that was there.
     slope = np.tile(np.array([1, 0, 0], np.float32), (count, 1))
-    bent = coat.first_maps(asset, start, texels, slope, dull, 0.2, 0.0)
+    bent = laid(slope, 0.2, 0.0)
     at = texels.covered
     expected = own[at] - [0.2, 0, 0]
     np.testing.assert_allclose(bent.normal[at], expected / np.linalg.norm(expected, axis=1, keepdims=True), atol=1e-5)

@@ -130,7 +130,11 @@ def save_half(path: Path, unet: Any, name: str, notes: Mapping[str, str]) -> Non
 
 def notes_of(path: Path) -> dict[str, str]:
     """What `save_half` noted in a LoRA's header; empty for files of others."""
-    return json.loads(header(path).get("__metadata__", {}).get("mistyle", "{}"))
+    try:
+        notes = json.loads(header(path).get("__metadata__", {}).get("mistyle", "{}"))
+    except (ValueError, RecursionError):
+        return {}
+    return {str(k): str(v) for k, v in notes.items()} if isinstance(notes, dict) else {}
 
 
 def read_lora(path: Path, half: Half | None = None) -> dict[str, torch.Tensor]:

@@ -12,8 +12,6 @@ from mistyle.stages.mvst import Stylizer
 from mistyle.surface.guides import Content
 from mistyle.surface.settings import SurfaceSettings
 
-DEPTH = 65_535  # steps of the painted colours (sRGB)
-
 
 def stylizer(
     mesh: Mesh,
@@ -38,9 +36,7 @@ def stylizer(
     )
 
     def paint(view: View, prior: Prior | None, rng: np.random.Generator) -> np.ndarray:
-        encoded = paint_view(view, prior, base, int(rng.integers(2**31)), module)
-        # 16 bits: sums on several threads may differ in the last bit of a float, and later views build on this one.
-        rgb = linear_from_srgb(np.round(encoded * DEPTH) / np.float32(DEPTH))
+        rgb = linear_from_srgb(paint_view(view, prior, base, int(rng.integers(2**31)), module))
         return rgb if prior is None else np.where((prior.known & view.mask)[..., None], prior.rgb, rgb)
 
     return paint

@@ -13,12 +13,12 @@ from typing import Any
 
 from mistyle.backends.models_list import MODELS, Model
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
+from mistyle.core.weights import header as weights_header
 from mistyle.files.store import sha256_file
 
 LOCK = "mistyle-models.json"
 WEIGHTS = ("diffusion_pytorch_model", "model")
 PACKAGES = ("diffusers", "transformers", "peft", "accelerate", "safetensors", "huggingface_hub")
-HEADER_LIMIT = 100_000_000
 PIECES, PIECE = 64, 65536
 
 
@@ -134,26 +134,18 @@ def variant(folder: Path) -> str | None:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """A configuration file."""
+    """A configuration file, decoded by the reader process."""
+    from mistyle.files.read import read_json as read
+
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputRefused(f"{path}: {error}; expected a model's JSON file; fetch the model again") from None
+        return read(path)
+    except InputRefused as error:
+        raise InputRefused(f"{error}; fetch the model again") from None
 
 
 def header(path: Path) -> dict[str, Any]:
-    """Names, types and shapes of a safetensors file, and '__metadata__', without reading its tensors."""
-    try:
-        with open(path, "rb") as file:
-            length = int.from_bytes(file.read(8), "little")
-            if not 2 <= length <= min(HEADER_LIMIT, path.stat().st_size):
-                raise ValueError(f"a header of {length} bytes")
-            table = json.loads(file.read(length))
-            if not isinstance(table, dict):
-                raise ValueError("a header that is no table")
-            return table
-    except (OSError, ValueError) as error:
-        raise InputRefused(f"{path}: {error}; expected a .safetensors file (pickles are not opened)") from None
+    """Names, types and shapes of a safetensors file, and '__metadata__', checked, without reading its tensors."""
+    return weights_header(path)[0]
 
 
 def shapes(paths: Iterable[Path]) -> dict[str, list[int]]:

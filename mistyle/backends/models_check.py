@@ -100,6 +100,8 @@ def checkpoint(path: Path, place: Path) -> None:
         )
     if not path.is_file():
         raise InputRefused(f"{path}: found nothing, expected an SDXL checkpoint (.safetensors); check the path")
+    if path.suffix.lower() != ".safetensors":
+        raise InputRefused(f"{path}: expected an SDXL checkpoint that ends in .safetensors (pickles are not opened)")
     shapes = models.shapes([path])
     first = shapes.get("model.diffusion_model.input_blocks.0.0.weight")
     if first is None or not any(name.startswith("conditioner.embedders.1.") for name in shapes):

@@ -1,5 +1,6 @@
 """Fetching models on request, through huggingface_hub, and the one conversion of a pickle into safetensors."""
 
+import errno
 import hashlib
 import os
 import re
@@ -9,7 +10,9 @@ from typing import Any
 from urllib.parse import urlparse
 
 from mistyle.backends import models
-from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
+from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
+from mistyle.core.weights import converted
+from mistyle.files import faults
 from mistyle.files.store import atomic_write, sha256_file
 
 PARTIAL = ".partial"
@@ -36,6 +39,12 @@ def fetch(name: str, folder: Path, allowed: bool) -> Path:
     try:
         wanted = _download(model, place) | dict(model.sha256)
     except (transport, OSError) as error:
+        if isinstance(error, OSError) and error.errno in (*faults.FULL, errno.EFBIG, *faults.NOT_TO_BE_WRITTEN):
+            raise MistyleError(
+                f"{place}: cannot be written ({os.strerror(error.errno or 0)}); '{name}' takes about {model.gigabytes} "
+                "GB. See to the disk, or name another folder with --models, and run the same command again: it goes on "
+                "where it stopped"
+            ) from None
         raise EnvironmentMissing(
             f"{model.repo} could not be fetched: {str(error).splitlines()[0]}; check the network (HF_ENDPOINT, proxy, "
             "HF_HUB_OFFLINE; HF_TOKEN where the licence must be accepted) and run the same command again: it goes on "
@@ -120,24 +129,14 @@ def _checked(path: Path, wanted: str | None) -> dict[str, Any]:
 def convert(pickle: Path, into: Path) -> Path:
     """A pickled state dict as safetensors in the folder `into`, beside a copy of its config.json.
 
-    The pickle is opened with `weights_only=True`: tensors and nothing that could run. Anything else is refused.
+    The pickle is opened in a child process with `weights_only=True`: tensors and nothing that could run. Anything else
+    is refused.
     """
-    import pickle as pickles
-
-    import torch
     from safetensors.torch import save_file
 
     if not pickle.is_file():
         raise InputRefused(f"{pickle}: found nothing, expected a pickled state dict (.bin)")
-    try:
-        state = torch.load(pickle, map_location="cpu", weights_only=True)
-    except (pickles.UnpicklingError, RuntimeError, EOFError) as error:
-        raise InputRefused(
-            f"{pickle}: not a plain table of tensors, so it was not opened ({str(error).splitlines()[0]})"
-        ) from None
-    if not isinstance(state, dict) or not all(isinstance(v, torch.Tensor) for v in state.values()):
-        raise InputRefused(f"{pickle}: expected a table of tensors")
-    tensors = {str(k): v.detach().clone().contiguous() for k, v in state.items()}
+    tensors = converted(pickle)
     target = into / "diffusion_pytorch_model.safetensors"
     atomic_write(target, lambda path: save_file(tensors, path, {"format": "pt"}))
     config = pickle.with_name("config.json")

@@ -4,6 +4,7 @@ Pixel coordinates are (x, y) with pixel centres at +0.5, as for cameras. OpenCV 
 `remap` rounds coordinates to 1/32 pixel, so fetches are written out here.
 """
 
+from collections.abc import Sequence
 from typing import Literal
 
 import cv2
@@ -57,18 +58,27 @@ def resize(
     if image.shape[:2] == size:
         return image.astype(np.float32, copy=True)
     if size[0] <= image.shape[0] and size[1] <= image.shape[1]:
-        small = cv2.resize(image.astype(np.float32), (size[1], size[0]), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(image.astype(np.float32, copy=False), (size[1], size[0]), interpolation=cv2.INTER_AREA)
         return small.reshape(*size, *image.shape[2:])
-    return _stretch(_stretch(image.astype(np.float32), 0, size[0], edge), 1, size[1], edge)
+    return resized_rows(image, size, slice(0, size[0]), edge)
 
 
-def _stretch(image: np.ndarray, axis: int, count: int, edge: str) -> np.ndarray:
-    """Linear interpolation along one axis to `count` pixels."""
+def resized_rows(
+    image: Float[np.ndarray, "h w *c"], size: tuple[int, int], rows: slice, edge: Literal["clamp", "repeat"] = "clamp"
+) -> Float[np.ndarray, "H W *c"]:
+    """`resize(image, size, edge)[rows]` without the rest; not for sizes that shrink the picture along both sides."""
+    if image.shape[:2] == size:
+        return image[rows].astype(np.float32, copy=True)
+    return _stretch(_stretch(image.astype(np.float32), 0, size[0], edge, rows), 1, size[1], edge)
+
+
+def _stretch(image: np.ndarray, axis: int, count: int, edge: str, part: slice = slice(None)) -> np.ndarray:
+    """Linear interpolation along one axis to `count` pixels, of which `part` is made."""
     have = image.shape[axis]
-    x = (np.arange(count) + 0.5) * have / count - 0.5
+    x = (np.arange(count)[part] + 0.5) * have / count - 0.5
     low = np.floor(x).astype(np.int64)
     shape = [1] * image.ndim
-    shape[axis] = count
+    shape[axis] = len(x)
     t = (x - low).astype(np.float32).reshape(shape)
     first, second = (k % have if edge == "repeat" else np.clip(k, 0, have - 1) for k in (low, low + 1))
     result, rest = image.take(first, axis=axis), image.take(second, axis=axis)
@@ -140,17 +150,35 @@ def nearest(valid: Bool[np.ndarray, "h w"]) -> tuple[Int[np.ndarray, "h w"], Flo
 
 def nearest_fill(values: Float[np.ndarray, "h w *c"], valid: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w *c"]:
     """Every invalid pixel takes the value of the nearest valid one; unchanged where no pixel is valid."""
-    if valid.all() or not valid.any():
-        return values.copy()
-    index, _ = nearest(valid)
-    return values.reshape(valid.size, -1).take(index.ravel(), axis=0).reshape(values.shape)
+    result = values.copy()
+    nearest_fill_in_place([result], valid)
+    return result
+
+
+def nearest_fill_in_place(maps: Sequence[np.ndarray], valid: Bool[np.ndarray, "h w"]) -> None:
+    """`nearest_fill` for several maps (h w *c) of one size, written into them."""
+    if not maps or valid.all() or not valid.any():
+        return
+    index = nearest(valid)[0].reshape(-1)
+    flat = valid.reshape(-1)
+    for values in maps:
+        rows = values.reshape(valid.size, -1)
+        for start in range(0, valid.size, 2**20):  # in pieces, since indices are eight times as large as the mask
+            holes = start + np.flatnonzero(~flat[start : start + 2**20])
+            rows[holes] = rows.take(index[holes], axis=0)
 
 
 def distance_to(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
     """Distance of every pixel's centre to that of the nearest mask pixel, in pixels; infinite where there is none."""
     if not mask.any():
         return np.full(mask.shape, np.inf, np.float32)
-    return np.asarray(cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
+    # Intel's version takes its roots according to where in memory the result happens to lie: its last bit is chance.
+    used = cv2.ipp.useIPP()
+    cv2.ipp.setUseIPP(False)  # of this thread only
+    try:
+        return np.asarray(cv2.distanceTransform((~mask).view(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_PRECISE), np.float32)
+    finally:
+        cv2.ipp.setUseIPP(used)
 
 
 def match_histogram(

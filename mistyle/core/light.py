@@ -26,6 +26,7 @@ scene file describes the light. The world is the cameras' world, and lengths are
 
 import json
 import math
+import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -279,18 +280,18 @@ def _light(entry: Any, where: str, load: Load | None) -> Light:
     if kind == "spherical_gaussian":
         sharpness = entry.get("sharpness")
         if not _number(sharpness) or not 0 <= sharpness < 1e6:
-            raise InputRefused(f"{where}: sharpness is {sharpness!r}; expected a number from 0 to a million.")
+            raise InputRefused(f"{where}: sharpness is {_said(sharpness)}; expected a number from 0 to a million.")
         axis, amplitude = _unit(entry, "axis", where), _triple(entry, "amplitude", where, 0.0)
         return SphericalGaussian(axis, float(sharpness), amplitude)
     if kind == "scene" and isinstance(entry.get("file"), str):
         return SceneLights(entry["file"])
-    raise InputRefused(f"{where}: type is {kind!r}; expected one of {', '.join(NAMES.values())}.")
+    raise InputRefused(f"{where}: type is {_said(kind)}; expected one of {', '.join(NAMES.values())}.")
 
 
 def _frame(entry: dict, where: str) -> Literal["world", "camera"]:
     frame = entry.get("frame", "world")
     if frame not in ("world", "camera"):
-        raise InputRefused(f'{where}: frame is {frame!r}; expected "world" or "camera".')
+        raise InputRefused(f'{where}: frame is {_said(frame)}; expected "world" or "camera".')
     return frame
 
 
@@ -298,9 +299,11 @@ def _environment(entry: dict, where: str, load: Load | None) -> Environment:
     file, turn, scale = entry.get("file"), entry.get("turn", 0.0), entry.get("scale", 1.0)
     if not isinstance(file, str) or not file or load is None:
         expected = "lights without files here" if load is None else "the name of an .exr or .hdr beside lights.json"
-        raise InputRefused(f"{where}: file is {file!r}; expected {expected}.")
+        raise InputRefused(f"{where}: file is {_said(file)}; expected {expected}.")
     if not _number(turn) or not _number(scale) or scale < 0:
-        raise InputRefused(f"{where}: turn is {turn!r}, scale is {scale!r}; expected degrees and a number >= 0.")
+        raise InputRefused(
+            f"{where}: turn is {_said(turn)}, scale is {_said(scale)}; expected degrees and a number >= 0."
+        )
     return Environment(load(file), float(turn), float(scale), file)
 
 
@@ -308,8 +311,13 @@ def _triple(entry: dict, key: str, where: str, least: float = -math.inf) -> Vect
     value = entry.get(key)
     if not isinstance(value, list) or len(value) != 3 or not all(_number(v) and v >= least for v in value):
         expected = f"three finite numbers{' >= 0' if least == 0 else ''}"
-        raise InputRefused(f"{where}: {key} is {value!r}; expected {expected}.")
+        raise InputRefused(f"{where}: {key} is {_said(value)}; expected {expected}.")
     return (float(value[0]), float(value[1]), float(value[2]))
+
+
+def _said(value: Any) -> str:
+    """A file's value as a sentence can hold it."""
+    return reprlib.repr(value)[:120]
 
 
 def _number(value: Any) -> TypeGuard[float]:
@@ -318,9 +326,9 @@ def _number(value: Any) -> TypeGuard[float]:
 
 def _unit(entry: dict, key: str, where: str) -> Vector:
     vector = np.asarray(_triple(entry, key, where))
-    length = float(np.linalg.norm(vector))
-    if length < 1e-9:
-        raise InputRefused(f"{where}: {key} has no length.")
+    length = math.hypot(*vector)
+    if not 1e-9 <= length < 1e150:
+        raise InputRefused(f"{where}: {key} has the length {length:g}; expected a direction.")
     # What is a unit vector already keeps its bits, so that writing and reading again changes nothing.
     x, y, z = (vector if abs(length - 1) < 1e-12 else vector / length).tolist()
     return (x, y, z)

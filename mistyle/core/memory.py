@@ -1,9 +1,27 @@
-"""What the C library does with memory that is given back."""
+"""How much memory this process holds and held, how it keeps within a budget, and what the C library does with memory
+that is given back.
 
+Within a budget (`within`) the large arrays of a job lie in files instead of in memory of the process's own: what
+`empty`, `copied`, `away` and `load` give are then maps of unlinked files, whose pages the kernel takes back whenever it
+likes, and which a thread lets go as soon as the process holds too much. What is computed does not change.
+"""
+
+import contextlib
 import ctypes
+import dataclasses
+import mmap
+import os
 import sys
-from collections.abc import Iterator
+import tempfile
+import threading
+import weakref
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import DTypeLike
 
 # mallopt's names for numbers; from how many bytes on a block is mapped on its own, and how much free heap is kept.
 M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
@@ -33,3 +51,197 @@ def kept() -> Iterator[None]:
         library.mallopt(M_MMAP_THRESHOLD, DEFAULT)
         library.mallopt(M_TRIM_THRESHOLD, DEFAULT)
         library.malloc_trim(0)
+
+
+_before = [0]  # bytes: the highest that was seen before the kernel's own mark was reset
+
+
+def resident() -> int:
+    """Bytes of main memory that this process holds now; 0 where nothing tells (not Linux)."""
+    return _status("VmRSS")
+
+
+def highest() -> int:
+    """The most bytes that this process, or the largest of its children that have ended, has held so far."""
+    try:
+        import resource
+    except ImportError:
+        return max(_before[0], _status("VmHWM"))
+    unit = 1 if sys.platform == "darwin" else 1024
+    own, children = (resource.getrusage(w).ru_maxrss for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return max(_before[0], _status("VmHWM"), own * unit, children * unit)
+
+
+@contextmanager
+def watched() -> Iterator[Callable[[], int]]:
+    """Yields a function that tells the most bytes this process has held since the block began.
+
+    Linux keeps the mark itself, so nothing is missed between two looks, and lets it be set back; where it cannot be
+    (another system, a closed /proc) the answer is the most that was held so far. A child that ends within the block and
+    was larger than all before it counts as well. Blocks do not nest: the inner one sets the outer one's mark back.
+    """
+    children, outer = _of_children(), highest()
+    _before[0] = max(_before[0], outer)
+    reset = _reset()
+
+    def most() -> int:
+        own = _status("VmHWM") if reset else highest()
+        grown = _of_children()
+        return max(own, grown if grown > children else 0)
+
+    yield most
+
+
+def _reset() -> bool:
+    try:
+        with open("/proc/self/clear_refs", "w", encoding="ascii") as file:
+            file.write("5")
+    except OSError:
+        return False
+    return True
+
+
+def _of_children() -> int:
+    try:
+        import resource
+    except ImportError:
+        return 0
+    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+
+
+def _status(name: str) -> int:
+    """A line of /proc/self/status in bytes."""
+    try:
+        with open("/proc/self/status", encoding="ascii", errors="replace") as file:
+            found = next((line for line in file if line.startswith(name + ":")), "")
+    except OSError:
+        return 0
+    return int(found.split()[1]) * 1024 if found else 0
+
+
+LEAST = 2**20  # bytes from which on an array is worth a file
+MARGIN = 0.8  # of the budget, from which on mapped pages are let go
+EVERY = 0.005  # seconds between two looks
+_scratch: list[Path] = []  # where files go; empty without a budget
+_limit = [float("inf")]
+_mapped: "weakref.WeakSet[mmap.mmap]" = weakref.WeakSet()
+T = TypeVar("T")
+
+
+@contextmanager
+def within(budget: float, folder: Path | None) -> Iterator[None]:
+    """Keep large arrays in files of `folder` (None: in memory, as outside), and what is held near `budget` bytes.
+
+    What has to be in memory at one time, above all the working arrays of a stage, is not made smaller by this: whether
+    a job can keep its budget is for `run/plan.py` to say. Blocks do not nest.
+    """
+    if folder is None:
+        yield
+        return
+    if not possible():
+        raise RuntimeError("large arrays can lie in files on Linux only")
+    folder.mkdir(parents=True, exist_ok=True)
+    _scratch.append(folder)
+    done = threading.Event()
+    _limit[0] = MARGIN * budget
+    watch = threading.Thread(target=_watch, args=(done,), daemon=True)
+    watch.start()
+    try:
+        yield
+    finally:
+        done.set()
+        watch.join()
+        _scratch.clear()
+
+
+def possible() -> bool:
+    """Whether this system lets a process give up mapped pages and tells it how much it holds."""
+    return sys.platform.startswith("linux")
+
+
+def tight() -> bool:
+    """Whether large arrays go to files now."""
+    return bool(_scratch)
+
+
+def empty(shape: tuple[int, ...] | int, dtype: DTypeLike = np.float32) -> np.ndarray:
+    """`np.empty`, in a file where there is a budget; zeros then. Raises OSError on a full disk."""
+    shape, kind = (shape,) if isinstance(shape, int) else shape, np.dtype(dtype)
+    count = int(np.prod(shape, dtype=np.int64)) * kind.itemsize
+    if not _scratch or count < LEAST:
+        return np.empty(shape, kind)
+    return np.frombuffer(_file(count), kind).reshape(shape)
+
+
+def zeros(shape: tuple[int, ...] | int, dtype: DTypeLike = np.float32) -> np.ndarray:
+    """`np.zeros`, in a file where there is a budget."""
+    result = empty(shape, dtype)
+    if not _scratch or result.nbytes < LEAST:
+        result.fill(0)
+    return result
+
+
+def copied(values: np.ndarray) -> np.ndarray:
+    """A copy, in a file where there is a budget."""
+    result = empty(values.shape, values.dtype)
+    np.copyto(result, values)
+    return result
+
+
+def away(record: T) -> T:
+    """A dataclass with its large arrays moved to one file where there is a budget; else itself."""
+    if not _scratch:
+        return record
+    assert dataclasses.is_dataclass(record) and not isinstance(record, type)
+    every = {f.name: getattr(record, f.name) for f in dataclasses.fields(record)}
+    large = {k: v for k, v in every.items() if isinstance(v, np.ndarray) and v.nbytes >= LEAST // 16}
+    if sum(v.nbytes for v in large.values()) < LEAST:
+        return record
+    starts = np.cumsum([0] + [-(-v.nbytes // 64) * 64 for v in large.values()]).tolist()
+    data = _file(starts[-1])
+    moved: dict[str, Any] = {}
+    for (name, values), start in zip(large.items(), starts, strict=False):
+        view = np.frombuffer(data, values.dtype, values.size, start).reshape(values.shape)
+        np.copyto(view, values)
+        moved[name] = view
+    return dataclasses.replace(record, **moved)
+
+
+def load(path: Path) -> np.ndarray:
+    """An array of a .npy file; where there is a budget, a large one is mapped and cannot be written to."""
+    if not _scratch or path.stat().st_size < LEAST:
+        return np.load(path, allow_pickle=False)
+    found = np.load(path, mmap_mode="r", allow_pickle=False)
+    _mapped.add(found._mmap)
+    return np.asarray(found)
+
+
+def _file(count: int) -> mmap.mmap:
+    """So many bytes of a file without a name: nothing stays of it, however the process ends."""
+    _let_go()
+    with tempfile.TemporaryFile(dir=_scratch[0]) as file:
+        # Allocated at once: a disk that is full later would end the process with a signal.
+        os.posix_fallocate(file.fileno(), 0, count)
+        data = mmap.mmap(file.fileno(), count)
+    _mapped.add(data)
+    return data
+
+
+def _watch(done: threading.Event) -> None:
+    while not done.wait(EVERY):
+        _let_go()
+
+
+def _let_go() -> None:
+    """Take mapped pages out of the process while it holds more than its limit; they stay in the kernel's cache."""
+    if _resident_now() <= _limit[0]:
+        return
+    for data in list(_mapped):
+        with contextlib.suppress(ValueError, OSError):  # closed meanwhile
+            data.madvise(mmap.MADV_DONTNEED)
+
+
+def _resident_now() -> int:
+    """`resident`, from the file that is quicker to read."""
+    with open("/proc/self/statm", "rb") as file:
+        return int(file.read().split()[1]) * mmap.PAGESIZE

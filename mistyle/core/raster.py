@@ -17,18 +17,23 @@ def fragments(
     on an edge belongs to one of the two triangles that share the edge, never to both or neither. With `wrap`,
     coordinates are taken modulo `size`; otherwise what lies outside is left out.
     """
-    faces, texels = [], []
+    found = list(fragment_pieces(uv, size, wrap=wrap))
+    if not found:
+        return np.zeros(0, np.int64), np.zeros(0, np.int64)
+    return np.concatenate([face for face, _ in found]), np.concatenate([texel for _, texel in found])
+
+
+def fragment_pieces(
+    uv: Float[np.ndarray, "f 3 2"], size: int, *, wrap: bool = True
+) -> Iterator[tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]]:
+    """`fragments` piece after piece, so that those of a large atlas need not be held together."""
     for face, column, row in _pieces(uv):
         if wrap:
             column, row = column % size, row % size
         else:
             inside = (column >= 0) & (column < size) & (row >= 0) & (row < size)
             face, column, row = face[inside], column[inside], row[inside]
-        faces.append(face)
-        texels.append(row * size + column)
-    if not faces:
-        return np.zeros(0, np.int64), np.zeros(0, np.int64)
-    return np.concatenate(faces), np.concatenate(texels)
+        yield face, row * size + column
 
 
 def _pieces(uv: Float[np.ndarray, "f 3 2"]) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:

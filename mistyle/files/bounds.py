@@ -8,6 +8,8 @@ from mistyle.core.errors import InputRefused
 
 MAX_FILE_BYTES = 2 << 30
 MAX_JSON_BYTES = 64 << 20
+MAX_SETTINGS_BYTES = 4 << 20  # of a TOML or YAML file
+MAX_VALUES = 1_000_000  # in a TOML or YAML file, its aliases spelled out
 MAX_DEPTH = 128  # of nested JSON and of the node graph
 MAX_NODES = 200_000
 MAX_PIXELS = 1 << 26  # of one picture: 8192 x 8192
@@ -17,11 +19,11 @@ WORK_TEXTURE = 4096  # a mesh's own textures are halved until no side is longer
 
 def refuse(path: Path | str, found: str, expected: str, fix: str) -> InputRefused:
     """The sentence that every refusal has: which file, what was found, what was expected, what to do."""
-    return InputRefused(f"{path}: found {found}; expected {expected}. {fix}")
+    return InputRefused(f"{path}: found {found[:400]}; expected {expected[:800]}. {fix}")
 
 
-def read_bytes(path: Path, limit: int | None = None) -> bytes:
-    """The whole file, if it is one and not larger than `limit` (MAX_FILE_BYTES)."""
+def read_bytes(path: Path, limit: int | None = None, count: int = -1) -> bytes:
+    """The whole file (or its first `count` bytes), if it is one and not larger than `limit` (MAX_FILE_BYTES)."""
     limit = MAX_FILE_BYTES if limit is None else limit
     if not path.exists():
         raise refuse(path, "nothing", "a file", "Check the path")
@@ -32,7 +34,8 @@ def read_bytes(path: Path, limit: int | None = None) -> bytes:
         found, most = f"{size / 2**20:.0f} MiB", f"at most {limit / 2**20:.0f} MiB"
         raise refuse(path, found, most, "Reduce the file (fewer faces, smaller textures)")
     try:
-        return path.read_bytes()
+        with open(path, "rb") as file:
+            return file.read(count)
     except OSError as error:
         raise refuse(
             path, f"a file that cannot be read ({error.strerror})", "a readable file", "Check its permissions"

@@ -31,8 +31,16 @@ from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Lights, lights_of_views
 from mistyle.files.bounds import beside, refuse
 from mistyle.files.cameras import ENDINGS, SPACE, Frame, read_entries, read_frames, stem
-from mistyle.files.colmap import SparsePoints, find_model, read_model, read_points
-from mistyle.files.read import read_exr, read_json, read_picture, read_radiance, read_size
+from mistyle.files.colmap import SparsePoints, find_model
+from mistyle.files.read import (
+    read_colmap,
+    read_colmap_points,
+    read_exr,
+    read_json,
+    read_picture,
+    read_radiance,
+    read_size,
+)
 from mistyle.files.views import standing_picture
 
 EXPECTED = "a folder with camera.json, transforms.json or a COLMAP model (sparse/0), or one of these files"
@@ -104,7 +112,7 @@ def read_shots(
         shots = [_own(file, camera, entry) for camera, entry in read_entries(file)]
     elif kind == "colmap":
         folder = _images(Path(path), file, pictures)
-        shots = [_shot(frame, folder) for frame in read_model(file)]
+        shots = [_shot(frame, folder) for frame in read_colmap(file)]
     else:
         folder = Path(pictures) if pictures is not None else file.parent
         frames = read_frames(file, lambda name: read_size(_find(folder, name)))
@@ -130,7 +138,7 @@ def camera_space(path: Path) -> Literal["working", "own"]:
 def sparse_points(path: Path) -> SparsePoints | None:
     """The points of a COLMAP model, in the cameras' space; None for other references."""
     kind, file = _source(Path(path))
-    return read_points(file) if kind == "colmap" else None
+    return read_colmap_points(file) if kind == "colmap" else None
 
 
 def load_shot(shot: Shot, saturation: float = 1.0, coverage: float = 0.999) -> Loaded:

@@ -1,6 +1,5 @@
 """The opacity of a user's cut-out and blended glTF materials, which a new base colour has to carry on."""
 
-import io
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,10 +7,11 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
-from mistyle.files.bounds import MAX_PIXELS, beside, read_bytes
+from mistyle.files.bounds import beside, read_bytes
 from mistyle.files.glb import Tree, values
-from mistyle.files.gltf_check import data_uri, load_gltf
+from mistyle.files.gltf_check import data_uri
 from mistyle.files.gltf_materials import set_of, texture_transform
+from mistyle.files.read import load_gltf, read_gltf_alpha
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,8 @@ def cutouts(asset: Asset) -> dict[int, Cutout]:
         if info is None:
             continue
         texcoord = primitive["attributes"].get(f"TEXCOORD_{set_of(info)}")
-        alpha = _alpha(image_of(tree, info["index"]), tree, buffers, path) if texcoord is not None else None
+        image = image_of(tree, info["index"])
+        alpha = read_gltf_alpha(path, image) if texcoord is not None and image is not None else None
         if texcoord is None or alpha is None:
             continue
         faces = asset.mesh.faces[entry.start : entry.stop] - entry.first_vertex
@@ -62,13 +63,13 @@ def _base_texture(tree: Tree, material: int | None) -> Tree | None:
     return entry.get("pbrMetallicRoughness", {}).get("baseColorTexture") or glossy.get("diffuseTexture")
 
 
-def image_of(tree: Tree, texture: int) -> Tree | None:
-    """The image of a texture; None where there is none that can be read."""
+def image_of(tree: Tree, texture: int) -> int | None:
+    """The number of a texture's image; None where there is none that can be read."""
     entry = tree["textures"][texture]
     webp = entry.get("extensions", {}).get("EXT_texture_webp")
     source = webp.get("source") if isinstance(webp, dict) else entry.get("source")
     images = tree.get("images", [])
-    return images[source] if isinstance(source, int) and 0 <= source < len(images) else None
+    return source if isinstance(source, int) and 0 <= source < len(images) else None
 
 
 def image_bytes(image: Tree, tree: Tree, buffers: list[bytes], path) -> bytes | None:
@@ -78,27 +79,8 @@ def image_bytes(image: Tree, tree: Tree, buffers: list[bytes], path) -> bytes | 
         view = tree["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
         return buffers[view["buffer"]][start : start + view["byteLength"]]
-    uri = image.get("uri", "")
+    uri = image.get("uri") or ""
     try:
         return data_uri(uri, path) if uri.startswith("data:") else read_bytes(beside(path, uri))
     except InputRefused:
         return None
-
-
-def _alpha(image: Tree | None, tree: Tree, buffers: list[bytes], path) -> Float[np.ndarray, "h w"] | None:
-    """The alpha channel, or None where the image has none (JPEG) or is opaque."""
-    from PIL import Image, UnidentifiedImageError
-
-    data = image_bytes(image, tree, buffers, path) if image is not None else None
-    if data is None:
-        return None
-    try:
-        opened = Image.open(io.BytesIO(data), formats=("PNG", "WEBP"))
-    except UnidentifiedImageError:
-        return None
-    if opened.width * opened.height > MAX_PIXELS:
-        raise InputRefused(f"{path}: a texture of {opened.width} x {opened.height} pixels; scale it down")
-    if not opened.has_transparency_data:
-        return None
-    alpha = np.asarray(opened.convert("RGBA").getchannel("A"), np.float32) / 255
-    return alpha if (alpha < 1).any() else None

@@ -4,12 +4,14 @@ import base64
 import binascii
 import json
 import struct
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from pydantic import ValidationError
 
+from mistyle.files import bounds
 from mistyle.files.bounds import MAX_DEPTH, MAX_JSON_BYTES, beside, read_bytes, refuse
 from mistyle.files.gltf_schema import Buffer, Document
 
@@ -56,14 +58,19 @@ def parse_json(data: bytes, path: Path) -> dict[str, Any]:
 
 
 def _check_depth(tree: Any, path: Path) -> None:
+    """Refuses nesting beyond MAX_DEPTH, and numbers that no double or 64-bit integer holds (1e999 is infinity)."""
     level = [tree]
     for _ in range(MAX_DEPTH):
-        level = [
-            child
-            for item in level
-            for child in (item.values() if isinstance(item, dict) else item)
-            if isinstance(child, dict | list)
-        ]
+        below: list[Any] = []
+        for item in level:
+            for child in item.values() if isinstance(item, dict) else item:
+                if isinstance(child, dict | list):
+                    below.append(child)
+                elif isinstance(child, float) and not isfinite(child):
+                    raise refuse(path, "a number beyond what a double holds", "finite numbers", AGAIN)
+                elif isinstance(child, int) and not -(2**63) <= child < 2**64:
+                    raise refuse(path, "a whole number of more than 64 bits", "finite numbers", AGAIN)
+        level = below
         if not level:
             return
     raise refuse(path, f"JSON nested deeper than {MAX_DEPTH} levels", f"at most {MAX_DEPTH}", AGAIN)
@@ -98,6 +105,11 @@ def load_gltf(path: Path) -> tuple[dict[str, Any], list[bytes]]:
         raise refuse(path, f"required extensions {', '.join(unknown)[:200]}", "core glTF 2.0", "Export it without them")
     _check_indices(document, path)
     _check_nodes(document, path)
+    total = sum(buffer.byteLength for buffer in document.buffers)
+    if total > bounds.MAX_FILE_BYTES:
+        raise refuse(
+            path, f"buffers of {total >> 20} MiB", f"at most {bounds.MAX_FILE_BYTES >> 20} MiB", "Reduce the mesh"
+        )
     buffers = [_buffer(buffer, binary if i == 0 else None, path) for i, buffer in enumerate(document.buffers)]
     _check_reach(document, path)
     _check_sparse(document, buffers, path)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from mistyle.files.bounds import beside, read_bytes
 from mistyle.files.gltf_check import data_uri
-from mistyle.files.pictures import Budget, decode
+from mistyle.files.pictures import Budget, texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 
 Tree = dict[str, Any]
@@ -103,16 +103,15 @@ def _load(
             continue
         where, data = image
         number = set_of(info)
-        lookup = dict(uvs=other.get(number) if number != base else None, transform=texture_transform(info))
+        lookup: Tree = dict(uvs=other.get(number) if number != base else None, transform=texture_transform(info))
+        pixels = texture(data, where, budget)
         if name == "albedo":
-            maps["albedo"] = RawMap(decode(data, where, budget, "colour"), **lookup)
+            maps["albedo"] = RawMap(pixels, **lookup, kind="colour")
         elif name == "normal":
-            normal = decode(data, where, budget, "normal", scale=float(info.get("scale", 1.0)))
-            maps["normal"] = RawMap(normal, **lookup)
+            maps["normal"] = RawMap(pixels, **lookup, kind="normal", scale=float(info.get("scale", 1.0)))
         else:
-            orm = decode(data, where, budget, "data")
-            maps["roughness"] = RawMap(np.ascontiguousarray(orm[..., 1]), **lookup)
-            maps["metallic"] = RawMap(np.ascontiguousarray(orm[..., 2]), **lookup)
+            maps["roughness"] = RawMap(np.ascontiguousarray(pixels[..., 1]), **lookup, kind="data")
+            maps["metallic"] = RawMap(np.ascontiguousarray(pixels[..., 2]), **lookup, kind="data")
     return maps, tuple(notes)
 
 
@@ -132,7 +131,7 @@ def _image(tree: Tree, buffers: list[bytes], path: Path, texture: int, notes: li
         view = tree["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
         return where, buffers[view["buffer"]][start : start + view["byteLength"]]
-    uri = image.get("uri", "")
+    uri = image.get("uri") or ""
     if uri.startswith("data:"):
         return where, data_uri(uri, path)
     target = beside(path, uri)

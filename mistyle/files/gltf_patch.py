@@ -19,10 +19,10 @@ from mistyle.core.asset import Asset, Primitive
 from mistyle.core.errors import MistyleError
 from mistyle.files.glb import TRIANGLES, Builder, Tree, values
 from mistyle.files.gltf_alpha import image_bytes
-from mistyle.files.gltf_check import load_gltf
 from mistyle.files.gltf_tidy import drop_unused
 from mistyle.files.gltf_vertices import Patch, rewrite, triangles
 from mistyle.files.images import encode_png
+from mistyle.files.read import load_gltf
 from mistyle.files.textures import Pictures, add_textures, part_stems, set_textures
 
 # Texture coordinates that were shifted by integers differ in their last bits; a texel of 16384 is 6e-5.

@@ -103,6 +103,7 @@ def _pieces(
         if "EXT_mesh_gpu_instancing" in entry.get("extensions", {}):
             notes.append("Instances (EXT_mesh_gpu_instancing) were read once; all of them show the same texels.")
         for number, primitive in enumerate(tree["meshes"][entry["mesh"]]["primitives"]):
+            _check_counts(tree, primitive, max_faces, path)
             index = _indices(tree, buffers, primitive, path)
             if index is None or "POSITION" not in primitive["attributes"] or len(index) == 0:
                 notes.append("Points and lines were left out.")
@@ -162,6 +163,14 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
         uvs=sets.get(base, nothing),
         other_uvs={n: uvs for n, uvs in sets.items() if n != base},
     )
+
+
+def _check_counts(tree: Tree, primitive: Tree, max_faces: int, path: Path) -> None:
+    """Before anything is decoded: accessors without a buffer view announce any number of zeros in a few bytes."""
+    for name, accessor in primitive["attributes"].items():
+        too_many(tree["accessors"][accessor]["count"], 3 * max_faces, path, f"elements of {name[:40]}")
+    if "indices" in primitive:
+        too_many(tree["accessors"][primitive["indices"]]["count"], 3 * max_faces + 2, path, "indices")
 
 
 def _indices(tree: Tree, buffers: list[bytes], primitive: Tree, path: Path) -> Int[np.ndarray, "f 3"] | None:

@@ -1,11 +1,12 @@
 """OpenEXR and Radiance files, header first."""
 
 import re
+import sys
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from mistyle.files.bounds import MAX_PIXELS, read_bytes, refuse
 
@@ -14,14 +15,14 @@ MAX_SAMPLES = 1 << 29  # texels times channels: 2 GiB of float32
 AGAIN = "Write or copy it again"
 
 
-def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
-    """See files/read.py."""
+def read_exr(path: Path) -> dict[str, Shaped[np.ndarray, "h w"]]:
+    """See files/read.py; in the file's own precision."""
     parts = parts_of_exr(path)
     planes: dict[str, np.ndarray] = {}
     for part in parts:
         prefix = f"{part.header['name']}." if len(parts) > 1 and part.header.get("name") else ""
         for name, channel in part.channels.items():
-            planes[prefix + name] = _shown(np.asarray(channel.pixels, np.float32), part.header, path)
+            planes[prefix + name] = _shown(np.asarray(channel.pixels), part.header, path)
     if len({plane.shape for plane in planes.values()}) > 1:
         raise refuse(path, "parts of different sizes", "one size", "Save the parts as files of their own")
     return planes
@@ -37,7 +38,7 @@ def parts_of_exr(path: Path) -> list[Any]:
     """The decoded parts of a file whose headers have passed; every part that the file announces is there."""
     import OpenEXR
 
-    if read_bytes(path)[:4] != b"\x76\x2f\x31\x01":
+    if read_bytes(path, count=4) != b"\x76\x2f\x31\x01":
         raise refuse(path, "no OpenEXR header", "an .exr file", "Check that it is the right file")
     headers = headers_of_exr(path)
     try:
@@ -93,7 +94,7 @@ def check_headers(headers: list[dict[str, Any]], path: Path) -> None:
         raise refuse(path, f"{samples} samples", f"at most {2 * MAX_SAMPLES}", "Scale it down or leave channels out")
 
 
-def _shown(pixels: Float[np.ndarray, "h w"], header: dict[str, Any], path: Path) -> Float[np.ndarray, "h2 w2"]:
+def _shown(pixels: Shaped[np.ndarray, "h w"], header: dict[str, Any], path: Path) -> Shaped[np.ndarray, "h2 w2"]:
     """The display window: zero where there are no data."""
     x, y, width, height = window_of(header, "dataWindow")
     sx, sy, shown_width, shown_height = window_of(header, "displayWindow")
@@ -101,7 +102,7 @@ def _shown(pixels: Float[np.ndarray, "h w"], header: dict[str, Any], path: Path)
         raise refuse(path, f"{pixels.shape} texels", f"{(height, width)} as its header says", AGAIN)
     if (x, y, width, height) == (sx, sy, shown_width, shown_height):
         return pixels
-    result = np.zeros((shown_height, shown_width), np.float32)
+    result = np.zeros((shown_height, shown_width), pixels.dtype)
     x0, y0 = max(x, sx), max(y, sy)
     x1, y1 = min(x + width, sx + shown_width), min(y + height, sy + shown_height)
     if x1 > x0 and y1 > y0:
@@ -122,7 +123,17 @@ def read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
     height, width = int(size[1]), int(size[2])
     if not 0 < height * width <= MAX_PIXELS:
         raise refuse(path, f"{width} x {height} pixels", f"1 to {MAX_PIXELS / 1e6:.0f} million", "Scale it down")
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    try:
+        # OpenCV decodes Radiance from files only: given bytes it writes them to a file of its own first, which the
+        # reader process may not do. On Windows it takes no path beyond ASCII.
+        straight = sys.platform != "win32" or str(path).isascii()
+        pixels = (
+            cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+            if straight
+            else cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        )
+    except cv2.error as error:
+        raise refuse(path, f"pixels that cannot be decoded ({str(error)[:120]!r})", "an .hdr file", AGAIN) from error
     if pixels is None or pixels.shape != (height, width, 3) or pixels.dtype != np.float32:
         raise refuse(path, "pixels that cannot be decoded", f"{width} x {height} RGBE pixels", AGAIN)
     return np.ascontiguousarray(pixels[..., ::-1])

@@ -1,7 +1,7 @@
 """Writing pictures: PNG with 8 or 16 bits and multi-layer OpenEXR. The same pixels give the same bytes."""
 
 import io
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,13 +13,19 @@ from mistyle.files.store import atomic_write
 REC709_CHROMATICITIES = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
 LINEAR_REC709 = "lin_rec709_scene"
 DATA = "data"
+ROWS = 2**20  # pixels encoded at a time
 
 
-def encode_png(array: Float[np.ndarray, "h w *c"], bits: int = 8) -> bytes:
+def encode_png(
+    array: Float[np.ndarray, "h w *c"],
+    bits: int = 8,
+    encode: Callable[[np.ndarray], np.ndarray] = np.asarray,
+) -> bytes:
     """The bytes of a PNG of shape (h w), (h w 3) or (h w 4), values 0..1 as they shall stand in the file.
 
-    Nothing is colour-converted: apply sRGB first where the file shall be sRGB. Values are clipped and rounded to the
-    nearest step; no time, colour space or other note is stored. Raises ValueError for another shape or NaN.
+    Nothing is colour-converted, unless `encode` does it, which is applied to some rows at a time. Values are clipped
+    and rounded to the nearest step; no time, colour space or other note is stored. Raises ValueError for another
+    shape or NaN.
     """
     import cv2
 
@@ -27,13 +33,17 @@ def encode_png(array: Float[np.ndarray, "h w *c"], bits: int = 8) -> bytes:
         raise ValueError(f"a PNG has 8 or 16 bits per channel, not {bits}")
     if not (array.ndim == 2 or (array.ndim == 3 and array.shape[2] in (3, 4))) or 0 in array.shape:
         raise ValueError(f"a PNG needs an array of shape (h w), (h w 3) or (h w 4), not {array.shape}")
-    if not np.isfinite(array).all():
-        raise ValueError("a PNG cannot hold NaN or infinity; fill the holes before writing")
     limit = 2**bits - 1
-    pixels = np.rint(np.clip(array, 0, 1) * np.float32(limit)).astype(np.uint8 if bits == 8 else np.uint16)
-    if pixels.ndim == 3:
-        pixels = pixels[..., [2, 1, 0, 3][: pixels.shape[2]]]  # OpenCV orders channels blue, green, red, alpha
-    done, data = cv2.imencode(".png", np.ascontiguousarray(pixels), [cv2.IMWRITE_PNG_COMPRESSION, 6])
+    pixels = np.empty(array.shape, np.uint8 if bits == 8 else np.uint16)
+    step = max(1, ROWS // array.shape[1])
+    for top in range(0, len(array), step):
+        rows = encode(array[top : top + step])
+        if not np.isfinite(rows).all():
+            raise ValueError("a PNG cannot hold NaN or infinity; fill the holes before writing")
+        if rows.ndim == 3:
+            rows = rows[..., [2, 1, 0, 3][: rows.shape[2]]]  # OpenCV orders channels blue, green, red, alpha
+        pixels[top : top + step] = np.rint(np.clip(rows, 0, 1) * np.float32(limit))
+    done, data = cv2.imencode(".png", pixels, [cv2.IMWRITE_PNG_COMPRESSION, 6])
     if not done:
         raise ValueError(f"the PNG encoder refused an array of shape {array.shape}")
     return data.tobytes()

@@ -11,10 +11,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from mistyle.core.image import linear_from_srgb
+from mistyle.core.asset import Picture
 from mistyle.files import hdr
 from mistyle.files.bounds import refuse
-from mistyle.files.pictures import read_picture
+from mistyle.files.texels import linear_rows
 
 BEAUTY = "beauty"
 # Names that renderers give the finished picture: it is matched across them as one layer.
@@ -73,7 +73,7 @@ class Frame:
 
 
 def read_frame(path: Path) -> Frame:
-    """See files/read.py."""
+    """An .exr or .hdr; see files/read.py."""
     path = Path(path)
     kind = path.suffix.lower()
     if kind == ".exr":
@@ -82,7 +82,11 @@ def read_frame(path: Path) -> Frame:
         rgb = hdr.read_hdr(path)
         whole = (0, 0, rgb.shape[1], rgb.shape[0])
         return Frame(path, (Layer(BEAUTY, ("R", "G", "B"), _planes(rgb), "colour", whole, whole),), True)
-    picture = read_picture(path)
+    raise refuse(path, f"a file ending in '{kind}'", "an .exr or .hdr", "Read it as a picture")
+
+
+def frame_of(picture: Picture) -> Frame:
+    """A plain picture as a frame; its rgb is linearised and premultiplied."""
     whole = (0, 0, picture.rgb.shape[1], picture.rgb.shape[0])
     linear = linear_rows(picture.rgb)
     layers = []
@@ -90,15 +94,7 @@ def read_frame(path: Path) -> Frame:
         linear *= picture.alpha[..., None]
         layers.append(Layer("alpha", ("A",), (picture.alpha,), "data", whole, whole))
     layers.insert(0, Layer(BEAUTY, ("R", "G", "B"), _planes(linear), "colour", whole, whole))
-    return Frame(path, tuple(layers), False, notes=picture.notes)
-
-
-def linear_rows(encoded: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """`linear_from_srgb` in rows, so that the temporaries of large pictures stay small."""
-    result = np.empty(encoded.shape, np.float32)
-    for start in range(0, len(encoded), 256):
-        result[start : start + 256] = linear_from_srgb(encoded[start : start + 256])
-    return result
+    return Frame(picture.path, tuple(layers), False, notes=picture.notes)
 
 
 def _planes(rgb: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, ...]:

@@ -1,7 +1,7 @@
 """MaterialX 1.39: one OpenPBR surface per material, its images beside it. Written as XML, without the library.
 
 Nodes and inputs are those of the specification (`ND_open_pbr_surface_surfaceshader`, `ND_normalmap_float`); colours
-are given as "srgb_texture" in 8-bit files and "lin_rec709" in EXR, data as none.
+are given as "srgb_texture" in 8-bit files and by their linear space in EXR, data as none.
 """
 
 from collections.abc import Sequence
@@ -10,12 +10,14 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
+from mistyle.files.ocio import ColourSpace, materialx_space
 from mistyle.files.store import atomic_write
 
 
 @dataclass(frozen=True)
 class Look:
-    """A material and its images: file names as the document names them (with <UDIM> for tiles)."""
+    """A material and its images: file names as the document names them. The albedo is sRGB, or light in `space` (None:
+    linear Rec.709)."""
 
     name: str
     albedo: str
@@ -23,6 +25,7 @@ class Look:
     roughness: str
     metallic: str
     srgb: bool = True
+    space: ColourSpace | None = None
 
 
 def write_materialx(path: Path, looks: Sequence[Look]) -> None:
@@ -31,7 +34,7 @@ def write_materialx(path: Path, looks: Sequence[Look]) -> None:
     for look in looks:
         graph = SubElement(root, "nodegraph", name=f"NG_{look.name}")
         colour = _image(graph, "albedo", "color3", look.albedo)
-        colour.set("colorspace", "srgb_texture" if look.srgb else "lin_rec709")
+        colour.set("colorspace", "srgb_texture" if look.srgb else materialx_space(look.space))
         _image(graph, "roughness", "float", look.roughness)
         _image(graph, "metallic", "float", look.metallic)
         _image(graph, "normal", "vector3", look.normal)

@@ -222,6 +222,9 @@ def _ply_header(data: bytes, path: Path) -> tuple[list[_Element], str, int]:
             raise refuse(path, f"the header line {line[:80]!r}", "PLY 1.0", AGAIN) from error
     if not form or any(e.count < 0 for e in elements):
         raise refuse(path, "a header without format or with negative counts", "PLY 1.0", AGAIN)
+    for names in ([e.name for e in elements], *([p.name for p in e.properties] for e in elements)):
+        if len(set(names)) < len(names):
+            raise refuse(path, "two elements or properties of one name", "PLY 1.0", AGAIN)
     return elements, form, end.end()
 
 

@@ -10,9 +10,10 @@ from jaxtyping import Float, Int
 from mistyle.core.asset import Primitive
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import beside, read_bytes, refuse
-from mistyle.files.pictures import Budget, Kind, decode
+from mistyle.files.pictures import Budget, texture
 from mistyle.files.polygons import check_positions, parse_numbers, too_many, triangulate
 from mistyle.files.raw import Maps, Raw, RawMap, RawMaterial, no_textures
+from mistyle.files.texels import Kind
 
 MAX_LIBRARY_BYTES = 16 << 20
 AGAIN = "Export the mesh again as OBJ with triangles or convex polygons"
@@ -195,7 +196,7 @@ def _runs(material: Int[np.ndarray, " f"], thing: Int[np.ndarray, " f"], things:
 def _libraries(names: list[bytes], path: Path) -> tuple[dict, tuple[str, ...]]:
     """Material makers by name, from every library that can be read; notes about those that cannot."""
     found, notes = {}, []
-    for name in dict.fromkeys(single for n in names for single in _file_names(n.decode("utf-8", "replace"), path)):
+    for name in dict.fromkeys(single for n in names for single in file_names(n.decode("utf-8", "replace"), path)):
         try:
             target = beside(path, name)
             if not target.is_file():
@@ -207,7 +208,7 @@ def _libraries(names: list[bytes], path: Path) -> tuple[dict, tuple[str, ...]]:
     return found, tuple(notes)
 
 
-def _file_names(statement: str, path: Path) -> list[str]:
+def file_names(statement: str, path: Path) -> list[str]:
     """One statement may name several libraries; a single name may hold spaces."""
     parts = statement.split()
     several = len(parts) > 1 and all(part.lower().endswith(".mtl") for part in parts)
@@ -238,7 +239,7 @@ def _numbers(entry: dict[bytes, bytes], key: bytes, default: list[float]) -> lis
 
 def _material(name: str, entry: dict[bytes, bytes], path: Path, budget: Budget) -> RawMaterial:
     """Kd counts where there is no map_Kd (many exporters write Kd 0 or 0.8 beside a texture), Pr and Pm likewise."""
-    files = {TEXTURES[key]: _file_name(value) for key, value in entry.items() if key in TEXTURES}
+    files = {TEXTURES[key]: file_name(value) for key, value in entry.items() if key in TEXTURES}
     colour = [1.0, 1.0, 1.0] if "albedo" in files else _numbers(entry, b"kd", [1.0, 1.0, 1.0])
     rough = 1.0 if "roughness" in files else _numbers(entry, b"pr", [0.5])[0]
     metal = 1.0 if "metallic" in files else _numbers(entry, b"pm", [0.0])[0]
@@ -254,7 +255,7 @@ def _material(name: str, entry: dict[bytes, bytes], path: Path, budget: Budget) 
     )
 
 
-def _file_name(statement: bytes) -> str:
+def file_name(statement: bytes) -> str:
     """The file name behind a texture statement's options; it may hold spaces."""
     rest = statement
     while (parts := rest.split(None, 1)) and parts[0].lower() in OPTIONS and len(parts) == 2:
@@ -289,6 +290,6 @@ def _load(files: dict[str, str], path: Path, budget: Budget, tile: int) -> tuple
             notes.append(f"Texture {wanted} is not there and was left out.")
             continue
         kind: Kind = "colour" if name == "albedo" else "normal" if name == "normal" else "data"
-        values = decode(read_bytes(target), str(target), budget, kind)
-        maps[name] = RawMap(values[..., 0] if kind == "data" else values)
+        values = texture(read_bytes(target), str(target), budget)
+        maps[name] = RawMap(values[..., 0] if kind == "data" else values, kind=kind)
     return maps, tuple(notes)

@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from mistyle.core.image import srgb_from_linear
 from mistyle.files.images import DATA, write_exr, write_png
+from mistyle.files.ocio import ColourSpace, exr_tags
 
 Image = Float[np.ndarray, "h w"] | Float[np.ndarray, "h w c"]
 
@@ -120,13 +121,15 @@ TARGETS = {
 }
 
 
-def write_slot(path: Path, slot: Slot, textures: TextureSet) -> None:
-    """Write one texture file."""
+def write_slot(path: Path, slot: Slot, textures: TextureSet, space: ColourSpace | None = None) -> None:
+    """Write one texture file; colours that are stored as light are converted to `space` and tagged as such."""
     pixels = slot.pixels(textures)
+    if slot.colour == "linear" and space is not None:
+        pixels = np.concatenate([space.from_working(pixels[..., :3]), pixels[..., 3:]], axis=-1)
     if slot.ext == "png":
         write_png(path, np.clip(pixels, 0, 1), bits=slot.bits)
         return
     names = "Y" if pixels.ndim == 2 else "RGBA"[: pixels.shape[2]]
     channels = {c: pixels if pixels.ndim == 2 else pixels[..., k] for k, c in enumerate(names)}
-    tags = {"mistyle:map": slot.map} | ({} if slot.colour == "linear" else {"colorInteropID": DATA})
+    tags = {"mistyle:map": slot.map} | (exr_tags(space) if slot.colour == "linear" else {"colorInteropID": DATA})
     write_exr(path, channels, half=slot.bits == 16, attributes=tags)

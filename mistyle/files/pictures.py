@@ -4,15 +4,15 @@ import io
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
 from mistyle.core.asset import Picture
 from mistyle.core.errors import InputRefused
-from mistyle.core.image import linear_from_srgb
 from mistyle.files.bounds import MAX_PIXELS, MAX_TEXTURE_PIXELS, WORK_TEXTURE, read_bytes, refuse
+from mistyle.files.texels import Kind, finished, fractions
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "AVIF", "TGA")
 EXPECTED = "a PNG, JPEG, WebP, TIFF, BMP, GIF or TGA picture"
@@ -38,8 +38,8 @@ class Budget:
             raise refuse(self.path, found + " in its textures", most, "Scale its textures down")
 
 
-def read_picture(path: Path) -> Picture:
-    """A style or any other picture file as sRGB-encoded float32 0..1, upright.
+def read_pixels(path: Path) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """A style or any other picture file as sRGB-encoded 8- or 16-bit rgb (h w 3) and alpha (h w), upright, and notes.
 
     Size is checked in the header before anything is decoded (at most MAX_PIXELS). Embedded colour profiles are
     converted to sRGB, EXIF orientation is applied, CMYK, palettes, grey and 16-bit files are converted, of an animation
@@ -52,8 +52,14 @@ def read_picture(path: Path) -> Picture:
     image, turned = _upright(image, str(path))
     if turned:
         notes.append("The picture was turned upright as its EXIF orientation says.")
-    rgb, alpha = _colour(image, data, str(path), notes)
-    return Picture(rgb=rgb, alpha=alpha, path=path, notes=tuple(notes))
+    rgb, alpha = _pixels(image, data, str(path), notes)
+    return rgb, alpha, tuple(notes)
+
+
+def picture_of(path: Path, pixels: tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]) -> Picture:
+    """What `read_pixels` gave, as floats."""
+    rgb, alpha, notes = pixels
+    return Picture(fractions(rgb), None if alpha is None else fractions(alpha), path, notes)
 
 
 def size_of_picture(path: Path) -> tuple[int, int]:
@@ -66,25 +72,52 @@ def size_of_picture(path: Path) -> tuple[int, int]:
     return (image.width, image.height) if turned else (image.height, image.width)
 
 
-Kind = Literal["colour", "normal", "data"]
-
-
-def decode(data: bytes, where: str, budget: Budget, kind: Kind, scale: float = 1.0) -> Float[np.ndarray, "h w 3"]:
-    """A mesh's texture as `Material` has it: linear colour, unit normals (x and y times `scale`) or plain data in three
-    channels. Embedded profiles are ignored, as glTF demands. Halved until no side exceeds WORK_TEXTURE.
+def texture(data: bytes, where: str, budget: Budget) -> Shaped[np.ndarray, "h w 3"]:
+    """A mesh's texture as its file has it, 8 or 16 bits a channel. Embedded profiles are ignored, as glTF demands.
 
     glTF's row 0 is v = 0 counted from the top, which is v = 1 counted up: no texture is ever flipped.
     """
     image, notes = _open(data, where)
     budget.take(image.width * image.height)
-    rgb, _ = _colour(image, data, where, notes, managed=False)
-    if kind == "colour":
-        rgb = _linear(rgb)
-    elif kind == "normal":
-        rgb = rgb * 2 - 1
-    while max(rgb.shape[:2]) > WORK_TEXTURE:
-        rgb = _halved(rgb)
-    return _unit(rgb, scale) if kind == "normal" else rgb
+    return _pixels(image, data, where, notes, managed=False)[0]
+
+
+def decode(data: bytes, where: str, budget: Budget, kind: Kind, scale: float = 1.0) -> Float[np.ndarray, "h w 3"]:
+    """A mesh's texture as `Material` has it: see files/texels.py `finished`; at most WORK_TEXTURE on a side."""
+    return finished(texture(data, where, budget), kind, scale, WORK_TEXTURE)
+
+
+def shrunk(data: bytes, where: str, longest: int, quality: int) -> tuple[bytes, str]:
+    """An embedded picture's file scaled down to `longest` pixels where larger, and its MIME type: JPEG of that quality,
+    or PNG where it has transparency."""
+    from PIL import Image
+
+    image, _ = _open(data, where)
+    _load(image, where)
+    image = image.convert("RGBA" if image.has_transparency_data else "RGB")
+    factor = longest / max(image.size)
+    if factor < 1:
+        width, height = (max(1, round(side * factor)) for side in image.size)
+        image = image.resize((width, height), Image.Resampling.BOX)
+    buffer = io.BytesIO()
+    if image.mode == "RGBA":
+        image.save(buffer, "PNG", optimize=True)
+        return buffer.getvalue(), "image/png"
+    image.save(buffer, "JPEG", quality=quality, subsampling=0)
+    return buffer.getvalue(), "image/jpeg"
+
+
+def alpha_of(data: bytes, where: str) -> Float[np.ndarray, "h w"] | None:
+    """The alpha 0..1 of a texture; None where it has none, is opaque, or is no picture at all."""
+    try:
+        image, _ = _open(data, where)
+        if not image.has_transparency_data:
+            return None
+        _load(image, where)
+        alpha = np.asarray(image.convert("RGBA").getchannel("A"), np.float32) / 255
+    except (InputRefused, OSError, ValueError):
+        return None
+    return alpha if (alpha < 1).any() else None
 
 
 def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
@@ -111,7 +144,7 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", Image.DecompressionBombWarning)
             image = Image.open(io.BytesIO(data), formats=[f for f in FORMATS if f in Image.OPEN])
-            frames = getattr(image, "n_frames", 1)
+            several = bool(getattr(image, "is_animated", False))  # to count the frames may take minutes
     except Image.DecompressionBombError as error:
         raise _too_large(where, "far too many pixels") from error
     except (OSError, ValueError, SyntaxError, EOFError, OverflowError, KeyError, TypeError) as error:
@@ -122,7 +155,7 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         raise refuse(where, f"{image.width} x {image.height} pixels", "at least one pixel", CONVERT)
     if image.width * image.height > MAX_PIXELS:
         raise _too_large(where, f"{image.width} x {image.height} pixels")
-    notes = ["Of the animation only the first frame was taken."] if frames > 1 else []
+    notes = ["Of the animation only the first frame was taken."] if several else []
     return image, notes
 
 
@@ -158,25 +191,25 @@ def _upright(image: Any, where: str) -> tuple[Any, bool]:
     return turned, turned is not image
 
 
-def _colour(
+def _pixels(
     image: Any, data: bytes, where: str, notes: list[str], managed: bool = True
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None]:
-    """Encoded rgb 0..1 and alpha (None where opaque) of a picture in whatever mode."""
+) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None]:
+    """Encoded rgb and alpha (None where opaque), 8 or 16 bits, of a picture in whatever mode."""
     _load(image, where)
     deep = _sixteen_bit(data, image, where)
     if deep is not None:
         rgb, alpha = deep
     else:
         image, transparency = _plain(image, where, notes)
-        alpha = None if transparency is None else np.asarray(transparency, np.float32) / 255
+        alpha = None if transparency is None else np.asarray(transparency)
         if managed:
             image = _to_srgb(image, where, notes)
         if image.mode != "RGB":
             if image.mode == "CMYK":
                 notes.append("A CMYK picture without a usable profile was converted plainly; its colours may differ.")
             image = image.convert("RGB")
-        rgb = np.asarray(image, np.float32) / 255
-    if alpha is not None and (alpha >= 1).all():
+        rgb = np.asarray(image)
+    if alpha is not None and (alpha == np.iinfo(alpha.dtype).max).all():
         alpha = None
     return np.ascontiguousarray(rgb), alpha
 
@@ -227,13 +260,13 @@ def _to_srgb(image: Any, where: str, notes: list[str]) -> Any:
 
 def _sixteen_bit(
     data: bytes, image: Any, where: str
-) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None] | None:
+) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None] | None:
     """Pictures with 16 bits a channel, which Pillow has as grey only or cuts to 8 bits; None for all others.
 
     Their colour profile is not applied.
     """
     if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
-        grey = np.asarray(image).astype(np.float32) / 65535
+        grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
         return np.repeat(grey[..., None], 3, axis=2), None
     png16 = data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) > 26 and data[24] == 16
     if not png16:
@@ -243,31 +276,7 @@ def _sixteen_bit(
     pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     if pixels is None or pixels.dtype != np.uint16:
         raise refuse(where, "a 16-bit PNG that cannot be decoded", "a complete picture", CONVERT)
-    values = pixels.astype(np.float32) / 65535
-    if values.ndim == 2:
-        values = values[..., None]
+    values = pixels[..., None] if pixels.ndim == 2 else pixels
     if values.shape[2] in (1, 2):
         return np.repeat(values[..., :1], 3, axis=2), values[..., 1] if values.shape[2] == 2 else None
     return values[..., 2::-1], values[..., 3] if values.shape[2] == 4 else None
-
-
-def _linear(rgb: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """sRGB to linear in rows, so that the powers' temporaries stay small."""
-    result = np.empty_like(rgb)
-    for start in range(0, len(rgb), 256):
-        result[start : start + 256] = linear_from_srgb(rgb[start : start + 256])
-    return result
-
-
-def _halved(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h2 w2 3"]:
-    """Means of 2 x 2 texels; an odd last row or column is repeated."""
-    h, w = values.shape[:2]
-    padded = np.pad(values, ((0, h % 2), (0, w % 2), (0, 0)), mode="edge")
-    return (padded[::2, ::2] + padded[1::2, ::2] + padded[::2, 1::2] + padded[1::2, 1::2]) / 4
-
-
-def _unit(normal: Float[np.ndarray, "h w 3"], scale: float) -> Float[np.ndarray, "h w 3"]:
-    """Unit normals that point outwards; texels without a direction become (0, 0, 1)."""
-    scaled = normal * np.array([scale, scale, 1], np.float32)
-    scaled[..., 2] = np.maximum(scaled[..., 2], 1e-3)
-    return (scaled / np.linalg.norm(scaled, axis=2, keepdims=True)).astype(np.float32)

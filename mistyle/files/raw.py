@@ -1,17 +1,21 @@
 """What a mesh file says, before anything is decided about it."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive
+from mistyle.core.errors import InputRefused
+from mistyle.files.bounds import WORK_TEXTURE
+from mistyle.files.texels import Kind, finished
 
 
 @dataclass(frozen=True)
 class RawMap:
-    """One texture: values as `Material` has them (row 0 is v = 1) and how to look them up.
+    """One texture: values as `Material` has them (row 0 is v = 1) and how to look them up. With a `kind` the values are
+    still the file's own numbers, which files/texels.py makes into such (normals with x and y times `scale`).
 
     The lookup is at `uvs` where the map uses another UV set than the material's base, else at the mesh's UVs; then
     `transform` (v up, homogeneous rows) is applied to it.
@@ -20,9 +24,41 @@ class RawMap:
     values: np.ndarray
     uvs: Float[np.ndarray, "f 3 2"] | None = None
     transform: Float[np.ndarray, "3 3"] | None = None
+    kind: Kind | None = None
+    scale: float = 1.0
+
+    def finished(self) -> "RawMap":
+        """With values as `Material` has them."""
+        if self.kind is None:
+            return self
+        values = finished(self.values, self.kind, self.scale, WORK_TEXTURE)
+        return replace(self, values=values, kind=None)
 
 
 Maps = Mapping[str, RawMap]  # keys: albedo, normal, roughness, metallic
+
+
+@dataclass(frozen=True)
+class Tile:
+    """The decoded textures of one UDIM tile, sentences about what could not be read, and why the tile as a whole cannot
+    be used (None: it can)."""
+
+    maps: dict[str, RawMap]
+    notes: tuple[str, ...] = ()
+    refused: str | None = None
+
+
+@dataclass(frozen=True)
+class Textures:
+    """The `load` of a material whose textures are decoded: tiles by number, 1001 for every number that is not there."""
+
+    tiles: dict[int, Tile]
+
+    def __call__(self, tile: int) -> tuple[Maps, tuple[str, ...]]:
+        found = self.tiles.get(tile) or self.tiles[1001]
+        if found.refused is not None:
+            raise InputRefused(found.refused)
+        return {name: entry.finished() for name, entry in found.maps.items()}, found.notes
 
 
 @dataclass(frozen=True)

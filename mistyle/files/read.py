@@ -3,37 +3,67 @@
 What cannot be used is refused (core/errors.py InputRefused) with the file, what was found, what was expected and the
 fix. Nothing is fetched from a network, nothing outside a mesh's own folder is opened, and nothing is repaired in
 silence: what was changed on the way in is in `Source.notes` and `Picture.notes`.
+
+Files are opened and decoded in the reader process (files/reader_process.py), which has limits on memory and time and
+cannot write; here only the numbers that it found are put together. A Mitsuba scene of the user's (`--scene`) is not
+read here: it can name any file and plugin and is trusted like code.
 """
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.asset import Asset, Picture
 from mistyle.files.bounds import refuse
-from mistyle.files.gltf_check import load_gltf, read_json
-from mistyle.files.layers import Frame
-from mistyle.files.pictures import read_picture
+from mistyle.files.layers import Frame, frame_of
+from mistyle.files.pictures import picture_of
+from mistyle.files.reader_process import ask
 
 __all__ = [
+    "MESHES",
     "Frame",
     "Picture",
     "load_gltf",
+    "read_colmap",
+    "read_colmap_points",
     "read_exr",
     "read_frame",
+    "read_gltf_alpha",
     "read_hdr",
     "read_json",
     "read_mesh",
     "read_npy",
     "read_picture",
     "read_radiance",
+    "read_references",
     "read_size",
+    "read_toml",
+    "read_usd_files",
+    "read_yaml",
+    "shrink_picture",
 ]
 
-MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+MESHES = {
+    ".obj": "mistyle.files.obj_read:read_obj",
+    ".ply": "mistyle.files.mesh_formats:read_ply",
+    ".stl": "mistyle.files.mesh_formats:read_stl",
+    ".off": "mistyle.files.mesh_formats:read_off",
+    ".glb": "mistyle.files.gltf_read:read_gltf",
+    ".gltf": "mistyle.files.gltf_read:read_gltf",
+    ".usd": "mistyle.files.usd_read:read_usd",
+    ".usda": "mistyle.files.usd_read:read_usd",
+    ".usdc": "mistyle.files.usd_read:read_usd",
+    ".usdz": "mistyle.files.usd_read:read_usd",
+}
+"""Who reads a mesh file, by its ending: "module:function" of (path: Path, max_faces: int) -> files/raw.py Raw.
+
+The function runs in the reader process, which imports its module then: it refuses with InputRefused, opens other files
+only through files/bounds.py (`read_bytes`, `beside`), checks indices and positions (files/polygons.py), and leaves its
+textures to `RawMaterial.load`, which is called there for every tile. A new format is one more line here.
+"""
 
 
 def read_mesh(
@@ -54,30 +84,38 @@ def read_mesh(
     size      the atlas size that a new unwrapping's padding is meant for
     progress  hears a share of 1; reading takes the first tenth, unwrapping most of the rest
 
-    OBJ, PLY, STL, OFF, GLB and glTF, each without merging or reordering vertices (STL, which repeats them, is joined
-    and says so). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees (glTF:
-    flat, as it demands). One part per material and UDIM tile. Not read: vertex colours, morph targets (the base shape
-    is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression (refused).
+    OBJ, PLY, STL, OFF, GLB, glTF and USD, each without merging or reordering vertices (STL, which repeats them, is
+    joined and says so). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees
+    (glTF: flat, as it demands). One part per material and UDIM tile. Not read: vertex colours, morph targets (the base
+    shape is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression (refused).
     """
     path = Path(path)
     kind = path.suffix.lower()
     if kind not in MESHES:
         found = f"a file ending in '{kind}'" if kind else "a file without an ending"
         raise refuse(path, found, f"one of {' '.join(MESHES)}", "Export the mesh as .glb or .obj")
-    if kind in (".glb", ".gltf"):
-        from mistyle.files.gltf_read import read_gltf as reader
-    elif kind == ".obj":
-        from mistyle.files.obj_read import read_obj as reader
-    else:
-        from mistyle.files import mesh_formats
-
-        reader = {".ply": mesh_formats.read_ply, ".stl": mesh_formats.read_stl, ".off": mesh_formats.read_off}[kind]
+    from mistyle.files.polygons import check_indices
     from mistyle.files.prepare import prepare
 
-    raw = reader(path, max_faces)
-    if len(raw.faces) == 0:
-        raise refuse(path, "no triangles", "at least one", "Export the mesh with its faces")
+    raw = ask("mesh", path, MESHES[kind], max_faces)
+    check_indices(raw.faces, len(raw.positions), path, "vertex")
     return prepare(raw, path, uv, up, size, progress)
+
+
+def read_usd_files(path: Path) -> list[Path]:
+    """The files that a USD file stands on: its layers, packages and textures, as far as they are in its folder."""
+    return [Path(file) for file in ask("usd_files", Path(path))]
+
+
+def load_gltf(path: Path) -> tuple[dict[str, Any], list[bytes]]:
+    """The JSON and the buffers of a .glb or .gltf file, checked: see files/gltf_check.py."""
+    tree, buffers = ask("gltf", Path(path))
+    return tree, buffers
+
+
+def read_gltf_alpha(path: Path, image: int) -> Float[np.ndarray, "h w"] | None:
+    """The alpha (0..1, row 0 at the top) of a glTF file's image of that number; None where it has none or is opaque."""
+    return ask("gltf_alpha", Path(path), image)
 
 
 def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
@@ -86,9 +124,7 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
     The header is checked before anything is decoded: windows, number of channels, texels. Of a file with several parts
     all are read, their names before the channels'. Deep files and subsampled channels are refused.
     """
-    from mistyle.files.hdr import read_exr as read
-
-    return read(Path(path))
+    return {name: np.asarray(plane, np.float32) for name, plane in ask("exr", Path(path)).items()}
 
 
 def read_frame(path: Path) -> Frame:
@@ -97,59 +133,67 @@ def read_frame(path: Path) -> Frame:
 
     Checked like `read_exr` and `read_picture`: header first, bounded. Two layers of one name are refused.
     """
-    from mistyle.files.layers import read_frame as read
-
-    return read(Path(path))
+    path = Path(path)
+    return ask("frame", path) if path.suffix.lower() in (".exr", ".hdr") else frame_of(read_picture(path))
 
 
 def read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
     """A Radiance .hdr file: linear Rec.709 radiance, float32, row 0 at the top."""
-    from mistyle.files.hdr import read_hdr as read
+    return ask("hdr", Path(path))
 
-    return read(Path(path))
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file of at most 64 MiB, nested at most 128 deep, without NaN or Infinity."""
+    return ask("json", Path(path))
+
+
+def shrink_picture(path: Path, data: bytes, longest: int, quality: int) -> tuple[bytes, str]:
+    """The picture in `data`, embedded in the file at `path`, as a JPEG (PNG with transparency) of at most `longest`
+    pixels on a side: its bytes and MIME type."""
+    return ask("shrink", Path(path), data, longest, quality)
+
+
+def read_references(path: Path) -> list[Path]:
+    """The files beside an .obj or .gltf file that it names and that exist, resolved and in order; see
+    files/references.py."""
+    return ask("references", Path(path))
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file of at most 4 MiB; dates and times, which no setting has, are refused."""
+    return ask("toml", Path(path))
+
+
+def read_yaml(path: Path) -> Any:
+    """The numbers, texts, lists and tables of a YAML file of at most 4 MiB; objects and dates are refused."""
+    return ask("yaml", Path(path))
 
 
 def read_npy(path: Path) -> np.ndarray:
     """The array of numbers in an .npy file; files of objects and damaged ones are refused."""
-    import io
+    return ask("npy", Path(path))
 
-    from mistyle.files.bounds import read_bytes
 
-    path = Path(path)
-    data = read_bytes(path)
-    try:
-        found = np.load(io.BytesIO(data), allow_pickle=False)
-    except (ValueError, OSError, EOFError, KeyError, TypeError, MemoryError, OverflowError) as error:
-        raise refuse(path, f"no array ({str(error)[:100]})", "an .npy file of numbers", "Write it again") from error
-    if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiub":
-        raise refuse(path, f"{getattr(found, 'dtype', type(found).__name__)}", "an array of numbers", "Write it again")
-    return found
+def read_picture(path: Path) -> Picture:
+    """A style or any other picture file as sRGB-encoded float32 0..1, upright; see files/pictures.py."""
+    return picture_of(Path(path), ask("picture", Path(path)))
 
 
 def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
     """An environment map: linear Rec.709 radiance >= 0 of an .exr (its R, G, B) or .hdr, row 0 at the top."""
-    path = Path(path)
-    kind = path.suffix.lower()
-    if kind not in (".exr", ".hdr"):
-        raise refuse(path, f"a file ending in '{kind}'", "an .exr or .hdr environment map", "Convert it to one of them")
-    if kind == ".hdr":
-        return read_hdr(path)
-    planes = read_exr(path)
-    if not {"R", "G", "B"} <= set(planes):
-        raise refuse(path, f"channels {', '.join(sorted(planes))[:200]}", "R, G and B", "Write the colours as R, G, B")
-    radiance = np.stack([planes[c] for c in "RGB"], axis=-1)
-    if not np.isfinite(radiance).all() or radiance.min() < 0:
-        raise refuse(path, "radiance that is negative, NaN or infinite", "finite radiance >= 0", "Write it again")
-    return radiance
+    return ask("radiance", Path(path))
 
 
 def read_size(path: Path) -> tuple[int, int]:
     """Height and width of a picture (EXIF orientation applied) or an .exr (display window), from its header alone."""
-    path = Path(path)
-    if not path.is_file():
-        raise refuse(path, "nothing", "a picture", "Check the path")
-    if path.suffix.lower() == ".exr":
-        from mistyle.files.hdr import size_of_exr as size_of
-    else:
-        from mistyle.files.pictures import size_of_picture as size_of
-    return size_of(path)
+    return ask("size", Path(path))
+
+
+def read_colmap(folder: Path) -> list[Any]:
+    """The registered images of a COLMAP model as files/cameras.py Frames; see files/colmap.py `read_model`."""
+    return ask("colmap_model", Path(folder))
+
+
+def read_colmap_points(folder: Path) -> Any:
+    """The points of a COLMAP model (files/colmap.py SparsePoints), or None where it has no points3D file."""
+    return ask("colmap_points", Path(folder))

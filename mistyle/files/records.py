@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.core import memory
 from mistyle.core.errors import InputRefused
 
 
@@ -63,7 +64,7 @@ def _unpack(tree: Any, folder: Path) -> Any:
     if kind == "array":
         if not (isinstance(value, str) and value.isalnum()):
             raise ValueError(f"bad array name {value!r}")
-        return np.load(folder / f"{value}.npy", allow_pickle=False)
+        return memory.load(folder / f"{value}.npy")
     if kind == "record":
         return _class(value)(**{k: _unpack(v, folder) for k, v in tree["fields"].items()})
     if kind in ("tuple", "list"):

@@ -4,9 +4,9 @@ Everything is written under a hidden temporary name beside its place (`.<name>.t
 disk and then renamed. A run that is killed at any moment leaves only such names behind; the next run removes them.
 """
 
+import contextlib
 import dataclasses
 import enum
-import errno
 import hashlib
 import itertools
 import json
@@ -14,42 +14,43 @@ import os
 import re
 import shutil
 import weakref
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel
 
 from mistyle.core.errors import MistyleError
-from mistyle.files import lock
+from mistyle.files import faults, lock
 
 DONE = "done.json"
 LOCK = ".mistyle.lock"
 _COUNTER = itertools.count()
-_LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>tmp|old)-(?P<host>.+)-(?P<pid>\d+)-\d+(\.\w+)?")
-_NO_ROOM = (errno.ENOSPC, errno.EDQUOT)
+_LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>tmp|old)-(?P<host>.+)-(?P<pid>\d+)-(?P<n>\d+)(\.\w+)?")
 
 
 def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
     """Write a file so that it is seen either whole or not at all.
 
     `data` is the content, or a function that writes it to the temporary path it is given (same folder, same suffix).
-    A full disk raises MistyleError and leaves neither the file nor a temporary one; any other error passes through.
+    A disk that is full, not to be written or gone raises MistyleError (`files/faults.py`) and leaves neither the file
+    nor a temporary one; any other error passes through.
     """
-    temporary = _hidden(path, "tmp", path.suffix)
-    with _sentence_when_full(path):
+    temporary = _hidden(path, next(_COUNTER), "tmp", path.suffix)
+    with faults.told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
+    try:
+        with faults.told(path, temporary):
             if callable(data):
                 data(temporary)
             else:
                 temporary.write_bytes(data)
             _flush(temporary)
             os.replace(temporary, path)
-        finally:
+            _flush_folder(path.parent)
+    finally:
+        with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
-    _flush_folder(path.parent)
 
 
 def atomic_folder(target: Path, write: Callable[[Path], None]) -> None:
@@ -59,30 +60,32 @@ def atomic_folder(target: Path, write: Callable[[Path], None]) -> None:
     killed just there is mended by the next call (or the next Keeper) for the same place.
     """
     target = Path(os.path.realpath(target))  # a link to a folder elsewhere stays a link
-    temporary, old = _hidden(target, "tmp"), _hidden(target, "old")
-    with _sentence_when_full(target):
+    count = next(_COUNTER)
+    temporary, old = _hidden(target, count, "tmp"), _hidden(target, count, "old")
+    with faults.told(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         clean_leftovers(target.parent, name=target.name)
-        try:
-            temporary.mkdir()
+        temporary.mkdir()
+    try:
+        with faults.told(target, temporary):
             write(temporary)
             for path in _files(temporary):
                 _flush(path)
             for folder in [*(p for p in sorted(temporary.rglob("*")) if p.is_dir()), temporary]:
                 _flush_folder(folder)
             _swap(temporary, target, old)
-        finally:
-            shutil.rmtree(temporary, ignore_errors=True)
-    _flush_folder(target.parent)
+            _flush_folder(target.parent)
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def _swap(temporary: Path, target: Path, old: Path) -> None:
-    if target.exists():
+    with contextlib.suppress(FileNotFoundError):  # none there, or another run has just taken it away
         os.rename(target, old)
     try:
         os.rename(temporary, target)
     except OSError:
-        if old.exists():
+        with contextlib.suppress(OSError):  # where another run's folder stands by now, that one stays
             os.rename(old, target)
         raise
     shutil.rmtree(old, ignore_errors=True)
@@ -102,8 +105,8 @@ def clean_leftovers(folder: Path, *, name: str | None = None, everyones: bool = 
             continue
         if match["kind"] == "old" and not target.exists():
             # Killed between the two renames of a swap: the new folder is complete and still has its temporary name.
-            run = match.group("name", "host", "pid")
-            new = [p for m, p in found if m["kind"] == "tmp" and m.group("name", "host", "pid") == run]
+            swap = match.group("name", "host", "pid", "n")
+            new = [p for m, p in found if m["kind"] == "tmp" and m.group("name", "host", "pid", "n") == swap]
             os.rename(new[0] if new else path, target)
         if not path.exists():
             continue
@@ -163,23 +166,26 @@ def _plain(obj: object) -> object:
     raise TypeError(f"cannot make a stable hash of a {type(obj).__name__}; pass numbers, text, paths, arrays, records")
 
 
-def save_arrays(folder: Path, name: str, **arrays: np.ndarray) -> None:
-    """Write arrays to `folder/name/<key>.npy` (no others stay there), without pickles: objects raise ValueError."""
-    place = folder / name
-    place.mkdir(parents=True, exist_ok=True)
-    for path in place.glob("*.npy"):
-        if path.stem not in arrays:
-            path.unlink()
-    for key, array in arrays.items():
-        atomic_write(place / f"{key}.npy", lambda path, array=array: np.save(path, array, allow_pickle=False))
+def seal(folder: Path, **told: object) -> None:
+    """Write the marker of a finished folder: what is told, and the sha256 of every file in it."""
+    hashes = {p.relative_to(folder).as_posix(): sha256_file(p) for p in _files(folder)}
+    text = json.dumps({**told, "files": hashes}, indent=1, sort_keys=True) + "\n"
+    (folder / DONE).write_text(text, encoding="utf-8")
 
 
-def load_arrays(folder: Path, name: str) -> dict[str, np.ndarray]:
-    """Read back what `save_arrays` wrote: key to array, keys in alphabetical order."""
-    place = folder / name
-    if not place.is_dir():
-        raise MistyleError(f"{place}: expected a folder of .npy files, found none; run the stage that writes it again")
-    return {p.stem: np.load(p, allow_pickle=False) for p in sorted(place.glob("*.npy"))}
+def intact(folder: Path, editable: Callable[[str], bool] = lambda name: False) -> set[str] | None:
+    """The files that a sealed folder was finished with, marker included; None when one is missing or changed.
+
+    Files whose names are `editable` may have changed.
+    """
+    done = _done(folder)
+    if done is None:
+        return None
+    whole = all(
+        (folder / name).is_file() and (editable(name) or sha256_file(folder / name) == value)
+        for name, value in done[1].items()
+    )
+    return {DONE, *done[1]} if whole else None
 
 
 class Keeper:
@@ -190,14 +196,18 @@ class Keeper:
     when the object or the process goes. A lock whose process is gone is taken over.
     """
 
-    def __init__(self, root: Path) -> None:
-        """Take the lock (UsageError when another run holds it) and clear away what a killed run left."""
-        self.root = Path(root)
-        with _sentence_when_full(self.root):
+    def __init__(self, root: Path, say: Callable[[str], None] = lambda text: None, *, shared: bool = False) -> None:
+        """Take the lock (UsageError when another run holds it) and clear away what killed runs left.
+
+        `say` gets a sentence about every folder that is set aside. In a `shared` folder others write single files
+        without the lock: only what dead processes of this computer left is cleared.
+        """
+        self.root, self._say = Path(os.path.abspath(root)), say
+        with faults.told(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
-            owner = lock.take(self.root / LOCK)
-        self._release = weakref.finalize(self, lock.release, self.root / LOCK, owner)
-        clean_leftovers(self.root, everyones=True)
+            self._owner = lock.take(self.root / LOCK)
+        self._release = weakref.finalize(self, lock.release, self.root / LOCK, self._owner)
+        clean_leftovers(self.root, everyones=not shared)
 
     def __enter__(self) -> "Keeper":
         return self
@@ -209,39 +219,41 @@ class Keeper:
         """Release the lock; may be called twice."""
         self._release()
 
-    def get(self, stage: str, key: str) -> Path | None:
+    def get(self, stage: str, key: str, editable: Callable[[str], bool] = lambda name: False) -> Path | None:
         """The folder of a stage finished under this key with every file as it was written, else None.
 
         A folder of another key stays where it is; a damaged one is renamed to `<stage>.broken-N`, never deleted.
-        Files that the stage did not write are ignored.
+        Files that the stage did not write are ignored, and `editable` ones may have changed (run/edits.py).
         """
         folder = self.root / _checked(stage)
+        self._check_lock()
         if not folder.exists():
             return None
         done = _done(folder)
         if done is not None and done[0] != key:
             return None
-        if done is not None and _written(folder) is not None:
+        if done is not None and intact(folder, editable) is not None:
             return folder
         self._set_aside(folder)
         return None
 
-    def put(self, stage: str, key: str, write: Callable[[Path], None]) -> Path:
+    def put(self, stage: str, key: str, write: Callable[[Path], None], edited: Mapping[str, str] | None = None) -> Path:
         """Run `write(folder)` on a new empty folder and keep it as the stage's result under `key`.
 
         An older result of the stage is replaced only once the new one is complete; when `write` raises, or the disk
         is full (MistyleError), the older one stays and nothing else does. What a user did there is not lost: an older
         result with changed files is set aside like a broken one, and files that the stage had not written come along.
+        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them.
         """
         target = self.root / _checked(stage)
+        self._check_lock()
 
         def fill(folder: Path) -> None:
             write(folder)
-            hashes = {p.relative_to(folder).as_posix(): sha256_file(p) for p in _files(folder)}
-            done = {"stage": stage, "key": key, "files": hashes}
-            (folder / DONE).write_text(json.dumps(done, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+            self._check_lock()
+            seal(folder, stage=stage, key=key, **({"edited": dict(edited)} if edited else {}))
             if target.exists():
-                written = _written(target)
+                written = intact(target, lambda name: name in (edited or {}))
                 if written is None:
                     self._set_aside(target)
                 else:
@@ -252,7 +264,17 @@ class Keeper:
 
     def _set_aside(self, folder: Path) -> None:
         number = next(n for n in itertools.count(1) if not (self.root / f"{folder.name}.broken-{n}").exists())
-        os.rename(folder, self.root / f"{folder.name}.broken-{number}")
+        aside = self.root / f"{folder.name}.broken-{number}"
+        os.rename(folder, aside)
+        self._say(f"{folder}: not as it was finished (a file is missing or has changed); set aside as {aside.name}")
+
+    def _check_lock(self) -> None:
+        """Raises MistyleError where the folder was removed, or removed and taken by another run."""
+        if not lock.held(self.root / LOCK, self._owner):
+            raise MistyleError(
+                f"{self.root}: this folder, or the lock in it, was removed while a run worked there; it stops, so that "
+                "it cannot mix with another run. Run the same command again"
+            )
 
 
 def carry_over(old: Path, new: Path, *, without: set[str]) -> None:
@@ -276,23 +298,14 @@ def _done(folder: Path) -> tuple[str, dict[str, str]] | None:
         return None
 
 
-def _written(folder: Path) -> set[str] | None:
-    """The files that a finished stage wrote, marker included; None when one is missing or changed."""
-    done = _done(folder)
-    if done is None:
-        return None
-    whole = all((folder / name).is_file() and sha256_file(folder / name) == value for name, value in done[1].items())
-    return {DONE, *done[1]} if whole else None
-
-
 def _checked(stage: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", stage):
         raise ValueError(f"'{stage}' is no name for a stage; use letters, digits, '-' and '_'")
     return stage
 
 
-def _hidden(path: Path, kind: str, suffix: str = "") -> Path:
-    return path.with_name(f".{path.name}.{kind}-{lock.this_host()}-{os.getpid()}-{next(_COUNTER)}{suffix}")
+def _hidden(path: Path, count: int, kind: str, suffix: str = "") -> Path:
+    return path.with_name(f".{path.name}.{kind}-{lock.this_host()}-{os.getpid()}-{count}{suffix}")
 
 
 def _files(folder: Path) -> list[Path]:
@@ -312,16 +325,3 @@ def _flush_folder(folder: Path) -> None:
         os.fsync(handle)
     finally:
         os.close(handle)
-
-
-@contextmanager
-def _sentence_when_full(path: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in _NO_ROOM:
-            raise
-        raise MistyleError(
-            f"{path}: the disk is full ({error.strerror}); nothing half-written was left there. "
-            "Free some space, or choose an output folder on another disk, and run the same command again"
-        ) from error

@@ -49,6 +49,12 @@ def part_stems(name: str, parts: Sequence[str]) -> list[str]:
     return stems
 
 
+def srgb_colours(albedo: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:
+    """sRGB of linear colours; a fourth channel is alpha and stays."""
+    encoded = srgb_from_linear(albedo[..., :3])
+    return encoded if albedo.shape[2] == 3 else np.concatenate([encoded, albedo[..., 3:]], axis=-1)
+
+
 def normal_colours(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """(n + 1) / 2: flat is (0.5, 0.5, 1)."""
     return (normal * np.float32(0.5) + np.float32(0.5)).astype(np.float32)
@@ -63,12 +69,12 @@ def encode_pictures(
     maps: Maps, occlusion: Float[np.ndarray, "h w"], alpha: Float[np.ndarray, "h w"] | None = None
 ) -> Pictures:
     """Encode one texture set; `alpha` (0..1, same size) is added to the albedo where given."""
-    albedo = srgb_from_linear(maps.albedo)
+    albedo = maps.albedo
     if alpha is not None:
         albedo = np.concatenate([albedo, alpha[..., None]], axis=-1).astype(np.float32)
     return Pictures(
-        albedo=encode_png(albedo),
-        normal=encode_png(normal_colours(maps.normal)),
+        albedo=encode_png(albedo, encode=srgb_colours),
+        normal=encode_png(maps.normal, encode=normal_colours),
         orm=encode_png(orm_colours(maps, occlusion)),
         has_alpha=alpha is not None,
     )

@@ -1,5 +1,7 @@
 """USD out: a mesh with UsdPreviewSurface materials, as text (.usda) and as one package (.usdz). Needs `usd-core`."""
 
+import struct
+import zipfile
 from collections.abc import Sequence
 from importlib import import_module
 from pathlib import Path
@@ -13,7 +15,8 @@ from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.core.mesh import Mesh
 from mistyle.files.materialx import Look
 
-NAMES = ("Gf", "Kind", "Sdf", "Usd", "UsdGeom", "UsdShade", "UsdUtils", "UsdValidation", "Vt")
+NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdUtils", "UsdValidation", "Vt")
+FIRST_DAY = struct.pack("<HH", 0, 1 << 5 | 1)  # DOS time and date of 1980-01-01
 
 
 def library() -> Any:
@@ -65,7 +68,7 @@ def write_usd(
     )
     st.Set(pxr.Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(mesh.corner_uvs.reshape(-1, 2), np.float32)))
     for part, look in enumerate(looks):
-        material = _material(pxr, stage, f"/{name}/Materials/{look.name}", look)
+        material = define_material(pxr, stage, f"/{name}/Materials/{look.name}", look)
         faces = np.flatnonzero(mesh.part == part).astype(np.int32)
         subset = pxr.UsdGeom.Subset.CreateGeomSubset(
             shape, look.name, pxr.UsdGeom.Tokens.face, pxr.Vt.IntArray.FromNumpy(faces), "materialBind"
@@ -75,11 +78,12 @@ def write_usd(
     stage.GetRootLayer().Save()
 
 
-def _material(pxr: Any, stage: Any, place: str, look: Look) -> Any:
+def define_material(pxr: Any, stage: Any, place: str, look: Look, primvar: str = "st") -> Any:
+    """A preview surface with the four textures of a look, looked up at `primvar`."""
     material = pxr.UsdShade.Material.Define(stage, place)
     surface = _shader(pxr, stage, f"{place}/Surface", "UsdPreviewSurface")
     reader = _shader(pxr, stage, f"{place}/UVs", "UsdPrimvarReader_float2")
-    reader.CreateInput("varname", pxr.Sdf.ValueTypeNames.String).Set("st")
+    reader.CreateInput("varname", pxr.Sdf.ValueTypeNames.String).Set(primvar)
     uv = reader.CreateOutput("result", pxr.Sdf.ValueTypeNames.Float2)
     sockets = (
         ("diffuseColor", look.albedo, "rgb", pxr.Sdf.ValueTypeNames.Color3f, "sRGB" if look.srgb else "raw"),
@@ -89,7 +93,11 @@ def _material(pxr: Any, stage: Any, place: str, look: Look) -> Any:
     )
     for name, file, channel, kind, space in sockets:
         texture = _shader(pxr, stage, f"{place}/{name}", "UsdUVTexture")
-        texture.CreateInput("file", pxr.Sdf.ValueTypeNames.Asset).Set(f"./{file}")
+        named = texture.CreateInput("file", pxr.Sdf.ValueTypeNames.Asset)
+        named.Set(f"./{file}")
+        if name == "diffuseColor" and not look.srgb and look.space is not None:
+            # The preview surface knows raw and sRGB only; what the numbers are stands beside.
+            named.GetAttr().SetColorSpace(look.space.interop or look.space.name)
         texture.CreateInput("st", pxr.Sdf.ValueTypeNames.Float2).ConnectToSource(uv)
         texture.CreateInput("sourceColorSpace", pxr.Sdf.ValueTypeNames.Token).Set(space)
         for side in ("wrapS", "wrapT"):
@@ -118,6 +126,24 @@ def write_usdz(path: Path, stage: Path) -> None:
     path.unlink(missing_ok=True)
     if not pxr.UsdUtils.CreateNewUsdzPackage(pxr.Sdf.AssetPath(str(stage)), str(path)):
         raise MistyleError(f"{path}: USD could not package {stage.name}; are all textures beside it?")
+    without_times(path)
+
+
+def without_times(archive: Path) -> None:
+    """Write zip's first day, 1980-01-01, over the time of every file in an archive, in place: equal content is then
+    equal bytes, whenever it was packed."""
+    with zipfile.ZipFile(archive) as found:
+        local, place, count = [i.header_offset for i in found.infolist()], found.start_dir, len(found.infolist())
+    with open(archive, "rb+") as file:
+        for start in local:  # local file header: time and date at byte 10
+            file.seek(start + 10)
+            file.write(FIRST_DAY)
+        for _ in range(count):  # central directory header: time and date at byte 12, three lengths at byte 28
+            file.seek(place + 28)
+            lengths = struct.unpack("<HHH", file.read(6))
+            file.seek(place + 12)
+            file.write(FIRST_DAY)
+            place += 46 + sum(lengths)
 
 
 def complaints(path: Path) -> list[str]:

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.core import memory
 from mistyle.core.camera import Camera, resized
 from mistyle.core.image import canny, linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Lights, from_json, to_json
@@ -121,7 +122,7 @@ def read_views(folder: Path) -> list[View]:
     """
     folder = Path(folder)
     cameras = _entries(folder)
-    return [_read_view(folder, camera, entry) for camera, entry in cameras]
+    return [memory.away(_read_view(folder, camera, entry)) for camera, entry in cameras]
 
 
 def _entries(folder: Path) -> list[tuple[Camera, ViewEntry | None]]:

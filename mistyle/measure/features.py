@@ -5,9 +5,7 @@ A feature extractor is a function: pictures (n, c, h, w), sRGB-encoded 0..1, c =
 differentiable and none keeps state.
 """
 
-import json
 import math
-import pickle
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
@@ -18,6 +16,7 @@ import torch.nn.functional as functional
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.weights import tensors
 
 Features = Callable[[torch.Tensor], list[torch.Tensor]]
 
@@ -44,7 +43,7 @@ NORMALISED_TAPS = (2, 9, 16, 29, 42)
 
 
 def load_features(path: Path | None) -> Features:
-    """The filter bank (None) or VGG-19 from `path`: .safetensors, or .pth read with weights_only.
+    """The filter bank (None) or VGG-19 from `path`: .safetensors, .npz or .pth (core/weights.py).
 
     Accepted: torchvision's layer order (`features.N.weight` or `N.weight`, N = 0, 2, 5, …), truncated anywhere after
     relu1_1; the normalised VGG of Li et al. (`0.weight` 1x1, then 2, 5, 9, 12, 16, …). Anything else is refused.
@@ -202,32 +201,8 @@ def _half(x: torch.Tensor) -> torch.Tensor:
 def _read_weights(path: Path) -> dict[str, torch.Tensor]:
     if not path.is_file():
         raise InputRefused(f"{path}: no such file of feature weights.")
-    try:
-        state: Any = _safetensors(path) if path.suffix == ".safetensors" else torch.load(path, "cpu", weights_only=True)
-    except (OSError, RuntimeError, ValueError, KeyError, TypeError, EOFError, pickle.UnpicklingError) as error:
-        raise InputRefused(f"{path}: cannot be read as weights ({type(error).__name__}: {error}).") from error
-    if not isinstance(state, dict):
-        raise InputRefused(f"{path}: holds a {type(state).__name__}; expected a dictionary of tensors.")
-    named = {str(key).removeprefix("features."): value for key, value in state.items()}
-    return {key: value.float() for key, value in named.items() if isinstance(value, torch.Tensor)}
-
-
-def _safetensors(path: Path) -> dict[str, torch.Tensor]:
-    """The tensors of a .safetensors file: eight bytes of header length, a JSON header, raw little-endian data."""
-    types = {"F32": torch.float32, "F16": torch.float16, "BF16": torch.bfloat16, "F64": torch.float64}
-    data = path.read_bytes()
-    length = int.from_bytes(data[:8], "little")
-    if length > min(len(data) - 8, 2**24):
-        raise ValueError("the header is longer than the file")
-    tensors = {}
-    for name, entry in json.loads(data[8 : 8 + length]).items():
-        if name == "__metadata__" or entry["dtype"] not in types:
-            continue
-        begin, end = (8 + length + int(offset) for offset in entry["data_offsets"])
-        if not 8 + length <= begin <= end <= len(data):
-            raise ValueError(f"{name} lies outside the file")
-        tensors[name] = torch.frombuffer(bytearray(data[begin:end]), dtype=types[entry["dtype"]]).view(entry["shape"])
-    return tensors
+    named = {key.removeprefix("features."): value for key, value in tensors(path).items()}
+    return {key: value.float() for key, value in named.items()}
 
 
 def _plan(weights: dict[str, torch.Tensor], convolutions, taps, pools_before, path: Path) -> list[tuple]:

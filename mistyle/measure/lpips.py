@@ -6,7 +6,6 @@ Two files of weights are needed, neither of which comes with mistyle: the backbo
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 import torch
@@ -29,13 +28,13 @@ SMALLEST = 32  # pixels: the deepest taps have one place then
 
 
 def load_lpips(backbone: Path, heads: Path) -> Lpips:
-    """LPIPS-squeeze v0.1 from its two files (.npz, .safetensors, or .pth read with weights_only).
+    """LPIPS-squeeze v0.1 from its two files (.npz, .safetensors or .pth; core/weights.py).
 
     The function takes (reference, test, mask): outside the mask the test takes the reference's pixels, and each tap's
     difference is averaged over the mask at the tap's resolution; over a full mask that is LPIPS as published. NaN for
     an empty mask. Refuses files whose layers are not those of SqueezeNet 1.1 or of the heads.
     """
-    net, weights = _squeezenet(_read(backbone), backbone), _heads(_read(heads), heads)
+    net, weights = _squeezenet(_read_weights(backbone), backbone), _heads(_read_weights(heads), heads)
 
     def distance(
         reference: Float[np.ndarray, "h w 3"], test: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
@@ -83,17 +82,6 @@ def _tap(features: Float[torch.Tensor, "2 k h w"], weight: Float[torch.Tensor, "
     difference = ((unit[0] - unit[1]).square() * weight[:, None, None]).sum(dim=0)
     share = functional.interpolate(mask, size=difference.shape, mode="area")[0, 0]
     return float((difference * share).sum() / share.sum())
-
-
-def _read(path: Path) -> dict[str, torch.Tensor]:
-    if path.suffix != ".npz" or not path.is_file():
-        return _read_weights(path)
-    try:
-        with np.load(path, allow_pickle=False) as stored:
-            arrays = {name: stored[name] for name in stored}
-    except (OSError, ValueError, BadZipFile) as error:
-        raise InputRefused(f"{path}: cannot be read as weights ({type(error).__name__}: {error}).") from error
-    return {name.removeprefix("features."): torch.from_numpy(a.astype(np.float32)) for name, a in arrays.items()}
 
 
 def _squeezenet(weights: Mapping[str, torch.Tensor], path: Path) -> dict[str, torch.Tensor]:

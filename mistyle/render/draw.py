@@ -1,19 +1,23 @@
 """Drawing: exact surface hits through pixel centres, the views of a job, and pictures for reports."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core import memory
 from mistyle.core.camera import Camera, pixel_centres
+from mistyle.core.image import resize
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.render import device
 from mistyle.render import scene as scenery
+
+FINER = 4  # texels along a side of the atlas per pixel along a side of the picture, beyond which nothing is gained
 
 
 @dataclass(frozen=True)
@@ -121,20 +125,37 @@ def draw_views(
     views = []
     for k, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
         hits = gbuffer(traced, camera)
-        views.append(
-            View(
-                camera=camera,
-                rgb=np.ascontiguousarray(picture[..., :3]),
-                depth=hits.depth,
-                normal=hits.normal,
-                uv=hits.uv,
-                part=hits.part,
-                mask=hits.mask,
-                coverage=np.ascontiguousarray(picture[..., 3]),
-            )
+        view = View(
+            camera=camera,
+            rgb=np.ascontiguousarray(picture[..., :3]),
+            depth=hits.depth,
+            normal=hits.normal,
+            uv=hits.uv,
+            part=hits.part,
+            mask=hits.mask,
+            coverage=np.ascontiguousarray(picture[..., 3]),
         )
+        views.append(memory.away(view))
         progress((k + 1) / len(cameras))
     return views
+
+
+def as_fine_as(maps: Maps, pixels: int) -> Maps:
+    """Maps for pictures of so many pixels a side: where they have FINER times as many texels or more, a coarser mip
+    level (means over squares of texels; normals unit length again), so that textures do not take more memory and
+    time than they show."""
+    size, by = min(maps.roughness.shape), 1
+    while size // (2 * by) >= FINER * pixels and size % (2 * by) == 0:
+        by *= 2
+    if by == 1:
+        return maps
+    shape = (maps.roughness.shape[0] // by, maps.roughness.shape[1] // by)
+    small = {name: resize(getattr(maps, name), shape) for name in ("albedo", "normal", "roughness", "metallic")}
+    length = np.linalg.norm(small["normal"], axis=-1, keepdims=True)
+    small["normal"] = np.where(
+        length > 1e-6, small["normal"] / np.maximum(length, 1e-6), np.array([0, 0, 1], np.float32)
+    )
+    return replace(maps, **small, known=maps.known[::by, ::by])
 
 
 def picture(
@@ -177,7 +198,9 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
     import mitsuba as mi
 
     device.use()
-    shapes = scenery.object_shapes(mesh, maps, flip_invalid=True, frame="mikkt")
+    chosen = None if maps is None else [as_fine_as(m, max(max(c.size) for c in cameras)) for m in maps]
+    shapes = scenery.object_shapes(mesh, chosen, flip_invalid=True, frame="mikkt")
+    del chosen
     for camera in cameras:
         described = scenery.scene_dict(
             mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes

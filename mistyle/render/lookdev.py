@@ -62,13 +62,14 @@ def material_maps(material: Material) -> Maps:
         return np.broadcast_to(np.asarray(factor, np.float32), (2, 2, channels) if channels else (2, 2)).copy()
 
     flat = np.zeros((2, 2, 3), np.float32) + np.array([0, 0, 1], np.float32)
+    albedo = full(material.albedo, material.albedo_factor, 3)
     # Maps may differ in size here: each becomes a texture of its own.
     with_any_size: dict[str, Any] = dict(
-        albedo=full(material.albedo, material.albedo_factor, 3),
+        albedo=albedo,
         normal=flat if material.normal is None else material.normal,
         roughness=full(material.roughness, material.roughness_factor, 0),
         metallic=full(material.metallic, material.metallic_factor, 0),
-        known=np.ones((2, 2), bool),
+        known=np.ones(albedo.shape[:2], bool),
     )
     return Maps(**with_any_size)
 

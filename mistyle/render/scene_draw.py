@@ -20,3 +20,11 @@ def sensor_picture(scene: Any, sensor: int, spp: int = 64, seed: int = 0) -> Flo
         picture = mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32)
         total = total + np.array(picture, dtype=np.float32)[..., :3]
     return np.ascontiguousarray(total / np.float32(times))
+
+
+def values(scene: Any) -> dict[str, Any]:
+    """Every parameter of a scene as it is now, by key: what a fit of it depends on, textures and meshes included."""
+    import drjit as dr
+    import mitsuba as mi
+
+    return {key: np.array(v) if dr.is_array_v(v) else str(v) for key, v in mi.traverse(scene)}

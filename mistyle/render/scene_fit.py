@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.core import stopping
 from mistyle.render import device, scene_grad, scene_job, scene_keys
 from mistyle.render import pyramid as laplacian
 from mistyle.render.scene_job import Bad, Regularizer
@@ -128,9 +129,10 @@ def fit_scene(
             if save is not None:
                 save(scene_job.checkpoint(state, job))
             raise
-        if save is not None and (stopped or time.monotonic() - saved >= save_every):
+        if save is not None and (stopped or stopping.asked() or time.monotonic() - saved >= save_every):
             save(scene_job.checkpoint(state, job))
             saved = time.monotonic()
+            stopping.check()
     after = _residuals(job, state.values, progress, 1 - edge, 1)
     return FittedScene(
         values={p.key: state.values[p.key] for p in job.chosen},

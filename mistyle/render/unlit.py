@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core import memory
 from mistyle.core.camera import Camera
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
@@ -33,7 +34,9 @@ def unlit(
     mi: Any = mitsuba
     traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
     starts = np.cumsum([0, *(chosen.roughness.size for chosen in maps)])
-    texels = mi.Float(np.concatenate([np.ascontiguousarray(chosen.albedo, np.float32).reshape(-1) for chosen in maps]))
+    flat = [np.ascontiguousarray(chosen.albedo, np.float32).reshape(-1) for chosen in maps]
+    texels = mi.Float(np.concatenate(flat) if len(flat) > 1 else flat[0])
+    del flat
     start = mi.UInt32(starts[:-1].astype(np.uint32))
     rows = mi.UInt32(np.array([chosen.roughness.shape[0] for chosen in maps], np.uint32))
     columns = mi.UInt32(np.array([chosen.roughness.shape[1] for chosen in maps], np.uint32))
@@ -60,7 +63,8 @@ def unlit(
 
     found = []
     for camera in cameras:
-        found.append(_picture(mi, dr, traced, camera, fine, fetch))
+        rgb, share = _picture(mi, dr, traced, camera, fine, fetch)
+        found.append((memory.copied(rgb), memory.copied(share)) if memory.tight() else (rgb, share))
         progress(len(found) / len(cameras))
     return found
 

@@ -17,11 +17,11 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
-from mistyle.files.store import Keeper, atomic_write
+from mistyle.files.store import Keeper, atomic_write, clean_leftovers
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs
 from mistyle.run.batch_plan import PLAN, Plan, read_plan, write_plan
-from mistyle.run.shard import finished, marker, outcome
+from mistyle.run.shard import SHARDS, finished, marker, outcome
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,8 @@ def run_batch(plan: Plan, choices: Choices) -> dict[str, Any]:
     if unknown:
         raise UsageError(f"--only {unknown[0]}: no such job; the plan has {', '.join(sorted(known))[:300]}")
     start = time.monotonic()
-    with Keeper(plan.out / "shards"):
+    with Keeper(plan.out / SHARDS, shared=True):
+        clean_leftovers(plan.out)
         write_plan(plan)
         chosen = [k for k, job in enumerate(plan.jobs) if not choices.only or job.name in choices.only]
         todo = [k for k in chosen if finished(plan, plan.jobs[k]) is None]
@@ -133,9 +134,9 @@ def _row(plan: Plan, index: int, job: Record, ended: engines.Ended | None) -> di
         row |= {k: told[k] for k in ("seconds", "peak_gb", "figures")}
     if state == "failed":
         code = ended.code if ended is not None else told.get("exit_code", 1)
-        crash = f"the process ended with {code}" + (" twice" if ended is not None and ended.tries > 1 else "")
+        error = ended.why if ended is not None else ""
         # A marker from before this try says nothing of a crash.
-        error = crash if engines.crashed(code) else told.get("error") or crash
+        error = error or told.get("error") or f"the process ended with {code}"
         row |= {"exit_code": code, "error": error, "last_lines": engines.last_lines(plan, index)}
     return row
 
@@ -149,6 +150,8 @@ def describe(summary: dict[str, Any]) -> str:
     for row in summary["rows"]:
         if row["state"] == "failed":
             lines.append(f"  {row['name']}: exit {row['exit_code']}: {row['error']}")
+            if engines.crashed(row["exit_code"]):
+                lines += [f"    | {line}" for line in row["last_lines"].splitlines()]
     if summary["retry"]:
         lines.append(f"retry what failed: {summary['retry']}")
     lines.append(f"all of them: {Path(summary['out']) / 'batch.html'}")
@@ -157,7 +160,6 @@ def describe(summary: dict[str, Any]) -> str:
 
 def dry_run(plan: Plan, choices: Choices) -> dict[str, Any]:
     """What the batch would do: estimated seconds, disk and memory of every job that is not done yet."""
-    from mistyle.run.plan import memory_gb
     from mistyle.run.plan import plan as estimate
     from mistyle.run.settings import Settings
     from mistyle.run.stages import Job
@@ -169,7 +171,7 @@ def dry_run(plan: Plan, choices: Choices) -> dict[str, Any]:
         if job.kind == "stylize" and job.style is not None:
             settings = Settings.model_validate(job.settings)
             told = estimate(Job(job.mesh, job.style, plan.out / job.name, settings, job.name))
-            row |= {"seconds": told["seconds"], "disk_gb": told["disk_gb"], "memory_gb": memory_gb(settings)}
+            row |= {"seconds": told["seconds"], "disk_gb": told["disk_gb"], "memory_gb": told["memory_gb"]}
         rows.append(row)
     left = [row for row in rows if not row["done"]]
     workers = min(workers_of(choices), max(len(left), 1))

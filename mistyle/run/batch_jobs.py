@@ -22,7 +22,6 @@ A folder is a grid of the meshes and the pictures in it (or in its folders `mesh
 
 import itertools
 import re
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -33,7 +32,7 @@ from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import merge, validate
 
-MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf")
+MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MOST_JOBS = 100_000
 MOST_TOLD = 20
@@ -129,15 +128,13 @@ def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
 
 
 def _of_file(path: Path) -> JobsFile:
+    from mistyle.files.read import read_toml, read_yaml
+
+    if not path.is_file():
+        raise InputRefused(f"{path}: found nothing, expected a jobs file (.toml, .yaml) or a folder")
     try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        raise InputRefused(f"{path}: found nothing, expected a jobs file (.toml, .yaml) or a folder") from None
-    except UnicodeDecodeError as error:
-        raise UsageError(f"{path}: not a text file: {error}") from None
-    try:
-        values = _yaml(text) if path.suffix.lower() in (".yaml", ".yml") else tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, ValueError) as error:
+        values = (read_yaml if path.suffix.lower() in (".yaml", ".yml") else read_toml)(path)
+    except InputRefused as error:
         raise UsageError(f"{path}: cannot be read: {error}") from None
     if not isinstance(values, dict):
         raise UsageError(f"{path}: found a {type(values).__name__}, expected keys such as job, grid, preset, settings")
@@ -145,15 +142,6 @@ def _of_file(path: Path) -> JobsFile:
         if isinstance(values.get(key), dict):  # [grid] for [[grid]]
             values[key] = [values[key]]
     return validate(values, str(path), JobsFile)
-
-
-def _yaml(text: str) -> Any:
-    import yaml
-
-    try:
-        return yaml.safe_load(text)
-    except yaml.YAMLError as error:
-        raise ValueError(str(error).replace("\n", " ")) from None
 
 
 def _of_folder(folder: Path) -> JobsFile:
@@ -192,7 +180,10 @@ def _globbed(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
             root, inner = (
                 (Path(place.anchor), place.relative_to(place.anchor)) if place.is_absolute() else (base, place)
             )
-            matches = sorted(p for p in root.glob(str(inner)) if p.is_file())
+            try:
+                matches = sorted(p for p in root.glob(str(inner)) if p.is_file())
+            except (ValueError, NotImplementedError, OSError) as error:
+                raise InputRefused(f"{origin}: '{pattern[:200]}' is no pattern of file names ({error})") from None
             if not matches:
                 raise InputRefused(f"{origin}: '{pattern}' matches no file in {base}; check the pattern")
             found += matches

@@ -1,13 +1,14 @@
 """Checkpoints of long fits: a folder that is replaced as a whole, named after everything that the fit depends on."""
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
 from mistyle.core.errors import InputRefused
 from mistyle.files.records import load_record, save_record
-from mistyle.files.store import atomic_folder
+from mistyle.files.store import atomic_folder, intact, seal
 
 
 def place(out: Path, key: str) -> Path:
@@ -17,17 +18,25 @@ def place(out: Path, key: str) -> Path:
 
 def save(folder: Path, arrays: dict[str, np.ndarray]) -> None:
     """Replace the checkpoint; a process that dies meanwhile leaves the older one."""
-    atomic_folder(folder, lambda new: save_record(new / "record", arrays))
+
+    def write(new: Path) -> None:
+        save_record(new / "record", arrays)
+        seal(new, stage="checkpoint", key=folder.name)
+
+    atomic_folder(folder, write)
 
 
-def load(folder: Path) -> dict[str, np.ndarray] | None:
-    """The checkpoint, or None where there is none that can be read: the fit then begins again."""
-    if not (folder / "record").is_dir():
+def load(folder: Path, say: Callable[[str], None] = lambda text: None) -> dict[str, np.ndarray] | None:
+    """The checkpoint, or None where there is none whose hashes hold: the fit then begins again, and says why."""
+    if not folder.is_dir():
         return None
     try:
-        return load_record(folder / "record")
+        if intact(folder) is not None:
+            return load_record(folder / "record")
     except InputRefused:
-        return None
+        pass
+    say(f"{folder}: this checkpoint is damaged; the fit begins again")
+    return None
 
 
 def clear(out: Path) -> None:

@@ -6,25 +6,31 @@ failed, 75 stopped and resumable, 130 interrupted.
 
 import argparse
 import json
-import signal
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 from mistyle import __version__
-from mistyle.core.errors import MistyleError, Stopped, UsageError
+from mistyle.core.errors import UsageError
+from mistyle.run import exits
 from mistyle.run.cli_batch import add_batch
 from mistyle.run.cli_compare import add_compare, add_converge
-from mistyle.run.cli_export import add_export
+from mistyle.run.cli_export import add_export, add_verify
 from mistyle.run.cli_fit import add_fit
+from mistyle.run.cli_lookdev import add_lookdev, add_view
 from mistyle.run.cli_models import GENERATIVE_OPTIONS, add_generative_options, add_models
 from mistyle.run.cli_train import add_train
 from mistyle.run.options import (
+    DELIVERY_OPTIONS,
+    NAME_HELP,
     PAINT_OPTIONS,
+    add_delivery_options,
     add_job_options,
+    add_memory_option,
     add_mesh_options,
     add_paint_options,
+    asset_name,
     examples,
     said_settings,
 )
@@ -46,6 +52,7 @@ def parser() -> argparse.ArgumentParser:
             mistyle bake bunny.obj views/ -o baked/                 edited views back onto the texture
             mistyle fit chair.glb photographs/ -o fitted/           albedo, normal and roughness from pictures
             mistyle batch jobs.toml -o OUT/                         hundreds of them, resumable, on a farm too
+            mistyle view out/                                       the report: 3-D, maps, what was seen, times
             mistyle compare a.exr b.exr -o diff/                    how two renders differ, to look at and as a gate
             mistyle doctor                                          what this machine has, what is missing
             """
@@ -64,6 +71,9 @@ def parser() -> argparse.ArgumentParser:
     add_converge(verbs)
     add_batch(verbs)
     add_export(verbs)
+    add_view(verbs)
+    add_lookdev(verbs)
+    add_verify(verbs)
     doctor = verbs.add_parser(
         "doctor", help="what was found on this machine, what is missing, and the command that fixes it"
     )
@@ -90,7 +100,7 @@ def _add_view_options(verb: argparse.ArgumentParser) -> None:
 
 
 def _add_style_options(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument("--name", help="name of the asset (default MESH_STYLE)")
+    verb.add_argument("--name", help=NAME_HELP.format(default=" (default MESH_STYLE)"))
     verb.add_argument(
         "--stylizer",
         choices=["embedded", "embedded-view", "diffusion"],
@@ -117,7 +127,11 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--variations", type=int, metavar="N", help="only try N seeds and stroke sizes, quickly, on one contact sheet"
     )
-    verb.add_argument("--dry-run", action="store_true", help="print the plan with estimated time and disk, and stop")
+    verb.add_argument(
+        "--dry-run", action="store_true", help="print the plan with estimated time, memory and disk, and stop"
+    )
+    add_memory_option(verb)
+    add_delivery_options(verb)
 
 
 def _add_stylize(verbs: Any) -> None:
@@ -132,11 +146,13 @@ def _add_stylize(verbs: Any) -> None:
             mistyle stylize chair.glb great_wave.jpg -o out/ --style seat=gold.jpg --stroke-size 3cm
             mistyle stylize helmet.glb woodcut.jpg -o out/ --uv keep --metallic keep --refine normal-roughness
             mistyle stylize bunny.obj starry_night.jpg -o out/ --from fit --set fit.iterations2=100
+            mistyle stylize chair.usda wave.jpg -o out/ --formats glb,usd --target houdini
+            mistyle stylize chair.glb wave.jpg -o out/ --target unreal,blender --name '{mesh}_{style}_v{v:03}'
             mistyle stylize --preset paper --print-config > job.toml
             """
         ),
     )
-    verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help=".obj .ply .stl .off .glb .gltf")
+    verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help=".obj .ply .stl .off .glb .gltf .usd .usdz")
     verb.add_argument("style", type=Path, nargs="?", metavar="STYLE", help="any picture")
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; the same command again goes on there")
     add_job_options(verb)
@@ -202,6 +218,7 @@ def _add_bake(verbs: Any) -> None:
 OPTIONS = {
     "seed": "seed",
     "threads": "threads",
+    "memory": "memory",
     "uv": "read.uv",
     "up": "read.up",
     "resolution": "rig.resolution",
@@ -214,6 +231,7 @@ OPTIONS = {
     "stroke_scale": "surface.style_scale",
     **PAINT_OPTIONS,
     **GENERATIVE_OPTIONS,
+    **DELIVERY_OPTIONS,
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",
@@ -251,7 +269,7 @@ def _demo(options: argparse.Namespace) -> int:
 
     if options.print_config:
         return _print_config(options)
-    return _run_job(options, scenes() / "demo.obj", scenes() / "demo_style.png", "demo", options.name or "demo")
+    return _run_job(options, scenes() / "demo.obj", scenes() / "demo_style.png", "demo", asset_name(options, "demo"))
 
 
 def _print_config(options: argparse.Namespace) -> int:
@@ -263,7 +281,7 @@ def _print_config(options: argparse.Namespace) -> int:
 
 def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
     settings = _settings(options, preset)
-    called = name or options.name or f"{mesh.stem}_{style.stem}"
+    called = name or asset_name(options, f"{mesh.stem}_{style.stem}")
     from mistyle.run.pipeline import stylize
     from mistyle.run.plan import describe_plan, plan
     from mistyle.run.progress import Progress
@@ -328,20 +346,4 @@ def _test(options: argparse.Namespace) -> int:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return its exit code; every expected failure becomes one sentence on stderr."""
     options = parser().parse_args(arguments)
-
-    def stop(signum: int, frame: Any) -> None:
-        raise Stopped("stopped on request; the same command again goes on from the last finished stage")
-
-    signal.signal(signal.SIGTERM, stop)
-    try:
-        return options.command(options)
-    except MistyleError as error:
-        if getattr(options, "json", False):
-            print(json.dumps({"error": str(error), "exit_code": error.exit_code}))
-        print(f"mistyle: {error}", file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print("mistyle: interrupted; the same command again goes on from the last finished stage", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        return 1
+    return exits.run(options.command, options)

@@ -2,13 +2,15 @@
 
 import argparse
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mistyle.run.options import examples
+from mistyle.core.children import PARENT, end_with_asker
+from mistyle.run.options import DELIVERY_OPTIONS, NAME_HELP, add_delivery_options, examples, said_settings
 
 
 def add_batch(verbs: Any) -> None:
@@ -46,7 +48,15 @@ def _add_batch(verbs: Any) -> None:
     verb.add_argument("--watch", action="store_true", help="a live table instead of a line per job")
     verb.add_argument("--dry-run", action="store_true", help="print the plan with time, disk and memory, and stop")
     verb.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
+    verb.add_argument("--name", type=_pattern, metavar="PATTERN", help=NAME_HELP.format(default=", of every job"))
+    add_delivery_options(verb, "OUT/<job>/delivered/<target>")
     verb.set_defaults(command=_batch)
+
+
+def _pattern(text: str) -> str:
+    if "{" not in text:
+        raise argparse.ArgumentTypeError(f"'{text}' would name every job alike; write {{mesh}}, {{style}} or {{v:03}}")
+    return text
 
 
 def _add_machine_options(verb: argparse.ArgumentParser) -> None:
@@ -109,6 +119,8 @@ def _add_farm(verbs: Any) -> None:
     _add_machine_options(verb)
     _add_map_option(verb)
     verb.add_argument("--json", action="store_true", help="the files as one JSON object on stdout")
+    verb.add_argument("--name", type=_pattern, metavar="PATTERN", help=NAME_HELP.format(default=", of every job"))
+    add_delivery_options(verb, "OUT/<job>/delivered/<target>")
     verb.set_defaults(command=_farm)
 
 
@@ -151,7 +163,9 @@ def _batch(options: argparse.Namespace) -> int:
         only=tuple(options.only),
         watch=options.watch and sys.stderr.isatty(),
     )
-    plan = planned(options.jobs, options.out, choices)
+    from mistyle.run.deliver import with_delivery
+
+    plan = with_delivery(planned(options.jobs, options.out, choices), said_settings(options, DELIVERY_OPTIONS))
     if options.dry_run:
         told = dry_run(plan, choices)
         print(json.dumps(told) if options.json else describe_dry_run(told))
@@ -168,6 +182,7 @@ def _shard(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.shard import FarmProgress, run_shard, stages_of
 
+    end_with_asker()
     plan = read_plan(options.plan, path_maps(options.path_map))
     chosen: Sequence[int] = indices(options.index, len(plan.jobs))
     if len(chosen) > 1:
@@ -180,11 +195,19 @@ def _shard(options: argparse.Namespace) -> int:
 
 def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
     """Each shard of a range as a process of its own, one after the other; a failing one does not stop the rest."""
+    from mistyle.run.engines import stopped
+
     worst = 0
     maps = [part for pair in options.path_map for part in ("--path-map", pair)]
     for index in chosen:
         line = [sys.executable, "-m", "mistyle", "shard", str(options.plan), "--index", str(index)]
-        code = subprocess.run([*line, "--progress", options.progress, *maps]).returncode
+        own = os.environ | {PARENT: str(os.getpid())}
+        child = subprocess.Popen([*line, "--progress", options.progress, *maps], env=own)
+        try:
+            code = child.wait()
+        except BaseException:
+            stopped(child)
+            raise
         worst = max(worst, code if code >= 0 else 1)
     return worst
 
@@ -192,10 +215,11 @@ def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
 def _farm(options: argparse.Namespace) -> int:
     from mistyle.run.batch import Choices, planned, say, threads_each
     from mistyle.run.batch_plan import path_maps
+    from mistyle.run.deliver import with_delivery
     from mistyle.run.farm import export
 
     choices = Choices(workers=options.workers, threads=options.threads)
-    plan = planned(options.jobs, options.out, choices)
+    plan = with_delivery(planned(options.jobs, options.out, choices), said_settings(options, DELIVERY_OPTIONS))
     files = export(
         plan,
         options.bundle or plan.out / "farm",

@@ -1,4 +1,4 @@
-"""The verb `mistyle export`."""
+"""The verbs `mistyle export` and `mistyle verify`."""
 
 import argparse
 import json
@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mistyle.run.options import examples
+from mistyle.run.options import NAME_HELP, examples
 
 
 def add_export(verbs: Any) -> None:
@@ -16,39 +16,96 @@ def add_export(verbs: Any) -> None:
         **examples(
             """
             mistyle export out/ -o delivered/ --target unreal                    what a run made, packed for Unreal
-            mistyle export out/ -o delivered/ --target houdini --formats usd mtlx maps
+            mistyle export out/ -o delivered/ --target houdini --formats usd,mtlx,maps
             mistyle export out/asset/ -o web/ --formats glb
-            mistyle export out/ -o v3/ --target arnold --name '{asset}_v003_{map}.{udim}.{ext}'
+            mistyle export out/ -o show/ --name '{mesh}_{style}_v{v:03}'         v001, v002, ... side by side
+            mistyle export out/ -o film/ --target arnold --colorspace ACEScg     EXR in the names of $OCIO
             """
         ),
     )
     verb.add_argument("asset", type=Path, metavar="ASSET", help="a run folder, its asset folder, or its <name>.json")
-    verb.add_argument("-o", "--out", type=Path, required=True, metavar="DIR")
+    verb.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="several targets: DIR/<target>")
     verb.add_argument("--formats", nargs="+", default=["maps", "glb"], metavar="F", help="glb usd mtlx obj maps")
     verb.add_argument(
-        "--target", default="blender", help="blender (default), unreal, unity-urp, unity-hdrp, houdini or arnold"
+        "--target",
+        nargs="+",
+        default=["blender"],
+        metavar="T",
+        help="blender (default), unreal, unity-urp, unity-hdrp, houdini, arnold",
     )
-    verb.add_argument("--name", default=None, metavar="PATTERN", help="texture files: {asset} {map} {udim} {ext}")
+    verb.add_argument("--name", default="{asset}", metavar="PATTERN", help=NAME_HELP.format(default=""))
+    verb.add_argument("--texture-name", metavar="PATTERN", help="texture files: {asset} {map} {udim} {ext}")
+    verb.add_argument("--source", type=Path, metavar="FILE", help="where the USD file now is that a look lies on")
     verb.add_argument(
         "--metres-per-unit", type=float, default=1.0, metavar="X", help="what USD says of the mesh's units"
     )
+    verb.add_argument("--colorspace", metavar="NAME", help="linear space of EXR textures (default: linear Rec.709)")
     verb.add_argument("--json", action="store_true", help="the files as one JSON object on stdout")
     verb.set_defaults(command=_export)
 
 
 def _export(options: argparse.Namespace) -> int:
-    from mistyle.run.deliver import NAMES, export
+    import os
 
-    files = export(
-        options.asset,
-        options.out,
-        formats=options.formats,
-        target=options.target,
-        names=options.name or NAMES,
-        metres_per_unit=options.metres_per_unit,
-    )
+    from mistyle.run.deliver import export
+    from mistyle.run.deliver_settings import TEXTURES, ColourSettings, listed
+
+    colour = ColourSettings(space=options.colorspace, config=os.environ.get("OCIO") or None)
+    targets, files = listed(options.target), []
+    for target in targets:
+        files += export(
+            options.asset,
+            options.out / target if len(targets) > 1 else options.out,
+            formats=listed(options.formats),
+            target=target,
+            name=options.name,
+            names=options.texture_name or TEXTURES,
+            metres_per_unit=options.metres_per_unit,
+            colour=colour,
+            source=options.source,
+        )
     if options.json:
         print(json.dumps({"files": [str(p) for p in files]}))
     else:
         print("\n".join(str(p) for p in files), file=sys.stderr)
     return 0
+
+
+def add_verify(verbs: Any) -> None:
+    verb = verbs.add_parser(
+        "verify",
+        help="open what was written with other people's readers, and render it in Cycles and in Mitsuba",
+        **examples(
+            """
+            mistyle verify out/                                  a run folder: its manifest, its GLB, what was delivered
+            mistyle verify delivered/ --blender /opt/bpy/bin/python
+            mistyle verify chair.glb -o checked/ --no-render
+            """
+        ),
+    )
+    verb.add_argument("asset", type=Path, metavar="ASSET", help="a run, asset or delivered folder, or one file")
+    verb.add_argument("-o", "--out", type=Path, metavar="DIR", help="pictures and verify.json (default ASSET/verify)")
+    verb.add_argument(
+        "--blender", metavar="PATH", help="blender, or a python with bpy (default: on PATH, or MISTYLE_BLENDER_PYTHON)"
+    )
+    verb.add_argument("--no-render", action="store_true", help="only open the files")
+    verb.add_argument("--views", type=int, default=3, metavar="N", help="cameras around the asset (default 3)")
+    verb.add_argument("--size", type=int, default=256, metavar="N", help="pixels along each side (default 256)")
+    verb.add_argument("--spp", type=int, default=128, metavar="N", help="samples per pixel (default 128)")
+    verb.add_argument("--light", default="studio", metavar="L", help="studio (default), key, grazing, or an .exr, .hdr")
+    verb.add_argument("--threads", type=int, default=0, metavar="N", help="threads of the renderers (default: all)")
+    verb.add_argument("--json", action="store_true", help="the outcome as one JSON object on stdout")
+    verb.set_defaults(command=_verify)
+
+
+def _verify(options: argparse.Namespace) -> int:
+    from mistyle.run.verify import Rendering, table, verify
+
+    rendering = None
+    if not options.no_render:
+        rendering = Rendering(options.views, options.size, options.spp, options.light, options.threads)
+    told = verify(options.asset, options.out, blender=options.blender, rendering=rendering)
+    if options.json:
+        print(json.dumps(told))
+    print(table(told), file=sys.stderr)
+    return 5 if told["failed"] else 0

@@ -7,7 +7,17 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
-from mistyle.run.options import add_job_options, add_mesh_options, examples, said_settings
+from mistyle.run.options import (
+    DELIVERY_OPTIONS,
+    NAME_HELP,
+    add_delivery_options,
+    add_job_options,
+    add_memory_option,
+    add_mesh_options,
+    asset_name,
+    examples,
+    said_settings,
+)
 
 # Option of the command line -> dotted setting.
 OPTIONS = {
@@ -25,7 +35,8 @@ OPTIONS = {
     "frame": "recover.frame",
     "metallic": "recover.metallic",
     "iterations": "recover.iterations",
-    "memory": "recover.memory",
+    "memory": "memory",
+    **DELIVERY_OPTIONS,
 }
 
 
@@ -43,7 +54,7 @@ def add_fit(verbs: Any) -> None:
             """
         ),
     )
-    verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help=".obj .ply .stl .off .glb .gltf")
+    verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help=".obj .ply .stl .off .glb .gltf .usd .usdz")
     verb.add_argument(
         "references",
         type=Path,
@@ -53,6 +64,7 @@ def add_fit(verbs: Any) -> None:
     )
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; the same command again goes on there")
     add_job_options(verb, ("draft", "standard"), "draft: a texture of 512²; standard (default): 1024²")
+    add_memory_option(verb)
     add_mesh_options(verb)
     _add_reference_options(verb)
     _add_material_options(verb)
@@ -81,7 +93,7 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
 
 def _add_material_options(verb: argparse.ArgumentParser) -> None:
     made = verb.add_argument_group("the material")
-    made.add_argument("--name", help="name of the asset (default: the mesh's)")
+    made.add_argument("--name", help=NAME_HELP.format(default=" (default: the mesh's)"))
     made.add_argument("--atlas", type=int, metavar="N", help="texture size")
     made.add_argument(
         "--material", choices=["principled", "gltf"], help="Mitsuba's principled (default), or glTF's for engines"
@@ -90,8 +102,8 @@ def _add_material_options(verb: argparse.ArgumentParser) -> None:
     made.add_argument("--metallic", action="store_true", default=None, help="fit metalness too")
     made.add_argument("--start", choices=["nothing", "own"], help="own: begin from the mesh's own material")
     made.add_argument("--iterations", type=int, metavar="N", help="steps of the gradient stage")
-    made.add_argument("--memory", type=float, metavar="GB", help="memory for cached surface hits and references")
     made.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
+    add_delivery_options(verb)
 
 
 def _add_scene_options(verb: argparse.ArgumentParser) -> None:
@@ -150,7 +162,7 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
         options.references,
         options.out,
         settings,
-        options.name or options.mesh.stem,
+        asset_name(options, options.mesh.stem),
         "unknown" if options.light == "unknown" else options.lights,
         options.masks,
         options.exposure,

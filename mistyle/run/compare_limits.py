@@ -1,7 +1,6 @@
 """Limits that a comparison must keep: from the command line and from compare.toml, for all images or for some."""
 
 import math
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -55,9 +54,11 @@ def checked(name: str, known: Sequence[str], where: str) -> str:
 
 def read_limits(path: Path, known: Sequence[str]) -> tuple[list[Limit], list[Limit]]:
     """Of a compare.toml: the limits for all images, and those for some images or layers, in the file's order."""
+    from mistyle.files.read import read_toml
+
     try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        data = read_toml(path)
+    except InputRefused as error:
         raise InputRefused(f"{path}: found no readable TOML ({error}); {EXPECTED}") from error
     strange = sorted(set(data) - {"limits", "images", "layers"})
     if strange:

@@ -1,19 +1,25 @@
 """Engines that run the shards of a plan: processes of this machine, or a Ray cluster.
 
 Each shard is a process of its own (`mistyle shard`), so that a native crash of one takes nothing else along; the
-engine only starts it, waits, and starts it once more where it crashed, then on the plain path (`MISTYLE_PLAIN`).
+engine only starts it, waits, and starts it once more where it crashed, then on the plain path: no kernel is recorded
+(`MISTYLE_PLAIN`), and none is taken from Dr.Jit's cache on disk. A shard ends when its engine does, however that ended.
 """
 
 import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+from mistyle.core.children import PARENT
 from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.run.batch_plan import PLAN, Plan
 from mistyle.run.shard import SHARDS
@@ -22,15 +28,19 @@ from mistyle.run.shard import SHARDS
 CRASHES = tuple(128 + n for n in (4, 6, 7, 8, 9, 11))
 PATIENCE = 30.0  # seconds that a stopped shard gets to write its checkpoint
 STOPPED = 75
+PLAIN = "MISTYLE_PLAIN"
+ONCE_MORE = "--- the process crashed; once more, on the plain path ---"
+LOOPBACK = "127.0.0.1"
 
 
 @dataclass(frozen=True)
 class Ended:
-    """How a shard's process ended, after how many tries."""
+    """How a shard's process ended, after how many tries, and why where its own words do not say."""
 
     index: int
     code: int
     tries: int
+    why: str = ""
 
 
 # Called when a shard begins and when it has ended (None while it runs).
@@ -62,7 +72,7 @@ def local(plan: Plan, todo: Sequence[int], workers: int, watch: Watch, timeout: 
 
     def one(index: int) -> Ended:
         watch(index, None)
-        ended = Ended(index, *_tried(lambda plain: children.run(plan, index, plain, timeout)))
+        ended = _tried(index, lambda plain: children.run(plan, index, plain, timeout), timeout)
         watch(index, ended)
         return ended
 
@@ -77,10 +87,43 @@ def local(plan: Plan, todo: Sequence[int], workers: int, watch: Watch, timeout: 
             raise
 
 
-def _tried(run: Callable[[bool], int]) -> tuple[int, int]:
-    """Exit code and number of tries: a crash is followed by another try on the plain path."""
-    code = run(False)
-    return (run(True), 2) if crashed(code) else (code, 1)
+def _tried(index: int, run: Callable[[bool], int], timeout: float | None) -> Ended:
+    """Run a shard; a crash is followed by another try on the plain path, a timeout is not."""
+    killed, code, late, tries = _killed_for_memory(), 0, False, 0
+    for plain in (False, True):
+        start, tries = time.monotonic(), tries + 1
+        try:
+            code = run(plain)
+        except OSError as error:
+            return Ended(index, 1, tries, f"the process could not be started: {error}")
+        late = timeout is not None and code != 0 and time.monotonic() - start >= timeout
+        if late or not crashed(code):
+            break
+    if late:
+        return Ended(index, code, tries, f"it took longer than {timeout:g} s and was stopped")
+    why = reason(code, _killed_for_memory() > killed)
+    return Ended(index, code, tries, f"{why}, twice (the second time on the plain path)" if why else "")
+
+
+def reason(code: int, memory: bool = False) -> str:
+    """What a crash's exit code says, in words; nothing for other codes. `memory`: the system has since killed some
+    process for lack of memory."""
+    if not crashed(code):
+        return ""
+    name = signal.Signals(-code if code < 0 else code - 128).name
+    if name != "SIGKILL":
+        return f"the process crashed in native code ({name})"
+    by = "by the system, which had run out of memory" if memory else "most likely by the system, for lack of memory"
+    return f"the process was killed ({name}), {by}: run fewer at a time (--workers), or ask for less (a smaller atlas)"
+
+
+def _killed_for_memory() -> int:
+    """How many processes this machine has ended for lack of memory so far, where it tells."""
+    try:
+        lines = Path("/proc/vmstat").read_text().splitlines()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) for line in lines if line.startswith("oom_kill ")), 0)
 
 
 @dataclass
@@ -92,29 +135,38 @@ class _Children:
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def run(self, plan: Plan, index: int, plain: bool, timeout: float | None) -> int:
-        with self.lock:
-            if self.stopping:
-                return STOPPED
-            child = _started(command(plan, index), log_of(plan, index), plain)
-            self.running.add(child)
-        try:
-            return _waited(child, timeout)
-        finally:
-            self.running.discard(child)
+        with _surroundings(plain) as environment:
+            with self.lock:
+                if self.stopping:
+                    return STOPPED
+                child = _started(command(plan, index), log_of(plan, index), environment)
+                self.running.add(child)
+            try:
+                return _waited(child, timeout)
+            finally:
+                self.running.discard(child)
 
     def stop(self) -> None:
         with self.lock:
             self.stopping = True
             left = list(self.running)
         for child in left:
-            child.terminate()
+            _ask(child)
         for child in left:
-            _ended(child)
+            stopped(child)
 
 
-def _ended(child: subprocess.Popen) -> int:
+def _ask(child: subprocess.Popen) -> None:
+    """Ask a process to stop. Windows knows no SIGTERM: Ctrl-Break, which reaches the child's own group."""
+    if sys.platform == "win32":
+        child.send_signal(signal.CTRL_BREAK_EVENT)
+    else:
+        child.terminate()
+
+
+def stopped(child: subprocess.Popen) -> int:
     """Ask a process to stop, wait for its checkpoint, then end it."""
-    child.terminate()
+    _ask(child)
     try:
         return child.wait(PATIENCE)
     except subprocess.TimeoutExpired:
@@ -122,15 +174,34 @@ def _ended(child: subprocess.Popen) -> int:
         return child.wait()
 
 
-def _started(line: list[str], log: Path, plain: bool) -> subprocess.Popen:
-    """A shard's process, its words in the log; a second try goes on in the log of the first."""
+@contextmanager
+def _surroundings(plain: bool) -> Iterator[dict[str, str]]:
+    """What a shard finds in its environment; on the plain path it has an empty kernel cache of its own."""
+    # Python's stack stands in the log when a library ends the process.
+    environment = os.environ | {PARENT: str(os.getpid()), "PYTHONFAULTHANDLER": "1"}
+    if not plain:
+        yield environment
+        return
+    with tempfile.TemporaryDirectory(prefix="mistyle-kernels-", ignore_cleanup_errors=True) as folder:
+        yield environment | {PLAIN: "1", "DRJIT_CACHE_DIR": folder}
+
+
+def _started(line: list[str], log: Path, environment: dict[str, str]) -> subprocess.Popen:
+    """A shard's process, its words in the log; a second try goes on in the log of the first.
+
+    It is a group of its own: Ctrl-C reaches the engine only, which asks each shard once.
+    """
     log.parent.mkdir(parents=True, exist_ok=True)
-    environment = os.environ | ({"MISTYLE_PLAIN": "1"} if plain else {})
+    plain = PLAIN in environment
+    apart: dict[str, Any] = (
+        {"process_group": 0} if sys.platform != "win32" else {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
+    )
     with open(log, "ab" if plain else "wb") as out:
         if plain:
-            out.write(b"\n--- the process crashed; once more, on the plain path ---\n")
+            out.write(f"\n{ONCE_MORE}\n".encode())
             out.flush()
-        return subprocess.Popen(line, stdin=subprocess.DEVNULL, stdout=out, stderr=out, env=environment)
+        given: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": out, "env": environment}
+        return subprocess.Popen(line, **(given | apart))
 
 
 def _waited(child: subprocess.Popen, timeout: float | None) -> int:
@@ -138,16 +209,18 @@ def _waited(child: subprocess.Popen, timeout: float | None) -> int:
     try:
         return child.wait(timeout)
     except subprocess.TimeoutExpired:
-        return _ended(child)
+        return stopped(child)
 
 
 def last_lines(plan: Plan, index: int, count: int = 5) -> str:
-    """The end of a shard's log, for a person."""
+    """The end of a shard's log, for a person; where it crashed, Python's innermost calls. The last try's."""
     try:
         text = log_of(plan, index).read_text(encoding="utf-8", errors="replace")
     except OSError:
         return ""
-    return "\n".join([line for line in text.splitlines() if line.strip()][-count:])
+    lines = [line[:300] for line in text.rpartition(ONCE_MORE)[2].splitlines() if line.strip()]
+    crash = max((k for k, line in enumerate(lines) if line.startswith("Fatal Python error")), default=None)
+    return "\n".join(lines[-count:] if crash is None else lines[max(crash - 2, 0) : crash + count])
 
 
 def ray(
@@ -168,14 +241,21 @@ def ray(
     of waiting for ever. A cluster of our own listens on the loopback address only and asks for a token. All machines
     must see the plan's folder at the same place.
     """
+    if address is None:
+        # Read when Ray is imported; without it Ray takes 127.0.0.1 for the machine's own address and listens on all.
+        os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
     try:
         import ray as library
     except ImportError:
         raise EnvironmentMissing("the engine 'ray' needs Ray: pip install 'mistyle[ray]'") from None
     if address is None:
-        library.init(
-            _node_ip_address="127.0.0.1", include_dashboard=False, log_to_driver=False, num_cpus=os.cpu_count()
-        )
+        library.init(_node_ip_address=LOOPBACK, include_dashboard=False, log_to_driver=False, num_cpus=os.cpu_count())
+        if (where := library.util.get_node_ip_address()) != LOOPBACK:
+            library.shutdown()
+            raise MistyleError(
+                f"Ray's cluster listens on {where}, not on {LOOPBACK} alone, as Ray was imported before; "
+                "start a cluster yourself and name it with --address, or use --engine processes"
+            )
     else:
         library.init(address=address, log_to_driver=False)
     try:
@@ -185,8 +265,6 @@ def ray(
 
 
 def _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout) -> list[Ended]:
-    import time
-
     offered = library.cluster_resources()
     for name, asked in (("CPU", threads), ("GPU", gpus)):
         if asked > offered.get(name, 0):
@@ -198,7 +276,7 @@ def _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout) -> list[En
     begun = {index: _begun(plan, index) for index in todo}
     for path in begun.values():
         path.unlink(missing_ok=True)
-    waiting = {task.remote(command(plan, k), str(log_of(plan, k)), str(begun[k]), timeout): k for k in todo}
+    waiting = {task.remote(k, command(plan, k), str(log_of(plan, k)), str(begun[k]), timeout): k for k in todo}
     started: set[int] = set()
     ended, since = [], time.monotonic()
     while waiting:
@@ -210,11 +288,9 @@ def _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout) -> list[En
         for reference in ready:
             index = waiting.pop(reference)
             try:
-                code, tries = library.get(reference)
+                ended.append(library.get(reference))
             except library.exceptions.RayError as error:
-                _append(log_of(plan, index), f"the Ray worker was lost: {type(error).__name__}")
-                code, tries = 1, 1
-            ended.append(Ended(index, code, tries))
+                ended.append(Ended(index, 1, 1, f"the Ray worker was lost: {type(error).__name__}"))
             watch(index, ended[-1])
             begun[index].unlink(missing_ok=True)
         if not started and not ended and time.monotonic() - since > wait:
@@ -225,17 +301,17 @@ def _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout) -> list[En
     return ended
 
 
-def _ray_shard(line: list[str], log: str, begun: str, timeout: float | None) -> tuple[int, int]:
+def _ray_shard(index: int, line: list[str], log: str, begun: str, timeout: float | None) -> Ended:
     """What a Ray worker does: the same process as everywhere, and once more where it crashes."""
     Path(begun).parent.mkdir(parents=True, exist_ok=True)
     Path(begun).touch()
-    return _tried(lambda plain: _waited(_started(line, Path(log), plain), timeout))
+
+    def run(plain: bool) -> int:
+        with _surroundings(plain) as environment:
+            return _waited(_started(line, Path(log), environment), timeout)
+
+    return _tried(index, run, timeout)
 
 
 def _begun(plan: Plan, index: int) -> Path:
     return plan.out / SHARDS / f".{plan.jobs[index].name}.begun"
-
-
-def _append(path: Path, text: str) -> None:
-    with open(path, "a", encoding="utf-8") as log:
-        log.write(text + "\n")

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mistyle.core.maps import Maps, Texels
+from mistyle.core.view import View
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,14 @@ class Baked:
     maps: tuple[Maps, ...]
     seen: tuple[np.ndarray, ...]
     begin: tuple[Maps, ...] = ()
+
+
+@dataclass(frozen=True)
+class Retouched:
+    """The painted texture and the views after a person's edits of the views were laid into both."""
+
+    baked: Baked
+    views: tuple[View, ...]
 
 
 @dataclass(frozen=True)

@@ -18,12 +18,16 @@ from mistyle.core.capture import Captures, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights
 from mistyle.core.maps import Maps, Texels
+from mistyle.files.textures import part_stems
 from mistyle.run import checkpoint
+from mistyle.run.budget import check_material
+from mistyle.run.edits import asset_stage, tell_edits
 from mistyle.run.inputs import input_files
+from mistyle.run.material_files import scene, write
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 from mistyle.run.progress import Progress, Report
 from mistyle.run.stages import MATERIAL_STAGES, Run
-from mistyle.run.start import ambient, read, start_engines
+from mistyle.run.start import read, start_engines
 
 
 @dataclass(frozen=True)
@@ -82,6 +86,7 @@ class MadeMaterial:
     recovered: Any
     measured: Measured
     folder: Path
+    notes: tuple[str, ...] = ()
 
 
 def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
@@ -90,10 +95,13 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     Raises a MistyleError for everything that a user can mend; what was finished before stays.
     """
     from mistyle.files.captures import read_captures, read_shots
+    from mistyle.run.colour import in_working_space, key_of
+    from mistyle.run.deliver import check, deliver
     from mistyle.run.material_report import material_report, write_summary
 
     files = input_files(job.mesh)
     s = job.settings
+    check(s)
     captures = read_captures(
         job.references,
         lights=job.lights,
@@ -103,7 +111,9 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         saturation=s.references.saturation,
     )
     refuse_scene_lights(captures, job.references)
+    check_material(s, pixels_of(captures))
     shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
+    captures = in_working_space(captures, shots, s.colour)
     pictures = [path for shot in shots for path in (shot.picture, shot.mask) if path is not None]
     with Run(job, progress, MATERIAL_STAGES) as run:
         start_engines(s)
@@ -111,7 +121,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
             "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(job.mesh, s.read, s.atlas.size, r)
         )
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
-        given = [pictures, [vars(c) for c in captures.cameras], captures.lights, s.references]
+        given = [pictures, [vars(c) for c in captures.cameras], captures.lights, s.references, key_of(s.colour)]
         placed = run.record("cameras", ["mesh"], given, lambda r: place(job, asset, captures, r))
         captures = replace(captures, cameras=placed.cameras, lights=placed.lights)
         if job.lights == "unknown":
@@ -120,17 +130,21 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         inputs = [s.recover, s.references, s.start, s.seed]
         after = ["texels", "cameras", *(["light"] if job.lights == "unknown" else [])]
         recovered = run.record("recover", after, inputs, lambda r: solve(run, asset, texels, subset(captures, kept), r))
+        checkpoint.clear(job.out)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
-        folder = run.stage("asset", ["recover"], [job.name], lambda f, r: write(f, job, asset, texels, recovered, r))
-        run.stage("scene", ["recover"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, captures))
-        made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
+        folder, edited = asset_stage(run, ["recover"], lambda f, e, r: write(f, job, asset, texels, recovered, r, e))
+        tell_edits(run)
+        maps = edited(part_stems(job.name, asset.mesh.parts), recovered.maps)[0]
+        recovered = replace(recovered, maps=tuple(maps))
+        run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, captures))
+        made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder, tuple(run.notes))
         run.stage(
             "report",
             ["asset", "measure"],
             [s.report, job.name],
             lambda f, r: material_report(f, made, progress, r),
         )
-        return write_summary(made, run)
+        return deliver(job, progress) | write_summary(made, run)
 
 
 def refuse_scene_lights(captures: Captures, references: Path) -> None:
@@ -233,6 +247,11 @@ def hold_out(captures: Captures, settings: ReferenceSettings) -> tuple[list[int]
     return kept, sorted(away)
 
 
+def pixels_of(captures: Captures) -> int:
+    """Of all pictures together."""
+    return sum(camera.size[0] * camera.size[1] for camera in captures.cameras)
+
+
 def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, report: Report) -> Any:
     """The fit, with checkpoints in work/ under the stage's key: one of another job is not taken up."""
     from mistyle.stages.recover import recover
@@ -243,19 +262,19 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
     if s.start == "own":
         start = [start_maps(m, t, s.atlas.size) for m, t in zip(asset.materials, texels, strict=True)]
     folder = checkpoint.place(run.job.out, run.keys["recover"])
-    made = recover(
+    # What is kept of the pictures' samples changes how long the fit takes and nothing else.
+    within = check_material(s, pixels_of(captures), len(asset.mesh.faces), len(texels))
+    return recover(
         asset.mesh,
         texels,
         captures,
-        s.recover,
+        within.recover,
         s.seed,
         report,
         start=start,
         save=lambda arrays: checkpoint.save(folder, arrays),
-        resume=checkpoint.load(folder),
+        resume=checkpoint.load(folder, run.progress.say),
     )
-    checkpoint.clear(run.job.out)
-    return made
 
 
 def measure(
@@ -306,37 +325,6 @@ def picture_of(traced: Any, captures: Captures, sizes, table, model: str, chosen
     """The one picture of `captures` as the maps predict it, and its coverage."""
     from mistyle.render.shade import Shade
 
-    shade = Shade(traced, captures, sizes, model=model, frame=chosen.frame, subsamples=4)
+    shade = Shade(traced, captures, sizes, model=model, frame=chosen.frame, subsamples=chosen.subsamples)
     shade.table = table
     return shade.image(0), shade.coverage(0)
-
-
-def write(
-    folder: Path, job: MaterialJob, asset: Asset, texels: Sequence[Texels], recovered: Any, report: Report
-) -> None:
-    """The asset as `stylize` writes it."""
-    from mistyle.stages.export import write_asset
-    from mistyle.stages.texels import pad_maps
-
-    occlusion = [
-        ambient(asset, part, job.settings.atlas.size, job.settings.seed, report)
-        for part in range(len(asset.mesh.parts))
-    ]
-    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(recovered.maps, texels, strict=True)]
-    provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
-    write_asset(folder, job.name, asset, padded, occlusion, texels, provenance=provenance)
-
-
-def scene(
-    folder: Path, job: MaterialJob, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures
-) -> None:
-    """A Mitsuba scene of the result that renders where mistyle is not installed."""
-    from mistyle.stages.frames import mitsuba_normals
-    from mistyle.stages.scene_file import write_scene
-    from mistyle.stages.texels import pad_maps
-
-    turned = list(recovered.maps)
-    if job.settings.recover.frame == "mikkt":
-        turned = [replace(m, normal=mitsuba_normals(asset.mesh, m, t)) for m, t in zip(turned, texels, strict=True)]
-    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(turned, texels, strict=True)]
-    write_scene(folder, job.name, asset.mesh, padded, captures.cameras, captures.lights[0])

@@ -9,12 +9,15 @@ import numpy as np
 
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.files.store import atomic_write
+from mistyle.run import report_overlays
 from mistyle.run.charts import Chart
 from mistyle.run.pages import close_up, file_list, frames, heat, map_shots, render, setting_groups, shown, side_by_side
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, MapSet, Note, Pair, Report, Shot, Step, Timing, write_report
+from mistyle.run.report_model import page_model
 from mistyle.run.stages import MATERIAL_STAGES, Run
-from mistyle.run.summary import earlier, merged_seconds, peak_gb, versions
+from mistyle.run.summary import earlier, merged_peaks, merged_seconds, peak_gb, versions
+from mistyle.run.turntable import write_turn
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "seen_share": ("share of the covered texels that at least one reference sees", "higher"),
@@ -32,11 +35,12 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
 
 
 def material_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html`, `beauty.png` and `overview.png` into `folder`."""
+    """Draw the pictures and write `index.html`, `beauty.png`, `overview.png` and the turntable into `folder`."""
     from mistyle.files.images import write_png
 
     settings, maps = made.job.settings, made.recovered.maps
     turntable = frames(made.asset, maps, settings, lambda done: report(0.7 * done))
+    write_turn(folder / "turntable", turntable)
     beauty = shown(render(made.asset, maps, [close_up(settings)], settings, backdrop=True, finer=4)[0])[..., :3]
     _, reference, predicted = made.measured.worst[0]
     write_png(folder / "beauty.png", beauty)
@@ -53,9 +57,10 @@ def material_report(folder: Path, made: Any, progress: Progress, report: Callabl
         turntable=tuple(turntable),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
-        notes=tuple(Note(t) for t in (*made.asset.source.notes, *made.placed.notes, *made.recovered.notes)),
+        notes=tuple(Note(t) for t in (*made.notes, *notes(made))),
         steps=steps(made),
         maps=map_sets(made),
+        model=page_model(made.folder / f"{made.job.name}.glb"),
         timings=tuple(Timing(MATERIAL_STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
         figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k]) for k, v in found.items()),
         settings=setting_groups(settings),
@@ -63,6 +68,10 @@ def material_report(folder: Path, made: Any, progress: Progress, report: Callabl
         files=file_list(made.folder, made.job.name),
     )
     write_report(folder / "index.html", page)
+
+
+def notes(made: Any) -> tuple[str, ...]:
+    return (*made.asset.source.notes, *made.placed.notes, *made.recovered.notes)
 
 
 def encoded(picture: np.ndarray, exposed_by: np.ndarray) -> np.ndarray:
@@ -145,7 +154,15 @@ def difference(reference: np.ndarray, predicted: np.ndarray) -> np.ndarray:
 
 
 def map_sets(made: Any) -> tuple[MapSet, ...]:
-    return tuple(MapSet(n, map_shots(m)) for n, m in zip(made.asset.mesh.parts, made.recovered.maps, strict=True))
+    """The fitted maps of every texture set, and what there is to lay over them."""
+    sets = []
+    for k, (name, texels) in enumerate(zip(made.asset.mesh.parts, made.texels, strict=True)):
+        over = (
+            report_overlays.confidence(made.recovered.confidence[k], texels),
+            report_overlays.coverage(made.recovered.seen[k], len(made.captures), texels),
+        )
+        sets.append(MapSet(name, map_shots(made.recovered.maps[k]), over))
+    return tuple(sets)
 
 
 def figures(made: Any) -> dict[str, float]:
@@ -183,8 +200,9 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "picture": str(job.out / "report" / "overview.png"),
         "seconds": merged_seconds(path, run),
         "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
+        "peaks_gb": merged_peaks(path, run),
         "figures": figures(made),
-        "notes": [*made.asset.source.notes, *made.placed.notes, *made.recovered.notes],
+        "notes": list(notes(made)),
     }
     record = summary | {
         "inputs": {"mesh": job.mesh.name, "references": job.references.name},

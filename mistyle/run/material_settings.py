@@ -4,6 +4,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.run.settings import ReadSettings, ReportSettings
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import AtlasSettings
@@ -39,6 +40,13 @@ class MaterialSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
+    memory: float = Field(
+        default=0,
+        ge=0,
+        le=100_000,
+        description="GB of main memory that the job may take; a job that cannot keep it is refused; 0: as much as it "
+        "takes, of that recover.memory for the pictures' samples",
+    )
     threads: int = Field(default=0, ge=0, le=1024, description="threads of the renderer; 0 takes all cores")
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     start: Literal["nothing", "own"] = Field(
@@ -49,6 +57,8 @@ class MaterialSettings(BaseModel):
     atlas: AtlasSettings = AtlasSettings(size=1024)
     recover: RecoverSettings = RecoverSettings()
     report: ReportSettings = ReportSettings(frames=12, resolution=384, spp=16)
+    deliver: DeliverSettings = DeliverSettings()
+    colour: ColourSettings = ColourSettings()
 
 
 MATERIAL_PRESETS: dict[str, dict[str, Any]] = {"draft": {"atlas": {"size": 512}}, "standard": {}}

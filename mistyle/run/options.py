@@ -39,6 +39,26 @@ def add_job_options(
     verb.add_argument("--print-config", action="store_true", help="print every setting as TOML and stop")
 
 
+def gigabytes(text: str) -> float:
+    """'4G', '4GB', '4096M' or '4' in GB (10^9 bytes)."""
+    number = text.strip().upper().removesuffix("B")
+    factor = {"M": 1e-3, "G": 1.0, "T": 1e3}.get(number[-1:], 1.0)
+    try:
+        found = float(number.rstrip("MGT")) * factor
+    except ValueError:
+        found = 0.0
+    if not 0 < found < 1e5:
+        raise argparse.ArgumentTypeError(f"'{text}' is no amount of memory; for example 4G or 4096M")
+    return found
+
+
+def add_memory_option(verb: argparse.ArgumentParser) -> None:
+    """How much of the machine's memory a job may take."""
+    verb.add_argument(
+        "--memory", type=gigabytes, metavar="4G", help="main memory that the job may take; refused where it cannot"
+    )
+
+
 # Option -> dotted setting, for `add_paint_options`.
 PAINT_OPTIONS = {
     "style_slot": "coat.slots",
@@ -97,6 +117,47 @@ def add_paint_options(verb: argparse.ArgumentParser) -> None:
     )
 
 
+# Option -> dotted setting, for `add_delivery_options`.
+DELIVERY_OPTIONS = {
+    "formats": "deliver.formats",
+    "target": "deliver.target",
+    "texture_name": "deliver.textures",
+    "metres_per_unit": "deliver.metres_per_unit",
+    "colorspace": "colour.space",
+}
+
+
+def add_delivery_options(verb: argparse.ArgumentParser, where: str = "OUT/delivered/<target>") -> None:
+    """What other programs get at the end, and in which colour space."""
+    made = verb.add_argument_group("for other programs", f"files in {where}, as soon as one of these is given")
+    made.add_argument("--formats", action="append", metavar="F,F", help="glb,usd,mtlx,obj,maps (default maps,glb)")
+    made.add_argument(
+        "--target", action="append", metavar="T,T", help="blender (default),unreal,unity-urp,unity-hdrp,houdini,arnold"
+    )
+    made.add_argument(
+        "--texture-name", metavar="PATTERN", help="texture files: {asset} {map} {udim} {ext} are filled in"
+    )
+    made.add_argument("--metres-per-unit", type=float, metavar="X", help="what USD says of the mesh's units (1)")
+    made.add_argument(
+        "--colorspace",
+        metavar="NAME",
+        help="linear space of EXR pictures in and EXR textures out, by its name in $OCIO or OpenColorIO's own config "
+        "(default: linear Rec.709)",
+    )
+
+
+NAME_HELP = (
+    "name of the asset{default}; with fields in it, such as '{{mesh}}_{{style}}_v{{v:03}}', the name of what is "
+    "delivered: {{v}} counts up and nothing delivered before is overwritten"
+)
+
+
+def asset_name(options: argparse.Namespace, default: str) -> str:
+    """The asset's own name: as --name says, unless that is a pattern for what is delivered."""
+    name = getattr(options, "name", None)
+    return default if not name or "{" in name else name
+
+
 def add_mesh_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--uv",
@@ -118,4 +179,7 @@ def said_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict
             for name in reversed(key.split(".")):
                 leaf = {name: leaf}
             said = merge(said, leaf)
-    return merge(said, assignments(options.set, "--set"))
+    name = getattr(options, "name", None)
+    if name and "{" in name and "formats" in names:
+        said = merge(said, {"deliver": {"name": name}})
+    return merge(said, assignments(getattr(options, "set", []), "--set"))

@@ -13,20 +13,25 @@ from mistyle.core.camera import Camera, orbit
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
+from mistyle.run import report_overlays
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
-from mistyle.run.stages import STAGES
+from mistyle.run.report_model import page_model
+from mistyle.run.stages import RETOUCH, STAGES
 from mistyle.run.summary import MEANINGS, figures, versions
+from mistyle.run.turntable import write_turn
 
 ELEVATION = 15.0
 
 
 def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html`, `beauty.png` and `overview.png` (mesh, style, result) into `folder`."""
+    """Draw the pictures and write `index.html`, `beauty.png`, `overview.png` (mesh, style, result) and the turntable's
+    frames, as `turntable/*.png` and `turntable.webp`, into `folder`."""
     from mistyle.files.images import write_png
 
     settings = made.job.settings
     turntable = frames(made.asset, made.repaired.maps, settings, lambda done: report(0.4 * done))
+    write_turn(folder / "turntable", turntable)
     plain = frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
     close = close_up(settings)
     beauty, before, bare = (
@@ -45,16 +50,31 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         plain=tuple(plain),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
-        notes=tuple(Note(text) for text in (*made.asset.source.notes, *made.style.notes, *made.fit.notes)),
+        notes=tuple(Note(text) for text in (*made.notes, *made.asset.source.notes, *made.style.notes, *made.fit.notes)),
         steps=steps(made, Shot(before, "as baked"), Shot(beauty, "after fit and repair")),
-        maps=tuple(MapSet(n, map_shots(m)) for n, m in zip(made.asset.mesh.parts, made.repaired.maps, strict=True)),
-        timings=tuple(Timing(STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
+        maps=map_sets(made),
+        model=page_model(made.folder / f"{made.job.name}.glb"),
+        timings=tuple(Timing((STAGES | RETOUCH)[k], v, k in progress.reused) for k, v in progress.seconds.items()),
         figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k.split(".")[-1]]) for k, v in figures(made).items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),
         files=file_list(made.folder, made.job.name),
     )
     write_report(folder / "index.html", page)
+
+
+def map_sets(made: Any) -> tuple[MapSet, ...]:
+    """The final maps of every texture set, and what there is to lay over them."""
+    sets = []
+    for k, (name, texels) in enumerate(zip(made.asset.mesh.parts, made.atlas.texels, strict=True)):
+        pulled = report_overlays.struggle(made.fit.struggle[k], made.fit.touched[k], texels)
+        over = (
+            report_overlays.coverage(made.baked.seen[k], len(made.views), texels),
+            *((pulled,) if pulled is not None else ()),
+            report_overlays.repaired(made.repaired.mask[k], texels),
+        )
+        sets.append(MapSet(name, map_shots(made.repaired.maps[k]), over))
+    return tuple(sets)
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
@@ -131,9 +151,12 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
     )
     stylized = Step(
         "Stylized views",
-        "The surface is painted once, so the views agree by construction."
-        if made.job.settings.stylizer == "embedded"
-        else "Views are painted one after another; what earlier ones show of a view is kept in it.",
+        (
+            "The surface is painted once, so the views agree by construction."
+            if made.job.settings.stylizer == "embedded"
+            else "Views are painted one after another; what earlier ones show of a view is kept in it."
+        )
+        + " Paint one over in stylized/, run the same command again, and it goes into the texture.",
         "4.1.3",
         shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.stylized),
         columns=8,
@@ -159,7 +182,8 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
     )
     repair = Step(
         "Repair",
-        "Texels that the fit could not settle or that no view saw, painted again from the surface.",
+        "Texels that the fit could not settle or that no view saw, painted again from the surface. The masks lie in "
+        "masks/: paint one over, run the same command again, and it decides.",
         "4.3",
         shots=tuple(
             Shot(mask_over(made.repaired.mask[k], made.repaired.maps[k], t), f"{name}: repaired texels")

@@ -1,15 +1,17 @@
 """The embedded stylizer in a job: the surface painted once, laid into the texture, and drawn from every camera."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from mistyle.core import memory
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import face_areas
+from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
@@ -39,13 +41,13 @@ def paint(asset: Asset, style: Picture, settings: Settings, report: Report, cont
 
 def coat(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Coats:
     """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
-    from mistyle.files.read import read_picture
+    from mistyle.run.colour import read_style
     from mistyle.stages.coat import content, masked_style, scaled, slot_masks
 
     surface = scaled(settings.surface, asset, settings.coat.stroke_size)
     settings = settings.model_copy(update={"surface": surface})
     paths, masks = slot_masks(asset, atlas.texels, settings.coat.slots)
-    pictures = [masked_style(style, settings.coat.style_mask), *(read_picture(path) for path in paths)]
+    pictures = [masked_style(style, settings.coat.style_mask), *(read_style(path, settings.colour) for path in paths)]
     choice = [np.zeros(texels.covered.shape, np.int32) for texels in atlas.texels]
     for number, chosen in enumerate(masks, start=1):
         for texels_of, mask in zip(choice, chosen, strict=True):
@@ -69,12 +71,12 @@ def texel_side(asset: Asset, part: int, texels: Texels) -> float:
 
 def bake(asset: Asset, coats: Coats, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report) -> Baked:
     """Section 4.1.4 for a painted surface: texels look the painting up directly; the views say who sees what."""
-    from mistyle.stages.backproject import backproject
+    from mistyle.stages.backproject import accepted
 
     maps, seen = painted(asset, coats, atlas, settings), []
     with_relief = raised(asset, coats, atlas, settings, maps)
     for part, texels in enumerate(atlas.texels):
-        seen.append(backproject(views, texels, settings.bake, mesh=asset.mesh).seen)
+        seen.append(accepted(views, texels, settings.bake, mesh=asset.mesh)[1].reshape(texels.covered.shape))
         report((part + 1) / len(atlas.texels))
     if settings.fit.refine == "off":
         return Baked(tuple(with_relief), tuple(seen))
@@ -86,6 +88,7 @@ HEIGHT = 0.15
 
 
 FINAL_GLOSS, FIRST_GLOSS = 1.0, 0.5
+LOOKED_UP = 2**20  # texels whose colour is looked up at one time
 
 
 def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings) -> list[Maps]:
@@ -95,15 +98,18 @@ def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Setti
     """
     from mistyle.backends.embedded import surface_colour
     from mistyle.stages.coat import painted_mask, protected
-    from mistyle.stages.texels import pad
+    from mistyle.stages.texels import pad_in_place
 
     maps = []
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
-        side, albedo = texel_side(asset, part, texels), np.zeros_like(start.albedo)
+        side, albedo = texel_side(asset, part, texels), memory.zeros(start.albedo.shape)
         for solution, at in whose(coats, part, texels):
-            place = texels.position[at], texels.normal[at]
-            albedo[at] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
-        coated = replace(start, albedo=pad(albedo, texels, settings.atlas.padding), known=texels.covered)
+            for rows in pieces(at):
+                here = at[rows]
+                place = texels.position[rows][here], texels.normal[rows][here]
+                albedo[rows][here] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
+        pad_in_place([albedo], texels, settings.atlas.padding)
+        coated = replace(start, albedo=albedo, known=texels.covered)
         if settings.coat.protect is not None:
             coated = protected(coated, start, painted_mask(settings.coat.protect, texels))
         maps.append(coated)
@@ -113,7 +119,8 @@ def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Setti
 def raised(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings, maps: Sequence[Maps]) -> list[Maps]:
     """Painted maps with the painting's relief laid upon their normals, and its gloss upon their roughness."""
     from mistyle.backends.embedded import surface_relief
-    from mistyle.stages.coat import first_maps, painted_mask, protected
+    from mistyle.core.image import nearest_fill_in_place
+    from mistyle.stages.coat import lay_relief, painted_mask, protected
 
     full = FINAL_GLOSS if settings.fit.refine == "off" else FIRST_GLOSS
     height = HEIGHT if settings.coat.height is None else settings.coat.height
@@ -122,16 +129,27 @@ def raised(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settin
         return list(maps)
     result = []
     for part, (texels, flat) in enumerate(zip(atlas.texels, maps, strict=True)):
-        side, gradient = texel_side(asset, part, texels), np.zeros_like(flat.albedo)
-        dull = np.zeros_like(flat.roughness)
+        side, tangents = texel_side(asset, part, texels), corner_tangents(asset.mesh)
+        made = replace(flat, normal=memory.copied(flat.normal), roughness=memory.copied(flat.roughness))
         for solution, at in whose(coats, part, texels):
-            gradient[at], dull[at] = surface_relief(solution, texels.position[at], texels.normal[at], footprint=side)
-        covered = texels.covered
-        made = first_maps(asset, flat, texels, gradient[covered], dull[covered], height, gloss)
+            for rows in pieces(at):
+                here = at[rows]
+                found = surface_relief(solution, texels.position[rows][here], texels.normal[rows][here], footprint=side)
+                lay_relief(asset, made, texels, rows, here, *found, height, gloss, tangents)
+        chosen = [values for values, used in ((made.normal, height), (made.roughness, gloss)) if used > 0]
+        nearest_fill_in_place(chosen, texels.covered)
         if settings.coat.protect is not None:
             made = protected(made, flat, painted_mask(settings.coat.protect, texels))
         result.append(made)
     return result
+
+
+def pieces(at: np.ndarray) -> Iterator[slice]:
+    """Bands of rows with about LOOKED_UP chosen texels each: what is looked up at one time."""
+    from mistyle.stages.texels import bands
+
+    share = max(float(at.mean()), 1e-3)
+    return (rows for rows in bands(at.shape[0], at.shape[1], round(LOOKED_UP / share)) if at[rows].any())
 
 
 def whose(coats: Coats | Solution, part: int, texels: Texels) -> list[tuple[Solution, np.ndarray]]:
@@ -158,3 +176,17 @@ def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], repor
 
     drawn = unlit(asset.mesh, maps, [view.camera for view in views], fine, report)
     return [replace(view, rgb=rgb, coverage=share) for view, (rgb, share) in zip(views, drawn, strict=True)]
+
+
+def with_geometry(asset: Asset, views: Sequence[View]) -> list[View]:
+    """Pictures with the depth and normals of the mesh where the files brought none: the mesh itself is the truth."""
+    from mistyle.render.draw import gbuffer, tracer
+
+    traced = tracer(asset.mesh)
+    result = []
+    for view in views:
+        hits = gbuffer(traced, view.camera)
+        result.append(
+            replace(view, depth=hits.depth, normal=hits.normal, uv=hits.uv, part=hits.part, mask=hits.mask & view.mask)
+        )
+    return result

@@ -4,8 +4,8 @@ Each stage is kept in the run folder under a key made of its inputs, its setting
 so that a killed run goes on from the last finished stage and a changed setting redoes only what depends on it.
 """
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,9 @@ import numpy as np
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.maps import Maps
 from mistyle.core.view import View
+from mistyle.files.textures import part_stems
+from mistyle.run.budget import kept
+from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import inpainter_inputs, texture_inpainter
 from mistyle.run.inputs import input_files
@@ -39,6 +42,7 @@ class Made:
     fit: Any
     repaired: Repaired
     folder: Path
+    notes: tuple[str, ...] = ()
 
 
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
@@ -47,19 +51,21 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     Returns the paths of what was written and the figures of `run.json`. Raises a MistyleError for everything that a
     user can mend; what was finished before stays and is taken over by the next run.
     """
-    from mistyle.files.read import read_picture
+    from mistyle.run.colour import read_style
+    from mistyle.run.deliver import check, deliver
     from mistyle.run.summary import write_summary
 
     files = input_files(job.mesh)
-    style = read_picture(job.style)
+    check(job.settings)
+    style = read_style(job.style, job.settings.colour)
     check_generative(job.settings, progress.say)
     if job.settings.stylizer != "embedded":
         from mistyle.run.sweep import refuse_what_is_not_kept
 
         refuse_what_is_not_kept(job.settings)
-    with Run(job, progress) as run:
+    with kept(job.settings, job.out / "work") as look_again, Run(job, progress) as run:
         start_engines(job.settings)
-        made = _stages(run, files, style)
+        made = _stages(run, files, style, look_again)
         from mistyle.run.pages import job_report
 
         run.stage(
@@ -68,28 +74,71 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
             [job.settings.report, job.name],
             lambda folder, r: job_report(folder, made, progress, r),
         )
-        return write_summary(made, run)
+        return deliver(job, progress) | write_summary(made, run)
 
 
-def _stages(run: Run, files: Sequence[Path], style: Picture) -> Made:
+def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Callable[[int, int], None]) -> Made:
     s, seed = run.job.settings, run.job.settings.seed
     asset = run.record(
         "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)
     )
+    look_again(len(asset.mesh.faces), len(asset.mesh.parts))
     atlas = run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
     views = views_stage(run, asset, atlas)
     baked, stylized = painted_stages(run, asset, style, atlas, views)
-    fitted = run.record("fit", ["bake", "stylized"], [s.fit, seed], lambda r: fit(asset, atlas, baked, stylized, s, r))
+    painted = ["bake", "stylized"]
+    if "stylized" in run.edited:
+        baked, stylized = retouched_stage(run, asset, atlas, baked, stylized)
+        painted = ["retouch"]
+    fitted = run.record("fit", painted, [s.fit, seed], lambda r: fit(asset, atlas, baked, stylized, s, r))
+    masks = masks_stage(run, asset, atlas, baked, fitted)
     repaired = run.record(
         "repair",
-        ["fit"],
+        ["masks"],
         [s.repair, seed, *inpainter_inputs(s, style)],
-        lambda r: repair(asset, style, atlas, baked, views, fitted, s, r),
+        lambda r: repair(asset, style, atlas, baked, views, fitted, masks, s, r),
     )
-    folder = run.stage(
-        "asset", ["repair"], [run.job.name], lambda f, r: write_asset(f, run.job, asset, atlas, repaired.maps, r)
+
+    def write(folder: Path, edited: Edited, report: Report) -> None:
+        write_asset(folder, run.job, asset, atlas, repaired.maps, report, edited)
+
+    folder, edited = asset_stage(run, ["repair"], write)
+    maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
+    repaired = replace(repaired, maps=tuple(maps))
+    tell_edits(run)
+    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, tuple(run.notes))
+
+
+def retouched_stage(
+    run: Run, asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View]
+) -> tuple[Baked, Sequence[View]]:
+    """What a person painted into the stylized views, laid into the texture and into the other views."""
+    from mistyle.run.retouch import retouch
+
+    s, edited, folder = run.job.settings, run.edited["stylized"], run.visible.root / "stylized"
+    made = run.record(
+        "retouch",
+        ["bake", "stylized"],
+        [s.bake],
+        lambda r: retouch(asset, atlas, baked, stylized, edited, folder, s, r),
     )
-    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder)
+    return made.baked, made.views
+
+
+def masks_stage(run: Run, asset: Asset, atlas: Atlas, baked: Baked, fitted: Any) -> list[np.ndarray]:
+    """Which texels are painted again (section 4.3), as pictures in `masks/` that a person may repaint."""
+    from mistyle.stages.inpaint import struggle_mask
+
+    s = run.job.settings
+    stems = part_stems(run.job.name, asset.mesh.parts)
+
+    def write(folder: Path, report: Report) -> None:
+        for part, (stem, texels) in enumerate(zip(stems, atlas.texels, strict=True)):
+            looks = fitted.struggle[part], fitted.touched[part]
+            write_mask(folder / f"{stem}.png", struggle_mask(*looks, baked.seen[part], texels, s.repair))
+
+    folder = run.stage("masks", ["fit"], [s.repair, run.job.name], write)
+    return [read_mask(folder / f"{m}.png", t.covered) & t.covered for m, t in zip(stems, atlas.texels, strict=True)]
 
 
 def painted_stages(
@@ -139,24 +188,22 @@ def repair(
     baked: Baked,
     views: Sequence[View],
     fitted: Any,
+    masks: Sequence[np.ndarray],
     settings: Settings,
     report: Report,
 ) -> Repaired:
-    """Section 4.3: where the fit struggled or nothing was seen, take the painting again, or let Paint3D paint; blend
-    at the edges."""
+    """Section 4.3: under the masks (where the fit struggled or nothing was seen) take the painting again, or let
+    Paint3D paint; blend at the edges."""
     from mistyle.backends.fill import from_paint
     from mistyle.stages.coat import painted_mask, protected
     from mistyle.stages.inpaint import repair as repair_part
-    from mistyle.stages.inpaint import struggle_mask
 
     network = texture_inpainter(settings, asset, style) if settings.inpainter == "paint3d" else None
-    maps, masks = [], []
-    for part, texels in enumerate(atlas.texels):
-        mask = struggle_mask(fitted.struggle[part], fitted.touched[part], baked.seen[part], texels, settings.repair)
+    maps = []
+    for part, (texels, mask) in enumerate(zip(atlas.texels, masks, strict=True)):
         rng = np.random.default_rng([settings.seed, part])
         again = network or from_paint(baked.maps[part].albedo)
         maps.append(repair_part(fitted.maps[part], mask, texels, again, settings.repair, rng))
-        masks.append(mask)
         report(0.3 * (part + 1) / len(atlas.texels))
     maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
     if settings.coat.protect is not None:
@@ -195,8 +242,16 @@ def settle_relief(
     return list(settled.maps)
 
 
-def write_asset(folder: Path, job: Job, asset: Asset, atlas: Atlas, maps: Sequence[Maps], report: Report) -> None:
-    """The files that other programs open."""
+def write_asset(
+    folder: Path,
+    job: Job,
+    asset: Asset,
+    atlas: Atlas,
+    maps: Sequence[Maps],
+    report: Report,
+    edited: Edited = UNEDITED,
+) -> None:
+    """The files that other programs open; `edited` holds textures that a person painted over."""
     from mistyle.stages.export import write_asset as write
 
     occlusion = [
@@ -206,5 +261,6 @@ def write_asset(folder: Path, job: Job, asset: Asset, atlas: Atlas, maps: Sequen
     from mistyle.stages.texels import pad_maps
 
     padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(maps, atlas.texels, strict=True)]
-    provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed}
+    padded, occlusion = edited(part_stems(job.name, asset.mesh.parts), padded, occlusion)
+    provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed, **edited.provenance}
     write(folder, job.name, asset, padded, occlusion, atlas.texels, provenance=provenance)

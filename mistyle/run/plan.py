@@ -1,7 +1,8 @@
 """What a job will do and what it will cost, before it does it (`--dry-run`). Imports nothing heavy.
 
 The times are products of counts and constants that were read off `python -m benchmarks.pipeline` on two cores of a
-2.6 GHz server; they are guides of a factor of two, not promises. Disk is what stays in the run folder.
+2.6 GHz server; they are guides of a factor of two, not promises. Memory is `run/budget.py`'s. Disk is what stays in the
+run folder.
 """
 
 import shutil
@@ -9,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused
+from mistyle.run.budget import PLAIN, TILED, counts, memory_gb, peaks, tiles, view_pixels
 from mistyle.run.inputs import input_files
-from mistyle.run.settings import Settings, thread_count
+from mistyle.run.settings import thread_count
 from mistyle.run.stages import STAGES, Job
 
 # Seconds on two cores, per unit named.
@@ -23,9 +25,6 @@ PER_CROP_PIXEL = 1.6e-6
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
 BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}
-
-# Read off the peaks of draft, demo and standard jobs.
-BASE_GB, GB_PER_TEXEL, GB_PER_VIEW_PIXEL = 0.9, 3.0e-7, 1.7e-7
 
 BYTES_PER_TEXEL = 190
 BYTES_PER_VIEW_PIXEL = 60
@@ -52,6 +51,7 @@ def plan(job: Job) -> dict[str, Any]:
         "bake": 2 * texels * PER_TEXEL + pixels * PER_VIEW_PIXEL,
         "stylized": 2 * pixels * PER_VIEW_PIXEL,
         "fit": crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
+        "masks": 0.3 * texels * PER_TEXEL,
         "repair": texels * PER_TEXEL + 0.1 * crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
         "asset": 2 * texels * PER_TEXEL,
         "report": 5 + frames * PER_SAMPLE_RAY,
@@ -64,22 +64,12 @@ def plan(job: Job) -> dict[str, Any]:
         "name": job.name,
         "stages": [{"stage": k, "what": STAGES[k], "seconds": round(v * scale, 1)} for k, v in seconds.items()],
         "seconds": round(sum(seconds.values()) * scale),
+        "memory_gb": memory_gb(s, faces),
+        "in_files": tiles(s, faces),
+        "peaks_gb": peaks(TILED if tiles(s, faces) else PLAIN, counts(s, faces)),
         "disk_gb": round((texels * BYTES_PER_TEXEL + 2 * pixels * BYTES_PER_VIEW_PIXEL) / 1e9, 2),
         "free_gb": round(shutil.disk_usage(_existing(job.out)).free / 1e9, 1),
     }
-
-
-def memory_gb(settings: Settings) -> float:
-    """Peak memory of a job with one texture set, GB: what the program itself takes, the atlas, and the views."""
-    texels = settings.atlas.size**2
-    return round(BASE_GB + GB_PER_TEXEL * texels + GB_PER_VIEW_PIXEL * view_pixels(settings), 1)
-
-
-def view_pixels(settings: Settings) -> int:
-    """Pixels of all views together; of a rig made for the mesh, which is not known yet, or of a file: of 16 at most."""
-    rig = settings.rig
-    views = {"paper": 16, "turntable": rig.views, "nbv": min(16, rig.most_views)}.get(rig.kind, 16)
-    return views * rig.resolution**2
 
 
 def _existing(folder: Path) -> Path:
@@ -93,5 +83,7 @@ def describe_plan(estimate: dict[str, Any]) -> str:
     lines = [f"{estimate['mesh']} in the style of {estimate['style']} -> {estimate['out']}"]
     lines += [f"  {row['what']:<36} about {row['seconds']:7.1f} s" for row in estimate["stages"]]
     lines.append(f"  in all about {estimate['seconds']} s, if one texture set is made and nothing is taken over")
+    files = ", large arrays in files" if estimate["in_files"] else ""
+    lines.append(f"  memory at most about {estimate['memory_gb']} GB{files}")
     lines.append(f"  disk about {estimate['disk_gb']} GB; free there: {estimate['free_gb']} GB")
     return "\n".join(lines)

@@ -5,15 +5,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+from mistyle.core import memory
+
 Report = Callable[[float], None]
 
 
 class Progress:
-    """Names the stage that runs and times it; `seconds` holds the finished ones."""
+    """Names the stage that runs, times it and watches its memory; `seconds` and `peaks` (GB) hold the finished ones."""
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
         self.seconds: dict[str, float] = {}
+        self.peaks: dict[str, float] = {}
         self.reused: list[str] = []
 
     def say(self, text: str) -> None:
@@ -24,12 +27,14 @@ class Progress:
     def stage(self, name: str, what: str) -> Iterator[Report]:
         """Runs a stage: yields the function that takes the share done, 0..1."""
         start = time.perf_counter()
-        if sys.stderr.isatty() and not self.quiet:
-            with _bar(what) as report:
-                yield report
-        else:
-            self.say(f"{what} ...")
-            yield _lines(what, self.say)
+        with memory.watched() as most:
+            if sys.stderr.isatty() and not self.quiet:
+                with _bar(what) as report:
+                    yield report
+            else:
+                self.say(f"{what} ...")
+                yield _lines(what, self.say)
+            self.peaks[name] = most() / 1e9
         self.seconds[name] = time.perf_counter() - start
         self.say(f"{what}: {self.seconds[name]:.1f} s")
 

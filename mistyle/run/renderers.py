@@ -22,10 +22,10 @@ import numpy as np
 
 from mistyle.core.camera import orbit
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
+from mistyle.run.blender import BLENDER, blender_command
 from mistyle.run.render_files import Shot, Subject, as_glb, exported, finished, run_job, scene_for, user_camera
 
 MITSUBA_VARIANTS = ("cuda_ad_rgb", "metal_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
-BLENDER = "MISTYLE_BLENDER_PYTHON"
 
 
 @dataclass(frozen=True)
@@ -239,7 +239,7 @@ def _cycles(python: str, found: Subject, shot: Shot, spp: int, seeds: Sequence[i
         "environment": str((folder / "environment.exr").resolve()),
         "shots": [{"out": str(o.resolve()), "spp": spp, "seed": s} for o, s in zip(outs, seeds, strict=True)],
     }
-    done = run_job([python, lookdev.CYCLES_WORKER], folder / "job.json", job, "blender:cycles")
+    done = run_job(blender_command(python, lookdev.CYCLES_WORKER), folder / "job.json", job, "blender:cycles")
     pictures = tuple(_rgba(read_frame(o)) for o in outs)
     return Rendered(pictures, tuple(done["seconds"]), f"blender {done['blender']}")
 

@@ -53,6 +53,69 @@
     if (count > 1 && !calm.matches && !location.hash.includes("still")) run(true);
   }
 
+  // The asset itself, once it comes near: unpacked here and handed to the viewer as a blob.
+  const model = one("section.model"), asset = one("#asset");
+  if (model && asset) {
+    const stage = one(".stage3d", model), play = one(".play", model), light = one(".exposure input", model);
+    const failed = () => { stage.classList.remove("shown"); one(".failed", model).hidden = false; };
+    const unpack = async () => {
+      const bytes = Uint8Array.from(atob(asset.textContent), (letter) => letter.charCodeAt(0));
+      const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"));
+      return new Response(stream).blob();
+    };
+    const start = async () => {
+      const viewer = document.createElement("model-viewer");
+      const first = { "camera-controls": "", "touch-action": "pan-y", "interaction-prompt": "none", "camera-orbit": "30deg 75deg auto",
+        "shadow-intensity": "0.7", "shadow-softness": "0.9", "min-camera-orbit": "auto auto 5%", alt: one("img", stage).alt, loading: "eager" };
+      for (const [name, value] of Object.entries(first)) viewer.setAttribute(name, value);
+      viewer.addEventListener("load", () => { stage.classList.add("shown"); one(".controls", model).hidden = false; });
+      viewer.addEventListener("error", failed);
+      viewer.src = URL.createObjectURL(await unpack());
+      stage.append(viewer);
+      light.addEventListener("input", () => { viewer.exposure = 2 ** Number(light.value); });
+      play.addEventListener("click", () => {
+        viewer.autoRotate = !viewer.autoRotate;
+        play.setAttribute("aria-pressed", String(viewer.autoRotate));
+      });
+      one(".home", model).addEventListener("click", () => {
+        viewer.cameraOrbit = first["camera-orbit"];
+        viewer.cameraTarget = viewer.fieldOfView = "auto";
+        viewer.resetTurntableRotation();
+        viewer.exposure = 1;
+        light.value = "0";
+        viewer.jumpCameraToGoal();
+      });
+    };
+    const near = new IntersectionObserver((entries) => {
+      if (!entries.some((entry) => entry.isIntersecting)) return;
+      near.disconnect();
+      // Asked here, for the viewer itself only writes an error to the console.
+      if (document.createElement("canvas").getContext("webgl2")) start().catch(failed);
+      else failed();
+    }, { rootMargin: "400px" });
+    near.observe(stage);
+  }
+
+  // What is laid over the maps: one picture per texture set and kind, shown over each of its maps.
+  for (const group of all(".maps .group")) {
+    const buttons = all(".overlays button", group), legend = one(".legend", group);
+    const lay = (button) => {
+      for (const each of buttons) each.setAttribute("aria-pressed", String(each === button));
+      const source = one("img", button);
+      legend.value = button.dataset.legend || "";
+      for (const opener of all(".shot .open", group)) {
+        for (const old of all(".overlay", opener)) old.remove();
+        if (!source) continue;
+        const over = new Image();
+        over.src = source.src;
+        over.alt = "";
+        over.className = "overlay";
+        opener.append(over);
+      }
+    };
+    for (const button of buttons) button.addEventListener("click", () => lay(button));
+  }
+
   // Before and after: the slider lies invisibly over the picture.
   for (const box of all(".compare")) {
     const slider = one("input", box);
@@ -82,11 +145,14 @@
   let at = 0, image = null, zoom = 1, x = 0, y = 0;
 
   const place = () => {
-    image.style.transform = `translate(${x}px, ${y}px) scale(${zoom})`;
-    image.style.imageRendering = zoom > 2.5 ? "pixelated" : "";
+    for (const layer of canvas.children) {
+      layer.style.transform = `translate(${x}px, ${y}px) scale(${zoom})`;
+      layer.style.imageRendering = zoom > 2.5 ? "pixelated" : "";
+    }
   };
   const fit = () => {
     const w = image.naturalWidth || 1, h = image.naturalHeight || 1;
+    for (const layer of canvas.children) layer.style.width = w + "px", layer.style.height = h + "px";
     zoom = Math.min(canvas.clientWidth / w, canvas.clientHeight / h, Math.max(1, 640 / Math.max(w, h)));
     x = (canvas.clientWidth - w * zoom) / 2;
     y = (canvas.clientHeight - h * zoom) / 2;
@@ -107,7 +173,8 @@
     image.alt = source.alt;
     image.draggable = false;
     image.src = source.src;
-    canvas.replaceChildren(image);
+    const over = one(".overlay", openers[at]);
+    canvas.replaceChildren(image, ...(over ? [over.cloneNode()] : []));
     const words = caption ? Array.from(caption.children, (part) => part.textContent) : [source.alt];
     what.textContent = [...words, `${at + 1} / ${openers.length}`].filter(Boolean).join("  ·  ");
     if (!viewer.open) viewer.showModal();

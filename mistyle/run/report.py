@@ -2,13 +2,14 @@
 
 `Report` is pure data: pictures are arrays that are ready to look at (sRGB-encoded, 8 bit or float 0..1; grey, rgb or
 rgb with straight alpha), everything else is text and numbers. `write_report` inlines every picture as WebP, escapes
-every text (jinja2 autoescape) and forbids itself every connection by a content-security policy; the one script is
-allowed by its hash. The page works without scripts too, only the turntable then stands still.
+every text (jinja2 autoescape) and forbids itself every connection by a content-security policy; its scripts are
+allowed by their hashes. The asset can be turned in three dimensions where it is small enough (run/report_model.py).
+The page works without scripts too: the turntable then stands still, and the asset is a picture.
 """
 
 import base64
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, TypeAlias
@@ -18,6 +19,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from mistyle.files.store import atomic_write
 from mistyle.run.charts import Chart, svg
+from mistyle.run.report_model import Model, TooLarge, packed, viewer_script
 from mistyle.run.report_pictures import Sizes, accents, palette, webp
 
 Pixels: TypeAlias = (
@@ -70,11 +72,21 @@ class Step:
 
 
 @dataclass(frozen=True)
+class Overlay:
+    """What can be laid over the maps of a texture set: a picture of their size with alpha, and what its colours say."""
+
+    name: str
+    picture: Pixels
+    legend: str
+
+
+@dataclass(frozen=True)
 class MapSet:
-    """The maps of one texture set."""
+    """The maps of one texture set, and what can be laid over each of them."""
 
     name: str
     shots: tuple[Shot, ...]
+    overlays: tuple[Overlay, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -130,7 +142,7 @@ class Report:
 
     `turntable` and `plain` are frames of equal size and number all round the stylized and the original asset, evenly
     spaced, transparent where nothing is; the first is what is seen first. `made` says when and with what in one line.
-    The title reads "mesh relation style".
+    The title reads "mesh relation style". `model` is the asset itself, or says why it is not in the page.
     """
 
     title: str
@@ -150,6 +162,7 @@ class Report:
     versions: tuple[tuple[str, str], ...] = ()
     files: tuple[File, ...] = ()
     relation: str = "in the style of"
+    model: Model | TooLarge | None = None
 
 
 def write_report(path: Path, report: Report) -> None:
@@ -183,20 +196,43 @@ def render(report: Report, scale: float = 1.0) -> str:
     # The chart's own texts are escaped by svg().
     env.filters |= {"seconds": seconds, "size": size, "slug": slug, "svg": lambda chart: Markup(svg(chart))}
     script = (here / "report.js").read_text(encoding="utf-8")
-    swatches = palette(report.painting.picture)
+    viewer = viewer_script() if isinstance(report.model, Model) else ""
+    swatches, sizes = palette(report.painting.picture), Sizes(scale)
     return env.get_template("report.html.j2").render(
         report=report,
         total=sum(t.seconds for t in report.timings),
         longest=max([t.seconds for t in report.timings], default=0.0) or 1.0,
-        sizes=Sizes(scale),
+        sizes=sizes,
         webp=webp,
         palette=swatches,
         accent=accents(swatches),
         # Both files are ours and hold no text of others.
         style=Markup((here / "report.css").read_text(encoding="utf-8")),
         script=Markup(script),
-        script_hash=base64.b64encode(hashlib.sha256(script.encode()).digest()).decode(),
+        # base64 needs no escaping.
+        asset=Markup(packed(report.model, sizes.of("texture"))) if isinstance(report.model, Model) else "",
+        viewer=Markup(viewer),
+        policy=Markup(policy([script, viewer] if viewer else [script])),
     )
+
+
+def policy(scripts: Sequence[str]) -> str:
+    """The content-security policy of a page with these scripts: nothing is fetched but what the page itself made.
+
+    The viewer, the second script, reads the asset and its textures from blobs of the page.
+    """
+    hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    blobs = len(scripts) > 1
+    rules = {
+        "default-src": "'none'",
+        "img-src": "data: blob:" if blobs else "data:",
+        **({"connect-src": "blob:"} if blobs else {}),
+        "style-src": "'unsafe-inline'",
+        "script-src": " ".join(f"'sha256-{value}'" for value in hashes),
+        "base-uri": "'none'",
+        "form-action": "'none'",
+    }
+    return "; ".join(f"{name} {value}" for name, value in rules.items())
 
 
 def seconds(value: float) -> str:

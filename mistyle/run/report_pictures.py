@@ -15,7 +15,7 @@ class Sizes:
     scale: float = 1.0
 
     def of(self, kind: str) -> int:
-        usual = {"painting": 960, "frame": 560, "view": 420, "pair": 900, "picture": 720, "map": 1280}
+        usual = {"painting": 960, "frame": 560, "view": 420, "pair": 900, "picture": 720, "map": 1280, "texture": 1024}
         return max(48, round(usual[kind] * self.scale))
 
 

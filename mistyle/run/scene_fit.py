@@ -15,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core import stopping
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import linear_from_srgb
 from mistyle.files.store import Keeper, atomic_folder, atomic_write, digest
@@ -23,6 +24,7 @@ from mistyle.run.charts import Chart
 from mistyle.run.material_report import difference, encoded
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, Note, Pair, Report, Shot, Step, write_report
+from mistyle.run.stages import program
 from mistyle.run.summary import peak_gb, versions
 
 PICTURES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".webp")
@@ -52,7 +54,7 @@ def run_scene(options: argparse.Namespace) -> int:
         raise UsageError(f"-s {options.sensor}: the scene has {len(every)} sensor(s), numbered from 0")
     numbers = list(range(len(every))) if options.sensor is None else [options.sensor]
     paths = reference_files(options.shots, [every[k].id() for k in numbers], len(every), numbers)
-    with Keeper(options.out / "work"):
+    with Keeper(options.out, shared=True), Keeper(options.out / "work"):
         summary = _fit(options, file, [p.key for p in chosen], numbers, paths, Progress())
     if options.json:
         print(json.dumps(summary))
@@ -71,17 +73,17 @@ def _fit(
     progress: Progress,
 ) -> dict[str, Any]:
     from mistyle.files.images import write_exr
+    from mistyle.render.scene_draw import values
     from mistyle.render.scene_fit import fit_scene
     from mistyle.render.scene_xml import write_scene
 
     read = [read_reference(path) for path in paths]
     iterations = options.iterations or ITERATIONS[options.preset or "standard"]
     seed = options.seed or 0
-    key = digest(
-        [options.scene, sorted(file.defines.items()), list(keys), list(numbers), list(paths), iterations, seed]
-    )
+    inputs = [sorted(file.defines.items()), list(keys), list(numbers), list(paths), iterations, seed, options.threads]
+    key = digest([program(), values(file.scene), *inputs])
     folder = checkpoint.place(options.out, key)
-    with progress.stage("fit", "fit the scene") as report:
+    with progress.stage("fit", "fit the scene") as report, stopping.at_checkpoints():
         fitted = fit_scene(
             file.scene,
             keys,
@@ -91,7 +93,7 @@ def _fit(
             iterations=iterations,
             seed=seed,
             save=lambda arrays: checkpoint.save(folder, arrays),
-            resume=checkpoint.load(folder),
+            resume=checkpoint.load(folder, progress.say),
             progress=report,
         )
     name = options.name or options.scene.stem
@@ -104,7 +106,6 @@ def _fit(
     with progress.stage("pictures", "render the sensors") as report:
         drawn = draw(file.scene, numbers, seed, report)
         atomic_folder(options.out / "pictures", lambda new: write_pictures(new, file.scene, numbers, drawn))
-    checkpoint.clear(options.out)
     xml = written[0].xml
     notes = [*file.notes, *fitted.notes, *written[0].notes]
     summary = {
@@ -121,6 +122,7 @@ def _fit(
     write_page(options, fitted, read, drawn, [every_name(file.scene, k) for k in numbers], summary, seed)
     record = summary | {"iterations": iterations, "seed": seed, "versions": versions()}
     atomic_write(options.out / "run.json", (json.dumps(record, indent=1) + "\n").encode())
+    checkpoint.clear(options.out)
     return summary
 
 

@@ -2,7 +2,8 @@
 
 Other kinds of job have a root record of their own (run/material_settings.py) and are resolved by the same functions.
 
-Precedence, lowest first: defaults, preset, `--config FILE`, the environment (MISTYLE_VGG, MISTYLE_SET), command line.
+Precedence, lowest first: defaults, preset, `--config FILE`, the environment (MISTYLE_VGG, OCIO, MISTYLE_SET), the
+command line.
 """
 
 import difflib
@@ -16,7 +17,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, Paint3dSettings, TrainSettings
 from mistyle.core.camera import RigSettings
-from mistyle.core.errors import UsageError
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.stages.backproject import BakeSettings
 from mistyle.stages.fit import FitSettings
 from mistyle.stages.inpaint import RepairSettings
@@ -68,6 +70,13 @@ class Settings(BaseModel):
     threads: int = Field(
         default=0, ge=0, le=1024, description="threads of the renderer and of torch; 0 takes all cores"
     )
+    memory: float = Field(
+        default=0,
+        ge=0,
+        le=100_000,
+        description="GB of main memory that the job may take (then large arrays lie in files of its work folder where "
+        "they must, with the same result; a job that cannot keep it is refused); 0: as much as it takes",
+    )
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     stylizer: Literal["embedded", "embedded-view", "diffusion"] = Field(
         default="embedded",
@@ -88,6 +97,8 @@ class Settings(BaseModel):
     fit: FitSettings = FitSettings()
     repair: RepairSettings = RepairSettings()
     report: ReportSettings = ReportSettings()
+    deliver: DeliverSettings = DeliverSettings()
+    colour: ColourSettings = ColourSettings()
     models: ModelSettings = ModelSettings()
     train: TrainSettings = TrainSettings()
     diffusion: DiffusionSettings = DiffusionSettings()
@@ -181,12 +192,14 @@ def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
 
 def read_config(path: Path) -> dict[str, Any]:
     """A job file in TOML; its keys are those that `--print-config` prints."""
+    from mistyle.files.read import read_toml
+
+    if not path.is_file():
+        raise UsageError(f"{path}: no such file; --config wants a TOML file")
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise UsageError(f"{path}: no such file; --config wants a TOML file") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise UsageError(f"{path}: not a TOML file: {error}") from None
+        return read_toml(path)
+    except InputRefused as error:
+        raise UsageError(f"{path}: not a TOML file that settings can be read from: {error}") from None
 
 
 def resolve(
@@ -205,10 +218,13 @@ def resolve(
         values.pop("preset", None)
         layers.append((str(config), values))
     preset = preset or "standard"
-    if preset not in presets:
-        raise UsageError(f"there is no preset '{preset}'; choose one of {', '.join(presets)}")
+    if not isinstance(preset, str) or preset not in presets:
+        origin = f"{config}: " if config is not None else ""
+        raise UsageError(f"{origin}there is no preset {str(preset)[:80]!r}; choose one of {', '.join(presets)}")
     if environment.get("MISTYLE_VGG") and "fit" in root.model_fields:
         layers.append(("MISTYLE_VGG", {"fit": {"features": environment["MISTYLE_VGG"]}}))
+    if environment.get("OCIO") and "colour" in root.model_fields:
+        layers.append(("OCIO", {"colour": {"config": environment["OCIO"]}}))
     variable = environment.get("MISTYLE_SET", "")
     layers.append(("MISTYLE_SET", assignments(filter(None, map(str.strip, variable.split(";"))), "MISTYLE_SET")))
     layers.append(("command line", command_line))

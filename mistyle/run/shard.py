@@ -2,9 +2,10 @@
 
 It may be run any number of times, anywhere, by any queue: a job whose marker OUT/shards/<name>.json has the key of the
 job and whose files still have their hashes is done; anything else is run, and goes on from its last finished stage.
-A failure leaves OUT/shards/<name>.failed.json, which the next success removes.
+A failure leaves OUT/shards/<name>.failed.json, which the next success removes; a shard that was stopped leaves neither.
 """
 
+import contextlib
 import json
 import sys
 import time
@@ -13,8 +14,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.errors import MistyleError
-from mistyle.files.store import atomic_write, digest, sha256_file
+from mistyle.core.errors import MistyleError, Stopped
+from mistyle.files import lock
+from mistyle.files.faults import unexpected
+from mistyle.files.store import LOCK, atomic_write, digest, sha256_file
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import Plan
 from mistyle.run.inputs import input_files
@@ -73,18 +76,23 @@ def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
         return told | {"reused": True}
     start = time.monotonic()
     failure = marker(plan, job, failed=True)
+    marker(plan, job).unlink(missing_ok=True)  # it is of another key, or its files are not as they were
+    _wait_for_folder(plan.out / job.name, progress)
     try:
         summary = _run(plan, job, progress)
-    except (Exception, KeyboardInterrupt) as error:
-        code = (
-            error.exit_code if isinstance(error, MistyleError) else 130 if isinstance(error, KeyboardInterrupt) else 1
-        )
-        text = str(error) if isinstance(error, MistyleError) else f"{type(error).__name__}: {error}"
+    except Stopped:
+        raise
+    except Exception as error:
+        expected = unexpected(error) if isinstance(error, OSError) else error
+        known = expected if isinstance(expected, MistyleError) else None
+        code, text = (known.exit_code, str(known)) if known else (1, f"{type(error).__name__}: {error}")
         note = {"name": job.name, "exit_code": code, "error": text, "seconds": round(time.monotonic() - start, 2)}
-        _write(failure, note)
+        with contextlib.suppress(MistyleError, OSError):  # a full disk takes no note either; the log has it
+            _write(failure, note)
         raise
     made = [p for p in sorted((plan.out / job.name / "asset").rglob("*")) if p.is_file()]
     made += [p for p in (plan.out / job.name / "report").glob("*.html")]
+    made += [Path(p) for files in summary.get("delivered", {}).values() for p in files if not p.endswith("_look.usda")]
     told = {
         "name": job.name,
         "key": key,
@@ -97,6 +105,15 @@ def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
     _write(marker(plan, job), told)
     failure.unlink(missing_ok=True)
     return told
+
+
+def _wait_for_folder(folder: Path, progress: Progress, seconds: float = 30.0) -> None:
+    """The shard of an engine that was killed may take a moment to end: wait for its folder rather than be refused."""
+    since = time.monotonic()
+    while lock.busy(folder / LOCK) and time.monotonic() - since < seconds:
+        if time.monotonic() - since < 0.1:
+            progress.say(f"{folder}: another process works there; waiting up to {seconds:g} s")
+        time.sleep(0.2)
 
 
 def _run(plan: Plan, job: Record, progress: Progress) -> dict[str, Any]:

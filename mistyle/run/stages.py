@@ -1,15 +1,18 @@
 """The stages of a run and how each is kept: under a key made of everything it depends on."""
 
-from collections.abc import Callable, Mapping, Sequence
+import contextlib
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
+from mistyle.core import memory, stopping
 from mistyle.core.errors import UsageError
 from mistyle.core.paths import PACKAGE
 from mistyle.files.records import load_record, save_record
 from mistyle.files.store import Keeper, digest
+from mistyle.run import edits
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings, thread_count
 
@@ -21,10 +24,13 @@ STAGES = {
     "bake": "bake the texture",
     "stylized": "draw the stylized views",
     "fit": "fit normal, roughness and albedo",
+    "masks": "mark what the fit left open",
     "repair": "repair what the fit left open",
     "asset": "write the asset",
     "report": "write the report",
 }
+# Only where views were edited.
+RETOUCH = {"retouch": "lay the edited views into the texture"}
 # Those of `mistyle fit`.
 MATERIAL_STAGES = {
     "mesh": "read the mesh",
@@ -38,7 +44,7 @@ MATERIAL_STAGES = {
     "report": "write the report",
 }
 # These stand in the run folder itself, for people; the others in work/.
-VISIBLE = ("views", "stylized", "asset", "scene", "report")
+VISIBLE = ("views", "stylized", "masks", "asset", "scene", "report")
 
 
 @dataclass(frozen=True)
@@ -80,16 +86,26 @@ def program() -> str:
 class Run(Generic[Work]):
     """Keeps the stages of one run folder; a class because it holds the folder's locks until it is closed."""
 
-    def __init__(self, job: Work, progress: Progress, stages: Mapping[str, str] = STAGES) -> None:
+    def __init__(self, job: Work, progress: Progress, stages: dict[str, str] = STAGES) -> None:
+        stages = stages | RETOUCH if stages is STAGES else stages
         if job.redo_from is not None and job.redo_from not in stages:
             raise UsageError(f"--from {job.redo_from}: there is no such stage; choose one of {', '.join(stages)}")
         self.job, self.progress, self.stages = job, progress, stages
         self.redoing = False
         self.keys: dict[str, str] = {}
+        # Stage -> edited file -> sha256; and those of them that no earlier run took up.
+        self.edited: dict[str, dict[str, str]] = {}
+        self.changed: dict[str, dict[str, str]] = {}
+        self.plain: dict[str, str] = {}
+        self.notes: list[str] = []
         # A changed program or thread count may change bytes: both belong to every key.
         self.base = digest([program(), thread_count(job.settings), job.settings.variant])
-        self.visible = Keeper(job.out)
-        self.hidden = Keeper(job.out / "work")
+        self.visible = Keeper(job.out, progress.say)
+        try:
+            self.hidden = Keeper(job.out / "work", progress.say)
+        except BaseException:
+            self.visible.close()
+            raise
 
     def __enter__(self) -> "Run":
         return self
@@ -99,24 +115,60 @@ class Run(Generic[Work]):
         self.hidden.close()
         for folder in (self.job.out / "work", self.job.out):
             # A job that was refused before its first stage leaves no empty folders behind.
-            if folder.is_dir() and not any(folder.iterdir()):
+            with contextlib.suppress(OSError):  # not empty; or where a disk is mounted
                 folder.rmdir()
 
     def stage(self, name: str, after: Sequence[str], inputs: Any, write: Callable[[Path, Report], object]) -> Path:
         """The folder of stage `name`, taken over or made; it depends on `inputs` and on the stages `after`."""
+        stopping.check()
         key = self.keys[name] = digest([self.base, name, inputs, [self.keys[a] for a in after]])
         keeper = self.visible if name in VISIBLE else self.hidden
         self.redoing = self.redoing or name == self.job.redo_from
-        found = None if self.redoing else keeper.get(name, key)
+        found = None if self.redoing else keeper.get(name, key, lambda file: edits.editable(name, file))
         if found is not None:
             self.progress.skip(name, self.stages[name])
+            self._take_note(keeper, name)
             return found
+        self._spare(keeper, name)
 
         def fill(folder: Path) -> None:
             write(folder, report)
 
         with self.progress.stage(name, self.stages[name]) as report:
             return keeper.put(name, key, fill)
+
+    def absorb(self, name: str, write: Callable[[Path, Report], object]) -> Path:
+        """Write a taken-over stage anew with the edits that it was found with, which are then part of it."""
+        keeper, edited = self.visible, self.edited[name]
+
+        def fill(folder: Path) -> None:
+            write(folder, report)
+
+        self.progress.reused.remove(name)
+        with self.progress.stage(name, self.stages[name]) as report:
+            return keeper.put(name, self.plain[name], fill, edited=edited)
+
+    def _take_note(self, keeper: Keeper, name: str) -> None:
+        """Edits of a taken-over stage become part of its key, on which all later stages hang."""
+        if name not in edits.EDITABLE:
+            return
+        taken_up, changed = edits.found(keeper.root / name, name)
+        if taken_up | changed:
+            self.plain[name] = self.keys[name]
+            self.edited[name], self.changed[name] = taken_up | changed, changed
+            self.keys[name] = digest([self.keys[name], self.edited[name]])
+
+    def _spare(self, keeper: Keeper, name: str) -> None:
+        """A folder with edited files that is about to be replaced is set aside, and that is said."""
+        if name not in edits.EDITABLE:
+            return
+        taken_up, changed = edits.found(keeper.root / name, name)
+        if taken_up | changed:
+            place = edits.set_aside(keeper.root / name)
+            files = ", ".join(sorted(taken_up | changed))
+            text = f"{name}/ is made anew, as what it stands on has changed; your edited {files} now lies in {place}."
+            self.notes.append(text)
+            self.progress.say(text)
 
     def record(self, name: str, after: Sequence[str], inputs: Any, make: Callable[[Report], Any]) -> Any:
         """Like `stage`, for a stage whose result is a record."""
@@ -127,4 +179,5 @@ class Run(Generic[Work]):
             save_record(folder / "record", made[0])
 
         folder = self.stage(name, after, inputs, write)
-        return made[0] if made else load_record(folder / "record")
+        # Within a budget of memory even what was just made is read back: then it lies in files.
+        return made[0] if made and not memory.tight() else load_record(folder / "record")

@@ -2,12 +2,11 @@
 
 import json
 import platform
-import resource
-import sys
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, Literal
 
 from mistyle import __version__
+from mistyle.core import memory
 from mistyle.files.store import atomic_write
 from mistyle.run.stages import Run
 
@@ -40,6 +39,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "stylized": str(job.out / "stylized"),
         "seconds": seconds,
         "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
+        "peaks_gb": merged_peaks(path, run),
         "figures": figures(made),
         "notes": list(made.asset.source.notes),
     }
@@ -68,12 +68,16 @@ def merged_seconds(path: Any, run: Run) -> dict[str, float]:
     return {name: round(before.get(name, 0.0) if name in run.progress.reused else now[name], 3) for name in now}
 
 
+def merged_peaks(path: Any, run: Run) -> dict[str, float]:
+    """The most memory that each stage needed, GB; as with the times, a stage that was taken over keeps its own."""
+    before = earlier(path).get("peaks_gb", {})
+    now = run.progress.peaks | {name: before[name] for name in run.progress.reused if name in before}
+    return {name: round(now[name], 3) for name in run.progress.seconds if name in now}
+
+
 def peak_gb() -> float:
     """Peak resident memory of this process or of its largest child, GB."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    return (
-        max(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)) * unit / 1e9
-    )
+    return memory.highest() / 1e9
 
 
 def versions() -> dict[str, str]:

@@ -47,10 +47,10 @@ def variations(settings: Settings, count: int) -> list[Variation]:
 def sheet(mesh: Path, style: Path, out: Path, settings: Settings, count: int, progress: Progress) -> dict[str, Any]:
     """Write OUT/variations.png; returns its path and, picture by picture, the options that make it."""
     from mistyle.files.images import write_png
-    from mistyle.files.read import read_picture
     from mistyle.run import start
+    from mistyle.run.colour import read_style
 
-    picture = read_picture(style)
+    picture = read_style(style, settings.colour)
     start.start_engines(settings)
     cameras = rig(RigSettings(resolution=RESOLUTION))
     with progress.stage("mesh", "read the mesh") as report:

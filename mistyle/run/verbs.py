@@ -1,13 +1,11 @@
 """The verbs `render` and `bake`: single stages for people who draw or paint the views themselves."""
 
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.asset import Asset
-from mistyle.core.view import View
 from mistyle.run.inputs import input_files
+from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
 from mistyle.run.progress import Progress
 from mistyle.run.settings import Settings
@@ -52,17 +50,3 @@ def bake_views(mesh: Path, views: Path, out: Path, settings: Settings, name: str
         atomic_folder(out, lambda folder: write_asset(folder, job, asset, atlas, maps, report))
     shares = [float(m.known.sum() / max(t.covered.sum(), 1)) for m, t in zip(maps, atlas.texels, strict=True)]
     return {"asset": str(out / f"{name}.glb"), "painted": dict(zip(asset.mesh.parts, shares, strict=True))}
-
-
-def with_geometry(asset: Asset, views: Sequence[View]) -> list[View]:
-    """Pictures with the depth and normals of the mesh where the files brought none: the mesh itself is the truth."""
-    from mistyle.render.draw import gbuffer, tracer
-
-    traced = tracer(asset.mesh)
-    result = []
-    for view in views:
-        hits = gbuffer(traced, view.camera)
-        result.append(
-            replace(view, depth=hits.depth, normal=hits.normal, uv=hits.uv, part=hits.part, mask=hits.mask & view.mask)
-        )
-    return result

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
+from mistyle.core import memory
 from mistyle.core.camera import Camera
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
@@ -74,16 +75,37 @@ def backproject(
     A texel whose normal, or (with `mesh`) whose face, turns away from a camera is never painted by it; the face counts
     as turned where its corner normals point. Views may differ in size. The result does not depend on the thread count.
     """
+    chosen, seen = accepted(views, texels, settings, lambda done: progress(0.7 * done), mesh=mesh)
+    position = texels.position.reshape(-1, 3)
+    albedo = memory.zeros((chosen.size, 3))
+
+    def paint(k: int) -> None:
+        _paint(albedo, views[k], np.flatnonzero(chosen == k), position, settings)
+
+    threaded(paint, len(views), lambda done: progress(0.7 + 0.3 * done))
+    shape = texels.covered.shape
+    return Baked(albedo.reshape(*shape, 3), (chosen >= 0).reshape(shape), chosen.reshape(shape), seen.reshape(shape))
+
+
+def accepted(
+    views: Sequence[View],
+    texels: Texels,
+    settings: BakeSettings,
+    progress: Callable[[float], None] = lambda done: None,
+    *,
+    mesh: Mesh | None = None,
+) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]:
+    """`backproject` without the colours: per texel, row by row, the view that would paint it (-1: none), and how many
+    views see it."""
     if not views:
         raise ValueError("there are no views to paint the atlas from; pass at least one")
     towards = None if mesh is None else _faces_towards(mesh, [view.camera for view in views])
     tables = _depth_tables(views, settings)
-    height, width = texels.covered.shape
-    chosen, seen = np.full(height * width, -1, np.int16), np.zeros(height * width, np.int16)
     covered = texels.covered.reshape(-1)
+    chosen, seen = memory.empty(covered.size, np.int16), memory.zeros(covered.size, np.int16)
+    chosen.fill(-1)
     position, normal = texels.position.reshape(-1, 3), texels.normal.reshape(-1, 3)
     face = texels.face.reshape(-1)
-    chunks = -(-covered.size // ROWS)
 
     def work(chunk: int) -> None:
         inside = chunk * ROWS + np.flatnonzero(covered[chunk * ROWS : (chunk + 1) * ROWS])
@@ -92,16 +114,8 @@ def backproject(
             points, normals = position.take(inside, axis=0), normal.take(inside, axis=0)
             chosen[inside], seen[inside] = _best(views, tables, points, normals, towards, own)
 
-    threaded(work, chunks, lambda done: progress(0.7 * done))
-    tables.clear()
-    albedo = np.zeros((height * width, 3), np.float32)
-
-    def paint(k: int) -> None:
-        _paint(albedo, views[k], np.flatnonzero(chosen == k), position, settings)
-
-    threaded(paint, len(views), lambda done: progress(0.7 + 0.3 * done))
-    shape = texels.covered.shape
-    return Baked(albedo.reshape(*shape, 3), (chosen >= 0).reshape(shape), chosen.reshape(shape), seen.reshape(shape))
+    threaded(work, -(-covered.size // ROWS), progress)
+    return chosen, seen
 
 
 def bake(
@@ -139,7 +153,8 @@ def _depth_tables(views: Sequence[View], settings: BakeSettings) -> list[Float[n
     sizes = [(view.camera.size[0] + 2, view.camera.size[1] + 2) for view in views]
     starts = np.cumsum([0] + [h * w for h, w in sizes])
     # One array for all: freed memory of this size goes back to the system, small pieces may not.
-    together = np.full((starts[-1], 4), -1, np.float32)
+    together = memory.empty((int(starts[-1]), 4))
+    together.fill(-1)
     tables = [together[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
 
     bands = [(k, top) for k, (rows, _) in enumerate(sizes) for top in range(0, rows - 2, BAND)]
@@ -325,6 +340,6 @@ def fill(baked: Baked, texels: Texels) -> Float[np.ndarray, "h w 3"]:
     The paper's distance transform leaks colours between islands that lie side by side in the atlas. Texels outside the
     islands are not touched (`stages.texels.pad`). Nothing is filled where no view painted anything at all.
     """
-    albedo = baked.albedo.copy()
+    albedo = memory.copied(baked.albedo)
     fill_in_place(albedo, baked.known, texels)
     return albedo

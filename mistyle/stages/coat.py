@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.core.image import nearest_fill, resize, srgb_from_linear
+from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import face_areas
-from mistyle.core.tangents import corner_tangents
 from mistyle.stages.frames import texel_frames
+from mistyle.stages.texels import bands
 from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import SurfaceSettings
 
@@ -114,17 +114,27 @@ def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.nda
 
     The nearest of about 200,000 texels of the same side answers.
     """
-    positions = np.concatenate([t.position[t.covered] for t in texels])
-    normals = np.concatenate([t.normal[t.covered] for t in texels])
-    albedo = np.concatenate([m.albedo[t.covered] for t, m in zip(texels, start, strict=True)])
-    light = srgb_from_linear(albedo @ np.array([0.2126, 0.7152, 0.0722], np.float32))
+    weights = np.array([0.2126, 0.7152, 0.0722], np.float32)
+    light = np.concatenate(
+        [
+            srgb_from_linear(m.albedo[rows][t.covered[rows]] @ weights)
+            for t, m in zip(texels, start, strict=True)
+            for rows in bands(*t.covered.shape)
+        ]
+    )
     if len(light) == 0 or light.std() < PLAIN:
         return None
     from scipy.spatial import KDTree
 
     every = max(len(light) // CONTENT_TEXELS, 1)
     reach = np.float32(0.02)  # working units by which a turn of the normal by one radian counts
-    tree = KDTree(np.concatenate([positions, reach * normals], axis=1)[::every])
+    counts = np.cumsum([0] + [int(t.covered.sum()) for t in texels])
+    places = []
+    for t, first, end in zip(texels, counts[:-1], counts[1:], strict=True):
+        chosen = np.flatnonzero(t.covered)[int(-first % every) : end - first : every]
+        parts = t.position.reshape(-1, 3)[chosen], reach * t.normal.reshape(-1, 3)[chosen]
+        places.append(np.concatenate(parts, axis=1))
+    tree = KDTree(np.concatenate(places))
     few = light[::every]
 
     def at(where: np.ndarray, facing: np.ndarray) -> np.ndarray:
@@ -133,34 +143,34 @@ def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.nda
     return at
 
 
-def first_maps(
+def lay_relief(
     asset: Asset,
-    start: Maps,
+    maps: Maps,
     texels: Texels,
+    rows: slice,
+    at: Bool[np.ndarray, "h w"],
     gradient: Float[np.ndarray, "t 3"],
     dull: Float[np.ndarray, " t"],
     height: float,
     gloss: float,
-) -> Maps:
-    """The asset's own normal map with the painting's relief laid upon it, and its roughness with the painting's gloss.
+    tangents: Float[np.ndarray, "f 3 4"],
+) -> None:
+    """Lay the painting's relief upon the normals of `maps`, and its gloss upon their roughness, in place, for the
+    texels `at` of some `rows`.
 
-    `gradient` (world, along the surface) and `dull` belong to the covered texels in row order. The normal that the
-    asset's map shows is bent by the relief's slope: nothing of it is overwritten.
+    `gradient` (world, along the surface) and `dull` belong to these texels in row order. The normal that the asset's
+    map shows is bent by the relief's slope: nothing of it is overwritten. `tangents` are `corner_tangents` of the mesh.
     """
-    at = texels.covered
-    normal, roughness = start.normal.copy(), start.roughness.copy()
+    normal, roughness = maps.normal[rows], maps.roughness[rows]
     if height > 0:
-        place = texels.face[at], texels.position[at], texels.normal[at]
-        frames = texel_frames(asset.mesh, *place, corner_tangents(asset.mesh))
+        place = texels.face[rows][at], texels.position[rows][at], texels.normal[rows][at]
+        frames = texel_frames(asset.mesh, *place, tangents)
         world = np.einsum("tk,tkx->tx", normal[at], frames) - np.float32(height) * gradient
         bent = np.einsum("tx,tkx->tk", world, frames)
         bent[:, 2] = np.maximum(bent[:, 2], 0.05)
         normal[at] = bent / np.linalg.norm(bent, axis=1, keepdims=True)
-        normal = nearest_fill(normal, at)
     if gloss > 0:
         roughness[at] = np.clip(roughness[at] + np.float32(gloss) * dull, SMOOTHEST, ROUGHEST)
-        roughness = nearest_fill(roughness, at)
-    return replace(start, normal=normal.astype(np.float32), roughness=roughness.astype(np.float32))
 
 
 def protected(maps: Maps, start: Maps, mask: Bool[np.ndarray, "h w"]) -> Maps:

@@ -112,14 +112,16 @@ def _write_textures(
     folder: Path, stem: str, maps: Maps, occlusion: np.ndarray, alpha: np.ndarray | None, pictures: Pictures
 ) -> list[tuple[Path, dict[str, Any]]]:
     """The eight texture files of one part, and what to say about each."""
+    # One after another: of large atlases each takes much memory.
     arrays = {
-        "albedo": maps.albedo if alpha is None else np.concatenate([maps.albedo, alpha[..., None]], axis=-1),
-        "normal": normal_colours(maps.normal),
-        "roughness": maps.roughness,
-        "orm": orm_colours(maps, occlusion),
+        "albedo": lambda: maps.albedo if alpha is None else np.concatenate([maps.albedo, alpha[..., None]], axis=-1),
+        "normal": lambda: normal_colours(maps.normal),
+        "roughness": lambda: maps.roughness,
+        "orm": lambda: orm_colours(maps, occlusion),
     }
     result = []
-    for kind, array in arrays.items():
+    for kind, make in arrays.items():
+        array = make()
         png, exr = folder / f"{stem}_{kind}.png", folder / f"{stem}_{kind}.exr"
         if kind == "roughness":
             write_png(png, array)

@@ -174,7 +174,7 @@ def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
     for view in targets:
         rgb, inside = np.nan_to_num(view.rgb, posinf=1.0), erode(view_mask(view), 1)
         stacked = np.concatenate([srgb_from_linear(rgb), inside[..., None].astype(np.float32)], axis=-1)
-        pictures.append(torch.from_numpy(np.ascontiguousarray(stacked.transpose(2, 0, 1))))
+        pictures.append(torch.from_numpy(memory.copied(stacked.transpose(2, 0, 1))))
         masks.append(inside)
     return World(
         traced=tracer(mesh),

@@ -5,14 +5,16 @@ turn to noise. The fit therefore moves the maps of a coarser mip level, about on
 is laid, interpolated, upon the maps as they came; their own finer detail stays.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.image import gaussian, nearest, resize
+from mistyle.core import memory
+from mistyle.core.image import gaussian, nearest, resized_rows
 from mistyle.core.maps import Maps, Texels
+from mistyle.stages.texels import bands
 
 MAPS = ("albedo", "normal", "roughness", "metallic")
 CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}
@@ -74,10 +76,7 @@ def build(
         height, width = where.covered.shape
         by = shrink if height % shrink == 0 and width % shrink == 0 else 1
         island = where.island.reshape(height // by, by, width // by, by).max(axis=(1, 3))
-        tilt = material.normal[..., :2] / np.maximum(np.linalg.norm(material.normal, axis=-1, keepdims=True), 1e-6)
-        channels = {"tilt": tilt, "roughness": material.roughness[..., None]}
-        channels |= {"albedo": material.albedo, "metallic": material.metallic[..., None]}
-        rows.append({name: _shrink(v, where.covered, by).reshape(-1, v.shape[-1]) for name, v in channels.items()})
+        rows.append({name: _shrink(material, name, where.covered, by).reshape(-1, n) for name, n in CHANNELS.items()})
         same = np.zeros((2, *island.shape), bool)
         same[0, :, :-1] = (island[:, :-1] == island[:, 1:]) & (island[:, :-1] >= 0)
         same[1, :-1] = (island[:-1] == island[1:]) & (island[:-1] >= 0)
@@ -218,17 +217,32 @@ def finished(table: Table, maps: Sequence[Maps], only: Sequence[Bool[np.ndarray,
     """The maps as they came with what the fit changed laid upon them, at their own resolution (inside `only`)."""
     result = []
     for k, material in enumerate(maps):
-        changes = {name: _change(table, k, name, material.roughness.shape) for name in CHANNELS}
-        made = _apply(material, {name: change for name, change in changes.items() if change is not None})
-        if only is not None:
-            fields = {n: _inside(only[k], getattr(made, n), getattr(material, n)) for n in MAPS}
-            made = replace(made, **fields)
-        result.append(made)
+        fields = {}
+        for name in CHANNELS:
+            change = _change(table, k, name)
+            if change is not None:
+                own = "normal" if name == "tilt" else name
+                fields[own] = _laid(getattr(material, own), name, change, None if only is None else only[k])
+        result.append(replace(material, **fields))
     return result
 
 
-def _inside(mask: Bool[np.ndarray, "h w"], inner: np.ndarray, outer: np.ndarray) -> np.ndarray:
-    return np.where(mask.reshape(*mask.shape, *[1] * (inner.ndim - 2)), inner, outer)
+def _laid(
+    values: Float[np.ndarray, "h w *c"],
+    name: str,
+    change: Float[np.ndarray, "H W c"],
+    mask: Bool[np.ndarray, "h w"] | None,
+) -> Float[np.ndarray, "h w *c"]:
+    """A map with a change, enlarged to it, laid upon it (inside the mask)."""
+    result, shape = memory.empty(values.shape), (values.shape[0], values.shape[1])
+    for rows in bands(*shape):
+        before = values[rows]
+        after = _apply(before, name, resized_rows(change, shape, rows, "repeat"))
+        result[rows] = after
+        if mask is not None:
+            kept = ~mask[rows]
+            result[rows][kept] = before[kept]
+    return result
 
 
 def spread(table: Table, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) -> list[Float[np.ndarray, "h w"]]:
@@ -237,12 +251,14 @@ def spread(table: Table, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) 
     for k, material in enumerate(maps):
         rows, columns = material.roughness.shape
         cells = values[table.offsets[k] : table.offsets[k + 1]].reshape(table.sizes[k]).astype(np.float32)
-        by = rows // table.sizes[k][0]
-        result.append(np.repeat(np.repeat(cells, by, axis=0), by, axis=1)[:rows, :columns])
+        by, made = rows // table.sizes[k][0], memory.empty((rows, columns))
+        made.reshape(rows // by, by, columns // by, by)[...] = cells[:, None, :, None]
+        result.append(made)
     return result
 
 
-def _change(table: Table, k: int, name: str, shape: tuple[int, int]) -> Float[np.ndarray, "h w c"] | None:
+def _change(table: Table, k: int, name: str) -> Float[np.ndarray, "H W c"] | None:
+    """What the fit changed, at the table's resolution; None where nothing."""
     part = slice(table.offsets[k], table.offsets[k + 1])
     size = table.sizes[k]
     change = (table.values[name][part] - table.start[name][part]).reshape(*size, -1)
@@ -253,33 +269,35 @@ def _change(table: Table, k: int, name: str, shape: tuple[int, int]) -> Float[np
     index, distance = nearest(np.asarray(moved))
     filled = change.reshape(-1, change.shape[-1])[index.ravel()].reshape(change.shape)
     filled = gaussian(filled, SMOOTH)
-    return resize(np.where((distance <= FILL)[..., None], filled, 0).astype(np.float32), shape, "repeat")
+    return np.where((distance <= FILL)[..., None], filled, 0).astype(np.float32)
 
 
-def _apply(material: Maps, changes: Mapping[str, Float[np.ndarray, "h w c"]]) -> Maps:
-    fields = {}
-    for name, change in changes.items():
-        if name == "tilt":
-            length = np.maximum(np.linalg.norm(material.normal, axis=-1, keepdims=True), 1e-6)
-            xy = project("tilt", material.normal[..., :2] / length + change)
-            z = np.sqrt(np.maximum(1 - (xy**2).sum(axis=-1, keepdims=True), 0))
-            fields["normal"] = np.concatenate([xy, z], axis=-1).astype(np.float32)
-        elif name == "albedo":
-            fields[name] = project(name, material.albedo + change).astype(np.float32)
-        else:
-            fields[name] = project(name, getattr(material, name) + change[..., 0]).astype(np.float32)
-    return replace(material, **fields)
+def _apply(
+    values: Float[np.ndarray, "h w *c"], name: str, change: Float[np.ndarray, "h w C"]
+) -> Float[np.ndarray, "h w *c"]:
+    if name == "tilt":
+        xy = project("tilt", _tilt(values) + change)
+        z = np.sqrt(np.maximum(1 - (xy**2).sum(axis=-1, keepdims=True), 0))
+        return np.concatenate([xy, z], axis=-1).astype(np.float32)
+    return project(name, values + (change if name == "albedo" else change[..., 0])).astype(np.float32)
 
 
-def _shrink(
-    values: Float[np.ndarray, "h w c"], covered: Bool[np.ndarray, "h w"], by: int
-) -> Float[np.ndarray, "H W c"]:
-    height, width, channels = values.shape
-    cells = (height // by, by, width // by, by)
-    weight = covered.reshape(cells).sum(axis=(1, 3), dtype=np.float32)
-    total = (values * covered[..., None]).reshape(*cells, channels).sum(axis=(1, 3), dtype=np.float32)
-    mean = total / np.maximum(weight, 1)[..., None]
-    if not (weight > 0).any():
-        return np.ascontiguousarray(values.reshape(*cells, channels).mean(axis=(1, 3), dtype=np.float32))
+def _tilt(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 2"]:
+    return normal[..., :2] / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
+
+
+def _shrink(material: Maps, name: str, covered: Bool[np.ndarray, "h w"], by: int) -> Float[np.ndarray, "H W c"]:
+    """Means of a map over the covered texels of cells; cells without any take the nearest."""
+    channels, (height, width) = CHANNELS[name], covered.shape
+    values = material.normal if name == "tilt" else getattr(material, name).reshape(height, width, channels)
+    weight = covered.reshape(height // by, by, width // by, by).sum(axis=(1, 3), dtype=np.float32)
+    counted = covered if (weight > 0).any() else np.ones_like(covered)
+    weight = weight if (weight > 0).any() else np.full_like(weight, by * by)
+    mean = np.empty((*weight.shape, channels), np.float32)
+    for rows in bands(height // by, width * by):  # of cells
+        texels = slice(rows.start * by, rows.stop * by)
+        here = _tilt(values[texels]) if name == "tilt" else values[texels]
+        cells = (here * counted[texels][..., None]).reshape(-1, by, width // by, by, channels)
+        mean[rows] = cells.sum(axis=(1, 3), dtype=np.float32) / np.maximum(weight[rows], 1)[..., None]
     index, _ = nearest(weight > 0)
     return np.ascontiguousarray(mean.reshape(-1, channels)[index.ravel()].reshape(*weight.shape, channels))

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
+from mistyle.core import memory
 from mistyle.core.image import dilate_within, distance_to, gaussian
 from mistyle.core.maps import Maps, Texels
 
@@ -119,7 +120,7 @@ def repair(
         raise ValueError(f"the inpainter returned {painted.shape}, not the albedo's {maps.albedo.shape}")
     if not np.isfinite(painted[hole]).all():
         raise ValueError("the inpainter returned numbers that are not finite; it must answer every texel of the hole")
-    albedo = maps.albedo.copy()
+    albedo = memory.copied(maps.albedo)
     w = weights[hole][:, None]
     albedo[hole] = np.where(w == 1, painted[hole], albedo[hole] + w * (painted[hole] - albedo[hole]))
     return replace(maps, albedo=albedo)

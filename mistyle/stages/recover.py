@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core import stopping
 from mistyle.core.capture import Captures
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
@@ -96,7 +97,8 @@ def recover(
     table, before = found.table, None
     if settings.solver != "texels" and settings.iterations:
         before = total_loss(shade, table, settings)
-        table = descend(work, shade, found, seed, trace, lambda d: progress(0.5 + 0.45 * d), save, resume)
+        with stopping.at_checkpoints():
+            table = descend(work, shade, found, seed, trace, lambda d: progress(0.5 + 0.45 * d), save, resume)
         after = total_loss(shade, table, settings)
         trace["pictures.whole"] = [before, after]
         if not after < before:
@@ -150,10 +152,12 @@ def descend(
             losses.extend(float(np.array(value)[0]) for value in lost)
             lost.clear()
             progress((k + 1) / settings.iterations)
-            if save is not None and time.monotonic() - saved > settings.checkpoint and k + 1 < settings.iterations:
+            due = stopping.asked() or time.monotonic() - saved > settings.checkpoint
+            if save is not None and due and k + 1 < settings.iterations:
                 state = descent.state() | {"iteration": np.array(k + 1), "losses": np.array(losses)}
                 save(state | {"table": np.array(table).reshape(-1, 8)})
                 saved = time.monotonic()
+                stopping.check()
     _note_stopped(work, descent.stopped())
     return np.array(table).reshape(-1, 8)
 

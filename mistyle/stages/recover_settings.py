@@ -54,12 +54,17 @@ class RecoverSettings(BaseModel):
         description="levels of the pyramid that preconditions Adam; none: 1 after the texels were solved, else 5",
     )
     loss: Literal["log_srgb_l1", "l2"] = Field(default="log_srgb_l1", description="what Adam minimises")
-    subsamples: int = Field(default=4, ge=1, le=64, description="samples a pixel, a square number")
+    subsamples: int = Field(
+        default=9,
+        ge=1,
+        le=64,
+        description="samples a pixel, a square number; with 4 the gradient at highlights is three times as wrong",
+    )
     roughness_floor: float = Field(
         default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
     )
     bounces: int = Field(
-        default=1, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
+        default=2, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
     )
     bounce_samples: int = Field(default=64, ge=1, le=4096, description="samples a pixel of that estimate")
     polish: int = Field(

@@ -6,7 +6,7 @@ the row formula holds, but glTF files have their origin at the top left (glTF 2.
 """
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from typing import Literal
@@ -15,16 +15,18 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pydantic import BaseModel, ConfigDict, Field
 
+from mistyle.core import memory
 from mistyle.core.asset import Material
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import nearest, resize
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.normals import same_points
-from mistyle.core.raster import fragments
+from mistyle.core.raster import fragment_pieces
 from mistyle.core.uvs import islands
 
 ROWS = 2**17  # texels handled at a time; the intermediate arrays then stay in the cache
+BAND_TEXELS = 2**20  # and where only the temporaries of large atlases count
 
 
 class AtlasSettings(BaseModel):
@@ -34,6 +36,12 @@ class AtlasSettings(BaseModel):
 
     size: int = Field(default=2048, ge=16, le=16384, description="texels along each side of every texture set")
     padding: int = Field(default=16, ge=0, le=1024, description="texels by which islands are continued outwards")
+
+
+def bands(height: int, width: int, count: int = BAND_TEXELS) -> Iterator[slice]:
+    """The rows of a map in pieces of about `count` texels, for what works texel by texel: temporaries stay small."""
+    step = max(1, count // max(width, 1))
+    return (slice(top, min(top + step, height)) for top in range(0, height, step))
 
 
 def threaded(work: Callable[[int], None], count: int, progress: Callable[[float], None] = lambda done: None) -> None:
@@ -65,12 +73,12 @@ def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
         )
     corners = np.stack([uv[..., 0] * size, (1 - uv[..., 1]) * size], axis=-1)
     local = np.full(size * size, -1, np.int32)
-    face, texel = fragments(corners, size)
-    # Where faces share a texel the last one written stays: writing backwards leaves it to the first.
-    local[texel[::-1]] = face[::-1]
     drawn = np.zeros(len(chosen), bool)
-    drawn[face] = True
-    del face, texel
+    for face, texel in fragment_pieces(corners, size):
+        drawn[face] = True
+        free = local[texel] < 0
+        # Where faces share a texel the last one written stays: writing backwards leaves it to the first.
+        local[texel[free][::-1]] = face[free][::-1]
     island = islands(same_points(mesh.positions)[mesh.faces[chosen]], mesh.corner_uvs[chosen])
     _claim_slivers(local, corners, drawn, island, size)
     return _interpolate(mesh, chosen, corners, local, island, size)
@@ -109,8 +117,10 @@ def _interpolate(
     )
     columns = np.ascontiguousarray(vertices.reshape(len(chosen), 18).T)  # numpy gathers from rows of one number fastest
     wraps = (corners.min(axis=(1, 2)) < 0) | (corners.max(axis=(1, 2)) > size)
-    position, normal = np.zeros((size * size, 3), np.float32), np.zeros((size * size, 3), np.float32)
-    face, islanded = np.full(size * size, -1, np.int32), np.full(size * size, -1, np.int32)
+    position, normal = memory.zeros((size * size, 3)), memory.zeros((size * size, 3))
+    face, islanded = memory.empty(size * size, np.int32), memory.empty(size * size, np.int32)
+    face.fill(-1)
+    islanded.fill(-1)
     rows = max(1, ROWS // size)
 
     def work(chunk: int) -> None:
@@ -207,24 +217,30 @@ def start_maps(material: Material, texels: Texels, size: int, metallic: Literal[
     if texels.covered.shape != (size, size):
         raise ValueError(f"the atlas has {texels.covered.shape} texels, not {size} x {size}")
     albedo = _resampled(material.albedo, material.albedo_factor, size)
-    normal = np.zeros((size, size, 3), np.float32)
+    normal = memory.zeros((size, size, 3))
     normal[..., 2] = 1
     if material.normal is not None:
         mean = resize(material.normal, (size, size), "repeat")
-        length = np.linalg.norm(mean, axis=-1, keepdims=True)
-        normal = np.where(length > 1e-6, mean / np.maximum(length, 1e-6), normal)
-    metal = np.zeros((size, size), np.float32)
+        for rows in bands(size, size):
+            length = np.linalg.norm(mean[rows], axis=-1, keepdims=True)
+            normal[rows] = np.where(length > 1e-6, mean[rows] / np.maximum(length, 1e-6), normal[rows])
+    metal = memory.zeros((size, size))
     if metallic == "keep":
         metal = _resampled(material.metallic, material.metallic_factor, size)
     roughness = _resampled(material.roughness, material.roughness_factor, size)
-    return Maps(albedo, normal.astype(np.float32), roughness, metal, np.zeros((size, size), bool))
+    return Maps(albedo, normal, roughness, metal, memory.zeros((size, size), bool))
 
 
 def _resampled(picture: np.ndarray | None, factor: np.ndarray | float, size: int) -> np.ndarray:
     scale = np.asarray(factor, np.float32)
+    result = memory.empty((size, size, *scale.shape))
     if picture is None:
-        return np.broadcast_to(np.clip(scale, 0, 1), (size, size, *scale.shape)).copy()
-    return np.clip(resize(picture, (size, size), "repeat") * scale, 0, 1).astype(np.float32)
+        result[...] = np.clip(scale, 0, 1)
+        return result
+    resized = resize(picture, (size, size), "repeat")
+    for rows in bands(size, size):
+        result[rows] = np.clip(resized[rows] * scale, 0, 1)
+    return result
 
 
 def pad(values: Float[np.ndarray, "h w *c"], texels: Texels, padding: int) -> Float[np.ndarray, "h w *c"]:
@@ -234,14 +250,14 @@ def pad(values: Float[np.ndarray, "h w *c"], texels: Texels, padding: int) -> Fl
     the ring is never narrower than asked for). Filtered look-ups and mip levels near an island's border then do not
     meet foreign colours (Blender's bake calls this its margin).
     """
-    result = values.copy()
+    result = memory.copied(values)
     pad_in_place([result], texels, padding)
     return result
 
 
 def pad_maps(maps: Maps, texels: Texels, padding: int) -> Maps:
     """`pad` for albedo, normal, roughness and metallic, with one search for the nearest texels."""
-    arrays = {name: getattr(maps, name).copy() for name in ("albedo", "normal", "roughness", "metallic")}
+    arrays = {name: memory.copied(getattr(maps, name)) for name in ("albedo", "normal", "roughness", "metallic")}
     pad_in_place(list(arrays.values()), texels, padding)
     return replace(maps, **arrays)
 
@@ -252,7 +268,9 @@ def pad_in_place(maps: Sequence[np.ndarray], texels: Texels, padding: int) -> No
         return
     index, distance = nearest(texels.covered)
     ring = np.flatnonzero((distance > 0) & (distance <= 1.05 * padding))
+    del distance
     source = index.reshape(-1)[ring]
+    del index
     for values in maps:
         flat = values.reshape(texels.covered.size, -1)
         flat[ring] = flat.take(source, axis=0)

@@ -1,0 +1,127 @@
+"""How much memory jobs take, beside what `--dry-run` says: `python -m benchmarks.memory [--quick] [--json FILE]`
+
+Each job runs in a process of its own, with few steps and turntable frames, on which memory does not hang. Figures:
+`<case>.estimate_gb`, `<case>.peak_gb`, `<case>.error` (estimate / peak - 1); and for a job that is given less than it
+would take, `budget.asked_gb`, `budget.peak_gb` and `budget.same_bytes` (1: its asset is that of the job without a
+budget, byte for byte). --quick runs the draft on spot, the fit at 256² and a small budget. `--stages` also prints every
+stage's peak beside its estimate, from which the constants of run/budget.py come.
+"""
+
+import argparse
+import hashlib
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+from benchmarks.common import finish
+
+DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
+SPOT, BUNNY = DATA / "meshes/plain/spot.obj", DATA / "meshes/plain/stanford-bunny.obj"
+WAVE, STARS = DATA / "styles/great_wave.jpg", DATA / "styles/starry_night.jpg"
+FEW = ["--set", "fit.iterations1=3", "--set", "fit.iterations2=3", "--set", "report.frames=4"]
+DRAFT = ["--preset", "draft", *FEW]
+
+STYLIZE: dict[str, list[Any]] = {
+    "draft_spot": ["stylize", SPOT, WAVE, *DRAFT],
+    "draft_bunny": ["stylize", BUNNY, STARS, *DRAFT],
+    "demo": ["demo", *FEW],
+    "atlas_4096": ["stylize", SPOT, WAVE, *DRAFT, "--atlas", "4096"],
+    "views_64": ["stylize", SPOT, WAVE, *DRAFT, "--set", "rig.kind=turntable", "--set", "rig.views=64"],
+}
+FITS = {"fit_256": ("256", "256"), "fit_512": ("512", "256")}  # atlas, pixels of the 16 pictures
+PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main())"
+
+
+def main() -> None:
+    options = argparse.ArgumentParser(prog="python -m benchmarks.memory", description=__doc__)
+    options.add_argument("--quick", action="store_true", help="three small jobs")
+    options.add_argument("--json", type=Path)
+    options.add_argument("--only", action="append", help="only this case (repeatable)")
+    options.add_argument("--stages", action="store_true", help="also print every stage's peak and estimate")
+    options.add_argument("--keep", type=Path, help="folder for the runs, to look at afterwards")
+    chosen = options.parse_args()
+    wanted = chosen.only or (["draft_spot", "fit_256", "budget"] if chosen.quick else [*STYLIZE, *FITS, "budget"])
+    figures: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        place = chosen.keep or Path(scratch)
+        for name in wanted:
+            if name in STYLIZE:
+                found = stylized(place / name, STYLIZE[name], chosen.stages)
+            elif name in FITS:
+                found = fitted(place / name, *FITS[name], chosen.stages)
+            else:
+                found = budget(place / name, chosen.quick)
+            figures |= {f"{name}.{key}": value for key, value in found.items()}
+            print(name, {key: round(value, 3) for key, value in found.items()}, file=sys.stderr, flush=True)
+    finish(figures, chosen.json)
+
+
+def mistyle(*words: Any) -> dict[str, Any]:
+    """Run a command; what it prints with --json."""
+    command = [sys.executable, "-c", PROGRAM, *map(str, words), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode != 0:
+        raise SystemExit(f"mistyle {' '.join(map(str, words))} ended with {done.returncode}: {done.stderr[-2000:]}")
+    return json.loads(done.stdout) if done.stdout.strip().startswith("{") else {}
+
+
+def error(estimate: float, peak: float) -> dict[str, float]:
+    return {"estimate_gb": estimate, "peak_gb": peak, "error": estimate / peak - 1}
+
+
+def stylized(out: Path, words: list[Any], stages: bool) -> dict[str, float]:
+    """Estimate and peak of a job."""
+    told = mistyle(*words, "-o", out, "--dry-run")
+    made = mistyle(*words, "-o", out)
+    if stages:
+        show(told.get("peaks_gb", {}), out)
+    return error(told["memory_gb"], made["peak_gb"])
+
+
+def fitted(out: Path, atlas: str, pixels: str, stages: bool) -> dict[str, float]:
+    """Estimate and peak of a fit to 16 pictures that were rendered for it."""
+    from mistyle.core.light import lights, to_json
+    from mistyle.run.budget import MATERIAL, Counts, material_gb, peaks
+    from mistyle.run.material_settings import MaterialSettings
+
+    views, light = out / "pictures", out / "lights.json"
+    mistyle("render", SPOT, "-o", views, "--resolution", pixels, "--spp", "4")
+    # Not what lit them: memory does not hang on how well the pictures are explained.
+    light.write_text(json.dumps(to_json(lights("phase1"))))
+    few = ["--lights", light, "--set", "recover.iterations=32", "--set", "report.frames=4"]
+    made = mistyle("fit", SPOT, views, "-o", out / "fit", "--atlas", atlas, *few)
+    settings = MaterialSettings.model_validate(json.loads((out / "fit" / "run.json").read_text())["settings"])
+    count = 16 * int(pixels) ** 2
+    if stages:
+        show(peaks(MATERIAL, Counts(settings.atlas.size**2, count)), out / "fit")
+    return error(material_gb(settings, count), made["peak_gb"])
+
+
+def budget(out: Path, quick: bool) -> dict[str, float]:
+    """A job that would take more than it is given, without gradients, and the same without a budget."""
+    size, asked = ("1024", 1.25) if quick else ("4096", 2.5)
+    words = ["stylize", SPOT, WAVE, *DRAFT, "--atlas", size, "--refine", "off"]
+    free = mistyle(*words, "-o", out / "free")
+    made = mistyle(*words, "-o", out / "kept", "--memory", f"{asked}G")
+    same = assets(out / "free") == assets(out / "kept")
+    return {"free_gb": free["peak_gb"], "asked_gb": asked, "peak_gb": made["peak_gb"], "same_bytes": float(same)}
+
+
+def assets(out: Path) -> list[str]:
+    """Digests of what a job wrote for others."""
+    files = sorted(p for part in ("asset", "stylized") for p in (out / part).rglob("*") if p.name != "done.json")
+    return [hashlib.sha256(p.read_bytes()).hexdigest() for p in files if p.is_file()]
+
+
+def show(estimates: dict[str, float], out: Path) -> None:
+    found = json.loads((out / "run.json").read_text())["peaks_gb"]
+    for stage, peak in found.items():
+        print(f"  {stage:<10} {estimates.get(stage, float('nan')):8.3f} {peak:8.3f}", file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,208 @@
+"""Materials of USD: UsdPreviewSurface, its constants, and its textures decoded when they are asked for."""
+
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.errors import InputRefused
+from mistyle.files.pictures import MAX_PICTURE_BYTES, Budget, decode
+from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
+from mistyle.files.usd_layers import Place, bytes_of, locate, place_of
+
+CHANNELS = {"r": (0,), "g": (1,), "b": (2,), "rgb": (0, 1, 2), "a": ()}
+INPUTS = {"albedo": "diffuseColor", "roughness": "roughness", "metallic": "metallic", "normal": "normal"}
+DEFAULTS = {"albedo": (0.18, 0.18, 0.18), "roughness": 0.5, "metallic": 0.0}
+
+
+@dataclass(frozen=True)
+class Texture:
+    """A UsdUVTexture: its file as named by the layer at `anchor`, value = scale * texel + bias, the channels used."""
+
+    file: str
+    anchor: Place
+    space: str
+    scale: tuple[float, ...] | None
+    bias: tuple[float, ...] | None
+    channel: str
+    primvar: str
+    transform: Float[np.ndarray, "3 3"] | None
+
+
+@dataclass(frozen=True)
+class Found:
+    """A material, and the primvar that its textures are looked up at (None: it has none)."""
+
+    material: RawMaterial
+    primvar: str | None
+
+
+def plain(name: str, colour: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Found:
+    """A material without textures."""
+    return Found(RawMaterial(name, no_textures, None, colour, 0.5, 0.0), None)
+
+
+def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any, notes: list[str]) -> Found:
+    """The preview surface of a UsdShade.Material; a plain material, and a note, where it has none."""
+    name = material.GetPrim().GetName()
+    surface = material.ComputeSurfaceSource()[0]
+    if not surface or surface.GetShaderId() != "UsdPreviewSurface":
+        notes.append(f"Material '{name}' has no UsdPreviewSurface and was read as plain.")
+        return plain(name)
+    textures: dict[str, Texture] = {}
+    constants: dict[str, Any] = dict(DEFAULTS)
+    for kind, named in INPUTS.items():
+        value = _source(pxr, surface.GetInput(named), time)
+        if isinstance(value, Texture):
+            textures[kind] = value
+        elif value is not None and kind != "normal":
+            constants[kind] = value
+    opacity = _source(pxr, surface.GetInput("opacity"), time)
+    if isinstance(opacity, Texture) or (opacity is not None and float(opacity) < 1):
+        notes.append(f"The opacity of material '{name}' was not read.")
+    primvars = [t.primvar for t in textures.values()]
+    if len(set(primvars)) > 1:
+        other = sorted(kind for kind, t in textures.items() if t.primvar != primvars[0])
+        notes.append(f"Textures of material '{name}' use several UV sets; {', '.join(other)} was left out.")
+        textures = {kind: t for kind, t in textures.items() if t.primvar == primvars[0]}
+    albedo = (1.0, 1.0, 1.0) if "albedo" in textures else tuple(float(np.clip(c, 0, 1)) for c in constants["albedo"])
+    tiled = any("<UDIM>" in t.file for t in textures.values())
+    made = RawMaterial(
+        name,
+        partial(_load, textures, root, budget) if textures else no_textures,
+        tiled if textures else None,
+        (albedo[0], albedo[1], albedo[2]),
+        1.0 if "roughness" in textures else float(np.clip(constants["roughness"], 0, 1)),
+        1.0 if "metallic" in textures else float(np.clip(constants["metallic"], 0, 1)),
+    )
+    return Found(made, primvars[0] if textures else None)
+
+
+def _source(pxr: Any, given: Any, time: Any) -> Any:
+    """A constant, a Texture, or None where nothing is said."""
+    if not given:
+        return None
+    producing = given.GetValueProducingAttributes()
+    if not producing:
+        return None
+    attribute = producing[0]
+    shader = pxr.UsdShade.Shader(attribute.GetPrim())
+    if not shader or not attribute.GetName().startswith("outputs:"):
+        return attribute.Get(time)
+    if shader.GetShaderId() != "UsdUVTexture":
+        return None
+    return _texture(pxr, shader, attribute.GetName().removeprefix("outputs:"), time)
+
+
+def _texture(pxr: Any, shader: Any, channel: str, time: Any) -> Texture | None:
+    file = _attribute(shader, "file")
+    asset = file.Get(time) if file else None
+    if asset is None or channel not in CHANNELS:
+        return None
+    layer = file.GetPropertyStack(time)[0].layer
+    primvar, transform = _lookup(pxr, shader.GetInput("st"), time)
+    space, scale, bias = (_value(shader, name, time) for name in ("sourceColorSpace", "scale", "bias"))
+    return Texture(
+        asset.path, place_of(layer), str(space or "auto"), None if scale is None else tuple(scale),
+        None if bias is None else tuple(bias), channel, primvar, transform,
+    )  # fmt: skip
+
+
+def _attribute(shader: Any, name: str) -> Any:
+    """Where an input's value comes from: itself, or what it is connected to."""
+    given = shader.GetInput(name)
+    producing = given.GetValueProducingAttributes() if given else []
+    return producing[0] if producing else None
+
+
+def _value(shader: Any, name: str, time: Any) -> Any:
+    attribute = _attribute(shader, name)
+    return attribute.Get(time) if attribute else None
+
+
+def _lookup(pxr: Any, given: Any, time: Any) -> tuple[str, Float[np.ndarray, "3 3"] | None]:
+    """The primvar's name and the UsdTransform2d on the way (translation * rotation * scale), v up."""
+    transform = None
+    for _ in range(8):
+        producing = given.GetValueProducingAttributes() if given else []
+        shader = pxr.UsdShade.Shader(producing[0].GetPrim()) if producing else None
+        kind = shader.GetShaderId() if shader else None
+        if kind == "UsdTransform2d":
+            turn = np.radians(float(_value(shader, "rotation", time) or 0))
+            scale = _value(shader, "scale", time) or (1, 1)
+            move = _value(shader, "translation", time) or (0, 0)
+            c, s = np.cos(turn), np.sin(turn)
+            here = np.array([[c, -s, move[0]], [s, c, move[1]], [0, 0, 1]]) @ np.diag([scale[0], scale[1], 1.0])
+            transform = here if transform is None else transform @ here
+            given = shader.GetInput("in") if shader else None
+            continue
+        name = _value(shader, "varname", time) if kind == "UsdPrimvarReader_float2" else None
+        return str(name or "st"), transform
+    return "st", transform
+
+
+def _load(textures: dict[str, Texture], root: Path, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
+    maps: dict[str, RawMap] = {}
+    notes: list[str] = []
+    for kind, texture in textures.items():
+        name = texture.file.replace("<UDIM>", str(tile))
+        try:
+            values = _texels(kind, texture, locate(root, texture.anchor, name), budget, notes)
+        except InputRefused as error:
+            notes.append(f"Texture {name} was left out: {error}")
+            continue
+        if values is not None:
+            maps[kind] = RawMap(values, transform=texture.transform)
+    return maps, tuple(notes)
+
+
+def _texels(kind: str, texture: Texture, place: Place, budget: Budget, notes: list[str]) -> np.ndarray | None:
+    """One map as `Material` has it; None with a note where it is not there or cannot be used."""
+    chosen = CHANNELS[texture.channel]
+    if not chosen:
+        notes.append(f"Texture {texture.file} is used by its alpha, which was not read.")
+        return None
+    if place.file.suffix.lower() == ".exr" or place.inner.lower().endswith(".exr"):
+        pixels = _light(place, notes)
+    else:
+        data = bytes_of(place, MAX_PICTURE_BYTES)
+        if data is None:
+            notes.append(f"Texture {texture.file} is not there and was left out.")
+        decoded = kind == "albedo" and texture.space != "raw"
+        pixels = None if data is None else decode(data, str(place), budget, "colour" if decoded else "data")
+    if pixels is None:
+        return None
+    return _meant(kind, texture, pixels, chosen)
+
+
+def _light(place: Place, notes: list[str]) -> np.ndarray | None:
+    """An EXR texture's first three channels; a single one counts for all."""
+    from mistyle.files.hdr import read_exr
+
+    if place.inner or not place.file.is_file():
+        why = "lies inside a package" if place.inner else "is not there"
+        notes.append(f"Texture {place} {why} and was left out.")
+        return None
+    planes = read_exr(place.file)
+    names = [c for c in "RGB" if c in planes] or sorted(planes)[:1]
+    return np.stack([planes[names[min(k, len(names) - 1)]] for k in range(3)], axis=-1)
+
+
+def _meant(kind: str, texture: Texture, pixels: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
+    """scale * texel + bias in the channels that are used; normals as unit vectors, 2 c - 1 where nothing is said."""
+    said = texture.scale is not None or texture.bias is not None
+    scale = np.array((texture.scale or (1, 1, 1, 1))[:3], np.float32)
+    bias = np.array((texture.bias or (0, 0, 0, 0))[:3], np.float32)
+    if kind == "normal" and not said:
+        scale, bias = np.full(3, 2, np.float32), np.full(3, -1, np.float32)
+    values = pixels * scale + bias
+    if kind == "normal":
+        values[..., 2] = np.maximum(values[..., 2], 1e-3)
+        return (values / np.linalg.norm(values, axis=-1, keepdims=True)).astype(np.float32)
+    values = np.clip(values, 0, 1)
+    if kind == "albedo":
+        return np.ascontiguousarray(values[..., list(chosen * 3 if len(chosen) == 1 else chosen)])
+    return np.ascontiguousarray(values[..., chosen[0]])

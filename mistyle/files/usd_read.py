@@ -1,0 +1,345 @@
+"""USD to triangles: every visible mesh of the stage, in metres and Y up, with its preview surfaces. Needs `usd-core`.
+
+Nothing is composed before usd_layers.py has seen every layer. Values are those of the default time, of animated ones
+the earliest. A subdivision surface comes as its control cage; of point instancers each prototype is read once, where
+its first instance stands, since all instances show the same texels.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.core.asset import Primitive
+from mistyle.files.bounds import MAX_NODES, refuse
+from mistyle.files.pictures import Budget
+from mistyle.files.polygons import check_indices, check_positions, too_many, triangulate
+from mistyle.files.raw import Raw
+from mistyle.files.usd import library
+from mistyle.files.usd_layers import check_layers, said, textures_named
+from mistyle.files.usd_materials import Found, plain, read_material
+
+Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+UV_NAMES = ("st", "UVMap", "map1", "uv")
+
+
+@dataclass(frozen=True)
+class Polygons:
+    """A mesh prim's faces: `corner` (t 3) are the polygon corners of every triangle, `polygon` its polygon.
+
+    vertices  the point of every polygon corner
+    turned    the file's corners are clockwise (leftHanded): corners 1 and 2 of every triangle are swapped
+    """
+
+    points: Float[np.ndarray, "v 3"]
+    sizes: Int[np.ndarray, " p"]
+    vertices: Int[np.ndarray, " c"]
+    corner: Int[np.ndarray, "t 3"]
+    polygon: Int[np.ndarray, " t"]
+    turned: bool
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """One mesh prim where it stands; `owner` is what instances of it share."""
+
+    name: str
+    owner: str
+    positions: np.ndarray
+    faces: np.ndarray
+    normals: np.ndarray | None
+    uvs: np.ndarray | None
+    material: np.ndarray
+
+
+def open_stage(pxr: Any, path: Path) -> Any:
+    """The composed stage of a file whose layers have passed. Raises InputRefused for every composition error."""
+    check_layers(pxr, path)
+    try:
+        stage = pxr.Usd.Stage.Open(str(path.resolve()))
+        errors = stage.GetCompositionErrors()
+    except pxr.Tf.ErrorException as error:
+        raise refuse(path, f"a stage that USD cannot open ({said(error)})", "a USD file", "Export it again") from None
+    if errors:
+        found = f"a stage that does not compose ({str(errors[0]).strip().splitlines()[0][:160]})"
+        raise refuse(path, found, "references without cycles to prims that are there", "Flatten or repair the stage")
+    return stage
+
+
+def files_of(path: Path) -> list[Path]:
+    """The layers, packages and textures that a file stands on, itself among them."""
+    pxr = library()
+    files = check_layers(pxr, path)
+    return [*files, *textures_named(pxr, files, path.parent.resolve())]
+
+
+def read_usd(path: Path, max_faces: int) -> Raw:
+    """Triangles of all visible meshes of purpose default or render, in stage order, one material per bound material."""
+    pxr = library()
+    stage = open_stage(pxr, path)
+    time, notes = pxr.Usd.TimeCode.EarliestTime(), []
+    found: dict[str, int] = {}
+    materials: list[Found] = []
+    budget, root = Budget(path), path.parent.resolve()
+
+    def number(material: Any, colour: Any) -> int:
+        key = str(material.GetPath()) if material else f"displayColor {colour}"
+        if key not in found:
+            found[key] = len(materials)
+            materials.append(
+                read_material(pxr, material, root, budget, time, notes) if material else plain("material", colour)
+            )
+        return found[key]
+
+    user, pieces, faces = _user_matrix(pxr, stage, notes), [], 0
+    for prim, owner, matrix in mesh_prims(pxr, stage, path, notes):
+        piece = _piece(pxr, prim, owner, matrix @ user, time, path, max_faces, number, materials, notes)
+        if piece is not None:
+            faces += len(piece.faces)
+            too_many(faces, max_faces, path)
+            pieces.append(piece)
+    if not pieces:
+        raise refuse(path, "no mesh on its stage", "at least one visible UsdGeomMesh", "Export the mesh itself")
+    return _raw(pieces, [f.material for f in materials], notes, path)
+
+
+def _raw(pieces: list[_Piece], materials: list, notes: list[str], path: Path) -> Raw:
+    starts = np.cumsum([0, *(len(p.faces) for p in pieces)])
+    first = np.cumsum([0, *(len(p.positions) for p in pieces)])[:-1]
+    twin, owners = np.arange(starts[-1]), {}
+    for piece, a in zip(pieces, starts[:-1], strict=True):
+        begin = owners.setdefault(piece.owner, int(a))
+        twin[a : a + len(piece.faces)] = np.arange(begin, begin + len(piece.faces))
+    if (twin != np.arange(len(twin))).any():
+        notes.append("Instances of a mesh share their texels; the first one's are painted.")
+
+    def joined(name: str, width: int) -> np.ndarray | None:
+        parts = [getattr(p, name) for p in pieces]
+        if all(part is None for part in parts):
+            return None
+        nothing = [np.full((len(p.faces), 3, width), np.nan, np.float32) for p in pieces]
+        return np.concatenate([no if part is None else part for part, no in zip(parts, nothing, strict=True)])
+
+    material = np.concatenate([p.material for p in pieces])
+    used = np.unique(material)
+    return Raw(
+        kind="usd",
+        positions=np.concatenate([p.positions for p in pieces]),
+        faces=np.concatenate([p.faces + f for p, f in zip(pieces, first, strict=True)]),
+        normals=joined("normals", 3),
+        uvs=joined("uvs", 2),
+        material=np.searchsorted(used, material),
+        materials=tuple(materials[k] for k in used),
+        primitives=tuple(
+            Primitive(-1, -1, -1, int(a), int(b), -1, -1, -1, int(f), p.name)
+            for p, a, b, f in zip(pieces, starts[:-1], starts[1:], first, strict=True)
+        ),
+        twin=twin,
+        notes=tuple(dict.fromkeys(notes)),
+    )
+
+
+def _user_matrix(pxr: Any, stage: Any, notes: list[str]) -> Float[np.ndarray, "4 4"]:
+    """From the stage's units and axis to metres and Y up, for row vectors."""
+    unit = float(pxr.UsdGeom.GetStageMetersPerUnit(stage))
+    unit = unit if np.isfinite(unit) and unit > 0 else 1.0
+    z_up = pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z
+    if z_up or unit != 1:
+        turned = "turned from Z up to Y up" if z_up else ""
+        scaled = f"scaled from units of {unit:g} m to metres" if unit != 1 else ""
+        notes.append(f"The stage was {' and '.join(x for x in (turned, scaled) if x)}.")
+    matrix = np.eye(4)
+    matrix[:3, :3] = unit * (Y_FROM_Z.T if z_up else np.eye(3))
+    return matrix
+
+
+def mesh_prims(pxr: Any, stage: Any, path: Path, notes: list[str]) -> Iterator[tuple[Any, str, np.ndarray]]:
+    """(prim, what its instances share, world matrix for row vectors) of every mesh that is shown, in stage order."""
+    time = pxr.Usd.TimeCode.EarliestTime()
+    cache = pxr.UsdGeom.XformCache(time)
+    every = pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)
+    visited = iter(pxr.Usd.PrimRange(stage.GetPseudoRoot(), every))
+    for count, prim in enumerate(visited):
+        if count > MAX_NODES:
+            raise refuse(path, f"more than {MAX_NODES} prims", "fewer", "Flatten instances that are not needed")
+        if not _shown(pxr, prim, time, notes):
+            visited.PruneChildren()
+        elif prim.IsA(pxr.UsdGeom.PointInstancer):
+            visited.PruneChildren()
+            yield from _prototypes(pxr, prim, cache, time, notes)
+        elif prim.IsA(pxr.UsdGeom.Mesh):
+            inside = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
+            yield prim, str(inside.GetPath()), np.array(cache.GetLocalToWorldTransform(prim))
+        elif prim.IsA(pxr.UsdGeom.Gprim):
+            notes.append("Shapes that are no meshes (spheres, curves, points) were left out.")
+
+
+def _shown(pxr: Any, prim: Any, time: Any, notes: list[str]) -> bool:
+    imageable = pxr.UsdGeom.Imageable(prim)
+    if not imageable:
+        return True
+    if imageable.GetVisibilityAttr().Get(time) == pxr.UsdGeom.Tokens.invisible:
+        notes.append("Invisible prims were left out.")
+        return False
+    if imageable.ComputePurpose() in (pxr.UsdGeom.Tokens.proxy, pxr.UsdGeom.Tokens.guide):
+        notes.append("Prims of purpose proxy or guide were left out.")
+        return False
+    return True
+
+
+def _prototypes(pxr: Any, prim: Any, cache: Any, time: Any, notes: list[str]) -> Iterator[tuple[Any, str, np.ndarray]]:
+    """The meshes of each prototype, placed by its first instance (scale, rotation, translation)."""
+    instancer = pxr.UsdGeom.PointInstancer(prim)
+    which = np.array(instancer.GetProtoIndicesAttr().Get(time) or [], np.int64)
+    at = instancer.GetPositionsAttr().Get(time)
+    turns, scales = instancer.GetOrientationsAttr().Get(time), instancer.GetScalesAttr().Get(time)
+    notes.append("Of a point instancer each prototype was read once, where its first instance stands.")
+    world = np.array(cache.GetLocalToWorldTransform(prim))
+    for k, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
+        own, first = prim.GetStage().GetPrimAtPath(target), np.flatnonzero(which == k)
+        if not own or not len(first) or at is None or first[0] >= len(at):
+            continue
+        i = int(first[0])
+        place = np.eye(4)
+        if turns is not None and i < len(turns):
+            place = np.array(pxr.Gf.Matrix4d().SetRotate(pxr.Gf.Quatd(turns[i])))
+        if scales is not None and i < len(scales):
+            place = np.diag([*map(float, scales[i]), 1.0]) @ place
+        place[3, :3] = np.array(at[i], float)
+        above = np.linalg.pinv(np.array(cache.GetParentToWorldTransform(own)))
+        for inner in pxr.Usd.PrimRange(own, pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)):
+            if inner.IsA(pxr.UsdGeom.Mesh):
+                local = np.array(cache.GetLocalToWorldTransform(inner)) @ above
+                yield inner, str(inner.GetPath()), local @ place @ world
+
+
+def polygons(pxr: Any, prim: Any, path: Path, max_faces: int = 2**31) -> Polygons | None:
+    """The faces of a mesh prim as triangles, in file order; None where it has none. Holes are left out."""
+    mesh, time = pxr.UsdGeom.Mesh(prim), pxr.Usd.TimeCode.EarliestTime()
+    points = np.array(mesh.GetPointsAttr().Get(time) or np.zeros((0, 3)), np.float64).reshape(-1, 3)
+    sizes = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int64)
+    vertices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int64)
+    if not len(points) or not len(sizes):
+        return None
+    again = "Export the mesh again"
+    if (sizes < 0).any() or sizes.sum() != len(vertices):
+        found = f"{prim.GetPath()} with {len(vertices)} corners for faces of {int(sizes.sum())}"
+        raise refuse(path, found, "as many indices as its faces have corners", again)
+    too_many(len(sizes), max_faces, path)
+    too_many(len(points), 3 * max_faces, path, "vertices")
+    check_indices(vertices, len(points), path, "vertex")
+    check_positions(points, path)
+    corner = triangulate(sizes, points[vertices])
+    polygon = np.repeat(np.arange(len(sizes)), sizes)[corner[:, 0]] if len(corner) else np.zeros(0, np.int64)
+    holes = np.array(mesh.GetHoleIndicesAttr().Get(time) or [], np.int64)
+    kept = ~np.isin(polygon, holes)
+    turned = mesh.GetOrientationAttr().Get(time) == pxr.UsdGeom.Tokens.leftHanded
+    corner = corner[kept][:, [0, 2, 1]] if turned else corner[kept]
+    return Polygons(points, sizes, vertices, corner, polygon[kept], turned)
+
+
+def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, notes) -> _Piece | None:
+    shape = polygons(pxr, prim, path, max_faces)
+    if shape is None or not len(shape.corner):
+        return None
+    mesh = pxr.UsdGeom.Mesh(prim)
+    if mesh.GetSubdivisionSchemeAttr().Get(time) != pxr.UsdGeom.Tokens.none:
+        notes.append("A subdivision surface was read as its control cage.")
+    if "SkelBindingAPI" in prim.GetAppliedSchemas():
+        notes.append("A skinned mesh was read in its bind pose.")
+    if mesh.GetPointsAttr().ValueMightBeTimeVarying():
+        notes.append("Of an animated mesh the first frame was read.")
+    if not np.isfinite(matrix).all():
+        raise refuse(path, f"{prim.GetPath()} with a transform that is not finite", "finite numbers", "Export it again")
+    linear = matrix[:3, :3]
+    if np.linalg.det(linear) < 0:
+        shape = Polygons(shape.points, shape.sizes, shape.vertices, shape.corner[:, [0, 2, 1]], shape.polygon, True)
+    positions = shape.points @ linear + matrix[3, :3]
+    material = _bound(pxr, prim, shape, number, time)
+    names = [materials[k].primvar for k in np.unique(material) if materials[k].primvar]
+    normals = _normals(pxr, mesh, shape, time, notes)
+    return _Piece(
+        name=str(prim.GetPath()),
+        owner=owner,
+        positions=positions,
+        faces=shape.vertices[shape.corner],
+        normals=None if normals is None else _turned(normals, linear),
+        uvs=_uvs(pxr, mesh, shape, names, time, notes),
+        material=material,
+    )
+
+
+def _turned(normals: np.ndarray, linear: np.ndarray) -> Float[np.ndarray, "f 3 3"]:
+    """Unit normals by the inverse transpose (row vectors)."""
+    turned = normals.astype(np.float64) @ np.linalg.pinv(linear).T
+    length = np.linalg.norm(turned, axis=-1, keepdims=True)
+    return (turned / np.where(length > 0, length, 1)).astype(np.float32)
+
+
+def _bound(pxr: Any, prim: Any, shape: Polygons, number: Any, time: Any) -> Int[np.ndarray, " f"]:
+    """The material of every triangle: that of its subset, else the mesh's own, else its display colour."""
+    api = pxr.UsdShade.MaterialBindingAPI
+    shown = pxr.UsdGeom.Gprim(prim).GetDisplayColorAttr().Get(time)
+    colour = tuple(float(np.clip(c, 0, 1)) for c in shown[0]) if shown is not None and len(shown) else (1.0, 1.0, 1.0)
+    of_polygon = np.full(len(shape.sizes), -1, np.int64)
+    for subset in api(prim).GetMaterialBindSubsets():
+        rows = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
+        rows = rows[(rows >= 0) & (rows < len(of_polygon))]
+        of_polygon[rows] = number(api(subset.GetPrim()).ComputeBoundMaterial()[0], colour)
+    if (of_polygon < 0).any():
+        of_polygon[of_polygon < 0] = number(api(prim).ComputeBoundMaterial()[0], colour)
+    return of_polygon[shape.polygon]
+
+
+def _normals(pxr: Any, mesh: Any, shape: Polygons, time: Any, notes: list[str]) -> np.ndarray | None:
+    primvar = pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
+    if primvar and primvar.HasValue():
+        return _spread(primvar.ComputeFlattened(time), primvar.GetInterpolation(), shape, 3, "normals", notes)
+    return _spread(mesh.GetNormalsAttr().Get(time), mesh.GetNormalsInterpolation(), shape, 3, "normals", notes)
+
+
+def uv_primvar(pxr: Any, mesh: Any, wanted: list[str]) -> Any:
+    """The primvar to look textures up at: the materials' own, a usual name, else the first of two components."""
+    primvars = pxr.UsdGeom.PrimvarsAPI(mesh)
+    for name in (*wanted, *UV_NAMES):
+        found = primvars.FindPrimvarWithInheritance(name)
+        if found and found.HasValue() and _is_pair(found):
+            return found
+    return next(
+        (p for p in primvars.GetPrimvarsWithValues() if _is_pair(p) and "texCoord" in str(p.GetTypeName())), None
+    )
+
+
+def _is_pair(primvar: Any) -> bool:
+    return str(primvar.GetTypeName()) in ("texCoord2f[]", "texCoord2d[]", "texCoord2h[]", "float2[]", "double2[]")
+
+
+def _uvs(pxr, mesh, shape: Polygons, wanted: list[str], time, notes: list[str]) -> np.ndarray | None:
+    found = uv_primvar(pxr, mesh, wanted)
+    if not found:
+        return None
+    return _spread(found.ComputeFlattened(time), found.GetInterpolation(), shape, 2, "UVs", notes)
+
+
+def _spread(
+    values: Any, interpolation: str, shape: Polygons, width: int, what: str, notes: list[str]
+) -> Float[np.ndarray, "f 3 w"] | None:
+    """A primvar's values at every triangle corner; None, with a note, where there are not as many as there must be."""
+    if values is None or len(values) == 0:
+        return None
+    table = np.array(values, np.float32).reshape(len(values), -1)
+    where = {
+        "faceVarying": (len(shape.vertices), shape.corner),
+        "vertex": (len(shape.points), shape.vertices[shape.corner]),
+        "varying": (len(shape.points), shape.vertices[shape.corner]),
+        "uniform": (len(shape.sizes), np.repeat(shape.polygon[:, None], 3, axis=1)),
+        "constant": (1, np.zeros_like(shape.corner)),
+    }
+    count, index = where.get(str(interpolation), (-1, shape.corner))
+    if count != len(table) or table.shape[1] != width:
+        notes.append(f"{what} of another number than {interpolation} values need were left out.")
+        return None
+    return table[index]

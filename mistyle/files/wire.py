@@ -1,0 +1,178 @@
+"""How values travel between the reader process and the job: a JSON tree and the raw bytes of its arrays, no pickle.
+
+A message is eight bytes of length (little endian), a JSON header, then each array's bytes in the order of the header's
+table [dtype, shape]. Only plain values, arrays of numbers and the records in RECORDS can be in it, and the receiving
+side builds nothing else: a process that a hostile file has taken over can send wrong numbers, but no code.
+"""
+
+import dataclasses
+import importlib
+import json
+import math
+import re
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+# Records that may be sent, by the name they have on the way. A reader that returns another record adds it here.
+RECORDS = {
+    "Picture": "mistyle.core.asset:Picture",
+    "Primitive": "mistyle.core.asset:Primitive",
+    "Lens": "mistyle.core.distortion:Lens",
+    "CameraFrame": "mistyle.files.cameras:Frame",
+    "SparsePoints": "mistyle.files.colmap:SparsePoints",
+    "Frame": "mistyle.files.layers:Frame",
+    "Layer": "mistyle.files.layers:Layer",
+    "Raw": "mistyle.files.raw:Raw",
+    "RawMap": "mistyle.files.raw:RawMap",
+    "RawMaterial": "mistyle.files.raw:RawMaterial",
+    "Textures": "mistyle.files.raw:Textures",
+    "Tile": "mistyle.files.raw:Tile",
+}
+NAMES = {place: name for name, place in RECORDS.items()}
+MAX_HEADER = 1 << 30
+MAX_ARRAYS = 16 << 30  # bytes of all arrays of one message
+CHUNK = 1 << 24
+DTYPE = re.compile(r"[<>|][?biuf](1|2|4|8|16)")
+
+
+class BrokenMessage(Exception):
+    """The other side is gone, or sent what no message is."""
+
+
+@dataclass(frozen=True)
+class Json:
+    """A value that JSON has: it is sent as it is, without a walk through all its parts."""
+
+    tree: Any
+
+
+Read = Callable[[memoryview], int]
+Write = Callable[[memoryview], int]
+
+
+def send(write: Write, value: Any, **entries: Any) -> None:
+    """Write one message: `value`, and plain `entries` of its header."""
+    arrays: list[np.ndarray] = []
+    seen: dict[int, int] = {}
+    tree = _pack(value, arrays, seen)
+    table = [[array.dtype.str, array.shape] for array in arrays]
+    head = json.dumps({"value": tree, "arrays": table, **entries}).encode()
+    _write_all(write, memoryview(len(head).to_bytes(8, "little") + head))
+    for array in arrays:
+        if array.nbytes:
+            _write_all(write, array.reshape(-1).view(np.uint8).data)
+
+
+def receive(read: Read) -> tuple[Any, dict[str, Any]]:
+    """The value of the next message and its header's other entries. Raises BrokenMessage."""
+    size = int.from_bytes(_bytes(read, 8), "little")
+    if size > MAX_HEADER:
+        raise BrokenMessage(f"a header of {size} bytes")
+    try:
+        head = json.loads(_bytes(read, size))
+        arrays = [_empty(*entry) for entry in _allowed(head.pop("arrays"))]
+        tree = head.pop("value")
+    except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
+        raise BrokenMessage(f"no message ({error})") from error
+    for array in arrays:
+        if array.nbytes:
+            _fill(read, array.reshape(-1).view(np.uint8).data)
+    try:
+        return _unpack(tree, arrays), head
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
+        raise BrokenMessage(f"no value ({error})") from error
+
+
+def _write_all(write: Write, data: memoryview) -> None:
+    while data:
+        data = data[write(data[:CHUNK]) :]
+
+
+def _fill(read: Read, data: memoryview) -> None:
+    while data:
+        count = read(data[:CHUNK])
+        if not count:
+            raise BrokenMessage("the other side is gone")
+        data = data[count:]
+
+
+def _bytes(read: Read, size: int) -> bytearray:
+    data = bytearray(size)
+    _fill(read, memoryview(data))
+    return data
+
+
+def _allowed(table: Iterable[Any]) -> list[tuple[str, tuple[int, ...]]]:
+    entries, total = [], 0
+    for kind, shape in table:
+        if not DTYPE.fullmatch(kind) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
+            raise ValueError(f"an array of {kind!r} {shape!r}")
+        total += np.dtype(kind).itemsize * math.prod(shape)
+        entries.append((kind, tuple(shape)))
+    if total > MAX_ARRAYS:
+        raise ValueError(f"arrays of {total} bytes")
+    return entries
+
+
+def _empty(kind: str, shape: tuple[int, ...]) -> np.ndarray:
+    return np.empty(shape, np.dtype(kind))
+
+
+def _pack(value: Any, arrays: list[np.ndarray], seen: dict[int, int]) -> Any:
+    if value is None or isinstance(value, bool | str | int | float):
+        return value
+    if isinstance(value, np.ndarray):
+        if id(value) not in seen:
+            if not DTYPE.fullmatch(value.dtype.str):
+                raise TypeError(f"an array of {value.dtype} cannot be sent")
+            seen[id(value)] = len(arrays)
+            arrays.append(np.asarray(value, order="C"))
+        return {"array": seen[id(value)]}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Json):
+        return {"json": value.tree}
+    if isinstance(value, bytes | bytearray | memoryview):
+        arrays.append(np.frombuffer(value, np.uint8))
+        return {"bytes": len(arrays) - 1}
+    if isinstance(value, Path):
+        return {"path": str(value)}
+    if isinstance(value, tuple | list):
+        return {"tuple" if isinstance(value, tuple) else "list": [_pack(item, arrays, seen) for item in value]}
+    if isinstance(value, dict):
+        return {"dict": [[_pack(k, arrays, seen), _pack(v, arrays, seen)] for k, v in value.items()]}
+    name = NAMES.get(f"{type(value).__module__}:{type(value).__qualname__}")
+    if name is None:
+        raise TypeError(f"a {type(value).__name__} cannot be sent")
+    fields = {f.name: _pack(getattr(value, f.name), arrays, seen) for f in dataclasses.fields(value)}
+    return {"record": name, "fields": fields}
+
+
+def _unpack(tree: Any, arrays: list[np.ndarray]) -> Any:
+    if not isinstance(tree, dict):
+        if isinstance(tree, list):
+            raise ValueError("a bare list")
+        return tree
+    if "record" in tree:
+        module, _, name = RECORDS[tree["record"]].partition(":")
+        fields = {key: _unpack(value, arrays) for key, value in tree["fields"].items()}
+        return getattr(importlib.import_module(module), name)(**fields)
+    ((kind, value),) = tree.items()
+    if kind == "array":
+        return arrays[value]
+    if kind == "bytes":
+        return arrays[value].tobytes()
+    if kind == "json":
+        return value
+    if kind == "path":
+        return Path(value)
+    if kind in ("tuple", "list"):
+        items = [_unpack(item, arrays) for item in value]
+        return tuple(items) if kind == "tuple" else items
+    if kind == "dict":
+        return {_unpack(key, arrays): _unpack(item, arrays) for key, item in value}
+    raise ValueError(f"a value of kind {kind!r}")

@@ -1,0 +1,218 @@
+"""How much memory a job will need, stage by stage, from counts alone; and whether it keeps the budget it was given.
+
+A stage's peak is what the program itself takes, plus bytes a texel of all texture sets, a pixel of all views together,
+a pixel of a step's crops, a surface sample and a face. Those of PLAIN were solved from the peaks that `run.json` notes
+for every stage (`peaks_gb`) of three jobs: `draft_spot` and `views_64` of `python -m benchmarks.memory --stages`, and
+the draft on spot with an atlas of 3072², four views and 20,000 samples. Those of TILED come from stages run alone at
+1024² and 2048²; the report's are PLAIN's without the arrays that are mapped. They hold on the processor, with two
+threads and the embedded filter bank: VGG-19 and the stylizers that need models count their own (run/generative.py).
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from mistyle.core import memory
+from mistyle.core.errors import UsageError
+from mistyle.run.settings import Settings
+
+
+class Need(NamedTuple):
+    """A stage's peak: GB of the program, then bytes a texel, view pixel, crop pixel, surface sample and face."""
+
+    program: float
+    texel: float = 0
+    view: float = 0
+    crop: float = 0
+    sample: float = 0
+    face: float = 0
+
+
+# With every array in memory.
+PLAIN = {
+    "mesh": Need(0.38, face=5000),
+    "texels": Need(0.38, texel=71),
+    "views": Need(0.46, texel=131, view=46.5),
+    "surface": Need(0.49, texel=135, view=45.5, sample=1200),
+    "bake": Need(0.59, texel=184, view=58.5),
+    "stylized": Need(0.53, texel=159, view=63.5),
+    "fit": Need(0.75, texel=235, view=107, crop=2000),
+    "masks": Need(0.77, texel=214, view=107),
+    "repair": Need(0.69, texel=255, view=121.5, crop=2000),
+    "asset": Need(0.75, texel=285, view=114),
+    "report": Need(0.71, texel=331, view=123.5),
+}
+# With large arrays in files: what has to be in memory all the same.
+TILED = {
+    "mesh": Need(0.39, face=5000),
+    "texels": Need(0.42, texel=30),
+    "views": Need(0.60, texel=10, view=4),
+    "surface": Need(0.60, texel=10, view=4, sample=1200),
+    "bake": Need(0.95, texel=20, view=4),
+    "stylized": Need(0.65, texel=10, view=4),
+    "fit": Need(0.75, texel=30, view=4, crop=2000),
+    "masks": Need(0.70, texel=35, view=4),
+    "repair": Need(0.75, texel=35, view=4, crop=2000),
+    "asset": Need(0.70, texel=30, view=4),
+    "report": Need(0.90, texel=170, view=20),
+}
+# A fit to pictures, without what is kept of the pictures' samples, up to `recover.memory`; the system does not get all
+# of that back after the stage. Read off one job (`fit_512`): of other sizes less is known.
+MATERIAL = {
+    "mesh": Need(0.38, face=5000),
+    "texels": Need(0.39, texel=71),
+    "recover": Need(0.75, texel=600),
+    "measure": Need(0.77, texel=300),
+    "asset": Need(0.80, texel=200),
+    "scene": Need(0.80, texel=200),
+    "report": Need(0.87, texel=300),
+}
+KEEPING = ("recover", "measure", "asset", "scene", "report")
+SAMPLE = 32  # bytes that are kept of a sample of a picture
+
+
+class Counts(NamedTuple):
+    """What the memory of a job hangs on."""
+
+    texels: int
+    view: int
+    crop: int = 0
+    sample: int = 0
+    face: int = 0
+
+
+def view_pixels(settings: Settings) -> int:
+    """Pixels of all views together; of a rig made for the mesh, which is not known yet, or of a file: of 16 at most."""
+    rig = settings.rig
+    views = {"paper": 16, "turntable": rig.views, "nbv": min(16, rig.most_views)}.get(rig.kind, 16)
+    return views * rig.resolution**2
+
+
+def counts(settings: Settings, faces: int = 0, sets: int = 1) -> Counts:
+    """The counts of `stylize` for a mesh of so many faces and texture sets."""
+    crop = 0 if settings.fit.refine == "off" else settings.fit.crops * settings.fit.crop_size**2
+    return Counts(sets * settings.atlas.size**2, view_pixels(settings), crop, settings.surface.samples, faces)
+
+
+def peaks(needs: Mapping[str, Need], count: Counts) -> dict[str, float]:
+    """GB of every stage."""
+    return {
+        stage: need.program
+        + (
+            need.texel * count.texels
+            + need.view * count.view
+            + need.crop * count.crop
+            + need.sample * count.sample
+            + need.face * count.face
+        )
+        / 1e9
+        for stage, need in needs.items()
+    }
+
+
+def memory_gb(settings: Settings, faces: int = 0, sets: int = 1) -> float:
+    """Peak memory of `stylize`, GB, with every array in memory, or, where its budget asks for that, in files: then what
+    is in memory is let go near the budget, and the peak lies below it."""
+    count = counts(settings, faces, sets)
+    whole, least = (max(peaks(needs, count).values()) for needs in (PLAIN, TILED))
+    if settings.memory and whole > settings.memory:
+        whole = max(least, settings.memory)
+    return round(whole, 2)
+
+
+def material_gb(settings: Any, pixels: int, faces: int = 0, sets: int = 1) -> float:
+    """Peak memory of a fit to pictures of so many pixels together, GB."""
+    found = peaks(MATERIAL, Counts(sets * settings.atlas.size**2, pixels, face=faces))
+    held = min(settings.recover.memory, SAMPLE * pixels * settings.recover.subsamples / 1e9)
+    found |= {stage: found[stage] + held for stage in KEEPING}
+    return round(max(found.values()), 2)
+
+
+def tiles(settings: Settings, faces: int = 0, sets: int = 1) -> bool:
+    """Whether the job's large arrays must lie in files for its budget. UsageError where even that is not enough."""
+    if not settings.memory:
+        return False
+    count = counts(settings, faces, sets)
+    if max(peaks(PLAIN, count).values()) <= settings.memory:
+        return False
+    if not memory.possible():
+        raise UsageError(
+            f"--memory {settings.memory:g}G: the job needs {memory_gb(_free(settings), faces, sets)} GB, and less only "
+            "on Linux, where its large arrays can lie in files; give it more, or leave --memory out"
+        )
+    needed = peaks(TILED, count)
+    worst = max(needed, key=lambda stage: needed[stage])
+    if needed[worst] <= settings.memory:
+        return True
+
+    def least(smaller: Settings) -> float:
+        return max(peaks(TILED, counts(smaller, faces, sets)).values())
+
+    raise UsageError(
+        f"--memory {settings.memory:g}G: the job needs {needed[worst]:.2f} GB in its stage '{worst}', even with its "
+        f"large arrays in files; give it --memory {rounded_up(needed[worst])}G or more, or {_smaller(settings, least)}"
+    )
+
+
+def _free(settings: Settings) -> Settings:
+    return settings.model_copy(update={"memory": 0})
+
+
+def check_material(settings: Any, pixels: int, faces: int = 0, sets: int = 1) -> Any:
+    """The settings of a fit to pictures with `recover.memory` cut to what its budget leaves; UsageError for none."""
+    if not settings.memory:
+        return settings
+
+    def least(chosen: Any) -> float:
+        return material_gb(_with(chosen, "recover.memory", 1e-9), pixels, faces, sets)
+
+    left = settings.memory - max(peaks(MATERIAL, Counts(sets * settings.atlas.size**2, pixels, face=faces)).values())
+    if least(settings) > settings.memory or left <= 0:
+        needed = least(settings)
+        raise UsageError(
+            f"--memory {settings.memory:g}G: the fit needs {needed:.2f} GB even if it keeps nothing of the pictures' "
+            f"samples; give it --memory {rounded_up(needed)}G or more, or {_smaller(settings, least)}"
+        )
+    return _with(settings, "recover.memory", min(settings.recover.memory, left))
+
+
+def rounded_up(gb: float) -> float:
+    """To the next tenth of a GB."""
+    return int(gb * 10 + 0.999) / 10
+
+
+def _smaller(settings: Any, least: Callable[[Any], float]) -> str:
+    """The one setting of which half saves most, and what is needed then."""
+    halves = {"atlas.size": 16, "surface.samples": 1000, "fit.crop_size": 32, "recover.subsamples": 1}
+    there = {key: low for key, low in halves.items() if hasattr(settings, key.split(".")[0])}
+    tried = {
+        key: (half := max(_value(settings, key) // 2, low), least(_with(settings, key, half)))
+        for key, low in there.items()
+    }
+    best = min(tried, key=lambda key: tried[key][1])
+    return f"--set {best}={tried[best][0]}, which needs {rounded_up(tried[best][1])} GB"
+
+
+def _value(settings: Any, key: str) -> int:
+    group, name = key.split(".")
+    return getattr(getattr(settings, group), name)
+
+
+def _with(settings: Any, key: str, value: float) -> Any:
+    group, name = key.split(".")
+    return settings.model_copy(update={group: getattr(settings, group).model_copy(update={name: value})})
+
+
+@contextmanager
+def kept(settings: Settings, work: Path) -> Iterator[Callable[[int, int], None]]:
+    """Inside, the job keeps the budget of its settings; refused beforehand where it cannot. Yields a function that
+    looks again, given the faces and texture sets of the mesh, once they are known."""
+    with ExitStack() as stack:
+
+        def look(faces: int, sets: int) -> None:
+            if tiles(settings, faces, sets) and not memory.tight():
+                stack.enter_context(memory.within(settings.memory * 1e9, work))
+
+        look(0, 1)
+        yield look

@@ -1,0 +1,115 @@
+"""What a job hands to other programs, and the colour spaces at its edges: two records that every kind of job has."""
+
+import re
+import string
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
+
+FORMATS = ("glb", "usd", "mtlx", "obj", "maps")
+PROGRAMS = ("blender", "unreal", "unity-urp", "unity-hdrp", "houdini", "arnold")
+TEXTURES = "{asset}_{map}.{ext}"
+NAME_FIELDS = frozenset({"asset", "mesh", "style", "target", "v"})
+TEXTURE_FIELDS = frozenset({"asset", "map", "ext", "udim"})
+
+
+def listed(value: Any) -> Any:
+    """'glb,usd' and ['glb,usd', 'maps'] as lists of words; anything else as it is."""
+    if isinstance(value, str):
+        value = [value]
+    if isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value):
+        return tuple(dict.fromkeys(word.strip() for v in value for word in v.split(",") if word.strip()))
+    return value
+
+
+def fields_of(pattern: str) -> dict[str, str]:
+    """The plain {fields} of a pattern and their format specifications. ValueError for anything cleverer."""
+    found: dict[str, str] = {}
+    for _, name, spec, conversion in string.Formatter().parse(pattern):
+        if name is None:
+            continue
+        if not re.fullmatch(r"[a-z]+", name) or conversion or not re.fullmatch(r"|0?[1-9]d?", spec or ""):
+            raise ValueError(f"'{{{name}}}' is no plain field such as {{v}} or {{v:03}}")
+        found[name] = spec or ""
+    return found
+
+
+def _tried(pattern: str) -> set[str] | None:
+    try:
+        return set(fields_of(pattern))
+    except ValueError:
+        return None
+
+
+def checked_name(pattern: str) -> str:
+    """A pattern for delivered names: {asset} {mesh} {style} {target} {v}, no folders."""
+    fields = _tried(pattern)
+    if fields is None or fields - NAME_FIELDS or not pattern or "/" in pattern or "\\" in pattern:
+        offered = ", ".join(f"{{{f}}}" for f in sorted(NAME_FIELDS))
+        raise ValueError(f"--name {pattern!r}: expected a file name, in which {offered} are filled in")
+    return pattern
+
+
+def checked_textures(pattern: str) -> str:
+    """A pattern for texture files: {map} and {ext}, and maybe {asset} and {udim}."""
+    fields = _tried(pattern)
+    if fields is None or not {"map", "ext"} <= fields or fields - TEXTURE_FIELDS or "/" in pattern or "\\" in pattern:
+        wanted = "a file name with {map} and {ext}, and maybe {asset}, {udim}"
+        raise ValueError(f"--texture-name {pattern!r}: expected {wanted}")
+    return pattern
+
+
+Format = Literal["glb", "usd", "mtlx", "obj", "maps"]
+Program = Literal["blender", "unreal", "unity-urp", "unity-hdrp", "houdini", "arnold"]
+
+
+class DeliverSettings(BaseModel):
+    """The files for other programs that a job leaves in OUT/delivered/<target>; none where nothing is said."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    formats: Annotated[tuple[Format, ...], BeforeValidator(listed)] = Field(
+        default=(), description="glb, usd, mtlx, obj, maps (maps and glb where only a target is named)"
+    )
+    target: Annotated[tuple[Program, ...], BeforeValidator(listed)] = Field(
+        default=(), description="the programs that textures are packed for (blender where only formats are named)"
+    )
+    name: Annotated[str, BeforeValidator(checked_name)] = Field(
+        default="{asset}",
+        description="pattern of the delivered name: {asset} {mesh} {style} {target}; {v:03} counts up, so that nothing "
+        "delivered before is overwritten",
+    )
+    textures: Annotated[str, BeforeValidator(checked_textures)] = Field(
+        default=TEXTURES, description="pattern of texture files: {asset} {map} {udim} {ext}"
+    )
+    metres_per_unit: float = Field(default=1.0, gt=0, description="what USD says of the mesh's units")
+
+    @property
+    def wanted(self) -> bool:
+        """Whether anything is delivered: as soon as any of this is said."""
+        return bool(self.formats or self.target or self.name != "{asset}" or self.textures != TEXTURES)
+
+    @property
+    def chosen_formats(self) -> tuple[Format, ...]:
+        return self.formats or ("maps", "glb")
+
+    @property
+    def chosen_targets(self) -> tuple[Program, ...]:
+        return self.target or ("blender",)
+
+
+class ColourSettings(BaseModel):
+    """Colour spaces at the edges; inside everything is linear Rec.709. Names are those of an OpenColorIO config."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    space: str | None = Field(
+        default=None,
+        description="scene-linear space of EXR and HDR pictures in and of delivered EXR textures (linear Rec.709)",
+    )
+    pictures: str | None = Field(
+        default=None, description="space of PNG, JPEG, TIFF pictures in (their profile, else sRGB)"
+    )
+    config: str | None = Field(
+        default=None, description="the OpenColorIO config ($OCIO, else the one inside opencolorio)"
+    )

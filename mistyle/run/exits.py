@@ -1,0 +1,39 @@
+"""How a command ends: its exit code, and one sentence on stderr for everything that was to be expected."""
+
+import argparse
+import json
+import sys
+from collections.abc import Callable
+
+from mistyle.core import stopping
+from mistyle.core.errors import MistyleError
+
+Command = Callable[[argparse.Namespace], int]
+
+
+def run(command: Command, options: argparse.Namespace) -> int:
+    """Run a command, answering signals; returns the exit code. Only a mistake in mistyle itself shows a traceback."""
+    with stopping.listening():
+        try:
+            return command(options)
+        except MistyleError as error:
+            return _failed(options, error)
+        except KeyboardInterrupt:
+            print("mistyle: interrupted; the same command again goes on from what was finished", file=sys.stderr)
+            return 130
+        except BrokenPipeError:
+            return 1
+        except OSError as error:
+            from mistyle.files.faults import unexpected
+
+            sentence = unexpected(error)
+            if sentence is None:
+                raise
+            return _failed(options, sentence)
+
+
+def _failed(options: argparse.Namespace, error: MistyleError) -> int:
+    if getattr(options, "json", False):
+        print(json.dumps({"error": str(error), "exit_code": error.exit_code}))
+    print(f"mistyle: {error}", file=sys.stderr)
+    return error.exit_code

@@ -1,0 +1,94 @@
+"""A finished asset read back from a run folder, edits of its textures included."""
+
+import json
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.asset import Asset
+from mistyle.core.errors import InputRefused
+from mistyle.core.image import linear_from_srgb
+from mistyle.files.packing import TextureSet
+
+
+@dataclass(frozen=True)
+class Finished:
+    """An asset folder of ours, read back: the mesh, its texture sets, and what its list says."""
+
+    asset: Asset
+    sets: tuple[TextureSet, ...]
+    manifest: dict[str, Any]
+    folder: Path
+
+
+def read_finished(place: Path) -> Finished:
+    """The asset of a run folder, an asset folder or a <name>.json. Raises InputRefused."""
+    from mistyle.files.read import read_mesh
+
+    folder, manifest = read_listing(place)
+    stems = [(str(part["name"]), str(part["textures"])) for part in manifest["parts"]]
+    name = str(manifest["name"])
+    glb = folder / f"{name}.glb"
+    if not glb.is_file():
+        raise InputRefused(f"{glb}: found nothing, expected the asset that {name}.json lists")
+    asset = read_mesh(glb, uv="keep")
+    if len(asset.mesh.parts) != len(stems):
+        raise InputRefused(
+            f"{glb}: found {len(asset.mesh.parts)} texture sets, {name}.json lists {len(stems)}; run the job again"
+        )
+    sets = [_texture_set(folder / "textures", part, stem) for part, stem in stems]
+    return Finished(asset, tuple(sets), manifest, folder)
+
+
+def read_listing(place: Path) -> tuple[Path, dict[str, Any]]:
+    """The asset folder and its list of files."""
+    listing = _listing(place)
+    try:
+        manifest = json.loads(listing.read_text(encoding="utf-8"))
+        _ = [(part["name"], part["textures"]) for part in manifest["parts"]], manifest["name"], manifest["files"]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputRefused(
+            f"{listing}: not the list of an asset of ours ({error}); export what mistyle wrote"
+        ) from None
+    return listing.parent, manifest
+
+
+def _listing(place: Path) -> Path:
+    if place.suffix == ".json":
+        return place
+    for folder in (place / "asset", place):
+        found = [p for p in sorted(folder.glob("*.json")) if p.name != "done.json"] if folder.is_dir() else []
+        if found:
+            return found[0]
+    raise InputRefused(
+        f"{place}: found no asset; expected a run folder of mistyle, its asset folder, or its <name>.json"
+    )
+
+
+def _texture_set(folder: Path, part: str, stem: str) -> TextureSet:
+    from mistyle.files.read import read_exr, read_picture
+
+    def planes(kind: str) -> Mapping[str, np.ndarray]:
+        return read_exr(folder / f"{stem}_{kind}.exr")
+
+    albedo, normal, roughness, orm = (planes(kind) for kind in ("albedo", "normal", "roughness", "orm"))
+    tile = re.search(r"\.(1\d{3})$", part)
+    rgb = np.stack([albedo[c] for c in "RGB"], axis=-1)
+    # The PNG is what everyone else sees, edits included; a changed one takes the EXR's place.
+    shown = linear_from_srgb(read_picture(folder / f"{stem}_albedo.png").rgb)
+    if shown.shape == rgb.shape and np.abs(shown - np.clip(rgb, 0, 1)).max() > 0.02:
+        rgb = shown
+    return TextureSet(
+        name=stem,
+        tile=int(tile[1]) if tile else 1001,
+        albedo=rgb.astype(np.float32),
+        normal=np.stack([normal[c] for c in "RGB"], axis=-1).astype(np.float32),
+        roughness=roughness["Y"],
+        metallic=orm["B"],
+        occlusion=orm["R"],
+        alpha=albedo.get("A"),
+    )

@@ -1,0 +1,230 @@
+"""`mistyle lookdev`: a look-dev sheet of any asset, and its turntables.
+
+OUT/lookdev.png .exr       the sheet: sRGB without a tone curve, and the same linear
+OUT/turntable/000.png …    the asset turning under fixed light, with --turntable; OUT/turntable.webp (.mp4)
+OUT/light_turn/000.png …   the light turning about a fixed asset, with --hdri-turn; OUT/light_turn.webp (.mp4)
+OUT/lookdev.json           what the sheet was made of
+"""
+
+import datetime
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from mistyle import __version__
+from mistyle.core.asset import Asset
+from mistyle.core.errors import MistyleError
+from mistyle.core.image import linear_from_srgb, srgb_from_linear
+from mistyle.files.store import atomic_write, sha256_file
+from mistyle.run.progress import Progress
+from mistyle.run.report_overlays import MAGENTA, viridis
+from mistyle.run.sheet_canvas import PANEL, Panel, Row, Sheet, beside, compose, measures, panel_widths
+
+VIEW_TRANSFORM = "sRGB (Rec.709), no tone curve"
+USUAL = 560  # pixels of a hero picture for which the sheet's type is made
+LIGHT_STEPS = 8  # pictures of the HDRI's rotation on the sheet
+
+
+class LookSettings(BaseModel):
+    """How the sheet and the turntables are drawn."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    size: int = Field(default=USUAL, ge=64, le=4096, description="pixels of the sheet's largest pictures of the asset")
+    spp: int = Field(default=64, ge=1, le=65536, description="samples per pixel of the largest pictures")
+    seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
+    turntable: int = Field(default=0, ge=0, le=720, description="frames of a turntable; 0: none")
+    hdri_turn: int = Field(default=0, ge=0, le=720, description="frames of the light's turn; 0: none")
+    frame: int = Field(default=512, ge=32, le=4096, description="pixels of a turntable's frame")
+    threads: int = Field(default=0, ge=0, le=1024, description="threads; 0 takes all cores")
+    variant: str = Field(default="auto", description="the Mitsuba variant")
+
+
+@dataclass(frozen=True)
+class Subject:
+    """What the sheet shows: the asset, its file, and pictures per texture set of what is known of its texels."""
+
+    asset: Asset
+    path: Path
+    known: dict[str, list[np.ndarray]]
+
+
+def lookdev(
+    place: Path,
+    out: Path,
+    settings: LookSettings,
+    progress: Progress,
+    *,
+    hdri: Path | None = None,
+    date: str | None = None,
+    mp4: bool = False,
+) -> dict[str, Any]:
+    """Draw the sheet of a mesh file or run folder into `out`; returns the paths of what was written.
+
+    `hdri` is an .hdr or .exr environment map for the third light; `date` stands in the burn-in (else the day on which
+    the asset's file was last changed, UTC). The same asset, settings and thread count give the same pictures.
+    """
+    from mistyle.files.images import write_exr, write_png
+    from mistyle.files.read import read_radiance
+    from mistyle.render import sheet as drawing
+    from mistyle.run.start import start_engines
+    from mistyle.run.turntable import encoder, write_turn
+
+    if mp4:
+        encoder()
+    start_engines(settings)
+    with progress.stage("read", "read the asset"):
+        subject = read_subject(place)
+        sky = None if hdri is None else read_radiance(hdri)
+    with progress.stage("light", "expose the lights"):
+        name = "" if hdri is None else hdri.stem
+        lights = [drawing.exposed(rig, settings.seed) for rig in drawing.rigs(sky, name, read_radiance)]
+        stage = drawing.Stage(subject.asset)
+    with progress.stage("sheet", "draw the sheet") as report:
+        day = date or datetime.datetime.fromtimestamp(subject.path.stat().st_mtime, datetime.UTC).date().isoformat()
+        picture = compose(*sheet(subject, stage, lights, settings, day, report))
+    write_png(out / "lookdev.png", srgb_from_linear(np.clip(picture, 0, 1)))
+    write_exr(out / "lookdev.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)), half=True)
+    written = {"sheet": str(out / "lookdev.png"), "exr": str(out / "lookdev.exr")}
+    turns = {
+        "turntable": (settings.turntable, stage.turn, lights[0]),
+        "light_turn": (settings.hdri_turn, stage.light_turn, lights[2]),
+    }
+    for name, (frames, draw, rig) in turns.items():
+        if frames:
+            with progress.stage(name, {"turntable": "turn the asset", "light_turn": "turn the light"}[name]) as report:
+                drawn = draw(frames, rig.light, settings.frame, max(settings.spp // 2, 1), settings.seed, report)
+                paths = write_turn(out / name, [shown(p) for p in drawn], mp4)
+                written[name] = str(paths[-1])
+    record = {"asset": subject.path.name, "sha256": sha256_file(subject.path), "date": day, "mistyle": __version__}
+    record |= {
+        "settings": settings.model_dump(mode="json"),
+        "view": VIEW_TRANSFORM,
+        "hdri": hdri.name if hdri else None,
+    }
+    record["exposure_stops"] = {rig.name: round(rig.stops, 3) for rig in lights}
+    atomic_write(out / "lookdev.json", (json.dumps(record, indent=1) + "\n").encode())
+    return written
+
+
+def read_subject(place: Path) -> Subject:
+    """A mesh file, or the asset of a run folder with what the run knows of its texels. Raises InputRefused."""
+    from mistyle.files.read import read_mesh
+    from mistyle.run.renderers import finished_asset
+
+    path = finished_asset(place) if place.is_dir() else place
+    asset = read_mesh(path)
+    known = texel_knowledge(place, len(asset.mesh.parts)) if place.is_dir() else {}
+    return Subject(asset, path, known)
+
+
+def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
+    """Coverage, confidence and repair of a run folder's texels as sRGB colours, one picture per texture set."""
+    from mistyle.files.records import load_record
+
+    def record(stage: str) -> Any:
+        place = folder / "work" / stage / "record"
+        try:
+            return load_record(place) if place.is_dir() else None
+        except MistyleError:
+            return None  # of another version: the sheet goes without
+
+    baked, repaired, recovered = (record(stage) for stage in ("bake", "repair", "recover"))
+    found: dict[str, list[np.ndarray]] = {}
+    source = recovered if recovered is not None else baked
+    if source is not None:
+        most = max(max(int(seen.max()) for seen in source.seen), 1)
+        found["coverage"] = [viridis(np.sqrt(seen / most).astype(np.float32)) / 255 for seen in source.seen]
+    if recovered is not None:
+        found["confidence"] = [viridis(values.astype(np.float32)) / 255 for values in recovered.confidence]
+    if repaired is not None:
+        found["struggle"] = [
+            np.where(mask[..., None], np.array(MAGENTA), 0.25 + 0.5 * srgb_from_linear(maps.albedo).mean(-1)[..., None])
+            for mask, maps in zip(repaired.mask, repaired.maps, strict=True)
+        ]
+    return {name: [p.astype(np.float32) for p in each] for name, each in found.items() if len(each) == parts}
+
+
+def sheet(
+    subject: Subject, stage: Any, lights: Sequence[Any], settings: LookSettings, day: str, report: Callable
+) -> tuple[Sheet, int, float]:
+    """What `compose` wants: the sheet with all its pictures drawn, the width of its rows, and the scale of its type."""
+    from mistyle.render import sheet as drawing
+    from mistyle.render.sheet_aovs import aovs
+
+    scale = settings.size / USUAL
+    column = drawing.column_camera(scale).size[1]
+    gutter = measures(scale)["gutter"]
+    width = 3 * (settings.size + column) + 2 * gutter
+    done = 0.0
+
+    def shot(azimuth: float, elevation: float, light: Any, size: int) -> np.ndarray:
+        nonlocal done
+        picture = stage.picture(azimuth, elevation, light, size, settings.spp, settings.seed)
+        done += (size / settings.size) ** 2
+        report(min(done / 9, 0.99))
+        return drawing.over(picture, (PANEL,) * 3)
+
+    heroes = []
+    for rig in lights:
+        references = drawing.references(rig.light, settings.spp, settings.seed, scale)
+        hero = shot(*drawing.CAMERAS["3/4"], rig.light, settings.size)
+        pictures = [hero, drawing.over(references, (PANEL,) * 3)[: settings.size]]
+        heroes.append(Panel(beside(pictures), rig.name, f"{rig.stops:+.1f} stops"))
+    side = panel_widths(len(drawing.CAMERAS), width, gutter)
+    cameras = [Panel(shot(*at, lights[0].light, side), name) for name, at in drawing.CAMERAS.items()]
+    known = {name: each for name, each in subject.known.items()}
+    passes = aovs(subject.asset, drawing.asset_camera(*drawing.CAMERAS["3/4"], 64), known)
+    small = panel_widths(len(passes), width, gutter) // 2 * 2
+    passes = aovs(subject.asset, drawing.asset_camera(*drawing.CAMERAS["3/4"], small), known)
+    strip = [Panel(linear_from_srgb(on_panel(p)), name) for name, p in passes.items()]
+    step = panel_widths(LIGHT_STEPS, width, gutter)
+    turned = []
+    for k in range(LIGHT_STEPS):
+        angle = 360 * k / LIGHT_STEPS
+        light = type(lights[2].light)(**{**vars(lights[2].light), "turn": lights[2].light.turn + angle})
+        turned.append(Panel(shot(*drawing.CAMERAS["3/4"], light, step), f"{angle:.0f}°"))
+    rows = (
+        Row("Three lights, each exposed so that the grey ball is 18 %", tuple(heroes)),
+        Row("Soft studio from five sides: the asset turns, the light stands still", tuple(cameras)),
+        Row("What lies behind", tuple(strip)),
+        Row(f"{lights[2].name}, turned about the asset", tuple(turned)),
+    )
+    return Sheet(subject.path.stem, facts(subject), rows, burn_in(subject, settings, day)), width, scale
+
+
+def on_panel(picture: np.ndarray) -> np.ndarray:
+    """Straight sRGB with alpha over a panel, still encoded."""
+    ground = float(srgb_from_linear(np.array(PANEL, np.float32)))
+    return (picture[..., :3] * picture[..., 3:] + (1 - picture[..., 3:]) * ground).astype(np.float32)
+
+
+def shown(picture: np.ndarray) -> np.ndarray:
+    """A premultiplied linear picture as straight sRGB and alpha."""
+    alpha = np.clip(picture[..., 3:], 0, 1)
+    colour = srgb_from_linear(np.clip(picture[..., :3] / np.maximum(alpha, 1e-4), 0, 1))
+    return np.concatenate([colour, alpha], axis=-1).astype(np.float32)
+
+
+def facts(subject: Subject) -> tuple[str, ...]:
+    """What the asset is, in a line, and what reading it had to change."""
+    mesh, sizes = subject.asset.mesh, []
+    for material in subject.asset.materials:
+        if material.albedo is not None:
+            sizes.append(f"{material.albedo.shape[1]} x {material.albedo.shape[0]}")
+    textures = ", ".join(sorted(set(sizes))) or "no textures"
+    sets = f"{len(mesh.parts)} texture set{'s' if len(mesh.parts) > 1 else ''}"
+    line = f"{len(mesh.faces):,} faces   ·   {sets}   ·   {textures}"
+    return (line, *subject.asset.source.notes[:2])
+
+
+def burn_in(subject: Subject, settings: LookSettings, day: str) -> str:
+    """The line at the foot of the sheet."""
+    digest = sha256_file(subject.path)[:16]
+    parts = (subject.path.name, f"sha256 {digest}", day, f"mistyle {__version__}")
+    return "   ·   ".join((*parts, f"{settings.spp} samples", "linear Rec.709", f"view: {VIEW_TRANSFORM}"))

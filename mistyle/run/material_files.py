@@ -1,0 +1,51 @@
+"""What `mistyle fit` writes for other programs: the asset, and a Mitsuba scene of it."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.asset import Asset
+from mistyle.core.capture import Captures
+from mistyle.core.maps import Texels
+from mistyle.files.textures import part_stems
+from mistyle.run.edits import UNEDITED, Edited
+from mistyle.run.progress import Report
+from mistyle.run.start import ambient
+
+
+def write(
+    folder: Path,
+    job: Any,
+    asset: Asset,
+    texels: Sequence[Texels],
+    recovered: Any,
+    report: Report,
+    edited: Edited = UNEDITED,
+) -> None:
+    """The asset as `stylize` writes it; `edited` holds textures that a person painted over."""
+    from mistyle.stages.export import write_asset
+    from mistyle.stages.texels import pad_maps
+
+    occlusion = [
+        ambient(asset, part, job.settings.atlas.size, job.settings.seed, report)
+        for part in range(len(asset.mesh.parts))
+    ]
+    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(recovered.maps, texels, strict=True)]
+    padded, occlusion = edited(part_stems(job.name, asset.mesh.parts), padded, occlusion)
+    provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
+    provenance |= edited.provenance
+    write_asset(folder, job.name, asset, padded, occlusion, texels, provenance=provenance)
+
+
+def scene(folder: Path, job: Any, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures) -> None:
+    """A Mitsuba scene of the result that renders where mistyle is not installed."""
+    from mistyle.stages.frames import mitsuba_normals
+    from mistyle.stages.scene_file import write_scene
+    from mistyle.stages.texels import pad_maps
+
+    turned = list(recovered.maps)
+    if job.settings.recover.frame == "mikkt":
+        turned = [replace(m, normal=mitsuba_normals(asset.mesh, m, t)) for m, t in zip(turned, texels, strict=True)]
+    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(turned, texels, strict=True)]
+    write_scene(folder, job.name, asset.mesh, padded, captures.cameras, captures.lights[0])

@@ -1,0 +1,212 @@
+"""`mistyle verify`: what was written, opened by other people's readers and rendered by two renderers.
+
+OUT/verify.json       every check with its outcome, and the figures of the renders
+OUT/<shot>.png        Cycles, Mitsuba, and where they differ (FLIP, 0 black to 1 white-yellow)
+OUT/renders/*.exr     the renders, linear Rec.709
+"""
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.files.images import write_exr, write_png
+from mistyle.files.store import DONE, atomic_folder
+from mistyle.run.blender import BLENDER, find_blender
+from mistyle.run.verify_checks import MODELS, READERS, Check, by_blender, exr, listed_files, png
+
+# Two right renderers differ by noise (FLIP 0.05 to 0.09 at 64 samples) and by their pixel filters.
+MOST_FLIP, LEAST_OVERLAP, LEAST_CORRELATION = 0.15, 0.98, 0.95
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """How the comparison is rendered: cameras all round, pixels along each side, samples, light (as for compare)."""
+
+    views: int = 3
+    size: int = 256
+    spp: int = 128
+    light: str = "studio"
+    threads: int = 0
+
+
+@dataclass(frozen=True)
+class Difference:
+    """How one shot differs between the renderers, over the pixels that either covers.
+
+    flip         mean LDR-FLIP, 0..1
+    overlap      intersection over union of the silhouettes
+    correlation  of the luminances, linear
+    brightness   mean of Mitsuba's over Cycles' luminance
+    """
+
+    shot: str
+    flip: float
+    overlap: float
+    correlation: float
+    brightness: float
+
+
+def verify(
+    place: Path, out: Path | None = None, *, blender: str | None = None, rendering: Rendering | None = None
+) -> dict[str, Any]:
+    """Check a run, an asset or a delivered folder, or one file; returns the content of verify.json.
+
+    Nothing is fetched: a reader that is not installed gives the outcome "not checked". `rendering` None leaves the
+    renders out.
+    """
+    if not place.exists():
+        raise InputRefused(f"{place}: found nothing, expected a run, an asset, a delivered folder, or one file")
+    out = out or (place if place.is_dir() else place.parent) / "verify"
+    if out.exists() and any(out.iterdir()) and not (out / "verify.json").is_file():
+        raise UsageError(f"{out}: this folder holds other things; choose an empty or new one with -o")
+    found = find_blender(blender)
+    files = _files(place, out)
+    if not files:
+        raise InputRefused(f"{place}: found none of our files; expected models ({' '.join(MODELS)}) or their lists")
+    checks = list(file_checks(place, files, found))
+    told: dict[str, Any] = {}
+
+    def fill(folder: Path) -> None:
+        renders = list(_rendered(place, files, folder, found, rendering, checks)) if rendering else []
+        told.update(
+            asset=str(place),
+            failed=sum(c.outcome == "failed" for c in checks),
+            not_checked=sum(c.outcome == "not checked" for c in checks),
+            checks=[asdict(c) for c in checks],
+            renders=[asdict(r) for r in renders],
+            limits={"flip": MOST_FLIP, "overlap": LEAST_OVERLAP, "correlation": LEAST_CORRELATION},
+            out=str(out),
+        )
+        (folder / "verify.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+
+    atomic_folder(out, fill)
+    return told
+
+
+def _files(place: Path, out: Path) -> list[Path]:
+    """What there is to check: of a run folder its asset, what it delivered, and its stages' markers."""
+    if place.is_file():
+        return [place]
+    folders = [p for p in (place / "asset", place / "delivered") if p.is_dir()] or [place]
+    found = [p for folder in folders for p in sorted(folder.rglob("*")) if p.is_file() and out not in p.parents]
+    if folders != [place]:
+        stages = sorted({*place.glob(f"*/{DONE}"), *place.glob(f"work/*/{DONE}")} - set(found))
+        found += [p for p in stages if ".broken-" not in p.parent.name]  # what was set aside is no part of the run
+    wanted = (*READERS, ".json", ".png", ".exr")
+    return [p for p in found if p.suffix.lower() in wanted]
+
+
+def file_checks(place: Path, files: Sequence[Path], blender: str | None) -> Iterator[Check]:
+    """Every file by every reader that there is for it."""
+    base = place if place.is_dir() else place.parent
+
+    def name(path: Path) -> str:
+        return path.relative_to(base).as_posix()
+
+    for path in files:
+        if path.suffix == ".json":
+            row = listed_files(path, name(path))
+            if row is not None:
+                yield row
+    for path in files:
+        for reader in READERS.get(path.suffix.lower(), ()):
+            yield from reader(path, name(path))
+    for ending, reader in ((".png", png), (".exr", exr)):
+        for folder in sorted({p.parent for p in files if p.suffix.lower() == ending}):
+            chosen = [p for p in files if p.parent == folder and p.suffix.lower() == ending]
+            yield from reader(chosen, f"{name(folder)}/*{ending}" if folder != base else f"*{ending}")
+    models = [p for p in files if p.suffix.lower() in MODELS]
+    if models:
+        yield from by_blender(models, [name(p) for p in models], blender)
+
+
+def _rendered(
+    place: Path, files: Sequence[Path], folder: Path, blender: str | None, how: Rendering, checks: list[Check]
+) -> Iterator[Difference]:
+    """Render the first GLB (a mesh of any kind where there is none) by both; adds a row for each shot."""
+    models = [p for p in files if p.suffix.lower() in (".glb", ".gltf")] or [
+        p for p in files if p.suffix.lower() in MODELS and not p.name.endswith("_look.usda")
+    ]
+    if not models:
+        return
+    base = place if place.is_dir() else place.parent
+    name, check = models[0].relative_to(base).as_posix(), "Cycles against Mitsuba"
+    if blender is None:
+        checks.append(Check(name, check, "not checked", f"no Blender here (name it with --blender or {BLENDER})"))
+        return
+    from mistyle.run.renderers import left_out, renderer, shots, subject
+
+    both = [renderer("blender:cycles", blender), renderer("mitsuba:path")]
+    with TemporaryDirectory(prefix="mistyle-") as work:
+        try:
+            what = subject(models[0], Path(work), both, how.threads)
+            missing = left_out(what)
+            if missing:
+                checks.append(Check(name, check, "not checked", f"{', '.join(missing)}: not drawn by Mitsuba here"))
+                return
+            for k, shot in enumerate(shots(what, [how.light], how.views, how.size)):
+                pair = [r.draw(what, shot, how.spp, [1 + 1000 * k + 100 * j]) for j, r in enumerate(both)]
+                pictures = [drawn.pictures[0] for drawn in pair]
+                difference, error = compared(shot.name, *pictures)
+                _keep(folder, shot.name, pictures, error)
+                checks.append(_judged(name, check, difference, " and ".join(drawn.version for drawn in pair)))
+                yield difference
+        except MistyleError as error:
+            checks.append(Check(name, check, "failed", str(error)[-300:]))
+
+
+def compared(
+    shot: str, reference: Float[np.ndarray, "h w 4"], test: Float[np.ndarray, "h w 4"]
+) -> tuple[Difference, Float[np.ndarray, "h w"]]:
+    """The difference of two renders (linear Rec.709, premultiplied, alpha), and the FLIP map."""
+    from mistyle.core.image import luminance, overlap
+    from mistyle.measure.compare_metrics import measure_colour
+
+    a, b = (np.nan_to_num(p[..., :3]).astype(np.float32) for p in (reference, test))
+    inside = [p[..., 3] > 0.5 for p in (reference, test)]
+    seen = (reference[..., 3] > 0) | (test[..., 3] > 0)
+    both = inside[0] & inside[1]
+    found = measure_colour(a, b, seen, ("flip",))
+    first, second = luminance(a)[both], luminance(b)[both]
+    varies = len(first) > 1 and first.std() > 0 and second.std() > 0
+    alike = float(np.corrcoef(first, second)[0, 1]) if varies else float(np.array_equal(first, second))
+    bright = float(second.mean() / first.mean()) if len(first) and first.mean() > 0 else float("nan")
+    return Difference(shot, found.values["flip"], overlap(*inside), alike, bright), found.maps["flip"]
+
+
+def _judged(name: str, check: str, d: Difference, versions: str) -> Check:
+    fine = d.flip <= MOST_FLIP and d.overlap >= LEAST_OVERLAP and d.correlation >= LEAST_CORRELATION
+    said = (
+        f"{d.shot}: FLIP {d.flip:.4f}, silhouettes {d.overlap:.4f}, correlation {d.correlation:.4f}, "
+        f"brightness {d.brightness:.4f} ({versions})"
+    )
+    return Check(name, check, "passed" if fine else "failed", said)
+
+
+def _keep(folder: Path, shot: str, pictures: Sequence[np.ndarray], error: np.ndarray) -> None:
+    from mistyle.core.image import srgb_from_linear
+    from mistyle.run.compare_pictures import heat
+
+    for who, picture in zip(("cycles", "mitsuba"), pictures, strict=True):
+        planes = dict(zip("RGBA", np.moveaxis(picture, -1, 0), strict=False))
+        write_exr(folder / "renders" / f"{shot}_{who}.exr", planes)
+    # On a middle grey, so that a dark and a missing part differ.
+    shown = [srgb_from_linear(p[..., :3] + 0.18 * (1 - p[..., 3:4])) for p in pictures]
+    write_png(folder / f"{shot}.png", np.concatenate([*shown, heat(error) / np.float32(255)], axis=1))
+
+
+def table(told: dict[str, Any]) -> str:
+    """The checks as a person reads them: file, check, outcome."""
+    rows = [(c["outcome"], c["file"], c["check"], c["said"]) for c in told["checks"]]
+    widths = [max((len(row[k]) for row in rows), default=0) for k in range(3)]
+    lines = ["  ".join([*(row[k].ljust(widths[k]) for k in range(3)), row[3]]) for row in rows]
+    passed = len(rows) - told["failed"] - told["not_checked"]
+    lines.append(f"{passed} passed, {told['failed']} failed, {told['not_checked']} not checked: {told['out']}")
+    return "\n".join(lines)

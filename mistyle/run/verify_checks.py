@@ -1,0 +1,238 @@
+"""The checks of `mistyle verify`: files opened by readers that are not ours, each outcome one row."""
+
+import json
+import os
+import subprocess
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+from shutil import which
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+
+from mistyle.core.errors import MistyleError
+from mistyle.files.store import sha256_file
+from mistyle.run.blender import BLENDER, OPEN_WORKER, blender_command
+
+Outcome = Literal["passed", "failed", "not checked"]
+MODELS = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj")
+VALIDATE = """
+const fs = require('fs'), path = require('path'), validator = require('gltf-validator');
+const file = process.argv[1], folder = path.dirname(file);
+validator.validateBytes(new Uint8Array(fs.readFileSync(file)), {
+  uri: path.basename(file), maxIssues: 100,
+  externalResourceFunction: (uri) => fs.promises.readFile(path.join(folder, decodeURIComponent(uri))),
+}).then((report) => console.log(JSON.stringify({ version: validator.version(), issues: report.issues })));
+"""
+
+
+@dataclass(frozen=True)
+class Check:
+    """What was looked at, by whom, and how it came out."""
+
+    file: str
+    check: str
+    outcome: Outcome
+    said: str
+
+
+def _row(file: str, check: str, complaints: Sequence[str], fine: str) -> Check:
+    if complaints:
+        more = f" (and {len(complaints) - 3} more)" if len(complaints) > 3 else ""
+        return Check(file, check, "failed", "; ".join(complaints[:3]) + more)
+    return Check(file, check, "passed", fine)
+
+
+def listed_files(listing: Path, name: str) -> Check | None:
+    """The files that a list of ours (an asset's, a delivery's, a stage's) names, by their sha256; None for any other
+    file."""
+    try:
+        content = json.loads(listing.read_text(encoding="utf-8"))
+        given = content["files"]
+        pairs = given.items() if isinstance(given, dict) else [(e["file"], e.get("sha256")) for e in given]
+        wanted = {str(file): value for file, value in pairs if value is not None}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return None
+    wrong = []
+    for file, value in wanted.items():
+        path = listing.parent / file
+        if not path.is_file():
+            wrong.append(f"{file} is missing")
+        elif sha256_file(path) != value:
+            wrong.append(f"{file} has changed")
+    return _row(name, "sha256 of the files it lists", wrong, f"{len(wanted)} files as they were written")
+
+
+def validator_home() -> Path | str:
+    """The node_modules with Khronos' validator in it, or why there is none. Nothing is fetched."""
+    node = which("node")
+    if node is None:
+        return "no node here"
+    places = [Path(p) for p in os.environ.get("NODE_PATH", "").split(os.pathsep) if p] + [Path("node_modules")]
+    cache = Path(os.environ.get("MISTYLE_CACHE") or Path.home() / ".cache" / "mistyle") / "npm"
+    places += sorted(cache.glob("*")) if cache.is_dir() else []
+    npm = which("npm")
+    if npm is not None:
+        done = subprocess.run([npm, "root", "-g"], capture_output=True, text=True, timeout=60)
+        places += [Path(done.stdout.strip())] if done.returncode == 0 and done.stdout.strip() else []
+    found = next((p for p in places if (p / "gltf-validator").is_dir()), None)
+    return found.resolve() if found else "node is here, gltf-validator is not (npm install -g gltf-validator)"
+
+
+def gltf(path: Path, name: str) -> Iterator[Check]:
+    """Khronos' validator through node."""
+    home = validator_home()
+    if isinstance(home, str):
+        yield Check(name, "Khronos glTF validator", "not checked", home)
+        return
+    command = ["node", "-e", VALIDATE, str(path.resolve())]
+    done = subprocess.run(
+        command, env=os.environ | {"NODE_PATH": str(home)}, capture_output=True, text=True, timeout=300
+    )
+    if done.returncode:
+        yield Check(
+            name, "Khronos glTF validator", "failed", done.stderr.strip()[-300:] or f"ended with {done.returncode}"
+        )
+        return
+    told = json.loads(done.stdout)
+    issues = told["issues"]
+    errors = [f"{m['code']} {m.get('pointer', '')}".strip() for m in issues["messages"] if m["severity"] == 0]
+    counts = f"{issues['numErrors']} errors, {issues['numWarnings']} warnings, {issues['numInfos']} notes"
+    if issues["numErrors"] and not errors:
+        errors = [counts]
+    yield _row(name, f"Khronos glTF validator {told['version']}", errors, counts)
+
+
+def by_trimesh(path: Path, name: str) -> Iterator[Check]:
+    """Faces, finite vertices, UVs and textures as trimesh finds them."""
+    import trimesh
+
+    check = f"trimesh {trimesh.__version__}"
+    try:
+        scene: Any = trimesh.load(path, process=False, force="scene")
+        parts = [g for g in scene.geometry.values() if hasattr(g, "faces")]
+    except Exception as error:  # whatever a reader of strangers says about the file is its finding
+        yield Check(name, check, "failed", f"{type(error).__name__}: {str(error)[:200]}")
+        return
+    faces = sum(len(part.faces) for part in parts)
+    wrong = [] if faces else ["no faces"]
+    wrong += [f"{key} is not finite" for key, g in scene.geometry.items() if not np.isfinite(g.vertices).all()]
+    bare = [g for g in parts if getattr(g.visual, "uv", None) is None]
+    wrong += [f"{len(bare)} meshes without UVs"] if bare else []
+    yield _row(name, check, wrong, f"{len(parts)} meshes, {faces} triangles, UVs on all")
+
+
+def usd(path: Path, name: str) -> Iterator[Check]:
+    """USD's own validators, and whether every texture that it names is there."""
+    try:
+        from mistyle.files.usd import complaints, library
+
+        pxr = library()
+    except MistyleError as error:
+        yield Check(name, "UsdValidation", "not checked", str(error))
+        return
+    try:
+        stage = pxr.Usd.Stage.Open(str(path))
+    except pxr.Tf.ErrorException as error:
+        yield Check(name, "UsdValidation", "failed", str(error).strip().splitlines()[-1][:300])
+        return
+    wrong = complaints(path)
+    named = [p.GetAttribute("inputs:file").Get() for p in stage.Traverse() if p.HasAttribute("inputs:file")]
+    wrong += [f"{asset.path} is not there" for asset in named if asset and not asset.resolvedPath]
+    meshes = sum(p.IsA(pxr.UsdGeom.Mesh) for p in stage.Traverse())
+    version = ".".join(map(str, pxr.Usd.GetVersion()[1:]))
+    yield _row(name, f"UsdValidation {version}", wrong, f"no errors; {meshes} meshes, {len(named)} textures resolved")
+
+
+def materialx(path: Path, name: str) -> Iterator[Check]:
+    """MaterialX's own validation, a definition for every node, and whether its images are there."""
+    try:
+        mx: Any = import_module("MaterialX")
+    except ImportError:
+        yield Check(name, "MaterialX", "not checked", "no MaterialX here (pip install 'mistyle[usd]')")
+        return
+    check = f"MaterialX {mx.getVersionString()}"
+    document, nodes = mx.createDocument(), mx.createDocument()
+    try:
+        mx.readFromXmlFile(document, str(path))
+    except mx.Exception as error:
+        yield Check(name, check, "failed", str(error)[:300])
+        return
+    own = [n for n in document.traverseTree() if n.isA(mx.Node)]
+    mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), nodes)
+    document.setDataLibrary(nodes)
+    valid, message = document.validate()
+    wrong = [] if valid else [message.strip()[:200]]
+    wrong += [f"{n.getNamePath()} has no definition" for n in own if n.getNodeDef() is None]
+    files = [n.getInput("file").getValueString() for n in own if n.getCategory() == "image"]
+    wrong += [f"{file} is not there" for file in files if not (path.parent / file).is_file()]
+    surfaces = sum(n.getType() == "surfaceshader" for n in own)
+    yield _row(name, check, wrong, f"valid; {surfaces} surfaces, {len(files)} images there")
+
+
+def png(paths: Sequence[Path], name: str) -> Iterator[Check]:
+    """Every PNG decoded by Pillow."""
+    import PIL
+    from PIL import Image
+
+    wrong = []
+    for path in paths:
+        try:
+            with Image.open(path) as picture:
+                picture.load()
+        except (OSError, SyntaxError, ValueError) as error:
+            wrong.append(f"{path.name}: {str(error)[:100]}")
+    yield _row(name, f"Pillow {PIL.__version__}", wrong, f"{len(paths)} PNG decoded")
+
+
+def exr(paths: Sequence[Path], name: str) -> Iterator[Check]:
+    """Every EXR decoded by OpenImageIO, with the colour space that it found."""
+    try:
+        import OpenImageIO as oiio  # pyright: ignore[reportMissingImports]
+    except ImportError:
+        yield Check(name, "OpenImageIO", "not checked", "no OpenImageIO here (pip install openimageio)")
+        return
+    wrong, spaces = [], set()
+    for path in paths:
+        found = oiio.ImageInput.open(str(path))
+        if found is None or found.read_image() is None:
+            wrong.append(f"{path.name}: {oiio.geterror()[:100]}")
+        else:
+            spaces.add(str(found.spec().getattribute("colorInteropID") or "no colour space"))
+    told = f"{len(paths)} EXR decoded: {', '.join(sorted(spaces))}"
+    yield _row(name, f"OpenImageIO {oiio.VERSION_STRING}", wrong, told)
+
+
+def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None) -> Iterator[Check]:
+    """Every model opened by Blender's importers: meshes there, no image missing."""
+    if blender is None:
+        told = f"no Blender here (name it with --blender or {BLENDER})"
+        yield from (Check(name, "Blender", "not checked", told) for name in names)
+        return
+    from mistyle.run.render_files import run_job
+
+    try:
+        with TemporaryDirectory(prefix="mistyle-") as folder:
+            job = {"files": [str(p.resolve()) for p in paths]}
+            done = run_job(blender_command(blender, OPEN_WORKER), Path(folder) / "job.json", job, "blender")
+    except MistyleError as error:
+        yield from (Check(name, "Blender", "failed", str(error)[-300:]) for name in names)
+        return
+    for name, found in zip(names, done["found"], strict=True):
+        wrong = [found["error"]] if "error" in found else []
+        wrong += [] if wrong or found["meshes"] and found["triangles"] else ["no mesh was imported"]
+        wrong += [f"image {image} is missing" for image in found.get("missing", [])]
+        fine = "" if wrong else "{meshes} meshes, {triangles} triangles, {materials} materials, {images} images"
+        yield _row(name, f"Blender {done['blender']}", wrong, fine.format(**found))
+
+
+# Who reads a model of which kind.
+READERS: dict[str, tuple[Callable[[Path, str], Iterator[Check]], ...]] = {
+    **dict.fromkeys((".glb", ".gltf"), (gltf, by_trimesh)),
+    ".obj": (by_trimesh,),
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), (usd,)),
+    ".mtlx": (materialx,),
+}

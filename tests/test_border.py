@@ -1,0 +1,500 @@
+"""The border: what strangers wrote is opened and decoded in the reader process, and whatever happens there, the job
+goes on with one sentence."""
+
+import ast
+import json
+import os
+import signal
+import struct
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from helpers import ROOT, data
+
+from mistyle.core import weights
+from mistyle.core.errors import InputRefused, MistyleError
+from mistyle.files import reader_process, wire
+from mistyle.files.images import write_exr, write_png
+from mistyle.files.raw import RawMap, Textures, Tile
+from mistyle.files.read import read_exr, read_json, read_mesh, read_npy, read_picture, read_size, read_toml, read_yaml
+
+posix = os.name == "posix"
+
+# --- what the source says ---
+
+# Calls that decode a file or bytes of a format, and where they may stand. Everything in DECODERS runs in the reader
+# process; the others read what mistyle itself wrote, or are child processes of their own.
+CALLS = {
+    *(
+        ("Image", "open"),
+        ("cv2", "imread"),
+        ("cv2", "imdecode"),
+        ("OpenEXR", "File"),
+        ("np", "load"),
+        ("np", "fromfile"),
+    ),
+    *(("torch", "load"), ("pickle", "load"), ("pickle", "loads"), ("yaml", "safe_load"), ("library", "safe_load")),
+    *(("yaml", "load"), ("tomllib", "load"), ("tomllib", "loads"), ("mi", "load_file"), ("np", "memmap")),
+    *(("ElementTree", "parse"), ("ElementTree", "fromstring"), ("zipfile", "ZipFile"), ("np", "loadtxt")),
+    *(("trimesh", "load"), ("imageio", "imread"), ("Stage", "Open"), ("json", "load"), ("xatlas", "parse_mesh")),
+}
+DECODERS = {
+    *("files/pictures", "files/hdr", "files/layers", "files/obj_read", "files/mesh_formats", "files/gltf_read"),
+    *("files/gltf_check", "files/gltf_materials", "files/colmap", "files/references", "files/reader_tasks"),
+    *("files/usd_read", "files/usd_layers", "files/usd_materials"),
+}
+ALLOWED = {
+    "bootstrap": "pyproject.toml of the clone",
+    "core/light": "scene files that come with mistyle",
+    "core/memory": "arrays that mistyle wrote into a run's folder",
+    "core/unwrap": "what its own child wrote into a folder of its own",
+    "core/xatlas_worker": "what its parent wrote into a folder of its own",
+    "core/weights": "safetensors, mapped in place after their header was checked",
+    "core/weights_worker": "a child process of its own: weights that are no safetensors",
+    "files/images": "writes EXR",
+    "files/usd": "the package that it has just written",
+    "files/usd_look": "the USD file that the reader process has read in the same run, to lay materials over it",
+    "measure/flip_bands": "what its parent wrote into a folder of its own",
+    "render/cycles_worker": "the job that mistyle wrote for it",
+    "render/mitsuba_worker": "the job that mistyle wrote for it, or the user's scene, trusted like code",
+    "render/lookdev": "the user's scene (--scene), trusted like code",
+    "render/scene": "the user's scene (--scene), trusted like code",
+    "run/batch_page": "a report's own picture",
+    "run/blender_worker": "the job that mistyle wrote for it",
+    "run/settings": "a word of the user's own command line",
+    "run/verify_checks": "pictures that mistyle has just written, decoded by others on purpose",
+    "stages/mvst": "views that a run kept in its own folder",
+}
+# Names of decoding modules that others may import: records, and what only looks at paths or checked trees.
+TYPES = {"Frame", "Layer", "Window", "BEAUTY", "SparsePoints", "find_model", "data_uri", "set_of", "texture_transform"}
+TYPES |= {"frame_of", "picture_of"}  # arithmetic on what was decoded
+
+
+def modules() -> dict[str, ast.Module]:
+    paths = sorted((ROOT / "mistyle").rglob("*.py"))
+    return {p.relative_to(ROOT / "mistyle").with_suffix("").as_posix(): ast.parse(p.read_text("utf-8")) for p in paths}
+
+
+def decoding(tree: ast.Module) -> list[str]:
+    """Calls of a module that decode, as "Image.open (line 3)"."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute):
+            owner = node.func.value
+            name = owner.id if isinstance(owner, ast.Name) else owner.attr if isinstance(owner, ast.Attribute) else ""
+            if (name, node.func.attr) in CALLS:
+                found.append(f"{name}.{node.func.attr} (line {node.lineno})")
+    return found
+
+
+def borrowed(tree: ast.Module) -> list[str]:
+    """Functions of decoding modules that a module imports."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            place = node.module.removeprefix("mistyle.").replace(".", "/")
+            for alias in node.names:
+                if place in DECODERS and alias.name not in TYPES:
+                    found.append(f"{alias.name} of {place}")
+                if f"{place}/{alias.name}" in DECODERS:
+                    found.append(f"{place}/{alias.name}")
+        if isinstance(node, ast.Import):
+            found += [a.name for a in node.names if a.name.removeprefix("mistyle.").replace(".", "/") in DECODERS]
+    return found
+
+
+def test_strangers_files_are_decoded_behind_the_border_only():
+    wrong = [
+        f"{name}: {call}"
+        for name, tree in modules().items()
+        if name not in DECODERS | ALLOWED.keys()
+        for call in decoding(tree)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_decoders_are_reached_through_the_reader_process_only():
+    wrong = [
+        f"{name} imports {what}"
+        for name, tree in modules().items()
+        if name not in DECODERS
+        for what in borrowed(tree)
+        # The child itself, and the writer of layers over a USD file that the child has read before.
+        if name not in {"files/reader_child", "files/usd_look"}
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_rules_can_be_broken():
+    assert decoding(ast.parse("from PIL import Image\ndef f(p):\n    return Image.open(p)"))
+    assert decoding(ast.parse("import numpy as np\nnp.load('a.npy')")) == ["np.load (line 2)"]
+    assert borrowed(ast.parse("from mistyle.files.pictures import read_picture"))
+    assert borrowed(ast.parse("from mistyle.files import hdr")) and borrowed(ast.parse("import mistyle.files.hdr"))
+    assert not borrowed(ast.parse("from mistyle.files.layers import Frame"))
+
+
+def test_what_is_excused_is_there():
+    there = modules()
+    assert DECODERS | ALLOWED.keys() <= there.keys(), (DECODERS | ALLOWED.keys()) - there.keys()
+    assert not [name for name in ALLOWED if not decoding(there[name])]
+
+
+def test_the_reader_loads_no_renderer_and_no_torch():
+    """It starts in well under a second, and a hostile file meets only decoders."""
+    source = "import sys, mistyle.files.reader_tasks; print(sorted({m.split('.')[0] for m in sys.modules}))"
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, cwd=ROOT, check=True)
+    loaded = set(ast.literal_eval(done.stdout))
+    assert not loaded & {"mitsuba", "drjit", "torch", "diffusers", "transformers", "ray", "jinja2", "socketserver"}
+
+
+# --- what the process does ---
+
+
+@pytest.fixture
+def picture(tmp_path: Path) -> Path:
+    write_png(tmp_path / "a.png", np.random.default_rng(0).random((5, 7, 3)).astype(np.float32))
+    return tmp_path / "a.png"
+
+
+def child() -> int:
+    """The number of the present reader process."""
+    reader = reader_process._reader
+    assert reader is not None
+    return reader.process.pid
+
+
+def alive(pid: int) -> bool:
+    try:
+        state = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0]
+    except OSError:
+        return False
+    return state != "Z"
+
+
+def test_one_child_serves_file_after_file(picture: Path):
+    first = read_picture(picture)
+    number = child()
+    assert read_size(picture) == (5, 7) and np.array_equal(read_picture(picture).rgb, first.rgb)
+    with pytest.raises(InputRefused, match="found nothing"):
+        read_picture(picture.with_name("b.png"))
+    assert child() == number and number != os.getpid()
+    first.rgb[0, 0] = 2  # arrays are this process's own, and can be written to
+
+
+def test_relative_paths_follow_the_working_folder(picture: Path, monkeypatch: pytest.MonkeyPatch):
+    read_size(picture)
+    monkeypatch.chdir(picture.parent)
+    assert read_size(Path("a.png")) == (5, 7)
+
+
+@pytest.mark.skipif(not posix, reason="signals")
+@pytest.mark.parametrize("name", ["SIGSEGV", "SIGABRT", "SIGKILL", "SIGXCPU"])
+def test_a_crash_is_a_refusal_and_the_next_file_gets_a_new_child(name: str, picture: Path):
+    read_size(picture)
+    number = child()
+    os.kill(number, signal.SIGSTOP)  # so that it dies amid the request
+    threading.Timer(0.2, lambda: (os.kill(number, getattr(signal, name)), os.kill(number, signal.SIGCONT))).start()
+    words = "processor time" if name == "SIGXCPU" else name
+    with pytest.raises(InputRefused, match=words) as refusal:
+        read_picture(picture)
+    assert str(picture) in str(refusal.value) and refusal.value.exit_code == 3
+    assert len(str(refusal.value).splitlines()) == 1
+    assert read_size(picture) == (5, 7) and child() != number and not alive(number)
+
+
+@pytest.mark.skipif(not posix, reason="signals")
+def test_a_hang_is_a_refusal(picture: Path, monkeypatch: pytest.MonkeyPatch):
+    read_size(picture)
+    number = child()
+    monkeypatch.setattr(reader_process, "PATIENCE", 0.5 / reader_process.SECONDS)
+    os.kill(number, signal.SIGSTOP)
+    start = time.monotonic()
+    with pytest.raises(InputRefused, match="not decoded within"):
+        read_picture(picture)
+    assert time.monotonic() - start < 5 and not alive(number)
+    monkeypatch.undo()
+    assert read_size(picture) == (5, 7)
+
+
+@pytest.mark.skipif(not posix, reason="needs limits on processor time")
+def test_a_file_that_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Concave polygons of 500 corners: cutting off ears takes the third power of their number."""
+    angle = np.linspace(0, 2 * np.pi, 500, endpoint=False)
+    star = np.stack([np.cos(angle), np.sin(angle)], axis=1) * (1 + 0.5 * (np.arange(500) % 2))[:, None]
+    lines = [f"v {x:.6f} {y:.6f} 0" for x, y in star] + ["f " + " ".join(map(str, range(1, 501)))] * 200
+    path = tmp_path / "a.obj"
+    path.write_text("\n".join(lines) + "\n")
+    monkeypatch.setattr(reader_process, "SECONDS", 0.5)
+    monkeypatch.setattr(reader_process, "SECONDS_PER_MIB", 0.0)
+    monkeypatch.setattr(reader_process, "PATIENCE", 200.0)
+    with pytest.raises(InputRefused, match="processor time"):
+        read_mesh(path)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the address space")
+def test_a_file_that_takes_too_much_memory_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "a.png"
+    write_png(path, np.zeros((3000, 3000, 3), np.float32))
+    monkeypatch.setattr(reader_process, "MEMORY", 80 << 20)
+    with pytest.raises(InputRefused, match="a.png: found a file whose decoding takes more than 0.1 GiB"):
+        read_picture(path)
+    monkeypatch.undo()
+    assert read_picture(path).rgb.shape == (3000, 3000, 3)
+
+
+def test_threads_share_the_child(tmp_path: Path):
+    for k in range(8):
+        write_exr(tmp_path / f"{k}.exr", {"Z": np.full((50, 60), k, np.float32)})
+    found: dict[int, list[float]] = {k: [] for k in range(8)}
+
+    def work(k: int) -> None:
+        for _ in range(5):
+            found[k].append(float(read_exr(tmp_path / f"{k}.exr")["Z"].mean()))
+
+    threads = [threading.Thread(target=work, args=(k,)) for k in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert found == {k: [float(k)] * 5 for k in range(8)}
+
+
+READ = "from pathlib import Path; from mistyle.files import read, reader_process; read.read_size(Path(r'{}'));"
+READ += "pid = reader_process._reader.process.pid; print(pid, flush=True);"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc")
+@pytest.mark.parametrize(
+    "rest", ["", "import os; os.kill(os.getpid(), 9)", "import os; os._exit(3)", "raise SystemExit(4)", "fork"]
+)
+def test_no_child_outlives_its_parent(rest: str, picture: Path):
+    if rest == "fork":  # a forked copy has a child of its own, and takes nothing from its parent's
+        rest = "import os; copy = os.fork();"
+        rest += f"read.read_size(Path(r'{picture}')); other = reader_process._reader.process.pid;"
+        rest += "same = other == pid; assert same == (copy != 0); copy and os.waitpid(copy, 0)"
+    done = subprocess.run([sys.executable, "-c", READ.format(picture) + rest], capture_output=True, text=True, cwd=ROOT)
+    assert "Error" not in done.stderr, done.stderr
+    number = int(done.stdout.split()[0])
+    deadline = time.monotonic() + 5
+    while alive(number) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(number)
+
+
+@pytest.mark.skipif(not posix, reason="needs limits on files")
+def test_the_reader_cannot_write(tmp_path: Path):
+    source = f"""
+import numpy as np, cv2, os, socket, subprocess
+from mistyle.files import reader_child
+reader_child._confine()
+place = {str(tmp_path)!r} + "/"
+for act in (lambda: open(place + "a", "w"), lambda: os.remove(place + "kept"), lambda: socket.socket(),
+            lambda: subprocess.run(["true"]), lambda: os.open(place + "b", os.O_CREAT | os.O_WRONLY),
+            lambda: os.rename(place + "kept", place + "c"), lambda: os.system("true")):
+    try:
+        act()
+    except PermissionError:
+        continue
+    raise SystemExit("was allowed")
+try:
+    cv2.imwrite(place + "d.png", np.zeros((5, 5, 3), np.uint8))  # native code does not ask Python
+except cv2.error:
+    pass
+"""
+    (tmp_path / "kept").write_text("x")
+    done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, cwd=ROOT)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {p.name: p.stat().st_size for p in tmp_path.iterdir()} in ({"kept": 1}, {"kept": 1, "d.png": 0})
+
+
+def test_a_reader_that_cannot_start_says_so(picture: Path, monkeypatch: pytest.MonkeyPatch):
+    reader_process.stop()
+    monkeypatch.setenv("PYTHONHOME", "/nowhere")
+    with pytest.raises(MistyleError, match="did not start") as error:
+        read_size(picture)
+    assert error.value.exit_code == 4
+    monkeypatch.undo()
+    assert read_size(picture) == (5, 7)
+
+
+# --- what is sent ---
+
+
+def through(value):
+    """What arrives of a value."""
+    sent = bytearray()
+    wire.send(lambda part: sent.extend(part) or len(part), value, extra=1)
+    at = 0
+
+    def read(into: memoryview) -> int:
+        nonlocal at
+        count = min(len(into), len(sent) - at, 1000)
+        into[:count] = sent[at : at + count]
+        at += count
+        return count
+
+    found, head = wire.receive(read)
+    assert head == {"extra": 1} and at == len(sent)
+    return found
+
+
+def test_values_arrive_as_they_were_sent(rng: np.random.Generator):
+    shared = rng.random((3, 4))
+    textures = Textures({1001: Tile({"albedo": RawMap(shared[:, ::2], transform=np.eye(3))}, ("note",))})
+    found = through((1, None, True, "ä", float("inf"), b"\0\1", Path("a"), {3: [shared, shared]}, textures, np.int8(3)))
+    assert found[:7] == (1, None, True, "ä", float("inf"), b"\0\1", Path("a")) and found[9] == 3
+    a, b = found[7][3]
+    assert a is b and np.array_equal(a, shared) and a.flags.writeable
+    assert np.array_equal(found[8](1001)[0]["albedo"].values, shared[:, ::2]) and found[8].tiles[1001].notes == (
+        "note",
+    )
+    assert through(np.zeros((0, 3), np.float16)).shape == (0, 3) and through(np.array(2.5)).shape == ()
+    assert through(wire.Json({"a": [1, {"b": None}]})) == {"a": [1, {"b": None}]}
+    for value in (object(), np.array([None]), np.array(["a"]), 1j, {1, 2}):
+        with pytest.raises(TypeError, match="cannot be sent"):
+            through(value)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        {"value": {"record": "Popen", "fields": {"args": "true"}}, "arrays": []},
+        {"value": {"record": "mistyle.core.asset:Picture", "fields": {}}, "arrays": []},
+        {"value": {"array": 0}, "arrays": [["|O", [1]]]},
+        {"value": {"array": 0}, "arrays": [["<f4", [1 << 40]]]},
+        {"value": {"array": 3}, "arrays": []},
+        {"value": {"a": 1, "b": 2}, "arrays": []},
+        {"value": [1], "arrays": []},
+        {"arrays": []},
+        [],
+    ],
+)
+def test_a_captured_reader_cannot_make_the_job_build_things(head):
+    text = json.dumps(head).encode()
+    message = len(text).to_bytes(8, "little") + text
+    at = 0
+
+    def read(into: memoryview) -> int:
+        nonlocal at
+        count = min(len(into), len(message) - at)
+        into[:count] = message[at : at + count]
+        at += count
+        return count
+
+    with pytest.raises(wire.BrokenMessage):
+        wire.receive(read)
+
+
+# --- absurd files ---
+
+
+def accessors(count: int) -> str:
+    tree = {
+        "asset": {"version": "2.0"},
+        "accessors": [{"type": "VEC3", "componentType": 5126, "count": count}],
+        "meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}],
+        "nodes": [{"mesh": 0}],
+    }
+    return json.dumps(tree)
+
+
+LAUGHS = "a0: &a0 [x, x, x, x, x, x, x, x, x, x]\n"
+LAUGHS += "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 10)}]\n" for k in range(1, 9))
+NPY = (
+    b"\x93NUMPY\x01\x00v\x00"
+    + b"{'descr': '<f8', 'fortran_order': False, 'shape': (1000000, 1000000), }".ljust(117)
+    + b"\n"
+)
+BOMBS = {
+    "zeros.gltf": (accessors(99_999_999).encode(), read_mesh, "99999999 elements of POSITION"),
+    "laughs.yaml": (LAUGHS.encode(), read_yaml, "more than 1000000 values"),
+    "deep.toml": (b"a = " + b"[" * 50_000 + b"]" * 50_000, read_toml, "no TOML|deeper"),
+    "date.toml": (b"a = 2020-01-01", read_toml, "found a date"),
+    "object.yaml": (b"a: !!python/object/apply:os.system ['true']", read_yaml, "no YAML"),
+    "huge.json": (b'{"a": 1' + b"0" * 400 + b"}", read_json, "more than 64 bits"),
+    "infinite.json": (b'{"a": [1e999]}', read_json, "beyond what a double holds"),
+    "shape.npy": (NPY, read_npy, "no array.*greater than file size"),
+    "buffers.gltf": (
+        json.dumps({"asset": {"version": "2.0"}, "buffers": [{"byteLength": 2**30, "uri": "a.bin"}] * 9}).encode(),
+        read_mesh,
+        "buffers of 9216 MiB",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BOMBS)
+def test_small_files_that_ask_for_much_are_refused_early(name: str, tmp_path: Path):
+    content, reader, words = BOMBS[name]
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputRefused, match=words) as refusal:
+        reader(tmp_path / name)
+    assert name in str(refusal.value)
+    assert reader_process.peak_bytes() < 2e9
+
+
+def test_nasty_meshes_are_all_in_the_table():
+    from test_read import NASTY
+
+    assert {p.name for p in data("meshes/nasty").iterdir()} == set(NASTY)
+
+
+# --- weights ---
+
+
+def tensors(table: object, data: bytes = bytes(48)) -> bytes:
+    head = json.dumps(table).encode()
+    return struct.pack("<Q", len(head)) + head + data
+
+
+def entry(kind: object = "F32", shape: object = (3, 4), at: object = (0, 48)) -> dict:
+    return {"dtype": kind, "shape": shape, "data_offsets": at}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\xff" * 8,
+        struct.pack("<Q", 10**9) + b"{}",
+        tensors([]),
+        tensors({"a": entry("F31")}),
+        tensors({"a": entry(at=(0, 52))}),
+        tensors({"a": entry(shape=(3, 5))}),
+        tensors({"a": entry(shape=(-3, -4))}),
+        tensors({"a": entry(at=(-48, 0))}),
+        tensors({"a": entry(), "b": entry(shape=(3,), at=(40, 52))}, bytes(60)),
+        tensors({"a": entry(shape=(2**40, 2**40))}),
+        tensors({"a": 3}),
+        tensors({"a": entry(shape=None)}),
+        tensors({"__metadata__": {"a": 1}}),
+        b"\x80\x04pickle",
+    ],
+)
+def test_damaged_safetensors_are_refused(content: bytes, tmp_path: Path):
+    (tmp_path / "a.safetensors").write_bytes(content)
+    with pytest.raises(InputRefused, match="a.safetensors"):
+        weights.tensors(tmp_path / "a.safetensors")
+
+
+def test_safetensors_are_mapped_and_may_be_changed_in_memory(tmp_path: Path):
+    values = np.arange(12, dtype=np.float32).reshape(3, 4)
+    path = tmp_path / "a.safetensors"
+    path.write_bytes(tensors({"a": entry(), "b": entry("F16", (0,), (48, 48))}, values.tobytes()))
+    found = weights.tensors(path)
+    assert np.array_equal(found["a"].numpy(), values) and found["b"].shape == (0,)
+    found["a"][0, 0] = 7
+    assert np.array_equal(weights.tensors(path)["a"].numpy(), values)
+
+
+def test_an_archive_that_unpacks_to_too_much_is_refused(tmp_path: Path):
+    np.savez_compressed(tmp_path / "a.npz", a=np.zeros(20_000_000, np.float32))
+    with pytest.raises(InputRefused, match="unpacks to 80000.* at most 200 times"):
+        weights.tensors(tmp_path / "a.npz")
+    np.savez(tmp_path / "b.npz", a=np.arange(5), b=np.ones((2, 3), np.float16))
+    found = weights.tensors(tmp_path / "b.npz")
+    assert found["a"].tolist() == [0, 1, 2, 3, 4] and found["b"].shape == (2, 3)

@@ -1,0 +1,97 @@
+"""What a job will need, said before it begins, and what is refused."""
+
+import argparse
+import json
+
+import pytest
+
+from mistyle.core.errors import UsageError
+from mistyle.run import budget
+from mistyle.run.cli import main
+from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
+from mistyle.run.options import gigabytes
+from mistyle.run.settings import Settings, resolve
+from mistyle.run.stages import MATERIAL_STAGES, STAGES
+
+
+def job(**more) -> Settings:
+    return resolve("draft", None, more, {})
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"), [("4G", 4.0), ("4GB", 4.0), ("4096M", 4.096), ("1.5g", 1.5), ("2", 2.0), ("0.5T", 500.0)]
+)
+def test_amounts_of_memory(text, expected):
+    assert gigabytes(text) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("text", ["", "much", "0", "-3G", "4X", "nan", "1e9"])
+def test_what_is_no_amount_of_memory(text):
+    with pytest.raises(argparse.ArgumentTypeError, match="for example 4G"):
+        gigabytes(text)
+
+
+def test_every_stage_has_its_needs():
+    assert set(budget.PLAIN) == set(budget.TILED) == set(STAGES)
+    assert set(budget.MATERIAL) <= set(MATERIAL_STAGES)
+
+
+def test_more_of_anything_needs_no_less():
+    least = budget.memory_gb(job())
+    more = [
+        {"atlas": {"size": 4096}},
+        {"rig": {"resolution": 2048}},
+        {"rig": {"kind": "turntable", "views": 200}},
+        {"fit": {"crops": 16, "crop_size": 512}},
+    ]
+    for change in more:
+        assert budget.memory_gb(job(**change)) > least, change
+    # Files take the place of memory: what has to be there all the same is less.
+    counts = budget.counts(job(atlas={"size": 8192}))
+    plain, tiled = (budget.peaks(needs, counts) for needs in (budget.PLAIN, budget.TILED))
+    assert max(tiled.values()) < 0.6 * max(plain.values())
+
+
+def test_a_budget_that_is_large_enough_changes_nothing_and_a_small_one_tiles():
+    large = {"atlas": {"size": 4096}}
+    whole = budget.memory_gb(job(**large))
+    assert not budget.tiles(job(**large)) and not budget.tiles(job(**large, memory=whole + 0.1))
+    assert budget.tiles(job(**large, memory=whole - 0.5))
+    assert budget.memory_gb(job(**large, memory=whole - 0.5)) <= whole - 0.5
+    # Two texture sets are twice the texels.
+    assert budget.tiles(job(**large, memory=whole + 0.1), sets=2)
+
+
+def test_the_refusal_names_what_would_work():
+    asked = job(atlas={"size": 8192}, memory=1.0)
+    with pytest.raises(UsageError) as caught:
+        budget.tiles(asked)
+    text = str(caught.value)
+    smallest = float(text.split("give it --memory ")[1].split("G")[0])
+    assert budget.tiles(job(atlas={"size": 8192}, memory=smallest))
+    with pytest.raises(UsageError):
+        budget.tiles(job(atlas={"size": 8192}, memory=smallest - 0.2))
+    assert "--set atlas.size=4096" in text
+    need = float(text.rsplit("which needs ", 1)[1].split()[0])
+    assert budget.tiles(job(atlas={"size": 4096}, memory=need))
+
+
+def test_a_fit_to_pictures_keeps_less_of_their_samples_or_is_refused():
+    settings = resolve("draft", None, {}, {}, MaterialSettings, MATERIAL_PRESETS)
+    pixels = 48 * 1024**2
+    assert budget.check_material(settings, pixels) is settings
+    free = budget.material_gb(settings, pixels)
+    kept = budget.check_material(settings.model_copy(update={"memory": free - 1}), pixels)
+    assert 0 < kept.recover.memory < settings.recover.memory
+    assert budget.material_gb(kept, pixels) <= free - 0.9
+    with pytest.raises(UsageError, match=r"--memory 0\.5G: the fit needs .* even if it keeps nothing"):
+        budget.check_material(settings.model_copy(update={"memory": 0.5}), pixels)
+
+
+def test_the_command_line_plans_and_refuses(tmp_path, capsys):
+    assert main(["demo", "-o", str(tmp_path / "out"), "--dry-run", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["memory_gb"] == pytest.approx(max(told["peaks_gb"].values()), abs=0.01) and not told["in_files"]
+    assert main(["demo", "-o", str(tmp_path / "out"), "--memory", "300M"]) == 2
+    assert "--memory 0.3G: the job needs" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists(), "refused before anything is made"

@@ -1,0 +1,202 @@
+"""`mistyle verify`: what it says of good files, of damaged ones, and of readers that are not there."""
+
+import json
+import os
+import shutil
+import stat
+from pathlib import Path
+
+import numpy as np
+import pytest
+from gltf_cases import bumpy_sphere, no_texels, quarters
+from node_tools import modules
+
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.run import verify_checks
+from mistyle.run.blender import blender_command, find_blender
+from mistyle.run.cli import main
+from mistyle.run.deliver import export
+from mistyle.run.verify import Rendering, compared, file_checks, table, verify
+from mistyle.stages.export import write_asset
+
+FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
+
+
+@pytest.fixture(scope="module")
+def good(tmp_path_factory) -> Path:
+    """A run folder with an asset of two texture sets, delivered in every format."""
+    pytest.importorskip("pxr")
+    folder = tmp_path_factory.mktemp("run")
+    ones = np.ones((16, 16), np.float32)
+    write_asset(
+        folder / "asset", "ball", bumpy_sphere(), [quarters()] * 2, [ones] * 2, [no_texels()] * 2, provenance={}
+    )
+    export(folder, folder / "delivered" / "blender", formats=FORMATS, target="blender")
+    return folder
+
+
+@pytest.fixture
+def run(good, tmp_path) -> Path:
+    return Path(shutil.copytree(good, tmp_path / "run"))
+
+
+@pytest.fixture(autouse=True)
+def no_blender(monkeypatch):
+    """Whether this machine has one must not matter."""
+    monkeypatch.delenv("MISTYLE_BLENDER_PYTHON", raising=False)
+    monkeypatch.setattr("mistyle.run.blender.which", lambda name: None)
+
+
+def outcomes(told: dict, *words: str) -> set[str]:
+    """The outcomes of the rows that have all the words in them."""
+    rows = [c for c in told["checks"] if all(w in f"{c['file']} {c['check']} {c['said']}" for w in words)]
+    assert rows, words
+    return {c["outcome"] for c in rows}
+
+
+def test_good_files_pass_every_reader_that_is_there(run, monkeypatch):
+    home = modules()
+    if isinstance(home, Path):
+        # Validators are looked for by the name that packages have.
+        monkeypatch.setenv("NODE_PATH", str(home))
+    told = verify(run)
+    assert told["failed"] == 0, table(told)
+    for words in (("ball.json", "sha256"), ("ball.export.json", "sha256"), ("ball.glb", "trimesh"),
+                  ("ball.obj", "trimesh"), ("ball.usda", "UsdValidation"), ("ball.usdz", "UsdValidation"),
+                  ("ball.mtlx", "MaterialX"), ("*.png", "Pillow")):  # fmt: skip
+        assert outcomes(told, *words) == {"passed"}, words
+    validator = {"passed"} if isinstance(home, Path) else {"not checked"}
+    assert outcomes(told, "ball.glb", "glTF validator") == validator
+    assert outcomes(told, "ball.usda", "Blender") == {"not checked"}
+    assert json.loads((run / "verify" / "verify.json").read_text()) == told
+    assert "not checked" in table(told) and "no Blender here" in table(told)
+    assert verify(run)["failed"] == 0  # its own folder is no part of what it checks
+
+
+def test_readers_that_are_not_there_are_plain_rows(run, monkeypatch):
+    monkeypatch.setattr(verify_checks, "which", lambda name: None)
+    told = verify(run / "asset" / "ball.glb", run / "checked")
+    assert outcomes(told, "glTF validator") == {"not checked"} and "no node here" in table(told)
+    assert told["failed"] == 0 and told["not_checked"] == 2
+
+
+def damaged_texture(run: Path) -> tuple[str, ...]:
+    path = run / "asset" / "textures" / "ball_lower_half_albedo.png"
+    path.write_bytes(path.read_bytes()[:-20])
+    return "ball.json", "ball_lower_half_albedo.png has changed"
+
+
+def cut_png(run: Path) -> tuple[str, ...]:
+    path = run / "asset" / "textures" / "ball_lower_half_albedo.png"
+    path.write_bytes(path.read_bytes()[:60])
+    return "asset/textures/*.png", "Pillow"
+
+
+def missing_file(run: Path) -> tuple[str, ...]:
+    (run / "delivered" / "blender" / "ball.obj").unlink()
+    return "ball.export.json", "ball.obj is missing"
+
+
+def lost_usd_texture(run: Path) -> tuple[str, ...]:
+    (run / "delivered" / "blender" / "textures" / "ball_lower_half_normal.png").unlink()
+    return "ball.usda", "ball_lower_half_normal.png is not there"
+
+
+def wrong_usd(run: Path) -> tuple[str, ...]:
+    path = run / "delivered" / "blender" / "ball.usda"
+    path.write_text(path.read_text().replace('kind = "component"', 'kind = "component"\n    displayName = 3', 1))
+    return "ball.usda", "UsdValidation"
+
+
+def wrong_materialx(run: Path) -> tuple[str, ...]:
+    path = run / "delivered" / "blender" / "ball.mtlx"
+    path.write_text(path.read_text().replace('<normalmap name="normal_in_world" type="vector3"', '<nothing name="normal_in_world" type="vector3"').replace("</normalmap>", "</nothing>"))  # fmt: skip # noqa: E501
+    return "ball.mtlx", "has no definition"
+
+
+def broken_glb(run: Path) -> tuple[str, ...]:
+    path = run / "asset" / "ball.glb"
+    path.write_bytes(path.read_bytes()[:2000])
+    return "asset/ball.glb", "trimesh"
+
+
+@pytest.mark.parametrize(
+    "spoil", [damaged_texture, cut_png, missing_file, lost_usd_texture, wrong_usd, wrong_materialx, broken_glb]
+)
+def test_damage_is_found_and_ends_with_5(run, spoil, capsys):
+    words = spoil(run)
+    assert main(["verify", str(run), "--no-render"]) == 5
+    told = json.loads((run / "verify" / "verify.json").read_text())
+    assert "failed" in outcomes(told, *words), table(told)
+    assert "failed" in capsys.readouterr().err
+
+
+def test_the_validator_finds_what_trimesh_lets_pass(run, monkeypatch):
+    home = modules()
+    if isinstance(home, str):
+        pytest.skip(home)
+    monkeypatch.setenv("NODE_PATH", str(home))
+    path = run / "asset" / "ball.glb"
+    path.write_bytes(path.read_bytes().replace(b'"mimeType":"image/png"', b'"mimeType":"image/xyz"'))
+    rows = list(file_checks(path, [path], None))
+    assert [r.outcome for r in rows if "validator" in r.check] == ["failed"]
+
+
+def test_blender_is_asked_as_the_program_or_as_a_python(run, monkeypatch, tmp_path):
+    assert blender_command("/x/bin/python", "s.py") == ["/x/bin/python", "s.py"]
+    assert blender_command("/opt/blender-5/blender", "s.py")[-3:] == ["--python", "s.py", "--"]
+    monkeypatch.setattr("mistyle.run.blender.which", lambda name: f"/usr/bin/{name}")
+    assert find_blender(None, {}) == "/usr/bin/blender" and find_blender("p", {}) == "p"
+    # A program that answers as our worker does: a mesh in the GLB, nothing in the OBJ, a missing image in the USD.
+    program = tmp_path / "blender"
+    program.write_text(
+        "#!/usr/bin/env python3\nimport json, sys\npath = sys.argv[-1]\nfound = []\n"
+        "for name in json.load(open(path))['files']:\n"
+        "    empty, lost = name.endswith('obj'), ['skin.png'] if name.endswith('usda') else []\n"
+        "    found.append({'meshes': int(not empty), 'triangles': 12 * (not empty), 'materials': 1, 'images': 1,\n"
+        "                  'missing': lost})\n"
+        "json.dump({'blender': '9.9', 'found': found}, open(path + '.done', 'w'))\n"
+    )
+    program.chmod(program.stat().st_mode | stat.S_IXUSR)
+    told = verify(run, blender=str(program))
+    assert outcomes(told, "ball.glb", "Blender 9.9") == {"passed"}
+    assert outcomes(told, "ball.obj", "Blender 9.9", "no mesh") == {"failed"}
+    assert outcomes(told, "ball.usda", "skin.png is missing") == {"failed"}
+    gone = verify(run, blender=os.devnull)
+    assert outcomes(gone, "ball.glb", "Blender") == {"failed"}
+
+
+def test_what_mitsuba_does_not_draw_is_not_compared(tmp_path, run):
+    from gltf_cases import strange_gltf
+
+    path = strange_gltf(tmp_path / "strange.glb")
+    told = verify(path, tmp_path / "out", blender=os.devnull, rendering=Rendering(1, 16, 1))
+    assert outcomes(told, "Cycles against Mitsuba", "emission, transparency") == {"not checked"}
+
+
+def test_the_figures_of_two_renders(rng):
+    picture = np.zeros((32, 48, 4), np.float32)
+    picture[4:28, 6:30, :3] = rng.uniform(0.1, 0.9, (24, 24, 3))
+    picture[4:28, 6:30, 3] = 1
+    same, error = compared("a", picture, picture)
+    assert (same.flip, same.overlap, same.correlation, same.brightness) == (0, 1, pytest.approx(1), 1)
+    assert error.shape == (32, 48)
+    brighter = picture * np.array([1.2, 1.2, 1.2, 1], np.float32)
+    found, _ = compared("a", picture, brighter)
+    assert found.brightness == pytest.approx(1.2, rel=1e-4) and found.correlation == pytest.approx(1)
+    turned, _ = compared("a", picture, np.ascontiguousarray(picture[:, ::-1]))
+    assert turned.overlap < 0.5 and turned.flip > 0.15
+    upside, _ = compared("a", picture, np.ascontiguousarray(picture[::-1]))
+    assert upside.overlap == 1 and upside.correlation < 0.5
+
+
+def test_what_cannot_be_verified_is_refused(tmp_path, run):
+    with pytest.raises(InputRefused, match="found nothing"):
+        verify(tmp_path / "gone")
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputRefused, match="none of our files"):
+        verify(tmp_path / "empty")
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "work.psd").write_text("mine")
+    with pytest.raises(UsageError, match="holds other things"):
+        verify(run, tmp_path / "mine")
