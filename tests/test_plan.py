@@ -43,6 +43,7 @@ def test_more_of_anything_needs_no_less():
         {"rig": {"resolution": 2048}},
         {"rig": {"kind": "turntable", "views": 200}},
         {"fit": {"crops": 16, "crop_size": 512}},
+        {"report": {"frames": 240, "resolution": 2048}},
     ]
     for change in more:
         assert budget.memory_gb(job(**change)) > least, change

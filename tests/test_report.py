@@ -30,7 +30,7 @@ from mistyle.run.report import (
     slug,
     write_report,
 )
-from mistyle.run.report_pictures import accents, eight_bit, palette, relative_luminance, webp
+from mistyle.run.report_pictures import accents, eight_bit, in_bands, palette, relative_luminance, webp
 
 EVIL = """<script>alert('x')</script>"><img src=http://example.org/a onerror=alert(1)>&amp;{{ 7 * 7 }}"""
 VOID = {"meta", "img", "input", "br", "link", "hr"}
@@ -268,3 +268,43 @@ def test_figures_as_people_say_them():
     assert [size(n) for n in (0, 999, 1000, 99_960, 4_211, 9_412_332, 2_000_000_000_000)] == [
         "0 B", "999 B", "1.0 kB", "100 kB", "4.2 kB", "9.4 MB", "2.0 TB"]  # fmt: skip
     assert [slug(t) for t in ("Stylized views", "<b>É!", "…")] == ["stylized-views", "b", "part"]
+
+
+@pytest.mark.parametrize("shape", [(700, 500, 3), (300, 611), (257, 256, 4)])
+@pytest.mark.parametrize("sharp", [False, True])
+def test_a_picture_made_in_bands_is_shown_as_the_whole_would_be(shape, sharp, rng):
+    whole = rng.random(shape).astype(np.float32)
+    small = in_bands(shape[:2], lambda at: whole[at], 200, sharp)
+    assert max(small.shape) == 200
+    assert webp(small, 200, sharp=sharp) == webp(whole, 200, sharp=sharp)
+
+
+def test_the_maps_of_a_large_atlas_are_never_whole_as_numbers():
+    """Floats of all four maps are 128 MB here."""
+    import tracemalloc
+
+    from mistyle.core.maps import Texels, flat_maps
+    from mistyle.run import report_overlays
+    from mistyle.run.pages import heat, map_shots, mask_over
+
+    size = 2048
+    maps, covered = flat_maps(size), np.ones((size, size), bool)
+    nowhere, none = np.zeros((size, size, 3), np.float32), np.zeros((size, size), np.int32)
+    texels = Texels(nowhere, nowhere, covered, none, none)
+    seen, looks = np.ones((size, size), np.int16), np.ones((size, size), np.float32)
+    tracemalloc.start()
+    try:
+        shots = map_shots(maps, 640)
+        over = [
+            report_overlays.coverage(seen, 4, texels, 640),
+            report_overlays.confidence(looks, texels, 640),
+            report_overlays.repaired(covered, texels, 640),
+            report_overlays.struggle(looks, looks, texels, 640),
+        ]
+        pictures = [heat(seen, 4, texels, 640), mask_over(covered, maps, texels, 640)]
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    every = [s.picture for s in shots] + [o.picture for o in over if o is not None] + pictures
+    assert len(every) == 10 and all(p.dtype == np.uint8 and max(p.shape) == 640 for p in every)
+    assert most < 64e6

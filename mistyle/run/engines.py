@@ -244,6 +244,8 @@ def ray(
     if address is None:
         # Read when Ray is imported; without it Ray takes 127.0.0.1 for the machine's own address and listens on all.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
+        # Ray's workers step back behind everything else by default: a shard is no less urgent here than by itself.
+        os.environ.setdefault("RAY_worker_niceness", "0")
     try:
         import ray as library
     except ImportError:
