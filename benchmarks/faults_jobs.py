@@ -1,6 +1,7 @@
 """Small jobs of every kind, as processes to be disturbed, and the bytes that they must end with."""
 
 import hashlib
+import signal
 import subprocess
 import sys
 import time
@@ -96,10 +97,14 @@ def made(folder: Path, wanted: Sequence[str]) -> dict[str, Job]:
 
 def begin(line: Sequence[str], log: Path, **more: Any) -> subprocess.Popen:
     """A process whose words go into a file; a session of its own, so that signals reach it alone."""
+
+    def heard() -> None:
+        # A background job of a shell has interrupts ignored, and its children inherit that.
+        signal.signal(signal.SIGINT, signal.SIG_DFL)
+
     with open(log, "wb") as words:
-        return subprocess.Popen(
-            line, stdin=subprocess.DEVNULL, stdout=words, stderr=words, start_new_session=True, **more
-        )
+        more = {"start_new_session": True, "preexec_fn": heard} | more
+        return subprocess.Popen(line, stdin=subprocess.DEVNULL, stdout=words, stderr=words, **more)
 
 
 def finish(line: Sequence[str], timeout: float = 300, **more: Any) -> tuple[int, str]:

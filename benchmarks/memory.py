@@ -85,7 +85,7 @@ def stylized(out: Path, words: list[Any], stages: bool) -> dict[str, float]:
 def fitted(out: Path, atlas: str, pixels: str, stages: bool) -> dict[str, float]:
     """Estimate and peak of a fit to 16 pictures that were rendered for it."""
     from mistyle.core.light import lights, to_json
-    from mistyle.run.budget import MATERIAL, Counts, material_gb, peaks
+    from mistyle.run.budget import MATERIAL, material_counts, material_gb, peaks
     from mistyle.run.material_settings import MaterialSettings
 
     views, light = out / "pictures", out / "lights.json"
@@ -97,13 +97,13 @@ def fitted(out: Path, atlas: str, pixels: str, stages: bool) -> dict[str, float]
     settings = MaterialSettings.model_validate(json.loads((out / "fit" / "run.json").read_text())["settings"])
     count = 16 * int(pixels) ** 2
     if stages:
-        show(peaks(MATERIAL, Counts(settings.atlas.size**2, count)), out / "fit")
+        show(peaks(MATERIAL, material_counts(settings, count)), out / "fit")
     return error(material_gb(settings, count), made["peak_gb"])
 
 
 def budget(out: Path, quick: bool) -> dict[str, float]:
     """A job that would take more than it is given, without gradients, and the same without a budget."""
-    size, asked = ("1024", 1.25) if quick else ("4096", 2.5)
+    size, asked = ("1024", 1.25) if quick else ("4096", 2.2)
     words = ["stylize", SPOT, WAVE, *DRAFT, "--atlas", size, "--refine", "off"]
     free = mistyle(*words, "-o", out / "free")
     made = mistyle(*words, "-o", out / "kept", "--memory", f"{asked}G")

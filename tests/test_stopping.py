@@ -59,8 +59,10 @@ BETWEEN_TRIES = "\n    ".join(
 
 def run(body: str, *signals: int, wait: str = "ready") -> tuple[int, str]:
     """A command with this body that gets the signals: exit code and words."""
+    # A background job of a shell has interrupts ignored, and its children inherit that.
+    heard = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
     child = subprocess.Popen(
-        [sys.executable, "-c", VERB.replace("BODY", body)], cwd=ROOT, text=True,
+        [sys.executable, "-c", heard + VERB.replace("BODY", body)], cwd=ROOT, text=True,
         stdout=subprocess.PIPE, stderr=subprocess.STDOUT,
     )  # fmt: skip
     assert child.stdout is not None

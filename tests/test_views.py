@@ -281,7 +281,7 @@ def test_lights_json(tmp_path: Path, views: list[View]) -> None:
         ({"type": "laser"}, "laser"),
         ({"type": "ambient", "radiance": [1, 1]}, "radiance"),
         ({"type": "ambient", "radiance": [1, -1, 1]}, ">= 0"),
-        ({"type": "directional", "direction": [0, 0, 0], "irradiance": [1, 1, 1]}, "no length"),
+        ({"type": "directional", "direction": [0, 0, 0], "irradiance": [1, 1, 1]}, "length 0"),
         ({"type": "directional", "direction": [0, 0, 1], "irradiance": [1, 1, 1], "frame": "moon"}, "moon"),
         ({"type": "spherical_gaussian", "axis": [0, 1, 0], "sharpness": True, "amplitude": [1, 1, 1]}, "sharpness"),
     ],

@@ -40,6 +40,18 @@ class Maps:
     known: Bool[np.ndarray, "h w"]
 
 
+FINER = 4  # texels along a side of the atlas per pixel along a side of the picture, beyond which nothing is gained
+
+
+def coarser(size: int, pixels: int) -> int:
+    """By which power of two maps of `size` texels a side can be coarser for pictures of so many pixels a side: they
+    keep FINER times as many texels."""
+    by = 1
+    while size // (2 * by) >= FINER * pixels and size % (2 * by) == 0:
+        by *= 2
+    return by
+
+
 def flat_maps(size: int, albedo: float = 0.5, roughness: float = 0.5, metallic: float = 0.0) -> Maps:
     """Constant maps: grey, flat, half rough, not metallic, nothing known."""
     normal = np.zeros((size, size, 3), np.float32)

@@ -234,8 +234,12 @@ def _watch(done: threading.Event) -> None:
 
 def _let_go() -> None:
     """Take mapped pages out of the process while it holds more than its limit; they stay in the kernel's cache."""
-    if _resident_now() <= _limit[0]:
-        return
+    if _resident_now() > _limit[0]:
+        let_go()
+
+
+def let_go() -> None:
+    """Take all mapped pages out of the process; before a call into a library that lets no other thread run."""
     for data in list(_mapped):
         with contextlib.suppress(ValueError, OSError):  # closed meanwhile
             data.madvise(mmap.MADV_DONTNEED)

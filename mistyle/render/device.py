@@ -65,6 +65,13 @@ def file_threads() -> Iterator[None]:
             dr.set_thread_count(before)
 
 
+def give_back() -> None:
+    """Memory that Dr.Jit keeps for arrays to come goes back to the system."""
+    import drjit as dr
+
+    dr.flush_malloc_cache()
+
+
 class Frozen:
     """`dr.freeze` of a function, with Python's garbage collector at rest while it runs.
 

@@ -11,13 +11,11 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core import memory
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.image import resize
-from mistyle.core.maps import Maps
+from mistyle.core.maps import Maps, coarser
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.render import device
 from mistyle.render import scene as scenery
-
-FINER = 4  # texels along a side of the atlas per pixel along a side of the picture, beyond which nothing is gained
 
 
 @dataclass(frozen=True)
@@ -141,12 +139,10 @@ def draw_views(
 
 
 def as_fine_as(maps: Maps, pixels: int) -> Maps:
-    """Maps for pictures of so many pixels a side: where they have FINER times as many texels or more, a coarser mip
+    """Maps for pictures of so many pixels a side: where they are finer than that shows (`coarser`), a coarser mip
     level (means over squares of texels; normals unit length again), so that textures do not take more memory and
     time than they show."""
-    size, by = min(maps.roughness.shape), 1
-    while size // (2 * by) >= FINER * pixels and size % (2 * by) == 0:
-        by *= 2
+    by = coarser(min(maps.roughness.shape), pixels)
     if by == 1:
         return maps
     shape = (maps.roughness.shape[0] // by, maps.roughness.shape[1] // by)
@@ -190,6 +186,7 @@ def pictures(
     for image in _pictures(mesh, maps, cameras, template, spp, seed, hdri=hdri, backdrop=backdrop):
         result.append(image)
         progress(len(result) / len(cameras))
+    device.give_back()
     return result
 
 
@@ -201,6 +198,7 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
     chosen = None if maps is None else [as_fine_as(m, max(max(c.size) for c in cameras)) for m in maps]
     shapes = scenery.object_shapes(mesh, chosen, flip_invalid=True, frame="mikkt")
     del chosen
+    memory.let_go()
     for camera in cameras:
         described = scenery.scene_dict(
             mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes

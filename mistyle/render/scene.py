@@ -22,6 +22,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core import memory
 from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps, flat_maps
@@ -106,6 +107,12 @@ def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
     return {"type": "bitmap", "data": data, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 
+def encoded(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """A normal map as textures hold it: (n + 1) / 2."""
+    result = np.multiply(normal, np.float32(0.5), out=memory.empty(normal.shape))
+    return np.add(result, np.float32(0.5), out=result)
+
+
 def bsdf_dict(
     maps: Maps, flip_invalid: bool = False, *, model: Model = "principled", frame: Frame = "mitsuba"
 ) -> dict[str, Any]:
@@ -123,7 +130,7 @@ def bsdf_dict(
         "specular": 0.5,
     }
     normal = {
-        "normalmap": texture_dict(maps.normal * 0.5 + 0.5),
+        "normalmap": texture_dict(encoded(maps.normal)),
         "flip_invalid_normals": flip_invalid,
         "bsdf": {"type": {"principled": "principled", "gltf": plugins.GLTF}[model], **textures},
     }

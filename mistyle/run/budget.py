@@ -1,11 +1,12 @@
 """How much memory a job will need, stage by stage, from counts alone; and whether it keeps the budget it was given.
 
 A stage's peak is what the program itself takes, plus bytes a texel of all texture sets, a pixel of all views together,
-a pixel of a step's crops, a surface sample and a face. Those of PLAIN were solved from the peaks that `run.json` notes
-for every stage (`peaks_gb`) of three jobs: `draft_spot` and `views_64` of `python -m benchmarks.memory --stages`, and
-the draft on spot with an atlas of 3072², four views and 20,000 samples. Those of TILED come from stages run alone at
-1024² and 2048²; the report's are PLAIN's without the arrays that are mapped. They hold on the processor, with two
-threads and the embedded filter bank: VGG-19 and the stylizers that need models count their own (run/generative.py).
+a pixel of a step's crops, a surface sample, a face, a texel of the textures as they are drawn, and a pixel of the
+turntable's frames. Those of PLAIN were solved from the peaks that `run.json` notes for every stage (`peaks_gb`) of five
+jobs: `draft_spot`, `views_64` and `atlas_4096` of `python -m benchmarks.memory --stages`, and the draft on spot with an
+atlas of 3072², four views and 20,000 samples, and of 2048². Those of TILED come from stages run alone at 1024² and
+2048², the report's from 2048² and 4096². They hold on the processor, with two threads and the embedded filter bank:
+VGG-19 and the stylizers that need models count their own (run/generative.py).
 """
 
 from collections.abc import Callable, Iterator, Mapping
@@ -15,11 +16,14 @@ from typing import Any, NamedTuple
 
 from mistyle.core import memory
 from mistyle.core.errors import UsageError
+from mistyle.core.maps import coarser
 from mistyle.run.settings import Settings
 
 
 class Need(NamedTuple):
-    """A stage's peak: GB of the program, then bytes a texel, view pixel, crop pixel, surface sample and face."""
+    """A stage's peak: GB of the program, then bytes a texel, view pixel, crop pixel, surface sample, face, texel of the
+    textures as the views draw them (kept by the renderer) and as the report's close-ups do, and pixel of the
+    turntable's frames."""
 
     program: float
     texel: float = 0
@@ -27,21 +31,24 @@ class Need(NamedTuple):
     crop: float = 0
     sample: float = 0
     face: float = 0
+    viewed: float = 0
+    drawn: float = 0
+    frame: float = 0
 
 
 # With every array in memory.
 PLAIN = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.38, texel=71),
-    "views": Need(0.46, texel=131, view=46.5),
-    "surface": Need(0.49, texel=135, view=45.5, sample=1200),
-    "bake": Need(0.59, texel=184, view=58.5),
-    "stylized": Need(0.53, texel=159, view=63.5),
-    "fit": Need(0.75, texel=235, view=107, crop=2000),
-    "masks": Need(0.77, texel=214, view=107),
-    "repair": Need(0.69, texel=255, view=121.5, crop=2000),
-    "asset": Need(0.75, texel=285, view=114),
-    "report": Need(0.71, texel=331, view=123.5),
+    "views": Need(0.46, texel=67, viewed=64, view=46.5),
+    "surface": Need(0.49, texel=67, viewed=68, view=45.5, sample=1200),
+    "bake": Need(0.59, texel=102, viewed=82, view=58.5),
+    "stylized": Need(0.53, texel=95, viewed=64, view=63.5),
+    "fit": Need(0.75, texel=184, viewed=51, view=107, crop=2000),
+    "masks": Need(0.77, texel=158, viewed=56, view=107),
+    "repair": Need(0.69, texel=200, viewed=55, view=121.5, crop=2000),
+    "asset": Need(0.75, texel=225, viewed=60, view=114),
+    "report": Need(0.71, texel=163, viewed=60, view=114, drawn=72, frame=24),
 }
 # With large arrays in files: what has to be in memory all the same.
 TILED = {
@@ -55,10 +62,10 @@ TILED = {
     "masks": Need(0.70, texel=35, view=4),
     "repair": Need(0.75, texel=35, view=4, crop=2000),
     "asset": Need(0.70, texel=30, view=4),
-    "report": Need(0.90, texel=170, view=20),
+    "report": Need(0.65, texel=5, view=4, drawn=78, frame=24),
 }
 # A fit to pictures, without what is kept of the pictures' samples, up to `recover.memory`; the system does not get all
-# of that back after the stage. Read off one job (`fit_512`): of other sizes less is known.
+# of that back after the stage. Read off `fit_512`, the report off `fit_256`: of other sizes less is known.
 MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
@@ -66,10 +73,12 @@ MATERIAL = {
     "measure": Need(0.77, texel=300),
     "asset": Need(0.80, texel=200),
     "scene": Need(0.80, texel=200),
-    "report": Need(0.87, texel=300),
+    "report": Need(0.78, texel=200, drawn=70, frame=24),
 }
 KEEPING = ("recover", "measure", "asset", "scene", "report")
 SAMPLE = 32  # bytes that are kept of a sample of a picture
+# Pages come in during a call into the renderer, faster than they are let go: a budget must be that much larger.
+MARGIN = 1.03
 
 
 class Counts(NamedTuple):
@@ -80,6 +89,9 @@ class Counts(NamedTuple):
     crop: int = 0
     sample: int = 0
     face: int = 0
+    viewed: int = 0
+    drawn: int = 0
+    frame: int = 0
 
 
 def view_pixels(settings: Settings) -> int:
@@ -92,7 +104,26 @@ def view_pixels(settings: Settings) -> int:
 def counts(settings: Settings, faces: int = 0, sets: int = 1) -> Counts:
     """The counts of `stylize` for a mesh of so many faces and texture sets."""
     crop = 0 if settings.fit.refine == "off" else settings.fit.crops * settings.fit.crop_size**2
-    return Counts(sets * settings.atlas.size**2, view_pixels(settings), crop, settings.surface.samples, faces)
+    return Counts(
+        sets * settings.atlas.size**2,
+        view_pixels(settings),
+        crop,
+        settings.surface.samples,
+        faces,
+        sets * as_drawn(settings.atlas.size, settings.rig.resolution),
+        *shown(settings, sets),
+    )
+
+
+def shown(settings: Any, sets: int) -> tuple[int, int]:
+    """Texels of the textures as the report's close-ups draw them, and pixels of the turntable's frames."""
+    turn = settings.report
+    return sets * as_drawn(settings.atlas.size, 2 * turn.resolution), turn.frames * turn.resolution**2
+
+
+def as_drawn(size: int, pixels: int) -> int:
+    """Texels of a texture of `size` a side that are drawn in pictures of so many pixels a side."""
+    return (size // coarser(size, pixels)) ** 2
 
 
 def peaks(needs: Mapping[str, Need], count: Counts) -> dict[str, float]:
@@ -105,6 +136,9 @@ def peaks(needs: Mapping[str, Need], count: Counts) -> dict[str, float]:
             + need.crop * count.crop
             + need.sample * count.sample
             + need.face * count.face
+            + need.viewed * count.viewed
+            + need.drawn * count.drawn
+            + need.frame * count.frame
         )
         / 1e9
         for stage, need in needs.items()
@@ -121,9 +155,15 @@ def memory_gb(settings: Settings, faces: int = 0, sets: int = 1) -> float:
     return round(whole, 2)
 
 
+def material_counts(settings: Any, pixels: int, faces: int = 0, sets: int = 1) -> Counts:
+    """The counts of a fit to pictures of so many pixels together."""
+    drawn, frame = shown(settings, sets)
+    return Counts(sets * settings.atlas.size**2, pixels, face=faces, drawn=drawn, frame=frame)
+
+
 def material_gb(settings: Any, pixels: int, faces: int = 0, sets: int = 1) -> float:
     """Peak memory of a fit to pictures of so many pixels together, GB."""
-    found = peaks(MATERIAL, Counts(sets * settings.atlas.size**2, pixels, face=faces))
+    found = peaks(MATERIAL, material_counts(settings, pixels, faces, sets))
     held = min(settings.recover.memory, SAMPLE * pixels * settings.recover.subsamples / 1e9)
     found |= {stage: found[stage] + held for stage in KEEPING}
     return round(max(found.values()), 2)
@@ -141,13 +181,13 @@ def tiles(settings: Settings, faces: int = 0, sets: int = 1) -> bool:
             f"--memory {settings.memory:g}G: the job needs {memory_gb(_free(settings), faces, sets)} GB, and less only "
             "on Linux, where its large arrays can lie in files; give it more, or leave --memory out"
         )
-    needed = peaks(TILED, count)
+    needed = {stage: MARGIN * gb for stage, gb in peaks(TILED, count).items()}
     worst = max(needed, key=lambda stage: needed[stage])
     if needed[worst] <= settings.memory:
         return True
 
     def least(smaller: Settings) -> float:
-        return max(peaks(TILED, counts(smaller, faces, sets)).values())
+        return MARGIN * max(peaks(TILED, counts(smaller, faces, sets)).values())
 
     raise UsageError(
         f"--memory {settings.memory:g}G: the job needs {needed[worst]:.2f} GB in its stage '{worst}', even with its "
@@ -167,7 +207,7 @@ def check_material(settings: Any, pixels: int, faces: int = 0, sets: int = 1) ->
     def least(chosen: Any) -> float:
         return material_gb(_with(chosen, "recover.memory", 1e-9), pixels, faces, sets)
 
-    left = settings.memory - max(peaks(MATERIAL, Counts(sets * settings.atlas.size**2, pixels, face=faces)).values())
+    left = settings.memory - max(peaks(MATERIAL, material_counts(settings, pixels, faces, sets)).values())
     if least(settings) > settings.memory or left <= 0:
         needed = least(settings)
         raise UsageError(

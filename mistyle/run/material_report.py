@@ -15,6 +15,7 @@ from mistyle.run.pages import close_up, file_list, frames, heat, map_shots, rend
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, MapSet, Note, Pair, Report, Shot, Step, Timing, write_report
 from mistyle.run.report_model import page_model
+from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
 from mistyle.run.stages import MATERIAL_STAGES, Run
 from mistyle.run.summary import earlier, merged_peaks, merged_seconds, peak_gb, versions
 from mistyle.run.turntable import write_turn
@@ -125,7 +126,7 @@ def steps(made: Any) -> tuple[Step, ...]:
         "PSNR of each prediction (sRGB, peak 1).",
         charts=(Chart("PSNR by picture", series, x_label="picture", y_label="dB", bars=True),),
     )
-    parts = list(zip(made.asset.mesh.parts, made.texels, strict=True))
+    parts, longest = list(zip(made.asset.mesh.parts, made.texels, strict=True)), Sizes().of(kind_in_step(2))
     trust = Step(
         "Confidence",
         "How well the references determine each texel's material: dark blue not at all, yellow well; and by how many "
@@ -134,8 +135,8 @@ def steps(made: Any) -> tuple[Step, ...]:
             Shot(picture, f"{name}: {what}", sharp=True)
             for k, (name, t) in enumerate(parts)
             for what, picture in (
-                ("confidence", heat(made.recovered.confidence[k], t)),
-                ("seen", heat(made.recovered.seen[k] / max(len(made.captures), 1), t)),
+                ("confidence", heat(made.recovered.confidence[k], 1, t, longest)),
+                ("seen", heat(made.recovered.seen[k], len(made.captures), t, longest)),
             )
         ),
         columns=2,
@@ -155,13 +156,13 @@ def difference(reference: np.ndarray, predicted: np.ndarray) -> np.ndarray:
 
 def map_sets(made: Any) -> tuple[MapSet, ...]:
     """The fitted maps of every texture set, and what there is to lay over them."""
-    sets = []
+    sets, longest = [], Sizes().of(kind_of_maps(len(made.asset.mesh.parts)))
     for k, (name, texels) in enumerate(zip(made.asset.mesh.parts, made.texels, strict=True)):
         over = (
-            report_overlays.confidence(made.recovered.confidence[k], texels),
-            report_overlays.coverage(made.recovered.seen[k], len(made.captures), texels),
+            report_overlays.confidence(made.recovered.confidence[k], texels, longest),
+            report_overlays.coverage(made.recovered.seen[k], len(made.captures), texels, longest),
         )
-        sets.append(MapSet(name, map_shots(made.recovered.maps[k]), over))
+        sets.append(MapSet(name, map_shots(made.recovered.maps[k], longest), over))
     return tuple(sets)
 
 

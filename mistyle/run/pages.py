@@ -17,6 +17,7 @@ from mistyle.run import report_overlays
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
 from mistyle.run.report_model import page_model
+from mistyle.run.report_pictures import Sizes, eight_bit, in_bands, kind_in_step, kind_of_maps
 from mistyle.run.stages import RETOUCH, STAGES
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
@@ -32,7 +33,11 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
     settings = made.job.settings
     turntable = frames(made.asset, made.repaired.maps, settings, lambda done: report(0.4 * done))
     write_turn(folder / "turntable", turntable)
-    plain = frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
+    turntable = [eight_bit(frame) for frame in turntable]
+    plain = [
+        eight_bit(frame)
+        for frame in frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
+    ]
     close = close_up(settings)
     beauty, before, bare = (
         shown(render(made.asset, maps, [close], settings, backdrop=True, finer=4)[0])[..., :3]
@@ -65,15 +70,15 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
 
 def map_sets(made: Any) -> tuple[MapSet, ...]:
     """The final maps of every texture set, and what there is to lay over them."""
-    sets = []
+    sets, longest = [], Sizes().of(kind_of_maps(len(made.asset.mesh.parts)))
     for k, (name, texels) in enumerate(zip(made.asset.mesh.parts, made.atlas.texels, strict=True)):
-        pulled = report_overlays.struggle(made.fit.struggle[k], made.fit.touched[k], texels)
+        pulled = report_overlays.struggle(made.fit.struggle[k], made.fit.touched[k], texels, longest)
         over = (
-            report_overlays.coverage(made.baked.seen[k], len(made.views), texels),
+            report_overlays.coverage(made.baked.seen[k], len(made.views), texels, longest),
             *((pulled,) if pulled is not None else ()),
-            report_overlays.repaired(made.repaired.mask[k], texels),
+            report_overlays.repaired(made.repaired.mask[k], texels, longest),
         )
-        sets.append(MapSet(name, map_shots(made.repaired.maps[k]), over))
+        sets.append(MapSet(name, map_shots(made.repaired.maps[k], longest), over))
     return tuple(sets)
 
 
@@ -96,7 +101,8 @@ def frames(asset: Asset, maps: Sequence[Maps], settings: Any, report: Callable[[
     cameras = [
         orbit(30 + 360 * k / chosen.frames, ELEVATION, distance=4, fov=30, size=size) for k in range(chosen.frames)
     ]
-    return [shown(picture) for picture in render(asset, maps, cameras, settings, report=report)]
+    drawn = render(asset, maps, cameras, settings, report=report)[::-1]
+    return [shown(drawn.pop()) for _ in cameras]
 
 
 def close_up(settings: Any) -> Camera:
@@ -161,13 +167,13 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.stylized),
         columns=8,
     )
-    parts = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True))
+    parts, longest = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True)), Sizes().of(kind_in_step(3))
     baked = Step(
         "Bake",
         "How many views see each texel: dark blue none, yellow many.",
         "4.1.4",
         shots=tuple(
-            Shot(heat(made.baked.seen[k] / max(len(made.views), 1), t), f"{name}: seen by views", sharp=True)
+            Shot(heat(made.baked.seen[k], len(made.views), t, longest), f"{name}: seen by views", sharp=True)
             for k, (name, t) in enumerate(parts)
         ),
         columns=3,
@@ -186,7 +192,7 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         "masks/: paint one over, run the same command again, and it decides.",
         "4.3",
         shots=tuple(
-            Shot(mask_over(made.repaired.mask[k], made.repaired.maps[k], t), f"{name}: repaired texels")
+            Shot(mask_over(made.repaired.mask[k], made.repaired.maps[k], t, longest), f"{name}: repaired texels")
             for k, (name, t) in enumerate(parts)
         ),
         columns=3,
@@ -205,20 +211,27 @@ def view_picture(view: View) -> np.ndarray:
     return shown(np.concatenate([view.rgb, view.coverage[..., None]], axis=-1))
 
 
-def heat(share: np.ndarray, texels: Texels) -> np.ndarray:
-    """A share 0..1 of every covered texel as colour (viridis), white elsewhere."""
+def heat(values: np.ndarray, most: float, texels: Texels, longest: int) -> np.ndarray:
+    """Values of 0..most of every covered texel as colour (viridis), white elsewhere; at most `longest` pixels."""
     import cv2
 
-    levels = np.clip(np.sqrt(share) * 255, 0, 255).astype(np.uint8)
-    colours = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1]
-    return np.where(texels.covered[..., None], colours, np.uint8(255)).astype(np.uint8)
+    def rows(at: slice) -> np.ndarray:
+        levels = np.clip(np.sqrt(values[at] / max(most, 1)) * 255, 0, 255).astype(np.uint8)
+        colours = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1]
+        return np.where(texels.covered[at, :, None], colours, np.uint8(255)).astype(np.uint8)
+
+    return in_bands(values.shape[:2], rows, longest, sharp=True)
 
 
-def mask_over(mask: np.ndarray, maps: Maps, texels: Texels) -> np.ndarray:
-    """The albedo with the masked texels in magenta, white outside the islands."""
-    albedo = srgb_from_linear(maps.albedo)
-    tinted = np.where(mask[..., None], 0.35 * albedo + 0.65 * np.array([1.0, 0.0, 0.8], np.float32), albedo)
-    return np.where(texels.covered[..., None], tinted, 1.0).astype(np.float32)
+def mask_over(mask: np.ndarray, maps: Maps, texels: Texels, longest: int) -> np.ndarray:
+    """The albedo with the masked texels in magenta, white outside the islands; at most `longest` pixels."""
+
+    def rows(at: slice) -> np.ndarray:
+        albedo = srgb_from_linear(maps.albedo[at])
+        tinted = np.where(mask[at, :, None], 0.35 * albedo + 0.65 * np.array([1.0, 0.0, 0.8], np.float32), albedo)
+        return np.where(texels.covered[at, :, None], tinted, 1.0).astype(np.float32)
+
+    return in_bands(mask.shape[:2], rows, longest)
 
 
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
@@ -227,13 +240,17 @@ def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
     return (*kept, *((name, f"{a:.4g} → {b:.4g}") for name, (a, b) in fit.figures.items()))
 
 
-def map_shots(maps: Maps) -> tuple[Shot, ...]:
-    """The maps of a texture set, as written beside the asset."""
+def map_shots(maps: Maps, longest: int) -> tuple[Shot, ...]:
+    """The maps of a texture set, as written beside the asset, at most `longest` pixels wide and high."""
+
+    def small(make: Callable[[slice], np.ndarray]) -> np.ndarray:
+        return in_bands(maps.roughness.shape[:2], make, longest)
+
     return (
-        Shot(srgb_from_linear(maps.albedo), "albedo", "sRGB"),
-        Shot(maps.normal * 0.5 + 0.5, "normal", "tangent space, +Y, MikkTSpace"),
-        Shot(maps.roughness, "roughness", "linear"),
-        Shot(maps.metallic, "metallic", "linear"),
+        Shot(small(lambda at: srgb_from_linear(maps.albedo[at])), "albedo", "sRGB"),
+        Shot(small(lambda at: maps.normal[at] * 0.5 + 0.5), "normal", "tangent space, +Y, MikkTSpace"),
+        Shot(small(lambda at: maps.roughness[at]), "roughness", "linear"),
+        Shot(small(lambda at: maps.metallic[at]), "metallic", "linear"),
     )
 
 

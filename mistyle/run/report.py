@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 from mistyle.files.store import atomic_write
 from mistyle.run.charts import Chart, svg
 from mistyle.run.report_model import Model, TooLarge, packed, viewer_script
-from mistyle.run.report_pictures import Sizes, accents, palette, webp
+from mistyle.run.report_pictures import Sizes, accents, kind_in_step, kind_of_maps, palette, webp
 
 Pixels: TypeAlias = (
     UInt8[np.ndarray, "h w c"]
@@ -204,6 +204,8 @@ def render(report: Report, scale: float = 1.0) -> str:
         longest=max([t.seconds for t in report.timings], default=0.0) or 1.0,
         sizes=sizes,
         webp=webp,
+        kind_in_step=kind_in_step,
+        kind_of_maps=kind_of_maps,
         palette=swatches,
         accent=accents(swatches),
         # Both files are ours and hold no text of others.

@@ -1,11 +1,15 @@
-"""What the report can lay over the maps of a texture set: what was seen, where the fit struggled, what was repaired."""
+"""What the report can lay over the maps of a texture set: what was seen, where the fit struggled, what was repaired.
+
+Every overlay is at most `longest` pixels wide and high; the arrays that it is made of may be much larger.
+"""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
-from mistyle.core.image import gaussian
+from mistyle.core.image import gaussian, resize
 from mistyle.core.maps import Texels
 from mistyle.run.report import Overlay
+from mistyle.run.report_pictures import in_bands
 
 OPACITY = 0.8
 MAGENTA = (1.0, 0.0, 0.8)
@@ -22,30 +26,44 @@ def viridis(share: Float[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def layer(
-    rgb: Float[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"], texels: Texels
+    rgb: Float[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w 3"],
+    alpha: Float[np.ndarray, "h w"],
+    covered: Bool[np.ndarray, "h w"],
 ) -> UInt8[np.ndarray, "h w 4"]:
-    """Colours (0..1 or 8 bits) and opacity as a picture that is transparent off the islands."""
+    """Colours (0..1 or 8 bits) and opacity as a picture that is transparent where nothing is covered."""
     colours = rgb if rgb.dtype == np.uint8 else np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    opacity = np.round(np.where(texels.covered, np.clip(alpha, 0, 1), 0) * 255).astype(np.uint8)
+    opacity = np.round(np.where(covered, np.clip(alpha, 0, 1), 0) * 255).astype(np.uint8)
     return np.concatenate([colours, opacity[..., None]], axis=-1)
 
 
-def coverage(seen: Int[np.ndarray, "h w"], views: int, texels: Texels) -> Overlay:
+def coverage(seen: Int[np.ndarray, "h w"], views: int, texels: Texels, longest: int) -> Overlay:
     """How many of the views see each texel."""
-    share = np.sqrt(seen / max(views, 1)).astype(np.float32)
-    picture = layer(viridis(share), np.full(share.shape, OPACITY, np.float32), texels)
+
+    def rows(at: slice) -> np.ndarray:
+        share = np.sqrt(seen[at] / max(views, 1)).astype(np.float32)
+        return layer(viridis(share), np.full(share.shape, OPACITY, np.float32), texels.covered[at])
+
+    picture = in_bands(seen.shape[:2], rows, longest, sharp=True)
     return Overlay("coverage", picture, f"dark blue: no view sees it; yellow: all {views} do")
 
 
-def confidence(values: Float[np.ndarray, "h w"], texels: Texels) -> Overlay:
+def confidence(values: Float[np.ndarray, "h w"], texels: Texels, longest: int) -> Overlay:
     """How well the references determine each texel, 0..1."""
-    picture = layer(viridis(values), np.full(values.shape, OPACITY, np.float32), texels)
+
+    def rows(at: slice) -> np.ndarray:
+        share = values[at]
+        return layer(viridis(share), np.full(share.shape, OPACITY, np.float32), texels.covered[at])
+
+    picture = in_bands(values.shape[:2], rows, longest, sharp=True)
     return Overlay("confidence", picture, "dark blue: the pictures say nothing of it; yellow: they determine it well")
 
 
-def struggle(total: Float[np.ndarray, "h w"], looks: Float[np.ndarray, "h w"], texels: Texels) -> Overlay | None:
+def struggle(
+    total: Float[np.ndarray, "h w"], looks: Float[np.ndarray, "h w"], texels: Texels, longest: int
+) -> Overlay | None:
     """The mean |gradient| of a look in the last steps of the fit's albedo phase; None where that phase did not run."""
-    looked = texels.covered & (looks > 0)
+    total, looks, covered = _means(total, looks, texels.covered, longest)
+    looked = covered & (looks > 0)
     if not looked.any():
         return None
     # Single texels' gradients are noise: what lies around them is told, as for the repair (stages/inpaint.py).
@@ -56,11 +74,32 @@ def struggle(total: Float[np.ndarray, "h w"], looks: Float[np.ndarray, "h w"], t
     share = np.clip((mean - low) / max(float(high - low), 1e-20), 0, 1).astype(np.float32)
     colours = np.stack([np.ones_like(share), 0.75 * (1 - share), np.zeros_like(share)], axis=-1)
     legend = "clear: settled like most; yellow to red: the fit kept pulling at its colour"
-    return Overlay("struggle", layer(colours, OPACITY * np.sqrt(share), texels), legend)
+    alpha = OPACITY * np.sqrt(share)
+    picture = in_bands(share.shape, lambda at: layer(colours[at], alpha[at], covered[at]), longest, sharp=True)
+    return Overlay("struggle", picture, legend)
 
 
-def repaired(mask: Bool[np.ndarray, "h w"], texels: Texels) -> Overlay:
+def _means(
+    total: np.ndarray, looks: np.ndarray, covered: np.ndarray, longest: int
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All three on a grid of means over squares of texels, which is no coarser than `longest`."""
+    side, by = min(covered.shape), 1
+    while side // (2 * by) >= longest and all(length % (2 * by) == 0 for length in covered.shape):
+        by *= 2
+    if by == 1:
+        return total, looks, covered
+    shape = (covered.shape[0] // by, covered.shape[1] // by)
+    some = covered.reshape(shape[0], by, shape[1], by).any(axis=(1, 3))
+    return resize(total, shape), resize(looks, shape), np.asarray(some)
+
+
+def repaired(mask: Bool[np.ndarray, "h w"], texels: Texels, longest: int) -> Overlay:
     """Which texels were painted again after the fit."""
-    colours = np.broadcast_to(np.array(MAGENTA, np.float32), (*mask.shape, 3))
-    picture = layer(np.ascontiguousarray(colours), 0.65 * mask.astype(np.float32), texels)
+
+    def rows(at: slice) -> np.ndarray:
+        share = mask[at].astype(np.float32)
+        colours = np.broadcast_to(np.array(MAGENTA, np.float32), (*share.shape, 3))
+        return layer(np.ascontiguousarray(colours), 0.65 * share, texels.covered[at])
+
+    picture = in_bands(mask.shape, rows, longest, sharp=True)
     return Overlay("repaired", picture, "magenta: painted again after the fit (masks/ has it as a picture to edit)")

@@ -2,10 +2,14 @@
 
 import base64
 import io
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
+
+BAND = 256  # rows
 
 
 @dataclass(frozen=True)
@@ -17,6 +21,16 @@ class Sizes:
     def of(self, kind: str) -> int:
         usual = {"painting": 960, "frame": 560, "view": 420, "pair": 900, "picture": 720, "map": 1280, "texture": 1024}
         return max(48, round(usual[kind] * self.scale))
+
+
+def kind_in_step(columns: int) -> str:
+    """The kind of a picture that stands in a row of so many."""
+    return "view" if columns > 2 else "picture"
+
+
+def kind_of_maps(sets: int) -> str:
+    """The kind of the maps of a mesh with so many texture sets."""
+    return "map" if sets < 3 else "picture"
 
 
 def eight_bit(picture: Shaped[np.ndarray, "h w *c"]) -> UInt8[np.ndarray, "h w n"]:
@@ -47,14 +61,40 @@ def webp(picture: Shaped[np.ndarray, "h w *c"], longest: int, quality: int = 84,
     """The picture as a WebP file, scaled down to `longest` pixels where larger; `sharp` is lossless."""
     from PIL import Image
 
-    image = Image.fromarray(eight_bit(picture))
-    factor = longest / max(image.size)
-    if factor < 1:
-        width, height = (max(1, round(side * factor)) for side in image.size)
-        image = image.resize((width, height), Image.Resampling.BOX if sharp else Image.Resampling.LANCZOS)
+    image = _fitted(Image.fromarray(eight_bit(picture)), longest, sharp)
     buffer = io.BytesIO()
     image.save(buffer, "WEBP", quality=quality, lossless=sharp, method=4)
     return Inline("data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode(), *image.size)
+
+
+def in_bands(
+    shape: tuple[int, int], make: Callable[[slice], np.ndarray], longest: int, sharp: bool = False
+) -> UInt8[np.ndarray, "h w n"]:
+    """The picture of `shape` (height, width) whose rows `make` gives, as `webp` would show it at `longest` pixels.
+
+    Only BAND rows at a time are more than a byte a channel: maps may be much larger than what is shown of them.
+    """
+    from PIL import Image
+
+    whole = None
+    for top in range(0, shape[0], BAND):
+        band = Image.fromarray(eight_bit(make(slice(top, top + BAND))))
+        whole = whole or Image.new(band.mode, (shape[1], shape[0]))
+        whole.paste(band, (0, top))
+    if whole is None:
+        raise ValueError(f"a picture of shape {shape}: expected at least one pixel")
+    return np.asarray(_fitted(whole, longest, sharp))
+
+
+def _fitted(image: Any, longest: int, sharp: bool) -> Any:
+    """A Pillow image scaled down to `longest` pixels where larger; `sharp` takes means of whole pixels."""
+    from PIL import Image
+
+    factor = longest / max(image.size)
+    if factor >= 1:
+        return image
+    width, height = (max(1, round(side * factor)) for side in image.size)
+    return image.resize((width, height), Image.Resampling.BOX if sharp else Image.Resampling.LANCZOS)
 
 
 def palette(picture: Shaped[np.ndarray, "h w *c"], count: int = 7) -> list[str]:
