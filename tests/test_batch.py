@@ -291,7 +291,7 @@ def test_what_is_done_is_not_begun_again_and_unknown_names_are_refused(props, tm
 def test_the_page_escapes_names_and_allows_no_connection(props, tmp_path):
     plan = planned(props, tmp_path / "out", Choices(threads=1))
     done_by_hand(plan, 0)
-    picture = plan.out / plan.jobs[0].name / "report" / "overview.png"
+    picture = plan.out / plan.jobs[0].name / "report" / "beauty.png"
     picture.parent.mkdir(parents=True)
     Image.new("RGB", (640, 480), (200, 30, 30)).save(picture)
     ended = {1: engines.Ended(1, 3, 1)}

@@ -74,7 +74,7 @@ def _row(plan: Plan, row: dict[str, Any]) -> dict[str, Any]:
         "error": row.get("error", ""),
         "last_lines": row.get("last_lines", ""),
         "report": f"{row['name']}/report/index.html" if report.is_file() else "",
-        "picture": _thumbnail(folder / "overview.png") if row["state"] == "done" else "",
+        "picture": _thumbnail(folder / "beauty.png") if row["state"] == "done" else "",
         "values": values,
     }
 
