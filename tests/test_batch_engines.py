@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.faults_jobs import BATCH
 from mistyle.core.paths import scenes
 from mistyle.run import engines
 from mistyle.run.batch import Choices, planned, run_batch
@@ -18,21 +19,10 @@ from mistyle.run.batch_plan import PLAN
 from mistyle.run.farm import export
 from mistyle.run.shard import marker
 
-JOBS = """
-preset = "draft"
-settings = {{ rig = {{ kind = "turntable", views = 3, resolution = 48 }}, draw = {{ spp = 1 }}, threads = 1, \
-surface = {{ samples = 1500 }}, atlas = {{ size = 64 }}, fit = {{ refine = "off" }}, \
-report = {{ frames = 4, resolution = 64, spp = 1 }} }}
-[[grid]]
-meshes = ["{mesh}"]
-styles = ["{style}"]
-variants = [{{ seed = 0 }}, {{ seed = 1 }}]
-"""
-
 
 def plan_in(folder: Path):
     jobs = folder.parent / "jobs.toml"
-    jobs.write_text(JOBS.format(mesh=scenes() / "demo.obj", style=scenes() / "demo_style.png"))
+    jobs.write_text(BATCH.format(mesh=scenes() / "demo.obj", style=scenes() / "demo_style.png"))
     return planned(jobs, folder, Choices(workers=2, threads=1))
 
 

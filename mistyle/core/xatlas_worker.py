@@ -9,6 +9,7 @@ import sys
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.children import end_with_parent
 from mistyle.core.raster import fragments
 from mistyle.core.uvs import signed_areas
 
@@ -282,15 +283,6 @@ def _pack_once(
     return uv[order].astype(np.float64) * np.array([atlas.width, atlas.height]), max(atlas.width, atlas.height)
 
 
-def _die_with_parent() -> None:
-    """On Linux: end when the parent ends, however it ended."""
-    if sys.platform == "linux":
-        import ctypes
-        import signal
-
-        ctypes.CDLL(None).prctl(1, signal.SIGKILL)
-
-
 if __name__ == "__main__":
-    _die_with_parent()
+    end_with_parent()
     run(sys.argv[1], sys.argv[2])

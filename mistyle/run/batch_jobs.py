@@ -29,10 +29,10 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.files.read import MESHES
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import merge, validate
 
-MESHES = (".obj", ".ply", ".stl", ".off", ".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MOST_JOBS = 100_000
 MOST_TOLD = 20
@@ -149,7 +149,7 @@ def _of_folder(folder: Path) -> JobsFile:
         place = folder / name if (folder / name).is_dir() else folder
         return sorted(str(p.relative_to(folder)) for p in place.iterdir() if p.suffix.lower() in kinds and p.is_file())
 
-    meshes, styles = inside("meshes", MESHES), inside("styles", PICTURES)
+    meshes, styles = inside("meshes", tuple(MESHES)), inside("styles", PICTURES)
     if not meshes or not styles:
         raise InputRefused(
             f"{folder}: found {len(meshes)} meshes and {len(styles)} pictures; expected at least one of each, there or "

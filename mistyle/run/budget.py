@@ -82,9 +82,9 @@ MARGIN = 1.03
 
 
 class Counts(NamedTuple):
-    """What the memory of a job hangs on."""
+    """What the memory of a job hangs on, by the names of Need."""
 
-    texels: int
+    texel: int
     view: int
     crop: int = 0
     sample: int = 0
@@ -129,18 +129,7 @@ def as_drawn(size: int, pixels: int) -> int:
 def peaks(needs: Mapping[str, Need], count: Counts) -> dict[str, float]:
     """GB of every stage."""
     return {
-        stage: need.program
-        + (
-            need.texel * count.texels
-            + need.view * count.view
-            + need.crop * count.crop
-            + need.sample * count.sample
-            + need.face * count.face
-            + need.viewed * count.viewed
-            + need.drawn * count.drawn
-            + need.frame * count.frame
-        )
-        / 1e9
+        stage: need.program + sum(getattr(need, each) * getattr(count, each) for each in Counts._fields) / 1e9
         for stage, need in needs.items()
     }
 

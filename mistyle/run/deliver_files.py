@@ -14,9 +14,9 @@ from mistyle.files.ocio import ColourSpace, exr_tags
 from mistyle.files.packing import TARGETS, Target, TextureSet, write_slot
 from mistyle.files.store import sha256_file
 from mistyle.files.textures import safe_name
+from mistyle.files.usd_layers import LAYERS
 from mistyle.run.finished import Finished
 
-USD = (".usd", ".usda", ".usdc", ".usdz")
 # What materials in files refer to: every map by itself, whatever the target packs.
 SINGLE = ("albedo", "normal", "roughness", "metallic")
 
@@ -117,7 +117,7 @@ def _materials(folder: Path, out: Path, finished: Finished, chosen: Delivery, ki
         write_obj(folder / f"{chosen.name}.obj", mesh, positions, tiles, looks)
     if "mtlx" in chosen.formats:
         write_materialx(folder / f"{chosen.name}.mtlx", looks)
-    if "usd" in chosen.formats and Path(str(finished.manifest.get("source", ""))).suffix.lower() in USD:
+    if "usd" in chosen.formats and Path(str(finished.manifest.get("source", ""))).suffix.lower() in LAYERS:
         return _look_layer(folder, out, finished, chosen, looks)
     if "usd" in chosen.formats:
         from mistyle.files.usd import write_usd, write_usdz

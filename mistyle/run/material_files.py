@@ -8,10 +8,9 @@ from typing import Any
 from mistyle.core.asset import Asset
 from mistyle.core.capture import Captures
 from mistyle.core.maps import Texels
-from mistyle.files.textures import part_stems
+from mistyle.run import asset_files
 from mistyle.run.edits import UNEDITED, Edited
 from mistyle.run.progress import Report
-from mistyle.run.start import ambient
 
 
 def write(
@@ -24,18 +23,8 @@ def write(
     edited: Edited = UNEDITED,
 ) -> None:
     """The asset as `stylize` writes it; `edited` holds textures that a person painted over."""
-    from mistyle.stages.export import write_asset
-    from mistyle.stages.texels import pad_maps
-
-    occlusion = [
-        ambient(asset, part, job.settings.atlas.size, job.settings.seed, report)
-        for part in range(len(asset.mesh.parts))
-    ]
-    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(recovered.maps, texels, strict=True)]
-    padded, occlusion = edited(part_stems(job.name, asset.mesh.parts), padded, occlusion)
     provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
-    provenance |= edited.provenance
-    write_asset(folder, job.name, asset, padded, occlusion, texels, provenance=provenance)
+    asset_files.write(folder, job, asset, texels, recovered.maps, provenance, report, edited)
 
 
 def scene(folder: Path, job: Any, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures) -> None:

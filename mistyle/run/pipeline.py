@@ -15,6 +15,7 @@ from mistyle.core.asset import Asset, Picture
 from mistyle.core.maps import Maps
 from mistyle.core.view import View
 from mistyle.files.textures import part_stems
+from mistyle.run import asset_files
 from mistyle.run.budget import kept
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.run.generative import check as check_generative
@@ -25,7 +26,7 @@ from mistyle.run.painting import bake, coat, coat_files, stylized_stage, unlit_v
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Job, Run
-from mistyle.run.start import ambient, draw, lay_out, read, start_engines
+from mistyle.run.start import draw, lay_out, read, start_engines
 
 
 @dataclass(frozen=True)
@@ -252,15 +253,5 @@ def write_asset(
     edited: Edited = UNEDITED,
 ) -> None:
     """The files that other programs open; `edited` holds textures that a person painted over."""
-    from mistyle.stages.export import write_asset as write
-
-    occlusion = [
-        ambient(asset, part, job.settings.atlas.size, job.settings.seed, report)
-        for part in range(len(asset.mesh.parts))
-    ]
-    from mistyle.stages.texels import pad_maps
-
-    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(maps, atlas.texels, strict=True)]
-    padded, occlusion = edited(part_stems(job.name, asset.mesh.parts), padded, occlusion)
-    provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed, **edited.provenance}
-    write(folder, job.name, asset, padded, occlusion, atlas.texels, provenance=provenance)
+    provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed}
+    asset_files.write(folder, job, asset, atlas.texels, maps, provenance, report, edited)

@@ -15,10 +15,11 @@ import numpy as np
 
 from mistyle.core.errors import MistyleError
 from mistyle.files.store import sha256_file
+from mistyle.files.usd_layers import LAYERS
 from mistyle.run.blender import BLENDER, OPEN_WORKER, blender_command
 
 Outcome = Literal["passed", "failed", "not checked"]
-MODELS = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz", ".obj")
+MODELS = (".glb", ".gltf", *LAYERS, ".obj")
 VALIDATE = """
 const fs = require('fs'), path = require('path'), validator = require('gltf-validator');
 const file = process.argv[1], folder = path.dirname(file);
@@ -233,6 +234,6 @@ def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None)
 READERS: dict[str, tuple[Callable[[Path, str], Iterator[Check]], ...]] = {
     **dict.fromkeys((".glb", ".gltf"), (gltf, by_trimesh)),
     ".obj": (by_trimesh,),
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), (usd,)),
+    **dict.fromkeys(LAYERS, (usd,)),
     ".mtlx": (materialx,),
 }
