@@ -5,9 +5,11 @@ import json
 import os
 import pickle
 import re
+import shutil
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -120,7 +122,13 @@ def fetch(
         "NO_PROXY": "127.0.0.1",
     }
     words = ["models", "fetch", *names, "--models", str(folder), *(["--allow-download"] if allow else [])]
-    program = "import sys; from mistyle.run.cli import main; sys.exit(main(sys.argv[1:]))"
+    # What the test's server holds is not what is published under these names.
+    program = (
+        "import sys; from dataclasses import replace; from mistyle.run.cli import main; "
+        "from mistyle.backends.models_list import MODELS; "
+        "MODELS.update({name: replace(model, sha256={}) for name, model in MODELS.items()}); "
+        "sys.exit(main(sys.argv[1:]))"
+    )
     return subprocess.run(
         [sys.executable, "-c", program, *words], env=environment, cwd=ROOT, capture_output=True, text=True, timeout=120
     )
@@ -140,7 +148,9 @@ def test_fetching_writes_the_layout_and_the_lock(hub, tmp_path):
     data = bytearray(file.read_bytes())
     data[-1] ^= 1
     file.write_bytes(data)
-    with pytest.raises(EnvironmentMissing, match=r"sha256 is .*, expected .* as it was fetched.*mistyle models fetch"):
+    with pytest.raises(
+        EnvironmentMissing, match=r"sha256 is .*, expected .* as it was when it was taken in.*mistyle models fetch"
+    ):
         models.find("depth", folder)
 
 
@@ -223,6 +233,33 @@ def test_the_cache_serves_where_no_folder_is_given(tmp_path, monkeypatch):
     (main_ref / "snapshots").mkdir()
     (main_ref / "snapshots" / "abc").symlink_to(tiny_models.folder() / "canny")
     assert models.find("canny", None) == main_ref / "snapshots" / "abc"
+
+
+def test_files_copied_by_hand_are_compared_with_the_published_ones(tmp_path, capsys, monkeypatch):
+    folder = tmp_path / "models"
+    shutil.copytree(tiny_models.folder() / "sdxl", folder / "sdxl")  # without the lock beside it
+    words = r"/vae/\w+.safetensors: sha256 is \w+, expected 1598f3d2\w+, .*mistyle models adopt sdxl"
+    with pytest.raises(EnvironmentMissing, match=words):
+        models.find("sdxl", folder)
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "cache"))
+    snapshot = tmp_path / "cache/models--stabilityai--stable-diffusion-xl-base-1.0/snapshots"
+    snapshot.mkdir(parents=True)
+    (snapshot / models.MODELS["sdxl"].revision).symlink_to(folder / "sdxl")
+    with pytest.raises(EnvironmentMissing, match=words):
+        models.find("sdxl", None)
+    assert main(["models", "adopt", "sdxl", "--models", str(folder)]) == 0
+    assert models.find("sdxl", folder) == folder / "sdxl"
+    assert main(["models", "adopt", "depth", "--models", str(folder)]) == 4
+    assert "depth is not there" in capsys.readouterr().err
+    published = hashlib.sha256((folder / "sdxl/vae/diffusion_pytorch_model.safetensors").read_bytes()).hexdigest()
+    pinned = replace(models.MODELS["sdxl"], sha256={"vae/diffusion_pytorch_model.safetensors": published})
+    monkeypatch.setitem(models.MODELS, "sdxl", pinned)
+    (folder / models.LOCK).unlink()
+    assert models.find("sdxl", folder) == folder / "sdxl"
+    assert list(models.read_lock(folder)["sdxl"]["files"]) == ["vae/diffusion_pytorch_model.safetensors"]
+    (folder / "sdxl/vae/diffusion_pytorch_model.safetensors").write_bytes(b"x")
+    with pytest.raises(EnvironmentMissing, match="changed or broke"):
+        models.find("sdxl", folder)
 
 
 def test_shards_and_variants_are_found(tmp_path):

@@ -20,6 +20,9 @@ from transformers import (
     CLIPVisionModelWithProjection,
 )
 
+from mistyle.backends.models_fetch import adopt
+from mistyle.backends.models_list import MODELS
+
 DOWN, UP = ("DownBlock2D", "CrossAttnDownBlock2D"), ("CrossAttnUpBlock2D", "UpBlock2D")
 SDXL = {
     "attention_head_dim": (2, 4),
@@ -39,6 +42,8 @@ def folder() -> Path:
     place = Path(tempfile.mkdtemp(prefix="mistyle-tiny-"))
     atexit.register(shutil.rmtree, place, True)
     build(place)
+    for name in MODELS:
+        adopt(name, place)
     return place
 
 
@@ -188,7 +193,7 @@ def copy_without(place: Path, *names: str) -> Path:
     place.mkdir(parents=True, exist_ok=True)
     for part in folder().iterdir():
         if part.name not in names:
-            shutil.copytree(part, place / part.name)
+            (shutil.copytree if part.is_dir() else shutil.copy2)(part, place / part.name)
     return place
 
 

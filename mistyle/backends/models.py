@@ -3,16 +3,18 @@
 Only safetensors are accepted: a pickle can run code when it is opened.
 """
 
+import functools
 import hashlib
 import json
 import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 from mistyle.backends.models_list import MODELS, Model
-from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
+from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
 from mistyle.core.weights import header as weights_header
 from mistyle.files.store import sha256_file
 
@@ -174,28 +176,48 @@ def read_lock(folder: Path) -> dict[str, Any]:
 
 
 def verify(name: str, place: Path, folder: Path | None) -> None:
-    """Compare a fetched model with the hashes of its fetching; files untouched since the last time are not read."""
-    if folder is None or place != folder / name:
-        return
-    lock = read_lock(folder)
+    """Compare a model's files with the hashes of their fetching or adopting, else with those that its publisher's are
+    known by. A file in the models' folder is read once and noted in the lock; in the cache, once a process.
+
+    Files that nobody has named a hash for (see `Model.sha256`) are taken as they are.
+    """
+    model = MODELS[name]
+    ours = folder is not None and place == folder / name
+    lock = read_lock(folder) if folder is not None and ours else {}
+    noted = lock.get(name, {}).get("files", {})
     changed = False
-    for relative, entry in lock.get(name, {}).get("files", {}).items():
+    for relative in dict.fromkeys([*noted, *model.sha256]):
         path = place / relative
         if not path.is_file():
             continue  # what is needed was checked; the rest may be removed
         stat = path.stat()
-        if (stat.st_size, stat.st_mtime_ns) == (entry["bytes"], entry["mtime_ns"]):
+        entry = noted.get(relative)
+        if entry is not None and (stat.st_size, stat.st_mtime_ns) == (entry["bytes"], entry["mtime_ns"]):
             continue
-        found = sha256_file(path)
-        if found != entry["sha256"]:
+        found = _sha256(path, stat.st_size, stat.st_mtime_ns)
+        if entry is not None and found != entry["sha256"]:
             raise EnvironmentMissing(
-                f"{path}: sha256 is {found}, expected {entry['sha256']} as it was fetched; the file changed or broke. "
-                f"Remove it and {how_to_get(MODELS[name], folder)}"
+                f"{path}: sha256 is {found}, expected {entry['sha256']} as it was when it was taken in; the file "
+                f"changed or broke. Remove it and {how_to_get(model, folder)}"
             )
-        entry.update(bytes=stat.st_size, mtime_ns=stat.st_mtime_ns)
+        if entry is None and found != model.sha256[relative]:
+            raise EnvironmentMissing(
+                f"{path}: sha256 is {found}, expected {model.sha256[relative]}, which is the file of {model.repo}. "
+                f"Remove it and {how_to_get(model, folder)}; if these weights are meant, put them into a folder of "
+                f"models and say so: mistyle models adopt {name} --models {folder or Path('models')}"
+            )
+        noted[relative] = {"sha256": found, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
         changed = True
-    if changed:
-        write_lock(folder, lock)
+    if folder is not None and ours and changed:
+        lock[name] = {"repo": model.repo, "revision": "copied by hand"} | lock.get(name, {}) | {"files": noted}
+        with suppress(MistyleError):  # a folder that cannot be written is read anew by the next run
+            write_lock(folder, lock)
+
+
+@functools.lru_cache(maxsize=256)
+def _sha256(path: Path, size: int, modified: int) -> str:
+    """The hash of a file as it was of that size at that time."""
+    return sha256_file(path)
 
 
 def write_lock(folder: Path, lock: Mapping[str, Any]) -> None:

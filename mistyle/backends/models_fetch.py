@@ -65,6 +65,22 @@ def fetch(name: str, folder: Path, allowed: bool) -> Path:
     return place
 
 
+def adopt(name: str, folder: Path) -> Path:
+    """Take a folder of weights as it lies there for the model `name`: its hashes go into the folder's lock.
+
+    For weights that are not the published ones, on purpose. Raises EnvironmentMissing where the folder is not complete.
+    """
+    model, place = models.get(name), folder / name
+    lost = models.lacking(model, place, model.loose) if place.is_dir() else [place]
+    if lost:
+        raise EnvironmentMissing(f"{lost[0]} is not there; {name} needs {', '.join(model.folders + model.loose)}")
+    lock = models.read_lock(folder)
+    entries = {path: _checked(place / path, None) for path in _files(place)}
+    lock[name] = {"repo": model.repo, "revision": "adopted", "files": entries}
+    models.write_lock(folder, lock)
+    return place
+
+
 def _files(place: Path) -> list[str]:
     every = (p.relative_to(place) for p in sorted(place.rglob("*")) if p.is_file())
     return [p.as_posix() for p in every if p.parts[0] != PARTIAL]

@@ -1,6 +1,8 @@
 """The models that the generative stages use: their names here, where they are published, licences, what they are for.
 
-Revisions and hashes are those that other projects' published lock files give; they were not compared with the hub.
+Revisions and hashes are those that other projects' published lock files give, several of them alike for every hash of
+SDXL and its ControlNets; they were not compared with the hub itself. Where a model has none, nobody was found to have
+published one.
 """
 
 from collections.abc import Mapping
@@ -45,6 +47,21 @@ MODELS = {
             "stylizer and LoRA training: the base model",
             SDXL,
             (*_network("unet", "text_encoder", "text_encoder_2"), *TOKENS, "vae/*.json", "vae/*model.safetensors"),
+            (),
+            {
+                "unet/diffusion_pytorch_model.fp16.safetensors": (
+                    "83e012a805b84c7ca28e5646747c90a243c65c8ba4f070e2d7ddc9d74661e139"
+                ),
+                "text_encoder/model.fp16.safetensors": (
+                    "660c6f5b1abae9dc498ac2d21e1347d2abdb0cf6c0c0c8576cd796491d9a6cdd"
+                ),
+                "text_encoder_2/model.fp16.safetensors": (
+                    "ec310df2af79c318e24d20511b601a591ca8cd4f1fce1d8dff822a356bcdb1f4"
+                ),
+                "vae/diffusion_pytorch_model.safetensors": (
+                    "1598f3d24932bcfe6634e8b618ea1e30ab1d57f5aad13a6d2de446d2199f2341"
+                ),
+            },
         ),
         Model(
             "depth",
@@ -55,6 +72,12 @@ MODELS = {
             "stylizer: depth ControlNet",
             ("",),
             _network(""),
+            (),
+            {
+                "diffusion_pytorch_model.fp16.safetensors": (
+                    "66a6813e6bd7270ecfe68206a59ddd605a011ae85321188376605c66e0a4f303"
+                )
+            },
         ),
         Model(
             "canny",
@@ -65,6 +88,12 @@ MODELS = {
             "stylizer: Canny ControlNet",
             ("",),
             _network(""),
+            (),
+            {
+                "diffusion_pytorch_model.fp16.safetensors": (
+                    "b2e7d3921058a442cc80430d1ec8847f42599c705e2451c95e77cf4dcf8d6c25"
+                )
+            },
         ),
         Model(
             "ip-adapter",

@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.camera import Camera
+from mistyle.core.lanes import aligned
 from mistyle.core.light import Ambient, Directional, Lights, direction_in_world
 from mistyle.render import device
 from mistyle.render.draw import Tracer
@@ -265,7 +266,7 @@ def _each(kind: Any, values: Float[np.ndarray, "c 3"], camera_of: Any) -> Any:
     import drjit as dr
     import mitsuba as mi
 
-    return dr.gather(kind, mi.Float(np.ascontiguousarray(values, np.float32).ravel()), camera_of)
+    return dr.gather(kind, mi.Float(aligned(values).ravel()), camera_of)
 
 
 def _tangent_frame(point: Any, barycentric: Any, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
@@ -273,7 +274,7 @@ def _tangent_frame(point: Any, barycentric: Any, tangents: Float[np.ndarray, "f 
     import drjit as dr
     import mitsuba as mi
 
-    corners = mi.Float(np.ascontiguousarray(tangents, np.float32).ravel())
+    corners = mi.Float(aligned(tangents).ravel())
     valid = point.is_valid()
     tangent, hand = mi.Vector3f(0), mi.Float(1)
     weights = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)

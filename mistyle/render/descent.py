@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core.lanes import aligned
 from mistyle.render import device
-from mistyle.render.texel_lm import aligned
 
 CHANNELS = ("albedo", "albedo", "albedo", "normal", "normal", "roughness", "metallic")
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12

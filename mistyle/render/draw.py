@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core import memory
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.image import resize
+from mistyle.core.lanes import aligned
 from mistyle.core.maps import Maps, coarser
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
@@ -67,7 +68,7 @@ def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
     directions, cosines = _directions(camera)
     # Opaque: as literals every camera would compile a kernel of its own.
     origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.position))
-    ray = mi.Ray3f(origin, mi.Vector3f(np.ascontiguousarray(directions.T)))
+    ray = mi.Ray3f(origin, mi.Vector3f(aligned(directions.T)))
     hit = traced.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
     valid = hit.is_valid()
     face = dr.select(valid, mi.Int32(hit.prim_index), -1)

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
 from mistyle.core.camera import Camera
+from mistyle.core.lanes import aligned
 from mistyle.core.light import Directional, Lights, Point, SceneLights, direction_in_world, position_in_world
 from mistyle.core.mesh import Mesh
 from mistyle.core.tangents import corner_tangents
@@ -272,7 +273,7 @@ def own(kind: Any, values: np.ndarray) -> Any:
     """A Dr.Jit array in memory of its own: NumPy's is aligned now so, now so, and a frozen function minds."""
     import drjit as dr
 
-    return kind(values) + dr.opaque(kind, 0)
+    return kind(aligned(values, values.dtype)) + dr.opaque(kind, 0)
 
 
 def _pad(values: np.ndarray, size: int) -> np.ndarray:
@@ -285,10 +286,10 @@ def _rays(camera: Camera, pixel: Integer[np.ndarray, " n"], offset: Float[np.nda
     import drjit as dr
     import mitsuba as mi
 
-    index = mi.UInt32(pixel)
+    index = mi.UInt32(aligned(pixel, np.uint32))
     width = camera.size[1]
-    x = (mi.Float(index % width) + mi.Float(offset[:, 0].copy()) - camera.centre[0]) / camera.focal
-    y = (mi.Float(index // width) + mi.Float(offset[:, 1].copy()) - camera.centre[1]) / camera.focal
+    x = (mi.Float(index % width) + mi.Float(aligned(offset[:, 0])) - camera.centre[0]) / camera.focal
+    y = (mi.Float(index // width) + mi.Float(aligned(offset[:, 1])) - camera.centre[1]) / camera.focal
     axes: list[Any] = [mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T]
     right, down, forward = axes
     return mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))
@@ -325,7 +326,7 @@ def _visible(traced, position, normal, up, variant, soft: Sky, shadows: bool) ->
 
     point = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
     point.p, point.n = position, normal
-    words, directions = [], mi.Float(soft.direction.ravel())
+    words, directions = [], mi.Float(aligned(soft.direction.ravel()))
     for first in range(0, len(soft.direction), 32):
         word = mi.UInt32(0)
         for k in range(min(32, len(soft.direction) - first)):

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera, resized
 from mistyle.core.image import nearest_fill
+from mistyle.core.lanes import aligned
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
@@ -129,4 +130,4 @@ def retarget(shade: Any, picture: int, rgb: Float[np.ndarray, "h w 3"], weight: 
         target = np.array(block.target).reshape(-1, 4)
         target[: len(block.pixel), :3] = rgb.reshape(-1, 3)[block.pixel]
         target[: len(block.pixel), 3] = weight.ravel()[block.pixel]
-        block.target = mi.Float(target.ravel())
+        block.target = mi.Float(aligned(target.ravel()))

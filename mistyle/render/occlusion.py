@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core.lanes import aligned
 from mistyle.core.mesh import Mesh
 from mistyle.render import device
 from mistyle.render.draw import Tracer, tracer
@@ -39,8 +40,8 @@ def ambient_occlusion(
     for low in range(0, len(positions), CHUNK):
         part = slice(low, low + CHUNK)
         lifted = positions[part] + LIFT * normals[part]
-        origin = mi.Point3f(np.ascontiguousarray(lifted.T, np.float32))
-        frame = mi.Frame3f(mi.Vector3f(np.ascontiguousarray(normals[part].T, np.float32)))
+        origin = mi.Point3f(aligned(lifted.T))
+        frame = mi.Frame3f(mi.Vector3f(aligned(normals[part].T)))
         index = dr.arange(mi.UInt32, len(lifted)) + low
         shift_x = mi.sample_tea_float32(index, mi.UInt32(2 * seed))
         shift_y = mi.sample_tea_float32(index, mi.UInt32(2 * seed + 1))

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.capture import Captures
+from mistyle.core.lanes import aligned
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device, scene_grad, scene_keys
@@ -154,8 +155,8 @@ class _Job:
         rgb, mask = self.captures.load(k)
         counts = mask & (np.array(shown)[..., 3] > SOLID)
         clean = np.ascontiguousarray(np.where(counts[..., None], rgb, 0), np.float32)
-        wide = self.mi.TensorXb(np.ascontiguousarray(np.broadcast_to(counts[..., None], clean.shape)))
-        return shown, scene_grad.Sight(sensor, self.mi.TensorXf(clean), wide, max(float(counts.mean()), 1e-9))
+        wide = self.mi.TensorXb(aligned(np.broadcast_to(counts[..., None], clean.shape), bool))
+        return shown, scene_grad.Sight(sensor, self.mi.TensorXf(aligned(clean)), wide, max(float(counts.mean()), 1e-9))
 
     def gradient(self, values, k: int, spp: tuple[int, int], seeds: tuple[int, int]):
         """Loss of picture k and its gradient by key."""

@@ -25,6 +25,7 @@ from jaxtyping import Float
 from mistyle.core import memory
 from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
 from mistyle.core.errors import InputRefused
+from mistyle.core.lanes import aligned, whole
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh, weld
 from mistyle.core.paths import scenes
@@ -85,10 +86,10 @@ def mitsuba_mesh(
     uvs = np.stack([welded.uvs[:, 0], 1 - welded.uvs[:, 1]], axis=1)
     values = mi.traverse(shape)
     # One update for all: an update that names only the positions recomputes the normals.
-    values["vertex_positions"] = mi.Float(np.ascontiguousarray(welded.positions.ravel(), np.float32))
-    values["vertex_normals"] = mi.Float(np.ascontiguousarray(welded.normals.ravel(), np.float32))
-    values["vertex_texcoords"] = mi.Float(np.ascontiguousarray(uvs.ravel(), np.float32))
-    values["faces"] = mi.UInt32(np.ascontiguousarray(welded.faces.ravel(), np.uint32))
+    values["vertex_positions"] = mi.Float(aligned(welded.positions.ravel()))
+    values["vertex_normals"] = mi.Float(aligned(welded.normals.ravel()))
+    values["vertex_texcoords"] = mi.Float(aligned(uvs.ravel()))
+    values["faces"] = mi.UInt32(aligned(welded.faces.ravel(), np.uint32))
     values.update()
     for key, data in attributes.items():
         shape.add_attribute(key, data.shape[1], data.ravel())
@@ -103,7 +104,7 @@ def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
     """
     import mitsuba as mi
 
-    data = mi.TensorXf(np.ascontiguousarray(values, np.float32))
+    data = mi.TensorXf(whole(values))
     return {"type": "bitmap", "data": data, "raw": True, "filter_type": "bilinear", "wrap_mode": "repeat"}
 
 

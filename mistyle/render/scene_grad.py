@@ -14,6 +14,7 @@ import numpy as np
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
+from mistyle.core.lanes import aligned
 from mistyle.render import scene as scenery
 from mistyle.render.scene_keys import Parameter
 
@@ -140,7 +141,7 @@ def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str
     tensor: Any = mi.TensorXb
     return Sight(
         sensor=sensor,
-        reference=mi.TensorXf(np.ascontiguousarray(clean, np.float32)),
+        reference=mi.TensorXf(aligned(clean)),
         counts=tensor(np.ascontiguousarray(np.broadcast_to(used[..., None], clean.shape))),
         share=float(used.mean()),
     )
@@ -269,7 +270,7 @@ def typed(kind: Any, values: np.ndarray) -> Any:
     import mitsuba as mi
 
     if dr.is_tensor_v(kind):
-        return kind(mi.TensorXf(np.ascontiguousarray(values, np.float32)))
+        return kind(mi.TensorXf(aligned(values)))
     if dr.depth_v(kind) > 1:
-        return kind(*[mi.Float(np.full(1, v, np.float32)) for v in values])
-    return kind(mi.Float(np.ascontiguousarray(values, np.float32)))
+        return kind(*[mi.Float(aligned(np.full(1, v))) for v in values])
+    return kind(mi.Float(aligned(values)))

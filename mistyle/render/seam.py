@@ -19,6 +19,7 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
+from mistyle.core.lanes import LANES, aligned
 from mistyle.core.maps import flat_maps
 from mistyle.render import deferred, device, split
 from mistyle.render import scene as scenery
@@ -134,6 +135,7 @@ class _Wrapped:
 
     def __call__(self, lit: deferred.Lit, pixels: Any, moving: Sequence[str]) -> Any:
         import mitsuba as mi
+        import torch
 
         self.integrator.lit = lit
         wanted = {}
@@ -142,10 +144,11 @@ class _Wrapped:
             if name == "normal":
                 image = image * 0.5 + 0.5
             if name in moving:
-                # A fresh tensor: Dr.Jit works on torch's memory, and does not recognise nn.Parameter.
-                wanted[name] = image.clone()
+                # A fresh tensor: Dr.Jit works on torch's memory, beyond its end too (core/lanes.py), and does not
+                # recognise nn.Parameter.
+                wanted[name] = torch.nn.functional.pad(image.reshape(-1), (0, LANES))[: image.numel()].view_as(image)
             else:
-                self.parameters[self.names[name]] = mi.TensorXf(image.detach().contiguous().numpy())
+                self.parameters[self.names[name]] = mi.TensorXf(aligned(image.detach().numpy()))
         if not wanted:
             return self._still()
         # Dr.Jit's wrapper makes every float argument ask for gradients, so only those that move are arguments.

@@ -23,6 +23,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.capture import Captures
+from mistyle.core.lanes import aligned
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
 from mistyle.render import bsdf, device, shading
@@ -293,7 +294,7 @@ def _steps(sizes: Sequence[tuple[int, int]]) -> tuple[Any, Any]:
     import drjit as dr
     import mitsuba as mi
 
-    right, down = (mi.Int32(column.copy()) for column in collecting.steps(sizes).T)
+    right, down = (mi.Int32(aligned(column, np.int32)) for column in collecting.steps(sizes).T)
     dr.make_opaque(right, down)
     return right, down
 

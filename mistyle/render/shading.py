@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.core.lanes import aligned
 from mistyle.render.hits import Pixels, Samples, Transpose
 from mistyle.render.sky import VARIANTS, Sky
 
@@ -221,8 +222,8 @@ def upload(sky: Sky) -> tuple[Any, ...]:
     angle = np.broadcast_to(sky.angle[:, None, None], (*sky.direction.shape[:2], 1))
     cells = np.concatenate([sky.direction, sky.energy, angle, np.zeros_like(angle)], axis=-1)
     pixels = np.concatenate([sky.radiance, sky.angle[sky.cell][..., None]], axis=-1)
-    arrays = [mi.Float(a.astype(np.float32).ravel()) for a in (cells, pixels)]
-    cell = mi.UInt32(sky.cell.astype(np.uint32).ravel())
+    arrays = [mi.Float(aligned(a).ravel()) for a in (cells, pixels)]
+    cell = mi.UInt32(aligned(sky.cell, np.uint32).ravel())
     dr.make_opaque(arrays, cell)
     return *arrays, cell, len(sky.angle), len(sky.cell)
 

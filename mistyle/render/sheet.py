@@ -16,6 +16,7 @@ from jaxtyping import Float
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera, look_at, orbit
 from mistyle.core.image import luminance
+from mistyle.core.lanes import aligned
 from mistyle.core.light import Ambient, Environment, SphericalGaussian, bake_environment, environment_directions
 from mistyle.render import device
 from mistyle.render.lookdev import asset_scene, asset_shapes, drawn, light_rig
@@ -131,7 +132,7 @@ def reference_shapes() -> dict[str, Any]:
         place = to().translate([x * UNIT, y * UNIT, 0]) @ to().scale(BALL_RADIUS * UNIT)
         shapes[name] = {"type": "sphere", "to_world": place, "bsdf": materials[name]}
     # Mitsuba's texture row 0 is v = 0, the rectangle's lower edge.
-    data = mi.TensorXf(np.ascontiguousarray(chart_texture()[::-1]))
+    data = mi.TensorXf(aligned(chart_texture()[::-1]))
     texture = {"type": "bitmap", "data": data, "raw": True, "filter_type": "nearest"}
     half = [side * UNIT / 2 for side in CHART_SIZE]
     place = to().translate([CHART_CENTRE[0] * UNIT, CHART_CENTRE[1] * UNIT, 0]) @ to().scale([*half, 1])

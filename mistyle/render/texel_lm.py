@@ -22,9 +22,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.lanes import aligned
 from mistyle.render import device
 from mistyle.render.texel_algebra import Sums, flat_of, nothing, spread_of, step, triangle, unflat
-from mistyle.render.texel_records import UNKNOWNS, Observations, Options, Points, Rig, Solution, aligned
+from mistyle.render.texel_records import UNKNOWNS, Observations, Options, Points, Rig, Solution
 from mistyle.render.texel_response import derivatives, differences, terms
 
 __all__ = ["UNKNOWNS", "Observations", "Options", "Points", "Problem", "Rig", "Solution", "aligned"]

@@ -1,7 +1,6 @@
 """What the per-texel solver (`texel_lm.py`) is given, and what it answers."""
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int, Integer
@@ -82,18 +81,3 @@ class Options:
     floor: float = 0.04
     tilt: float = 0.95
     differences: bool = False
-
-
-def aligned(values: np.ndarray, kind: Any = np.float32) -> np.ndarray:
-    """A copy that starts at a multiple of 64 bytes.
-
-    Dr.Jit reads NumPy's memory in place and compiles the alignment into its kernels: arrays that happen to start
-    elsewhere would be another kernel in every call.
-    """
-    values = np.asarray(values)
-    count = values.size * np.dtype(kind).itemsize
-    memory = np.empty(count + 64, np.uint8)
-    first = -memory.ctypes.data % 64
-    result = memory[first : first + count].view(kind).reshape(values.shape)
-    result[...] = values
-    return result

@@ -8,11 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera
+from mistyle.core.lanes import aligned
 from mistyle.core.light import Directional, Light, Lights, Point, direction_in_world, position_in_world
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
 from mistyle.render.hits import BLOCK_RAYS
-from mistyle.render.texel_lm import Rig, aligned
+from mistyle.render.texel_lm import Rig
 
 
 @dataclass(frozen=True)

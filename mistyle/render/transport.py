@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.camera import Camera
+from mistyle.core.lanes import aligned
 from mistyle.render import bsdf, deferred, device, seam
 from mistyle.render.draw import Tracer
 
@@ -36,13 +37,13 @@ def transport(
     on = np.flatnonzero(surface.mask)
     result = np.zeros((len(surface.mask), len(directions), 3), np.float32)
     wi = surface.frame.to_local(surface.towards)
-    material = mi.Float(np.ascontiguousarray(values, np.float32).ravel())
-    towards = mi.Float(np.ascontiguousarray(directions, np.float32).ravel())
+    material = mi.Float(aligned(values).ravel())
+    towards = mi.Float(aligned(directions).ravel())
     step = max(1, AT_ONCE // len(directions))
     for start in range(0, len(on), step):
         rows = on[start : start + step]
         pair = dr.arange(mi.UInt32, len(rows) * len(directions))
-        pixel = dr.gather(mi.UInt32, mi.UInt32(rows.astype(np.uint32)), pair // len(directions))
+        pixel = dr.gather(mi.UInt32, mi.UInt32(aligned(rows, np.uint32)), pair // len(directions))
         world = dr.gather(mi.Vector3f, towards, pair % len(directions))
         lit = ~traced.scene.ray_test(dr.gather(type(surface.point), surface.point, pixel).spawn_ray(world))
         frame = dr.gather(type(surface.frame), surface.frame, pixel)

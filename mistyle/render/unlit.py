@@ -8,6 +8,7 @@ from jaxtyping import Float
 
 from mistyle.core import memory
 from mistyle.core.camera import Camera
+from mistyle.core.lanes import aligned, whole
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device
@@ -35,12 +36,12 @@ def unlit(
     traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
     starts = np.cumsum([0, *(chosen.roughness.size for chosen in maps)])
     flat = [np.ascontiguousarray(chosen.albedo, np.float32).reshape(-1) for chosen in maps]
-    texels = mi.Float(np.concatenate(flat) if len(flat) > 1 else flat[0])
+    texels = mi.Float(whole(np.concatenate(flat) if len(flat) > 1 else flat[0]))
     del flat
-    start = mi.UInt32(starts[:-1].astype(np.uint32))
-    rows = mi.UInt32(np.array([chosen.roughness.shape[0] for chosen in maps], np.uint32))
-    columns = mi.UInt32(np.array([chosen.roughness.shape[1] for chosen in maps], np.uint32))
-    part = mi.UInt32(traced.mesh.part.astype(np.uint32))
+    start = mi.UInt32(aligned(starts[:-1], np.uint32))
+    rows = mi.UInt32(aligned([chosen.roughness.shape[0] for chosen in maps], np.uint32))
+    columns = mi.UInt32(aligned([chosen.roughness.shape[1] for chosen in maps], np.uint32))
+    part = mi.UInt32(aligned(traced.mesh.part, np.uint32))
 
     def fetch(hit: Any) -> Any:
         """Albedo at a hit (zero where there is none); Mitsuba's v points down, as rows do."""

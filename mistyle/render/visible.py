@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.camera import Camera, in_frame, px_from_world
+from mistyle.core.lanes import aligned
 from mistyle.render import device
 from mistyle.render.draw import Tracer
-from mistyle.render.texel_records import aligned
 
 LIFT = 1e-3  # how far above the surface rays start, working units
 RAYS = 1 << 21  # traced at a time

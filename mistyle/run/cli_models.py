@@ -61,11 +61,14 @@ def add_models(verbs: Any) -> None:
             mistyle models --models DIR                             what is there, what is missing, and the layout
             mistyle models fetch sdxl depth canny --models DIR --allow-download
             mistyle models convert position paint3d.bin --models DIR     a pickle once into safetensors
+            mistyle models adopt sdxl --models DIR                  take DIR/sdxl though it is not the published one
             """
         ),
     )
-    verb.add_argument("action", nargs="?", choices=["list", "fetch", "convert"], default="list")
-    verb.add_argument("names", nargs="*", metavar="NAME", help="models to fetch; or NAME and the file to convert")
+    verb.add_argument("action", nargs="?", choices=["list", "fetch", "convert", "adopt"], default="list")
+    verb.add_argument(
+        "names", nargs="*", metavar="NAME", help="models to fetch or adopt; or NAME and the file to convert"
+    )
     verb.add_argument("--models", type=Path, metavar="DIR", help="folder of models (else the Hugging Face cache)")
     verb.add_argument("--allow-download", action="store_true", help="fetch may use the network")
     verb.add_argument("--json", action="store_true", help="one JSON object on stdout")
@@ -73,7 +76,7 @@ def add_models(verbs: Any) -> None:
 
 
 def run_models(options: argparse.Namespace) -> int:
-    """List, fetch or convert."""
+    """List, fetch, convert or adopt."""
     if options.action == "list":
         return _list(options)
     if options.models is None:
@@ -81,15 +84,18 @@ def run_models(options: argparse.Namespace) -> int:
     if options.action == "convert":
         return _convert(options)
     if not options.names:
-        raise UsageError("mistyle models fetch NAME...; `mistyle models` prints the names")
+        raise UsageError(f"mistyle models {options.action} NAME...; `mistyle models` prints the names")
     from mistyle.backends.models import get
-    from mistyle.backends.models_fetch import fetch
+    from mistyle.backends.models_fetch import adopt, fetch
 
     for name in options.names:
         get(name)
     places = {}
     for name in options.names:
-        places[name] = str(fetch(name, options.models, options.allow_download))
+        if options.action == "adopt":
+            places[name] = str(adopt(name, options.models))
+        else:
+            places[name] = str(fetch(name, options.models, options.allow_download))
         print(f"{name}: {places[name]}", file=sys.stderr)
     if options.json:
         print(json.dumps(places))
@@ -97,15 +103,18 @@ def run_models(options: argparse.Namespace) -> int:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    from mistyle.backends.models import get, need_extra
-    from mistyle.backends.models_fetch import convert
+    from mistyle.backends.models import get, lacking, need_extra
+    from mistyle.backends.models_fetch import adopt, convert
 
     if len(options.names) != 2:
         raise UsageError("mistyle models convert NAME FILE.bin --models DIR")
-    name, source = get(options.names[0]).name, Path(options.names[1])
+    model, source = get(options.names[0]), Path(options.names[1])
     need_extra()
     pickle = source / "diffusion_pytorch_model.bin" if source.is_dir() else source
-    print(convert(pickle, options.models / name))
+    place = options.models / model.name
+    print(convert(pickle, place))
+    if not lacking(model, place, model.loose):
+        adopt(model.name, options.models)
     return 0
 
 
@@ -125,7 +134,7 @@ def _list(options: argparse.Namespace) -> int:
             print(f"  sha256 {value}  {file}")
     print(
         "\nNothing is downloaded unless you say so: mistyle models fetch NAME --models DIR --allow-download. "
-        "Each model's licence is yours to accept.\nRevisions and hashes come from other projects' lock files; fetch "
-        "compares them with what arrives."
+        "Each model's licence is yours to accept.\nRevisions and hashes come from other projects' lock files; they "
+        "are compared with what is fetched, and with what was copied there by hand."
     )
     return 0

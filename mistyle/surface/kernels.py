@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.core.lanes import aligned
+
 TURNED = np.uint32(1 << 31)  # the bit of a table entry that says the neighbour's picture is upside down
 PAGES = 4  # the picture in its four quarter turns
 WIDTH = 24  # floats per style pixel: 16 patch components, 3 colour, 2 orientation, 1 band, 2 unused
@@ -73,12 +75,12 @@ def module(name: str) -> ModuleType:
 
 def floats(dj: ModuleType, values: np.ndarray) -> Any:
     """A flat device array of float32."""
-    return dj.Float(np.ascontiguousarray(values, np.float32).reshape(-1))
+    return dj.Float(aligned(values).reshape(-1))
 
 
 def whole(dj: ModuleType, values: np.ndarray) -> Any:
     """A flat device array of uint32."""
-    return dj.UInt(np.ascontiguousarray(values).astype(np.uint32).reshape(-1))
+    return dj.UInt(aligned(values, np.uint32).reshape(-1))
 
 
 def tables(
@@ -185,7 +187,7 @@ def describe_pixels(dj: ModuleType, colour: Any, shapes: Int[np.ndarray, "4 2"],
     area = int(shapes[0].prod())
     count = PAGES * area
     i = dr.arange(dj.Int, count)
-    width = dr.gather(dj.Int, dj.Int(shapes[:, 1].astype(np.int32)), i // dr.opaque(dj.Int, area))
+    width = dr.gather(dj.Int, dj.Int(aligned(shapes[:, 1], np.int32)), i // dr.opaque(dj.Int, area))
     last = dr.opaque(dj.Int, count - 1)
 
     def pixel(k: Any) -> Any:
