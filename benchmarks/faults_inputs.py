@@ -22,6 +22,9 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from benchmarks.common import arguments, finish, peak_gb
 from benchmarks.faults_corpus import Seed, png, seeds, write
@@ -51,7 +54,26 @@ def _mesh(path: Path) -> None:
     from mistyle.files.read import read_mesh, read_references
 
     read_references(path)
-    read_mesh(path, uv="keep", max_faces=100_000)
+    asset = read_mesh(path, uv="keep", max_faces=100_000)
+    if asset.source.kind in ("glb", "gltf"):
+        _patched(asset)
+
+
+def _patched(asset: Any) -> None:
+    """A glTF that is read is written again with plain textures as well, and read once more: its faces are all there."""
+    from mistyle.core.maps import flat_maps
+    from mistyle.files.gltf import patch_glb
+    from mistyle.files.gltf_alpha import cutouts
+    from mistyle.files.read import read_mesh
+
+    parts = len(asset.mesh.parts)
+    cutouts(asset)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "patched.glb")
+        patch_glb(path, asset, [flat_maps(8)] * parts, [np.ones((8, 8), np.float32)] * parts, name="x")
+        again = read_mesh(path, uv="keep", max_faces=100_000)
+    if len(again.mesh.faces) != len(asset.mesh.faces):
+        raise AssertionError(f"{len(asset.mesh.faces)} faces were read, {len(again.mesh.faces)} were written")
 
 
 def _picture(path: Path) -> None:
@@ -175,6 +197,32 @@ def peak_reader_gb() -> float:
     return peak_bytes() / 1e9
 
 
+def unwrapped(count: int, folder: Path, report: Callable[[str], None]) -> list[Outcome]:
+    """Damaged meshes that get new texture coordinates: finite, in the unit square, one a corner; or refused."""
+    from mistyle.core.errors import MistyleError
+    from mistyle.files.read import read_mesh
+
+    chosen = [seed for seed in seeds() if seed.kind == "mesh"]
+    found = []
+    for k in range(count):
+        seed = chosen[k % len(chosen)]
+        write(damaged(seed, random.Random(2 * 10**6 + k).randrange), folder)
+        what, sentence = "read", ""
+        try:
+            mesh = read_mesh(folder / seed.entry, uv="new", size=256, max_faces=100_000).mesh
+            uvs = mesh.corner_uvs
+            if uvs.shape != (len(mesh.faces), 3, 2) or not np.isfinite(uvs).all() or uvs.min() < 0 or uvs.max() > 1:
+                what = f"texture coordinates of {uvs.shape} from {uvs.min()} to {uvs.max()}"
+        except MistyleError as error:
+            what, sentence = "refused", str(error)
+        except Exception as error:  # what must never come
+            what = f"{type(error).__name__}: {str(error)[:200]}"
+        found.append(Outcome(f"unwrap {seed.name}", what, sentence))
+        if not found[-1].held:
+            report(f"  unwrap {k} {seed.name}: {what}")
+    return found
+
+
 def commands(count: int, folder: Path, report: Callable[[str], None]) -> list[Outcome]:
     """Damaged meshes through the command line: exit code 0, 2 or 3, one line of error, no traceback, no output."""
     chosen = [seed for seed in seeds() if seed.kind == "mesh"]
@@ -225,6 +273,7 @@ def run(full: bool, report: Callable[[str], None] = print) -> dict[str, float]:
                 (Path(place) / "run").mkdir()
                 Path(place, "run", "style.png").write_bytes(png())
                 found += commands(COMMANDS, Path(place, "run"), report)
+                found += unwrapped(COMMANDS, Path(place, "unwrap"), report)
         finally:
             os.environ.pop("TMPDIR") if old is None else os.environ.__setitem__("TMPDIR", old)
             tempfile.tempdir = None

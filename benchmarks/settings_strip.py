@@ -6,6 +6,7 @@ left to right. Writes small JPGs (under 60 kB) and nothing else. --quick: two va
 
 import argparse
 import io
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 from PIL import Image
 
 from mistyle.core.camera import RigSettings, rig
+from mistyle.files.images import write_png
 from mistyle.files.read import read_mesh, read_picture
 from mistyle.run import start
 from mistyle.run.settings import Settings
@@ -23,8 +25,8 @@ STRIPS: dict[str, tuple[dict[str, Any], ...]] = {
     "stroke_scale": tuple({"style_scale": v} for v in (0.5, 1.0, 2.0, 3.0)),
     "detail": ({"detail": 0.0, "glaze": 0.0}, {"detail": 2.0, "glaze": 0.3}, {}, {"detail": 12.0, "relief": 4.0}),
     "strength": tuple({"stroke_coherence": v} for v in (0.0, 0.01, 0.02, 0.04)),
-    "palette": ({"palette": 0.2}, {"palette": 1.0}, {"palette": 4.0}, {"palette_mix": 1.0}),
-    "direction": ({"orientation": 0.0}, {}, {"direction": "up"}, {"direction": "around"}),
+    "palette": ({"palette": 0.02}, {}, {"palette": 4.0}, {"palette_mix": 1.0}),
+    "direction": ({"orientation": 0.0}, {}, {"direction": "up"}, {"direction": "around"}, {"flow": (1, 1)}),
 }
 VIEW = 0  # of the paper's rig: front right
 LARGEST = 60_000  # bytes of a strip
@@ -36,12 +38,22 @@ def strip(asset: Any, picture: Any, base: Settings, variants: tuple[dict[str, An
     camera = rig(RigSettings(resolution=side))[VIEW]
     tiles = []
     for change in variants:
-        settings = base.model_copy(update={"surface": base.surface.model_copy(update=change)})
-        tiles.append(np.round(tile(asset, picture, settings, [camera], lambda done: None) * 255).astype(np.uint8))
+        with tempfile.TemporaryDirectory() as folder:
+            settings = changed(base, change, Path(folder))
+            tiles.append(np.round(tile(asset, picture, settings, [camera], lambda done: None) * 255).astype(np.uint8))
     used = np.stack([(t < WHITE).any(axis=2) for t in tiles]).any(axis=0)
     rows, columns = np.flatnonzero(used.any(axis=-1)), np.flatnonzero(used.any(axis=0))
     window = np.s_[max(rows[0] - 4, 0) : rows[-1] + 5, max(columns[0] - 4, 0) : columns[-1] + 5]
     return Image.fromarray(np.concatenate([t[window] for t in tiles], axis=1))
+
+
+def changed(base: Settings, change: dict[str, Any], folder: Path) -> Settings:
+    """The settings with other ones of the surface, or ("flow") with a direction map of one colour, left in `folder`."""
+    if "flow" not in change:
+        return base.model_copy(update={"surface": base.surface.model_copy(update=change)})
+    path = folder / "flow.png"
+    write_png(path, np.broadcast_to(np.array([*change["flow"], 0.5], np.float32), (8, 8, 3)))
+    return base.model_copy(update={"coat": base.coat.model_copy(update={"direction_map": path})})
 
 
 def save(picture: Image.Image, path: Path) -> int:

@@ -218,6 +218,22 @@ def test_turntables_are_files(tmp_path, rng):
     assert (tmp_path / "turn.webp").read_bytes() == first
 
 
+def test_mp4_is_what_another_decoder_shows(tmp_path):
+    """Even sides, as many frames as were given, in their colours; OpenCV reads it."""
+    import cv2
+
+    pytest.importorskip("imageio_ffmpeg", reason="mp4 needs mistyle[video]")
+    frames = [np.full((33, 48, 4), 1, np.float32) * (k / 5, 0.5, 1 - k / 5, 1) for k in range(6)]
+    write_turn(tmp_path / "turn", [f.astype(np.float32) for f in frames], mp4=True)
+    film = cv2.VideoCapture(str(tmp_path / "turn.mp4"))
+    shown = []
+    while (read := film.read())[0]:
+        shown.append(read[1][..., ::-1] / 255)
+    assert len(shown) == 6 and shown[0].shape == (32, 48, 3)
+    for frame, found in zip(frames, shown, strict=True):
+        np.testing.assert_allclose(found.mean(axis=(0, 1)), frame[0, 0, :3], atol=0.03)
+
+
 def test_mp4_without_its_encoder_is_refused_before_anything_is_drawn(tmp_path, ball, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     code = main(["lookdev", str(ball), "-o", str(tmp_path / "out"), "--turntable", "4", "--mp4"])

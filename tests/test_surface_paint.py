@@ -119,6 +119,46 @@ def test_strokes_go_where_they_are_told(follow, axis):
     assert front.sum() > 50 and (np.abs(tangent[front, axis]) > 0.99).all() and (sure[front] > 0.9).all()
 
 
+def test_a_painted_course_takes_the_place_of_the_form():
+    points = spread_on(box(0.6, 1.2, 0.6), 1500)
+    slanting = np.array([1, 1, 0], np.float32) / np.float32(np.sqrt(2))
+
+    def course(where, facing):
+        return np.broadcast_to(slanting, where.shape), (where[:, 1] > 0).astype(np.float32)
+
+    with_it, without = (linefield.directions(linefield.line_field(points, "up", c), points)[0] for c in (course, None))
+    front = (np.abs(points.normals[:, 2]) > 0.99) & (np.abs(points.positions[:, 0]) < 0.2)
+    above, below = front & (points.positions[:, 1] > 0.15), front & (points.positions[:, 1] < -0.25)
+    assert above.sum() > 30 and below.sum() > 20
+    assert (np.abs(with_it[above] @ slanting) > 0.97).all() and (np.abs(without[above] @ slanting) < 0.8).all()
+    assert (np.abs(with_it[below, 1]) > 0.97).all()
+
+
+def test_red_and_green_of_a_direction_map_are_u_and_v(painted_sheet, tmp_path):
+    mesh, texels, _ = painted_sheet
+    rows, columns = np.nonzero(texels.covered[1:-1, 1:-1])
+    at = (rows + 1, columns + 1)
+    along_u = texels.position[at[0], at[1] + 1] - texels.position[at[0], at[1] - 1]
+    along_v = texels.position[at[0] - 1, at[1]] - texels.position[at[0] + 1, at[1]]  # row 0 is v = 1
+    inside = np.linalg.norm(along_u, axis=1) * np.linalg.norm(along_v, axis=1) > 0
+    for colour, expected in (((1, 0.5, 0), along_u), ((0.5, 0, 1), along_v), ((0.9, 0.9, 0.5), along_u + along_v)):
+        write_png(tmp_path / "flow.png", np.broadcast_to(np.array(colour, np.float32), (8, 8, 3)))
+        course = coat.painted_course(tmp_path / "flow.png", mesh, [texels])
+        found, counts = course(texels.position[at][inside], texels.normal[at][inside])
+        wanted = expected[inside] / np.linalg.norm(expected[inside], axis=1, keepdims=True)
+        assert inside.sum() > 100 and (np.abs((found * wanted).sum(axis=1)) > 0.99).mean() > 0.95
+        np.testing.assert_allclose(counts, 1)
+    half = np.full((8, 8, 3), 0.5, np.float32)
+    write_png(tmp_path / "grey.png", half)
+    with pytest.raises(InputRefused, match="mid grey or transparent everywhere"):
+        coat.painted_course(tmp_path / "grey.png", mesh, [texels])
+    half[:, :4] = (1, 0.5, 0)
+    write_png(tmp_path / "half.png", half)
+    found, counts = coat.painted_course(tmp_path / "half.png", mesh, [texels])(texels.position[at], texels.normal[at])
+    assert (counts[at[1] < 12] == 1).all() and (counts[at[1] > 20] == 0).all()
+    assert coat.painted_course(None, mesh, [texels]) is None
+
+
 def ramp_solution(turn):
     """One sample on the plane y = 0 that shows the middle of a picture of ramps in a quarter turn."""
     rows, columns = np.mgrid[:200, :200].astype(np.float32)

@@ -8,6 +8,7 @@ from jaxtyping import Float
 from mistyle.core.asset import Picture
 from mistyle.core.mesh import Mesh
 from mistyle.surface.guides import Content, Occlusion
+from mistyle.surface.linefield import Course
 from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import SurfaceSettings
 
@@ -36,16 +37,27 @@ def solve_surface(
     progress: Callable[[float], None] = lambda done: None,
     *,
     content: Content | None = None,
+    course: Course | None = None,
 ) -> Solution:
     """Paint `mesh` in the style of a picture; see `mistyle.surface.synthesis.solve` for what it can and cannot do.
 
-    `content(positions, normals)` is the lightness (0..1) of a texture that the mesh has already.
+    `content(positions, normals)` is the lightness (0..1) of a texture that the mesh has already, `course` where strokes
+    shall run.
     """
     from mistyle.surface.synthesis import solve
 
     module, occlusion = array_module(), open_sky(mesh, seed)
     return solve(
-        mesh, style.rgb, settings, seed, occlusion, progress, alpha=style.alpha, content=content, device=module
+        mesh,
+        style.rgb,
+        settings,
+        seed,
+        occlusion,
+        progress,
+        alpha=style.alpha,
+        content=content,
+        course=course,
+        device=module,
     )
 
 

@@ -10,6 +10,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
 from mistyle.stages.mvst import Stylizer
 from mistyle.surface.guides import Content
+from mistyle.surface.linefield import Course
 from mistyle.surface.settings import SurfaceSettings
 
 
@@ -21,6 +22,7 @@ def stylizer(
     progress: Callable[[float], None] = lambda done: None,
     *,
     content: Content | None = None,
+    course: Course | None = None,
 ) -> Stylizer:
     """A Stylizer of views of `mesh` in the style of a picture; it keeps outlines.
 
@@ -32,7 +34,16 @@ def stylizer(
 
     module, occlusion = array_module(), open_sky(mesh, seed)
     base = ground(
-        mesh, style.rgb, settings, seed, occlusion, progress, alpha=style.alpha, content=content, device=module
+        mesh,
+        style.rgb,
+        settings,
+        seed,
+        occlusion,
+        progress,
+        alpha=style.alpha,
+        content=content,
+        course=course,
+        device=module,
     )
 
     def paint(view: View, prior: Prior | None, rng: np.random.Generator) -> np.ndarray:

@@ -19,7 +19,7 @@ h1{font-size:1.4rem}.sheet{display:grid;grid-template-columns:repeat(auto-fill,m
 figure{margin:0;border:1px solid var(--line);border-radius:6px;overflow:hidden}
 figure img,figure .none{width:100%;aspect-ratio:1;object-fit:contain;display:block;background:#8881}
 figcaption{padding:.5rem .7rem;overflow-wrap:anywhere}.failed figcaption b{color:#d33}
-table{border-collapse:collapse;width:100%;margin:2rem 0;font-variant-numeric:tabular-nums}
+.wide{overflow-x:auto}table{border-collapse:collapse;width:100%;margin:2rem 0;font-variant-numeric:tabular-nums}
 th,td{border-bottom:1px solid var(--line);padding:.35rem .6rem;text-align:right}
 th:first-child,td:first-child,td.text{text-align:left}th button{all:unset;cursor:pointer}
 th[aria-sort=ascending] button::after{content:" ▲"}th[aria-sort=descending] button::after{content:" ▼"}

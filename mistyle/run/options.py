@@ -68,6 +68,7 @@ PAINT_OPTIONS = {
     "keep_content": "surface.keep_content",
     "palette_mix": "surface.palette_mix",
     "direction": "surface.direction",
+    "direction_map": "coat.direction_map",
 }
 UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "": 1.0}
 
@@ -114,6 +115,12 @@ def add_paint_options(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument(
         "--direction", choices=["curvature", "up", "around"], help="what strokes follow (default: the form)"
+    )
+    verb.add_argument(
+        "--direction-map",
+        type=Path,
+        metavar="PICTURE",
+        help="painted directions in the mesh's UVs, red along u and green along v (a flow map); grey leaves it open",
     )
 
 

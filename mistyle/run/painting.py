@@ -19,30 +19,41 @@ from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
 from mistyle.stages.coat import Coats
 from mistyle.surface.guides import Content
+from mistyle.surface.linefield import Course
 from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import CoatSettings
 
 
 def coat_files(chosen: CoatSettings) -> list[Path]:
     """The files that a coat names: their contents count, not their names."""
-    named = [chosen.style_mask, chosen.protect]
+    named = [chosen.style_mask, chosen.protect, chosen.direction_map]
     for slot in chosen.slots:
         name, _, picture = slot.rpartition("=")
         named += [Path(name), Path(picture)]
     return [path for path in named if path is not None and path.is_file()]
 
 
-def paint(asset: Asset, style: Picture, settings: Settings, report: Report, content: Content | None = None) -> Solution:
-    """The surface painted once with one picture; `content` is the lightness of a texture that it has already."""
+def paint(
+    asset: Asset,
+    style: Picture,
+    settings: Settings,
+    report: Report,
+    content: Content | None = None,
+    course: Course | None = None,
+) -> Solution:
+    """The surface painted once with one picture; `content` is the lightness of a texture that it has already, `course`
+    where strokes shall run."""
     from mistyle.backends.embedded import solve_surface
 
-    return solve_surface(asset.mesh, style, settings.surface, settings.seed, progress=report, content=content)
+    return solve_surface(
+        asset.mesh, style, settings.surface, settings.seed, progress=report, content=content, course=course
+    )
 
 
 def coat(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Coats:
     """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
     from mistyle.run.colour import read_style
-    from mistyle.stages.coat import content, masked_style, scaled, slot_masks
+    from mistyle.stages.coat import content, masked_style, painted_course, scaled, slot_masks
 
     surface = scaled(settings.surface, asset, settings.coat.stroke_size)
     settings = settings.model_copy(update={"surface": surface})
@@ -53,13 +64,14 @@ def coat(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report:
         for texels_of, mask in zip(choice, chosen, strict=True):
             texels_of[mask] = number
     found = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
+    course = painted_course(settings.coat.direction_map, asset.mesh, atlas.texels)
     solutions = []
     for k, picture in enumerate(pictures):
 
         def part_done(done: float, k: int = k) -> None:
             report((k + done) / len(pictures))
 
-        solutions.append(paint(asset, picture, settings, part_done, found))
+        solutions.append(paint(asset, picture, settings, part_done, found, course))
     return Coats(tuple(solutions), tuple(choice))
 
 

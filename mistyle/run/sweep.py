@@ -57,15 +57,15 @@ def stylizer_of(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, 
     from importlib import import_module
 
     from mistyle.backends import STYLIZERS
-    from mistyle.stages.coat import content, masked_style, scaled
+    from mistyle.stages.coat import content, masked_style, painted_course, scaled
 
     surface = scaled(settings.surface, asset, settings.coat.stroke_size)
     found = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
     module, _, name = STYLIZERS[settings.stylizer].partition(":")
     make = getattr(import_module(module), name)
-    return make(
-        asset.mesh, masked_style(style, settings.coat.style_mask), surface, settings.seed, report, content=found
-    )
+    course = painted_course(settings.coat.direction_map, asset.mesh, atlas.texels)
+    picture = masked_style(style, settings.coat.style_mask)
+    return make(asset.mesh, picture, surface, settings.seed, report, content=found, course=course)
 
 
 def masker_of(settings: Settings) -> Masker | None:

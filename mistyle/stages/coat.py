@@ -6,22 +6,24 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels
-from mistyle.core.mesh import face_areas
+from mistyle.core.mesh import Mesh, face_areas
+from mistyle.core.tangents import corner_tangents
 from mistyle.stages.frames import texel_frames
-from mistyle.stages.texels import bands
+from mistyle.surface.linefield import Course
 from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import SurfaceSettings
 
 PICTURE_STROKES = 32  # strokes side by side along a picture's long side, by which `stroke_size` is turned into a scale
-CONTENT_TEXELS = 200_000  # texels of the asset's own albedo that are asked for content
+FEW_TEXELS = 200_000  # texels that are asked for content, or for a painted direction
 PLAIN = 0.004  # standard deviation of lightness (0..1) below which an albedo has no content
 ROUGHEST, SMOOTHEST = 1.0, 0.08
+FLOW_FREE, FLOW_SURE = 0.1, 0.5  # distances from mid grey up to which, and from which on, a painted direction counts
 
 
 @dataclass(frozen=True)
@@ -114,33 +116,73 @@ def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.nda
 
     The nearest of about 200,000 texels of the same side answers.
     """
-    weights = np.array([0.2126, 0.7152, 0.0722], np.float32)
-    light = np.concatenate(
-        [
-            srgb_from_linear(m.albedo[rows][t.covered[rows]] @ weights)
-            for t, m in zip(texels, start, strict=True)
-            for rows in bands(*t.covered.shape)
-        ]
-    )
-    if len(light) == 0 or light.std() < PLAIN:
+    if not any(t.covered.any() for t in texels):
         return None
+    near, chosen = nearest_texels(texels)
+    weights = np.array([0.2126, 0.7152, 0.0722], np.float32)
+    own = zip(start, chosen, strict=True)
+    light = np.concatenate([srgb_from_linear(m.albedo.reshape(-1, 3)[few] @ weights) for m, few in own])
+    return None if light.std() < PLAIN else lambda where, facing: light[near(where, facing)]
+
+
+def nearest_texels(
+    texels: Sequence[Texels],
+) -> tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], list[Int[np.ndarray, " n"]]]:
+    """About FEW_TEXELS of the covered texels, as flat indices of each set, and which of them, counted through all sets,
+    lies nearest to points (positions, normals) of the surface, of the same side."""
     from scipy.spatial import KDTree
 
-    every = max(len(light) // CONTENT_TEXELS, 1)
-    reach = np.float32(0.02)  # working units by which a turn of the normal by one radian counts
     counts = np.cumsum([0] + [int(t.covered.sum()) for t in texels])
-    places = []
-    for t, first, end in zip(texels, counts[:-1], counts[1:], strict=True):
-        chosen = np.flatnonzero(t.covered)[int(-first % every) : end - first : every]
-        parts = t.position.reshape(-1, 3)[chosen], reach * t.normal.reshape(-1, 3)[chosen]
-        places.append(np.concatenate(parts, axis=1))
-    tree = KDTree(np.concatenate(places))
-    few = light[::every]
+    every = max(int(counts[-1]) // FEW_TEXELS, 1)
+    reach = np.float32(0.02)  # working units by which a turn of the normal by one radian counts
+    spans = zip(texels, counts[:-1], counts[1:], strict=True)
+    chosen = [np.flatnonzero(t.covered)[int(-first % every) : end - first : every] for t, first, end in spans]
+    both = zip(texels, chosen, strict=True)
+    parts = [(t.position.reshape(-1, 3)[few], reach * t.normal.reshape(-1, 3)[few]) for t, few in both]
+    tree = KDTree(np.concatenate([np.concatenate(part, axis=1) for part in parts]))
 
-    def at(where: np.ndarray, facing: np.ndarray) -> np.ndarray:
-        return few[tree.query(np.concatenate([where, reach * facing], axis=1), workers=-1)[1]]
+    def near(where: np.ndarray, facing: np.ndarray) -> np.ndarray:
+        return np.asarray(tree.query(np.concatenate([where, reach * facing], axis=1), workers=-1)[1])
 
-    return at
+    return near, chosen
+
+
+def painted_course(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> Course | None:
+    """Where strokes shall run by a picture in the mesh's UVs (row 0 is v = 1): red and green, less one half, are the
+    direction along u and v. The further a colour is from mid grey, and the more opaque, the more it counts; half way is
+    fully.
+
+    Lines have no sign: opposite colours mean the same.
+    """
+    if path is None:
+        return None
+    from mistyle.files.read import read_picture
+
+    found = read_picture(path)
+    alpha = np.ones(found.rgb.shape[:2], np.float32) if found.alpha is None else found.alpha
+    near, chosen = nearest_texels(texels)
+    tangents, flows, frames = corner_tangents(mesh), [], []
+    for t, few in zip(texels, chosen, strict=True):
+        wide = resize(2 * found.rgb[..., :2] - 1, t.covered.shape) * resize(alpha, t.covered.shape)[..., None]
+        flows.append(wide.reshape(-1, 2)[few])
+        place = t.face.ravel()[few], t.position.reshape(-1, 3)[few], t.normal.reshape(-1, 3)[few]
+        frames.append(texel_frames(mesh, *place, tangents)[:, :2])
+    flow = np.concatenate(flows)
+    length = np.linalg.norm(flow, axis=1)
+    counts = np.clip((length - FLOW_FREE) / (FLOW_SURE - FLOW_FREE), 0, 1).astype(np.float32)
+    world = np.einsum("tk,tkx->tx", flow, np.concatenate(frames))
+    world /= np.maximum(np.linalg.norm(world, axis=1, keepdims=True), 1e-9)
+    if not counts.any():
+        raise InputRefused(
+            f"{path}: mid grey or transparent everywhere; a direction map says with red (along u) and green (along v) "
+            "where strokes run"
+        )
+
+    def course(where: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        index = near(where, facing)
+        return world[index], counts[index]
+
+    return course
 
 
 def lay_relief(

@@ -5,6 +5,7 @@ They follow the direction of least curvature where the surface bends more one wa
 tone where the shading has a slope; elsewhere they run level. Diffusion over the surface joins these into one field.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,11 @@ AROUND = 17  # neighbours of a point, itself included
 ROUNDS = 60
 HOLD = 0.06  # share of the data in each round of diffusion
 LEVEL_LINES = 0.02  # weight of horizontal strokes where nothing else speaks
+PAINTED_LINES = 2.0  # weight of strokes whose course somebody painted: as much as a form can say
+
+Course = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""What a person wants: (positions, normals) of surface points -> unit directions (n, 3) along the surface, and how much
+they count against the form, 0..1."""
 
 
 @dataclass(frozen=True)
@@ -28,16 +34,19 @@ class LineField:
     tensors: Float[np.ndarray, "n 3 3"]
 
 
-def line_field(points: Points, follow: str = "curvature") -> LineField:
+def line_field(points: Points, follow: str = "curvature", course: Course | None = None) -> LineField:
     """The field at `points` (5,000 to 10,000 are enough; the diffusion reaches some tens of spacings).
 
     `follow` "curvature" asks the form; "up" makes strokes run up and down, "around" level, wherever the surface is not
-    level itself.
+    level itself. Where `course` counts it takes the place of either.
     """
     index = nearest(points, points, AROUND)[1]
     normals = points.normals.astype(np.float64)
     weight = ((normals[index] * normals[:, None]).sum(axis=2) > 0.1).astype(np.float64)
     data = observed(points, normals, index, weight) if follow == "curvature" else asked(normals, follow)
+    if course is not None:
+        towards, share = course(points.positions, points.normals)
+        data = (1 - share)[:, None, None] * data + PAINTED_LINES * lines(towards.astype(np.float64), share)
     project = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     share = weight / weight.sum(axis=1, keepdims=True)
     tensors = data

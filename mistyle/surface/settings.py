@@ -30,7 +30,7 @@ class SurfaceSettings(BaseModel):
         default=4.0, ge=0.0, le=16.0, description="how strongly cavities and ridges demand dark and light strokes"
     )
     relief: float = Field(
-        default=2.4,
+        default=1.7,
         ge=0.0,
         le=6.0,
         description="contrast of those strokes, in standard deviations of the painting's own",
@@ -49,7 +49,7 @@ class SurfaceSettings(BaseModel):
         description="how much the light and dark of the asset's own texture count, against those of its shape",
     )
     palette: float = Field(
-        default=1.0, ge=0.0, le=8.0, description="how strictly a place takes the colour that optimal transport gave it"
+        default=0.2, ge=0.0, le=8.0, description="how strictly a place takes the colour that optimal transport gave it"
     )
     liveliness: float = Field(
         default=0.8,
@@ -70,7 +70,7 @@ class SurfaceSettings(BaseModel):
         description="price of leaving a stroke: higher copies larger pieces of the painting",
     )
     variety: float = Field(
-        default=0.003, ge=0.0, le=0.05, description="price of using a part of the painting more often than the others"
+        default=0.016, ge=0.0, le=0.05, description="price of using a part of the painting more often than the others"
     )
     orientation: float = Field(
         default=0.02, ge=0.0, le=0.5, description="how strictly strokes follow the line field of the surface"
@@ -100,6 +100,11 @@ class CoatSettings(BaseModel):
         description="further pictures: SLOT=PICTURE, SLOT being a material of the mesh or a mask picture in its UVs",
     )
     style_mask: Path | None = Field(default=None, description="picture as large as the style: dark parts are not used")
+    direction_map: Path | None = Field(
+        default=None,
+        description="picture in the mesh's UVs: red and green are the strokes' direction along u and v, as in engines' "
+        "flow maps; mid grey and transparent parts leave it to `surface.direction`",
+    )
     protect: Path | None = Field(default=None, description="picture in the mesh's UVs: light parts keep their own look")
     stroke_size: float | None = Field(
         default=None,

@@ -7,9 +7,9 @@ place p (page, x, y) of the painting with the least
     |D_p - D_s|^2 + detail w(s) (band_p - relief std(band) d_s)^2 + variety use(p) / wanted use(p)
         + stroke_coherence * sum over 4 neighbours of [1 if on another page, else min(jump^2, 4) / 4]
 
-where D joins 16 principal components of the patch (Lab / 100, over 5), the large-area colour (weights 1, 0.6, 0.6 times
-`palette`) and the stroke direction (`orientation`); d_s is the detail guide, w(s) = min(|d_s|, 1.5)^1.5, jump the
-distance in pixels from where the neighbour's picture would go on.
+where D joins 16 principal components of the patch (Lab / 100, over 5), the large-area colour (weights 1, 0.6, 0.6
+times `palette`, five times that for paintings of two tones) and the stroke direction (`orientation`); d_s is the detail
+guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance in pixels from where the neighbour's picture would go on.
 
 The search is deterministic: all places are tried for all samples on the coarse levels; on every level a sample tries
 to go on with its neighbours' pictures (coherent search, Ashikhmin 2001) and a fixed set of steps about its own place.
@@ -27,7 +27,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.surface import kernels, style
 from mistyle.surface.glaze import glaze
 from mistyle.surface.guides import Content, Guide, Occlusion, guides
-from mistyle.surface.linefield import directions, line_field
+from mistyle.surface.linefield import Course, directions, line_field
 from mistyle.surface.lookup import Solution, solution
 from mistyle.surface.samples import Level, nearest, sample_normals, spread, with_tables
 from mistyle.surface.settings import SurfaceSettings
@@ -44,6 +44,7 @@ ALL_PAIRS = 1.2e9  # sample-pixel pairs up to which all are tried, summed over t
 CHUNK_PAIRS = 8_000_000
 INITIAL_JITTER = 0.004
 CHROMA = 0.6
+TWO_TONES = 5.0  # how many times as much the large-area colour of a painting without middle tones counts
 LEAST_WANTED = 0.1
 TYPICAL_LOAD = 0.35  # mean urgency of detail at which its weight is the setting's
 UNREACHABLE = 1e3  # descriptor of pixels that must not be used: farther than anything else
@@ -76,18 +77,20 @@ def solve(
     *,
     alpha: Float[np.ndarray, "h w"] | None = None,
     content: Content | None = None,
+    course: Course | None = None,
     device: str = "llvm",
 ) -> Solution:
     """Paint `mesh` in the style of `picture_rgb` (encoded sRGB, 0..1), of whose transparent parts nothing is used.
 
-    `occlusion(positions, normals)` gives the share of open sky at points of the surface, 0..1. The answer holds for
+    `occlusion(positions, normals)` gives the share of open sky at points of the surface, 0..1; `course` where strokes
+    shall run. The answer holds for
     any point of the surface (`lookup.colour`) at the painting's own resolution. 250,000 samples take about 20 CPU
     seconds and 0.9 GB. Raises InputRefused for a mesh without area and for an unusable picture. It copies pieces of
     the painting: recognisable objects in it (a star, an eye) may appear on the surface.
     """
     dj = kernels.module(device)
     begun = lambda done: progress(0.25 * done)  # noqa: E731
-    painting, levels, wanted = prepared(mesh, picture_rgb, settings, seed, occlusion, begun, alpha, content, dj)
+    painting, levels, wanted = prepared(mesh, picture_rgb, settings, seed, occlusion, begun, alpha, content, course, dj)
     progress(0.35)
     choice, book = synthesise(levels, wanted, painting, settings, seed, dj, lambda done: progress(0.35 + 0.65 * done))
     laid = glaze(levels, wanted[-1], book.lab[pixels(book, choice), 0], book, settings)
@@ -103,11 +106,12 @@ def prepared(
     progress: Callable[[float], None],
     alpha: Float[np.ndarray, "h w"] | None,
     content: Content | None,
+    course: Course | None,
     dj: ModuleType,
 ) -> tuple[style.Painting, list[Level], list[Guide]]:
     """What the search begins from: the painting, the samples coarse to fine, and what each of them asks for."""
     painting = style.prepare(picture_rgb, settings.crop, alpha)
-    levels = hierarchy(mesh, settings, seed, dj, progress)
+    levels = hierarchy(mesh, settings, seed, dj, progress, course)
     rng = np.random.default_rng([seed, 2])
     palette = style.palette(painting, settings.liveliness, rng, settings.palette_mix)
     wanted = guides(levels, palette, occlusion, settings.bake_light, rng, content, settings.keep_content)
@@ -134,11 +138,12 @@ def hierarchy(
     seed: int,
     dj: ModuleType,
     progress: Callable[[float], None] = lambda done: None,
+    course: Course | None = None,
 ) -> list[Level]:
     """Samples, frames along the strokes and neighbour tables, coarse to fine, four times as many each level."""
     normals = sample_normals(mesh)
     rng = np.random.default_rng([seed, 1])
-    field = line_field(spread(mesh, normals, LINE_POINTS, rng, dj), settings.direction)
+    field = line_field(spread(mesh, normals, LINE_POINTS, rng, dj), settings.direction, course)
     progress(0.15)
     count = level_count(settings)
     levels = []
@@ -220,7 +225,7 @@ def paint_level(
 ) -> Choice:
     """Search and vote, `rounds` times over, from `start` or (None) from what the guides alone ask for."""
     basis = style.patch_basis(pages, rng)
-    guide_scale = guide_weights(settings)
+    guide_scale = guide_weights(settings, pages)
     described = described_pages(pages, guide_scale)
     axes, mean = kernels.floats(dj, basis.axes / 5), kernels.floats(dj, basis.mean)
     lab = kernels.floats(dj, pages.lab)
@@ -258,9 +263,13 @@ def paint_level(
     return on_host(place)
 
 
-def guide_weights(settings: SurfaceSettings) -> Float[np.ndarray, " 5"]:
-    """Square roots of the weights of colour (L, a, b) and stroke direction (2), by which descriptors are multiplied."""
-    palette = settings.palette * np.array([1, CHROMA, CHROMA])
+def guide_weights(settings: SurfaceSettings, pages: style.Pages) -> Float[np.ndarray, " 5"]:
+    """Square roots of the weights of colour (L, a, b) and stroke direction (2), by which descriptors are multiplied.
+
+    Where a painting has two tones only, its large-area colour is all that says where strokes are: it counts more.
+    """
+    stricter = 1 + (TWO_TONES - 1) * (1 - style.middle_tones(pages.lab[:, 0]))
+    palette = settings.palette * stricter * np.array([1, CHROMA, CHROMA])
     return np.sqrt(np.concatenate([palette, [settings.orientation] * 2])).astype(np.float32)
 
 

@@ -18,6 +18,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
 from mistyle.surface import kernels, lookup, style
 from mistyle.surface.guides import Content, Guide, Occlusion
+from mistyle.surface.linefield import Course
 from mistyle.surface.samples import CENTRE, GRID, Level, Points, as_points, carry, drop, unit
 from mistyle.surface.settings import SurfaceSettings
 from mistyle.surface.synthesis import Pins, prepared, synthesise
@@ -67,11 +68,14 @@ def ground(
     *,
     alpha: Float[np.ndarray, "h w"] | None = None,
     content: Content | None = None,
+    course: Course | None = None,
     device: str = "llvm",
 ) -> Ground:
     """The guides of `mesh` for a painting (encoded sRGB, 0..1); as in `mistyle.surface.synthesis.solve`."""
     dj = kernels.module(device)
-    painting, levels, wanted = prepared(mesh, picture_rgb, settings, seed, occlusion, progress, alpha, content, dj)
+    painting, levels, wanted = prepared(
+        mesh, picture_rgb, settings, seed, occlusion, progress, alpha, content, course, dj
+    )
     return Ground(tuple(levels), tuple(wanted), painting, settings)
 
 
