@@ -3,8 +3,9 @@
 Each job runs in a process of its own, with few steps and turntable frames, on which memory does not hang. Figures:
 `<case>.estimate_gb`, `<case>.peak_gb`, `<case>.error` (estimate / peak - 1); and for a job that is given less than it
 would take, `budget.asked_gb`, `budget.peak_gb` and `budget.same_bytes` (1: its asset is that of the job without a
-budget, byte for byte). --quick runs the draft on spot, the fit at 256² and a small budget. `--stages` also prints every
-stage's peak beside its estimate, from which the constants of run/budget.py come.
+budget, byte for byte); `tiled.asked_gb` and `tiled.peak_gb` of an atlas of 8192² with 64 views. --quick runs the draft
+on spot, the fit at 256² and a small budget. `--stages` also prints every stage's peak beside its estimate, from which
+the constants of run/budget.py come.
 """
 
 import argparse
@@ -32,6 +33,7 @@ STYLIZE: dict[str, list[Any]] = {
     "atlas_4096": ["stylize", SPOT, WAVE, *DRAFT, "--atlas", "4096"],
     "views_64": ["stylize", SPOT, WAVE, *DRAFT, "--set", "rig.kind=turntable", "--set", "rig.views=64"],
 }
+TILED = [*DRAFT, "--atlas", "8192", "--set", "rig.kind=turntable", "--set", "rig.views=64"]
 FITS = {"fit_256": ("256", "256"), "fit_512": ("512", "256")}  # atlas, pixels of the 16 pictures
 PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main())"
 
@@ -44,7 +46,9 @@ def main() -> None:
     options.add_argument("--stages", action="store_true", help="also print every stage's peak and estimate")
     options.add_argument("--keep", type=Path, help="folder for the runs, to look at afterwards")
     chosen = options.parse_args()
-    wanted = chosen.only or (["draft_spot", "fit_256", "budget"] if chosen.quick else [*STYLIZE, *FITS, "budget"])
+    wanted = chosen.only or (
+        ["draft_spot", "fit_256", "budget"] if chosen.quick else [*STYLIZE, *FITS, "budget", "tiled"]
+    )
     figures: dict[str, float] = {}
     with tempfile.TemporaryDirectory() as scratch:
         place = chosen.keep or Path(scratch)
@@ -53,6 +57,8 @@ def main() -> None:
                 found = stylized(place / name, STYLIZE[name], chosen.stages)
             elif name in FITS:
                 found = fitted(place / name, *FITS[name], chosen.stages)
+            elif name == "tiled":
+                found = tiled(place / name, 4.0)
             else:
                 found = budget(place / name, chosen.quick)
             figures |= {f"{name}.{key}": value for key, value in found.items()}
@@ -109,6 +115,12 @@ def budget(out: Path, quick: bool) -> dict[str, float]:
     made = mistyle(*words, "-o", out / "kept", "--memory", f"{asked}G")
     same = assets(out / "free") == assets(out / "kept")
     return {"free_gb": free["peak_gb"], "asked_gb": asked, "peak_gb": made["peak_gb"], "same_bytes": float(same)}
+
+
+def tiled(out: Path, asked: float) -> dict[str, float]:
+    """What a job that is far too large for its budget held of main memory."""
+    made = mistyle("stylize", SPOT, WAVE, *TILED, "-o", out, "--memory", f"{asked}G")
+    return {"asked_gb": asked, "peak_gb": made["peak_gb"]}
 
 
 def assets(out: Path) -> list[str]:
