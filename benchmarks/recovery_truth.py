@@ -21,6 +21,7 @@ import numpy as np
 from mistyle.core.camera import Camera, in_frame, px_from_world
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import nearest_fill
+from mistyle.core.lanes import aligned
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.files.read import read_mesh
@@ -196,8 +197,8 @@ def seen(truth: Truth, cameras: Sequence[Camera]) -> tuple[np.ndarray, ...]:
             to /= distance[:, None]
             px, z = px_from_world(camera, points)
             facing = ((to * n).sum(axis=1) > LEAST_COSINE) & in_frame(camera, px) & (z > 0)
-            ray = mi.Ray3f(mi.Point3f(np.ascontiguousarray(origin.T)), mi.Vector3f(np.ascontiguousarray(to.T)))
-            ray.maxt = mi.Float(np.ascontiguousarray(distance * 0.999))
+            ray = mi.Ray3f(mi.Point3f(aligned(origin.T)), mi.Vector3f(aligned(to.T)))
+            ray.maxt = mi.Float(aligned(distance * 0.999))
             count[texels.covered] += facing & ~np.array(scene.ray_test(ray))
         result.append(count)
     return tuple(result)

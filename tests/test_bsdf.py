@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mistyle.core.lanes import aligned
 from mistyle.render import bsdf, device
 
 COUNT = 8000
@@ -44,7 +45,7 @@ def mitsubas(given, flip, shadow, specular=0.5):
     count = len(given["wi"])
 
     def texture(values):
-        data = mi.TensorXf(np.ascontiguousarray(values.reshape(2, count // 2, -1)))
+        data = mi.TensorXf(aligned(values.reshape(2, count // 2, -1)))
         return {"type": "bitmap", "data": data, "raw": True, "filter_type": "nearest"}
 
     inner = {"type": "principled", "specular": specular, "base_color": texture(given["albedo"])}

@@ -13,6 +13,7 @@ from helpers import ROOT
 
 from mistyle.core.camera import Camera, orbit, pixel_centres, px_from_world, world_from_px, zoom
 from mistyle.core.errors import EnvironmentMissing, InputRefused
+from mistyle.core.lanes import aligned
 from mistyle.core.light import (
     Directional,
     SphericalGaussian,
@@ -319,7 +320,7 @@ def test_the_papers_environment_is_its_spherical_gaussians(rng: np.random.Genera
     directions = directions[np.abs(directions[:, 1]) < 0.97]
     exact = sum(spherical_gaussian(light, directions) for light in rig)
     loaded = mi.load_file(str(ROOT / "scenes" / "paper_views.xml"), optimize=False, spp="1")
-    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(np.ascontiguousarray(directions.T, np.float32)))
+    ray = mi.Ray3f(mi.Point3f(0), mi.Vector3f(aligned(directions.T)))
     hit = mi.Scene.ray_intersect(mi.load_dict({"type": "scene", "e": loaded.environment()}), ray)
     seen = np.array(loaded.environment().eval(hit)).T
     # Half floats and linear interpolation between texels of 2.8 degrees.

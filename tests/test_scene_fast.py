@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from test_scene_fit import bitmap, smooth
 
+from mistyle.core.lanes import aligned
 from mistyle.render import device, scene_fit, scene_grad, scene_job, scene_keys
 from mistyle.render.scene_fast import Fast, NotFast
 
@@ -44,9 +45,9 @@ def mesh(name, bsdf, scale=1.0, shift=(0.0, 0.0, 0.0), side=1) -> Any:
     shape = mi.Mesh(name, len(positions), len(faces), props=props, has_vertex_normals=True, has_vertex_texcoords=True)
     table = mi.traverse(shape)
     table["vertex_positions"] = mi.Float((positions * scale + np.array(shift)).astype(np.float32).ravel())
-    table["vertex_normals"] = mi.Float(normals.astype(np.float32).ravel())
-    table["vertex_texcoords"] = mi.Float(uv.astype(np.float32).ravel())
-    table["faces"] = mi.UInt32(faces.astype(np.uint32).ravel())
+    table["vertex_normals"] = mi.Float(aligned(normals).ravel())
+    table["vertex_texcoords"] = mi.Float(aligned(uv).ravel())
+    table["faces"] = mi.UInt32(aligned(faces, np.uint32).ravel())
     table.update()
     return shape
 
