@@ -66,7 +66,7 @@ def fetch(name: str, folder: Path, allowed: bool) -> Path:
 
 
 def adopt(name: str, folder: Path) -> Path:
-    """Take a folder of weights as it lies there for the model `name`: its hashes go into the folder's lock.
+    """Take a folder of weights as it lies there for the model `name`: their hashes go into the folder's lock.
 
     For weights that are not the published ones, on purpose. Raises EnvironmentMissing where the folder is not complete.
     """
@@ -75,7 +75,7 @@ def adopt(name: str, folder: Path) -> Path:
     if lost:
         raise EnvironmentMissing(f"{lost[0]} is not there; {name} needs {', '.join(model.folders + model.loose)}")
     lock = models.read_lock(folder)
-    entries = {path: _checked(place / path, None) for path in _files(place)}
+    entries = {path: _checked(place / path, None) for path in _files(place) if path.endswith(".safetensors")}
     lock[name] = {"repo": model.repo, "revision": "adopted", "files": entries}
     models.write_lock(folder, lock)
     return place

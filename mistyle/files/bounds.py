@@ -6,6 +6,7 @@ from urllib.parse import unquote
 
 from mistyle.core.errors import InputRefused
 
+USD = (".usd", ".usda", ".usdc", ".usdz")
 MAX_FILE_BYTES = 2 << 30
 MAX_JSON_BYTES = 64 << 20
 MAX_SETTINGS_BYTES = 4 << 20  # of a TOML or YAML file

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.bounds import MAX_FILE_BYTES, refuse
+from mistyle.files.bounds import MAX_FILE_BYTES, USD, refuse
 
-LAYERS = (".usd", ".usda", ".usdc", ".usdz")
 MAX_LAYERS = 2_000
 MAX_ENTRIES = 20_000
 COPY = "Copy it into the mesh's folder, or flatten the stage (usdcat --flatten)"
@@ -82,8 +81,8 @@ def check_layers(pxr: Any, path: Path) -> list[Path]:
             raise refuse(path, found, f"at most {MAX_LAYERS} and {MAX_FILE_BYTES >> 20} MiB", "Flatten the stage")
         for reference in _named(pxr, here, path):
             there = locate(root, _inside(here), reference)
-            if Path(there.inner or there.file).suffix.lower() not in LAYERS:
-                raise refuse(path, f"a layer {reference[:120]!r}", f"layers of kind {' '.join(LAYERS)}", COPY)
+            if Path(there.inner or there.file).suffix.lower() not in USD:
+                raise refuse(path, f"a layer {reference[:120]!r}", f"layers of kind {' '.join(USD)}", COPY)
             if there.inner and there.inner.lower().endswith(".usdz"):
                 raise refuse(path, f"a package in a package ({reference[:120]!r})", "one package", "Package it again")
             if str(there) not in seen:

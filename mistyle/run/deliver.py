@@ -16,10 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
+from mistyle.files.bounds import USD
 from mistyle.files.packing import TARGETS
 from mistyle.files.store import atomic_folder, atomic_write, carry_over, digest, sha256_file
 from mistyle.files.textures import safe_name
-from mistyle.files.usd_layers import LAYERS
 from mistyle.run.colour import key_of, light_space, picture_space
 from mistyle.run.deliver_files import Delivery, fields_for, write_delivery
 from mistyle.run.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
@@ -175,7 +175,7 @@ def deliver(job: Any, progress: Any) -> dict[str, dict[str, list[str]]]:
                 names=chosen.textures,
                 metres_per_unit=chosen.metres_per_unit,
                 colour=job.settings.colour,
-                source=job.mesh if job.mesh.suffix.lower() in LAYERS else None,
+                source=job.mesh if job.mesh.suffix.lower() in USD else None,
             )
             made[target] = [str(path) for path in files]
             report(len(made) / len(chosen.chosen_targets))

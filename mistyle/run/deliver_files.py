@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.files.bounds import USD
 from mistyle.files.materialx import Look, write_materialx
 from mistyle.files.obj_write import write_obj
 from mistyle.files.ocio import ColourSpace, exr_tags
 from mistyle.files.packing import TARGETS, Target, TextureSet, write_slot
 from mistyle.files.store import sha256_file
 from mistyle.files.textures import safe_name
-from mistyle.files.usd_layers import LAYERS
 from mistyle.run.finished import Finished
 
 # What materials in files refer to: every map by itself, whatever the target packs.
@@ -117,7 +117,7 @@ def _materials(folder: Path, out: Path, finished: Finished, chosen: Delivery, ki
         write_obj(folder / f"{chosen.name}.obj", mesh, positions, tiles, looks)
     if "mtlx" in chosen.formats:
         write_materialx(folder / f"{chosen.name}.mtlx", looks)
-    if "usd" in chosen.formats and Path(str(finished.manifest.get("source", ""))).suffix.lower() in LAYERS:
+    if "usd" in chosen.formats and Path(str(finished.manifest.get("source", ""))).suffix.lower() in USD:
         return _look_layer(folder, out, finished, chosen, looks)
     if "usd" in chosen.formats:
         from mistyle.files.usd import write_usd, write_usdz

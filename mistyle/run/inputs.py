@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.usd_layers import LAYERS
+from mistyle.files.bounds import USD
 
 
 def input_files(path: Path) -> tuple[Path, ...]:
@@ -13,7 +13,7 @@ def input_files(path: Path) -> tuple[Path, ...]:
         raise InputRefused(
             f"{path}: found {found}, expected a mesh file (.obj .ply .stl .off .glb .gltf .usd); check the path"
         )
-    if path.suffix.lower() in LAYERS:
+    if path.suffix.lower() in USD:
         from mistyle.files.read import read_usd_files
 
         return (path, *sorted(p for p in read_usd_files(path) if p != path.resolve()))

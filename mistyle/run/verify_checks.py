@@ -14,12 +14,12 @@ from typing import Any, Literal
 import numpy as np
 
 from mistyle.core.errors import MistyleError
+from mistyle.files.bounds import USD
 from mistyle.files.store import sha256_file
-from mistyle.files.usd_layers import LAYERS
 from mistyle.run.blender import BLENDER, OPEN_WORKER, blender_command
 
 Outcome = Literal["passed", "failed", "not checked"]
-MODELS = (".glb", ".gltf", *LAYERS, ".obj")
+MODELS = (".glb", ".gltf", *USD, ".obj")
 VALIDATE = """
 const fs = require('fs'), path = require('path'), validator = require('gltf-validator');
 const file = process.argv[1], folder = path.dirname(file);
@@ -234,6 +234,6 @@ def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None)
 READERS: dict[str, tuple[Callable[[Path, str], Iterator[Check]], ...]] = {
     **dict.fromkeys((".glb", ".gltf"), (gltf, by_trimesh)),
     ".obj": (by_trimesh,),
-    **dict.fromkeys(LAYERS, (usd,)),
+    **dict.fromkeys(USD, (usd,)),
     ".mtlx": (materialx,),
 }
