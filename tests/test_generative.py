@@ -132,6 +132,8 @@ def test_a_wrong_architecture_and_a_missing_lora_end_it_too(tmp_path, capsys):
     assert "this is not a ControlNet for SDXL" in capsys.readouterr().err
     assert stylize(tmp_path / "out", "--style-mask", str(scenes() / "demo_style.png")) == 2
     assert "crop the picture instead" in capsys.readouterr().err
+    assert stylize(tmp_path / "out", "--direction-map", str(scenes() / "demo_style.png")) == 2
+    assert "cannot follow it" in capsys.readouterr().err
     assert stylize(tmp_path / "out", "--style-lora", str(tmp_path / "no.safetensors")) == 3
     assert "check the path" in capsys.readouterr().err and not (tmp_path / "out").exists()
 

@@ -11,7 +11,7 @@ import trimesh
 from PIL import Image
 
 import mistyle
-from mistyle.core.errors import Stopped, UsageError
+from mistyle.core.errors import InputRefused, Stopped, UsageError
 from mistyle.run import painting, pipeline
 from mistyle.run.progress import Progress
 from mistyle.run.settings import resolve
@@ -125,6 +125,14 @@ def test_a_second_run_takes_everything_over_and_from_redoes(inputs, whole):
 def test_unknown_stages_and_busy_folders_are_refused(inputs, tmp_path):
     with pytest.raises(UsageError, match="there is no such stage"):
         pipeline.stylize(job(inputs, tmp_path / "a", redo_from="paint"), Progress(quiet=True))
+
+
+@pytest.mark.parametrize("name", ["style_mask", "protect", "direction_map"])
+def test_pictures_of_the_coat_that_are_not_there_end_it_at_once(inputs, tmp_path, name):
+    settings = resolve("draft", None, {**TINY, "coat": {name: str(tmp_path / "no.png")}}, {})
+    with pytest.raises(InputRefused, match=r"no\.png: found nothing; expected a picture"):
+        pipeline.stylize(Job(inputs[0], inputs[1], tmp_path / "a", settings, "bell"), Progress(quiet=True))
+    assert not (tmp_path / "a").exists()
 
 
 def test_the_python_call_does_the_same(inputs, whole):

@@ -28,6 +28,8 @@ def check(settings: Settings, say: Callable[[str], None]) -> None:
 
         if settings.coat.style_mask is not None:
             raise UsageError("--style-mask: the diffusion stylizer learns whole pictures; crop the picture instead")
+        if settings.coat.direction_map is not None:
+            raise UsageError("--direction-map: the diffusion stylizer cannot follow it; leave it out")
         check_stylizer(settings.models, settings.diffusion, settings.rig.resolution)
         if settings.rig.kind in ("paper", "turntable"):
             views = 16 if settings.rig.kind == "paper" else settings.rig.views

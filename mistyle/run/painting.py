@@ -8,6 +8,7 @@ import numpy as np
 
 from mistyle.core import memory
 from mistyle.core.asset import Asset, Picture
+from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import face_areas
@@ -22,6 +23,13 @@ from mistyle.surface.guides import Content
 from mistyle.surface.linefield import Course
 from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import CoatSettings
+
+
+def check_coat(chosen: CoatSettings) -> None:
+    """Refuse a coat whose pictures are not there, before anything is rendered."""
+    for path in (chosen.style_mask, chosen.protect, chosen.direction_map):
+        if path is not None and not path.is_file():
+            raise InputRefused(f"{path}: found nothing; expected a picture. Check the path")
 
 
 def coat_files(chosen: CoatSettings) -> list[Path]:

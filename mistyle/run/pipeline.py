@@ -22,7 +22,7 @@ from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import inpainter_inputs, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
-from mistyle.run.painting import bake, coat, coat_files, stylized_stage, unlit_views
+from mistyle.run.painting import bake, check_coat, coat, coat_files, stylized_stage, unlit_views
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Job, Run
@@ -59,6 +59,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     files = input_files(job.mesh)
     check(job.settings)
     style = read_style(job.style, job.settings.colour)
+    check_coat(job.settings.coat)
     check_generative(job.settings, progress.say)
     if job.settings.stylizer != "embedded":
         from mistyle.run.sweep import refuse_what_is_not_kept
