@@ -110,8 +110,9 @@ def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]
 
 def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str) -> Sight:
     """Check one reference picture against its camera. Raises InputRefused, calling the camera `name`."""
-    import mitsuba as mi
+    import mitsuba
 
+    mi: Any = mitsuba
     film: Any = sensor.film()
     columns, rows = (int(n) for n in film.crop_size())
     if reference.ndim != 3 or reference.shape[2] != 3:
@@ -138,11 +139,10 @@ def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str
     if film.base_channels_count() < 3:
         raise InputRefused(f'the film of {name} has one channel; expected <string name="pixel_format" value="rgb"/>.')
     clean = np.where(used[..., None], reference, 0)
-    tensor: Any = mi.TensorXb
     return Sight(
         sensor=sensor,
         reference=mi.TensorXf(aligned(clean)),
-        counts=tensor(np.ascontiguousarray(np.broadcast_to(used[..., None], clean.shape))),
+        counts=mi.TensorXb(aligned(np.broadcast_to(used[..., None], clean.shape), bool)),
         share=float(used.mean()),
     )
 

@@ -28,7 +28,7 @@ from mistyle.render.texel_algebra import Sums, flat_of, nothing, spread_of, step
 from mistyle.render.texel_records import UNKNOWNS, Observations, Options, Points, Rig, Solution
 from mistyle.render.texel_response import derivatives, differences, terms
 
-__all__ = ["UNKNOWNS", "Observations", "Options", "Points", "Problem", "Rig", "Solution", "aligned"]
+__all__ = ["UNKNOWNS", "Observations", "Options", "Points", "Problem", "Rig", "Solution"]
 
 LANES = 1 << 16
 LIGHTER, HEAVIER = 0.25, 5.0  # factors of the damping after a step that helped, and after one that did not

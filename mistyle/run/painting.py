@@ -25,20 +25,25 @@ from mistyle.surface.lookup import Solution
 from mistyle.surface.settings import CoatSettings
 
 
+def coat_pictures(chosen: CoatSettings) -> list[Path]:
+    """The pictures that a coat names and that must be there."""
+    return [path for path in (chosen.style_mask, chosen.protect, chosen.direction_map) if path is not None]
+
+
 def check_coat(chosen: CoatSettings) -> None:
     """Refuse a coat whose pictures are not there, before anything is rendered."""
-    for path in (chosen.style_mask, chosen.protect, chosen.direction_map):
-        if path is not None and not path.is_file():
+    for path in coat_pictures(chosen):
+        if not path.is_file():
             raise InputRefused(f"{path}: found nothing; expected a picture. Check the path")
 
 
 def coat_files(chosen: CoatSettings) -> list[Path]:
     """The files that a coat names: their contents count, not their names."""
-    named = [chosen.style_mask, chosen.protect, chosen.direction_map]
+    named = coat_pictures(chosen)
     for slot in chosen.slots:
         name, _, picture = slot.rpartition("=")
         named += [Path(name), Path(picture)]
-    return [path for path in named if path is not None and path.is_file()]
+    return [path for path in named if path.is_file()]
 
 
 def paint(

@@ -83,10 +83,9 @@ def solve(
     """Paint `mesh` in the style of `picture_rgb` (encoded sRGB, 0..1), of whose transparent parts nothing is used.
 
     `occlusion(positions, normals)` gives the share of open sky at points of the surface, 0..1; `course` where strokes
-    shall run. The answer holds for
-    any point of the surface (`lookup.colour`) at the painting's own resolution. 250,000 samples take about 20 CPU
-    seconds and 0.9 GB. Raises InputRefused for a mesh without area and for an unusable picture. It copies pieces of
-    the painting: recognisable objects in it (a star, an eye) may appear on the surface.
+    shall run. The answer holds for any point of the surface (`lookup.colour`) at the painting's own resolution. 250,000
+    samples take about 20 CPU seconds and 0.9 GB. Raises InputRefused for a mesh without area and for an unusable
+    picture. It copies pieces of the painting: recognisable objects in it (a star, an eye) may appear on the surface.
     """
     dj = kernels.module(device)
     begun = lambda done: progress(0.25 * done)  # noqa: E731
