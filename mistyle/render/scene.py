@@ -92,7 +92,8 @@ def mitsuba_mesh(
     values["faces"] = mi.UInt32(aligned(welded.faces.ravel(), np.uint32))
     values.update()
     for key, data in attributes.items():
-        shape.add_attribute(key, data.shape[1], aligned(data.ravel()))
+        flat: Any = aligned(data.ravel())
+        shape.add_attribute(key, data.shape[1], flat)
     dr.eval(values["vertex_positions"], values["vertex_normals"], values["vertex_texcoords"])
     return shape
 
