@@ -21,7 +21,7 @@ from mistyle.render.indirect import Indirect, averaged
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
-from mistyle.stages.recover_observe import gather
+from mistyle.stages.recover_observe import Gathered, gather
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
 
@@ -125,6 +125,40 @@ def test_says_how_sure_it_is(world, recovered):
     assert np.abs(roughness[least]).mean() > 2 * np.abs(roughness[most]).mean()
     assert (recovered.confidence[0][recovered.seen[0] == 0] == 0).all()
     assert not recovered.maps[0].known[~texels.covered].any()
+
+
+@pytest.mark.parametrize(("variation", "noise"), [(0.0, 0.01), (0.01, 0.01), (0.02, 0.005), (0.2, 0.01)])
+def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
+    """Texels that differ by `variation`, found with `noise` under a prior that has drawn them to their mean."""
+    from mistyle.render.texel_lm import Observations, Points, Rig, Solution
+    from mistyle.stages import recover_solve as solving
+
+    size, mean = 64, np.full((64 * 64, 7), 0.5, np.float32)
+    truth = mean + variation * rng.standard_normal(mean.shape)
+    found = truth + noise * rng.standard_normal(mean.shape)
+    prior, alone = np.full(mean.shape, 1 / 0.03**2, np.float32), 1 / noise**2
+    values = ((found * alone + mean * prior) / (alone + prior)).astype(np.float32)
+    spread = (1 / np.sqrt(alone + prior)).astype(np.float32)
+    solution = Solution(values, np.zeros(len(mean), np.float32), spread, spread, prior)
+    grid = np.ones((size, size - 1), bool), np.ones((size - 1, size), bool)
+    where = solving.Atlas(((size, size),), (np.ones((size, size), bool),), grid[:1], grid[1:], (np.arange(size**2),))
+    nine = 9 * np.arange(size**2 + 1)
+    zeros, none = np.zeros(nine[-1], np.float32), np.zeros((0, 3), np.float32)
+    seen = Observations(
+        nine, np.zeros(nine[-1], np.int32), np.zeros((nine[-1], 3), np.float32), zeros, zeros.astype(np.int32)
+    )
+    points = Points(np.zeros((size**2, 3), np.float32), np.zeros((size**2, 3, 3), np.float32))
+    rig = Rig(none, np.zeros(1, np.int32), none, none[:, 0], none)
+    count = np.zeros(size**2, np.int32)
+    gathered = Gathered(np.arange(size**2), points, rig, seen, (), count, count)
+    np.testing.assert_allclose(solving.likelihood(solution)[0], noise, rtol=1e-2)
+    firm = 1 / np.sqrt(solving.belief(solution, mean, gathered, where, 0.03))
+    wanted = np.clip(variation, solving.LEAST, 0.03)
+    if variation > 0:
+        np.testing.assert_allclose(np.median(firm[:, :6]), wanted, rtol=0.1)
+    else:
+        assert np.median(firm[:, :6]) < noise / 3
+    np.testing.assert_allclose(firm[:, 6], 0.03, rtol=1e-5)
 
 
 def test_the_same_bytes_again_and_after_an_interruption(world):
@@ -352,7 +386,8 @@ def test_descent_is_adam_with_masked_updates(rng, levels):
 
     device.use()
     size = (32, 32)
-    descent = Descent([size], (1, 1, 1, 1, 1, 1, 1, 0), levels=levels)
+    shares = rng.random((32 * 32, 8)).astype(np.float32)
+    descent = Descent([size], (1, 1, 1, 1, 1, 1, 1, 0), levels=levels, shares=shares)
     table = np.full((32 * 32, 8), 0.5, np.float32)
     x, wanted = table_on_device(table), table[:, :7].reshape(*size, 7).astype(np.float64)
     first, second, age = ([np.zeros((32 >> k, 32 >> k, c)) for k in range(levels)] for c in (7, 7, 1))
@@ -371,5 +406,5 @@ def test_descent_is_adam_with_masked_updates(rng, levels):
             with np.errstate(divide="ignore", invalid="ignore"):
                 step = first[k] / (1 - 0.9 ** age[k]) / (np.sqrt(second[k] / (1 - 0.99 ** age[k])) + 1e-12)
             step = np.where(on, step, 0).astype(np.float32)
-            wanted -= 0.01 * (resize(step, size) if k else step)
+            wanted -= 0.01 * (resize(step, size) if k else step) * shares[:, :7].reshape(*size, 7)
     np.testing.assert_allclose(np.array(x).reshape(*size, 8)[..., :7], wanted, atol=2e-5)

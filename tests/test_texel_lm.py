@@ -1,5 +1,7 @@
 """The batched per-texel solver: its derivatives, its answers on texels of known truth, and its determinism."""
 
+from dataclasses import fields
+
 import numpy as np
 import pytest
 
@@ -68,12 +70,9 @@ def best_of_starts(solver, count, roughness=(0.25, 0.7), metallic=(0.0,), iterat
                 best = found
             else:
                 better = found.cost < best.cost
-                best = lm.Solution(
-                    np.where(better[:, None], found.values, best.values),
-                    np.where(better, found.cost, best.cost),
-                    np.where(better[:, None], found.spread, best.spread),
-                    np.where(better[:, None], found.diagonal, best.diagonal),
-                )
+                pairs = {f.name: (getattr(found, f.name), getattr(best, f.name)) for f in fields(found)}
+                chosen = {n: np.where(better.reshape(-1, *[1] * (a.ndim - 1)), a, b) for n, (a, b) in pairs.items()}
+                best = lm.Solution(**chosen)
     assert best is not None
     return best
 

@@ -26,10 +26,11 @@ FINE = 0xFFFFFFFF  # nothing went wrong in this texel
 class Descent:
     """Moments of every level of every texture set's pyramid, and the step.
 
-    `rates` are factors of the rate per channel of the table (8 of them, 0: stands still); `still` names texels that do
-    not move at all; roughness stays within floor..1, |tilt| below `tilt`, the rest within 0..1. `damping` times the
-    root mean square of a level's gradients in a channel joins Adam's denominator: without it a number on which the
-    pictures hardly depend moves as fast as all others, by nothing but chance.
+    `rates` are factors of the rate per channel of the table (8 of them, 0: stands still), `shares` further ones by
+    texel and channel; `still` names texels that do not move at all; roughness stays within floor..1, |tilt| below
+    `tilt`, the rest within 0..1. `damping` times the root mean square of a level's gradients in a channel joins Adam's
+    denominator: without it a number on which the pictures hardly depend moves as fast as all others, by nothing but
+    chance.
     """
 
     def __init__(
@@ -42,6 +43,7 @@ class Descent:
         tilt: float = 0.95,
         damping: float = 0.0,
         still: Bool[np.ndarray, " t"] | None = None,
+        shares: Float[np.ndarray, "t 8"] | None = None,
     ) -> None:
         device.use()
         import mitsuba
@@ -58,6 +60,7 @@ class Descent:
         if still is not None:
             free[still] = FINE - 1
         self.blame = mi.UInt32(aligned(free, np.uint32))
+        self.shares = [] if shares is None else [mi.Float(aligned(shares.ravel()))]
         self._run = device.Frozen(self._step)
 
     def step(self, table: Any, gradient: Any, rate: float, picture: int) -> Any:
@@ -67,7 +70,7 @@ class Descent:
 
         mi: Any = mitsuba
         table, self.moments, self.ages, self.blame = self._run(
-            table, gradient, self.moments, self.ages, self.blame,
+            table, gradient, self.moments, self.ages, self.blame, self.shares,
             dr.opaque(mi.Float, float(rate)), dr.opaque(mi.UInt32, 8 * picture),
         )  # fmt: skip
         return table
@@ -96,7 +99,7 @@ class Descent:
         bad = np.flatnonzero(blame < FINE - 1)
         return [(int(k), CHANNELS[int(blame[k]) % 8], int(blame[k]) // 8) for k in bad]
 
-    def _step(self, table, gradient, moments, ages, blame, rate, picture) -> Any:
+    def _step(self, table, gradient, moments, ages, blame, shares, rate, picture) -> Any:
         import drjit as dr
         import mitsuba
 
@@ -130,6 +133,8 @@ class Descent:
             moved.append(total)
             start += count
         change = moved[0] if len(moved) == 1 else [dr.concat([m[c] for m in moved]) for c in range(8)]
+        for share in shares:
+            change = [change[c] * dr.gather(mi.Float, share, texel * 8 + c) for c in range(8)]
         new = [old[c] - rate * self.rates[c] * change[c] if self.rates[c] else old[c] for c in range(8)]
         new = [dr.select(moves, a, b) for a, b in zip(self._projected(new), old, strict=True)]
         table = dr.ravel(mi.ArrayXf(new))

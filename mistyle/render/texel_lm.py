@@ -91,7 +91,7 @@ class Problem:
                 chunk, start[texel], mean[texel], prior[texel], iterations
             )
             progress((k + 1) / len(self.chunks))
-        return Solution(values, cost, spread, diagonal)
+        return Solution(values, cost, spread, diagonal, prior)
 
     def predict(self, values: Float[np.ndarray, "t 7"]) -> Float[np.ndarray, "o 3"]:
         """The model's radiance of every observation."""

@@ -59,13 +59,14 @@ class Solution:
     """`values` (t, 7) in the order of UNKNOWNS; `cost` without the prior; `spread` (t, 7), standard deviations.
 
     spread² is the diagonal of the inverse of normal matrix + prior: what the observations leave open. `diagonal` is
-    that of the normal matrix alone.
+    that of the normal matrix alone, `prior` the weights that were asked for.
     """
 
     values: Float[np.ndarray, "t 7"]
     cost: Float[np.ndarray, " t"]
     spread: Float[np.ndarray, "t 7"]
     diagonal: Float[np.ndarray, "t 7"]
+    prior: Float[np.ndarray, "t 7"]
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,9 @@ class RecoverSettings(BaseModel):
         description="how often what the pictures still differ by is given back to the texels, which are solved again",
     )
     neighbours: float = Field(
-        default=0.03, gt=0, description="standard deviation between a texel and the mean of its neighbours"
+        default=0.03,
+        gt=0,
+        description="largest standard deviation between a texel and its neighbours' mean; smooth surfaces have less",
     )
     noise: float = Field(default=0.002, gt=0, le=1, description="standard deviation of a pixel in the dark")
     relative: float = Field(default=0.01, ge=0, le=1, description="standard deviation of a pixel relative to its value")

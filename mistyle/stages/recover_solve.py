@@ -6,10 +6,10 @@ what they still differ by is added to what the texels should reach (defect corre
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels
@@ -28,6 +28,8 @@ STARTS = (0.25, 0.7)  # roughness has local minima
 RESTARTS = 3  # rounds in which texels also try what their neighbours found
 MISFIT = 0.1  # cost per observation above which a texel has less to say to its neighbours
 BLUR = 4  # steps of spreading, each to the four nearest texels
+WIDE = 24  # steps over which the surface's own variance is measured
+LEAST = 0.002  # of the standard deviation between a texel and the mean of its neighbours
 
 Table = Float[np.ndarray, "a 8"]
 Values = Float[np.ndarray, "t 7"]
@@ -149,13 +151,13 @@ def best(solutions: Sequence[tuple[Solution, Float[np.ndarray, " t"]]]) -> Solut
         cost = other.cost + extra
         better = cost < least
         least = np.where(better, cost, least)
-        result = Solution(
-            np.where(better[:, None], other.values, result.values),
-            np.where(better, other.cost, result.cost),
-            np.where(better[:, None], other.spread, result.spread),
-            np.where(better[:, None], other.diagonal, result.diagonal),
-        )
+        names = [f.name for f in fields(Solution)]
+        result = Solution(**{n: _pick(better, getattr(other, n), getattr(result, n)) for n in names})
     return result
+
+
+def _pick(choice: Bool[np.ndarray, " t"], a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    return np.where(choice.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
 
 def another_round(
@@ -169,7 +171,7 @@ def another_round(
 ) -> Solution:
     """Solve again for targets corrected by `differences(k)`, reference minus render of picture k for `solution`.
 
-    Each texel's prior is the mean of its neighbours, weighted by how sure they are.
+    Each texel's prior is the mean of its neighbours, weighted by how sure they are, as firm as the surface is smooth.
     """
     target = problem.predict(solution.values)
     if len(target) < len(gathered.observations.rgb):
@@ -178,13 +180,8 @@ def another_round(
         if len(sighting.rows):
             target[sighting.rows] += fetch(differences(k), sighting)
     problem.retarget(target)
-    sure = 1 / np.maximum(solution.spread, 1e-4) ** 2
-    sure = np.minimum(sure, np.quantile(sure, 0.9, axis=0))
-    misfit = solution.cost / np.maximum(gathered.seen, 1) / MISFIT
-    sure = (sure / (1 + misfit[:, None]) ** 2).astype(np.float32)
-    sure[gathered.seen == 0] = 1e-6
-    mean = neighbourhood(solution.values, sure, gathered, where, BLUR)
-    prior = np.full(mean.shape, 1 / settings.neighbours**2, np.float32)
+    mean = neighbourhood(solution.values, sureness(solution, gathered), gathered, where, BLUR)
+    prior = belief(solution, mean, gathered, where, settings.neighbours)
 
     def tried(start: Values, steps: int, metal: Float[np.ndarray, " t"]) -> tuple[Solution, Float[np.ndarray, " t"]]:
         if not settings.metallic:
@@ -202,6 +199,41 @@ def another_round(
                 other[:, 5] = roughness
             solved.append(tried(other, 8, _nearest(mean)))
     return best(solved)
+
+
+def sureness(solution: Solution, gathered: Gathered) -> Values:
+    """What a texel counts in its neighbours' means: by its spread, and less where its observations do not fit."""
+    sure = 1 / np.maximum(solution.spread, 1e-4) ** 2
+    sure = np.minimum(sure, np.quantile(sure, 0.9, axis=0))
+    misfit = solution.cost / np.maximum(gathered.seen, 1) / MISFIT
+    sure = (sure / (1 + misfit[:, None]) ** 2).astype(np.float32)
+    sure[gathered.seen == 0] = 1e-6
+    return sure
+
+
+def belief(solution: Solution, mean: Values, gathered: Gathered, where: Atlas, neighbours: float) -> Values:
+    """How firmly each texel is held to `mean`, as weights of (x - mean)²: one over the variance of the surface itself.
+
+    Empirical Bayes: that variance is what the texels around differ by from their means, less what their own
+    observations leave open, at most `neighbours`² and at least LEAST². Metallic, which is 0 or 1, has `neighbours`.
+    """
+    open_, gain = likelihood(solution)
+    # Observations that do not fit say less than their number promises.
+    open_ = open_ * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
+    apart = (solution.values - mean) / np.maximum(gain, 1e-3)
+    weight = (1 / (open_**2 + neighbours**2) ** 2).astype(np.float32)
+    weight[gathered.seen == 0] = 0
+    variance = neighbourhood((apart**2 - open_**2).astype(np.float32), weight, gathered, where, WIDE)
+    variance = np.clip(variance, min(LEAST, neighbours) ** 2, neighbours**2)
+    variance[:, 6] = neighbours**2
+    return (1 / variance).astype(np.float32)
+
+
+def likelihood(solution: Solution) -> tuple[Values, Values]:
+    """What the observations alone leave open (standard deviations), and the share of a texel's distance from its prior
+    that they decide: 1 all of it, 0 none. Unknown by unknown, as if they did not depend on each other."""
+    alone = np.maximum(1 / np.maximum(solution.spread, 1e-6) ** 2 - solution.prior, 1e-6)
+    return 1 / np.sqrt(alone), alone / (alone + solution.prior)
 
 
 def _nearest(values: Values) -> Float[np.ndarray, " t"]:

@@ -35,10 +35,14 @@ class Work:
 
 @dataclass(frozen=True)
 class Found:
-    """What the texels found out by themselves, at the atlas's resolution; not `solved`: only where they start."""
+    """What the texels found out by themselves, at the atlas's resolution; not `solved`: only where they start.
+
+    `decided` is the share of a texel's tilt, 0..1, that its own pictures decide and not its neighbours.
+    """
 
     table: Float[np.ndarray, "a 8"]
     spread: Float[np.ndarray, "a 7"]
+    decided: Float[np.ndarray, " a"]
     seen: Int[np.ndarray, " a"]
     views: Int[np.ndarray, " a"]
     solved: bool
@@ -75,9 +79,10 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
                 for a, b, size in zip(where.offsets[:-1], where.offsets[1:], where.sizes, strict=True)
             ]
         )
-        for values in (found.table, found.spread, found.seen, found.views)
+        for values in (found.table, found.spread, found.decided, found.seen, found.views)
     ]
-    return Found(large[0].astype(np.float32), large[1], large[2][:, 0], large[3][:, 0], found.solved)
+    table, spread, decided, seen, views = large
+    return Found(table.astype(np.float32), spread, decided[:, 0], seen[:, 0], views[:, 0], found.solved)
 
 
 def _enlarged(values: np.ndarray, by: int) -> np.ndarray:
@@ -116,6 +121,7 @@ def solve_texels(
     first = mean.copy() if start is None else pack(start)[gathered.texel, :7].copy()
     mean[:, 6] = first[:, 6]
     spread = np.tile(np.array(solving.PRIOR_SPREAD, np.float32), (len(mean), 1))
+    decided = np.ones(len(mean), np.float32)
     values, solved = first, settings.solver != "pictures" and len(gathered.observations.rgb) > 0
     if solved:
         problem = Problem(
@@ -145,6 +151,7 @@ def solve_texels(
             progress(0.5 + 0.5 * (number + 1) / total)
         # Observations that do not fit say less than their number promises.
         values = solution.values
+        decided = solving.likelihood(solution)[1][:, 3:5].mean(axis=1)
         spread = solution.spread * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
         bad = np.asarray(~np.isfinite(values).all(axis=1))
         if bad.any():
@@ -156,6 +163,7 @@ def solve_texels(
     return Found(
         solving.spread_out(values, gathered, where),
         _placed(spread, gathered.texel, where, np.array(solving.PRIOR_SPREAD, np.float32)),
+        _placed(decided, gathered.texel, where, 1),
         _placed(gathered.seen + gathered.soft, gathered.texel, where, 0),
         _placed(gathered.views, gathered.texel, where, 0),
         solved,
