@@ -34,7 +34,8 @@ STYLIZE: dict[str, list[Any]] = {
     "views_64": ["stylize", SPOT, WAVE, *DRAFT, "--set", "rig.kind=turntable", "--set", "rig.views=64"],
 }
 TILED = [*DRAFT, "--atlas", "8192", "--set", "rig.kind=turntable", "--set", "rig.views=64"]
-FITS = {"fit_256": ("256", "256"), "fit_512": ("512", "256")}  # atlas, pixels of the 16 pictures
+# Atlas, pixels along a picture's side, pictures: looks at texels cost memory by their number, pictures by their size.
+FITS = {"fit_256": (256, 256, 16), "fit_512": (512, 256, 16), "fit_200": (1024, 128, 200), "fit_12mpx": (1024, 3464, 3)}
 PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main())"
 
 
@@ -88,20 +89,21 @@ def stylized(out: Path, words: list[Any], stages: bool) -> dict[str, float]:
     return error(told["memory_gb"], made["peak_gb"])
 
 
-def fitted(out: Path, atlas: str, pixels: str, stages: bool) -> dict[str, float]:
-    """Estimate and peak of a fit to 16 pictures that were rendered for it."""
+def fitted(out: Path, atlas: int, side: int, pictures: int, stages: bool) -> dict[str, float]:
+    """Estimate and peak of a fit to pictures that were rendered for it."""
     from mistyle.core.light import lights, to_json
     from mistyle.run.budget import MATERIAL, material_counts, material_gb, peaks
     from mistyle.run.material_settings import MaterialSettings
 
     views, light = out / "pictures", out / "lights.json"
-    mistyle("render", SPOT, "-o", views, "--resolution", pixels, "--spp", "4")
+    rig = ["--rig", "turntable", "--set", f"rig.views={pictures}"]
+    mistyle("render", SPOT, "-o", views, "--resolution", side, "--spp", "4", *rig)
     # Not what lit them: memory does not hang on how well the pictures are explained.
     light.write_text(json.dumps(to_json(lights("phase1"))))
     few = ["--lights", light, "--set", "recover.iterations=32", "--set", "report.frames=4"]
     made = mistyle("fit", SPOT, views, "-o", out / "fit", "--atlas", atlas, *few)
     settings = MaterialSettings.model_validate(json.loads((out / "fit" / "run.json").read_text())["settings"])
-    count = 16 * int(pixels) ** 2
+    count = [side**2] * pictures
     if stages:
         show(peaks(MATERIAL, material_counts(settings, count)), out / "fit")
     return error(material_gb(settings, count), made["peak_gb"])

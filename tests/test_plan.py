@@ -79,7 +79,7 @@ def test_the_refusal_names_what_would_work():
 
 def test_a_fit_to_pictures_keeps_less_of_their_samples_or_is_refused():
     settings = resolve("draft", None, {}, {}, MaterialSettings, MATERIAL_PRESETS)
-    pixels = 48 * 1024**2
+    pixels = [1024**2] * 48
     assert budget.check_material(settings, pixels) is settings
     free = budget.material_gb(settings, pixels)
     kept = budget.check_material(settings.model_copy(update={"memory": free - 1}), pixels)

@@ -300,7 +300,9 @@ def _chunk(points: Points, seen: Observations, texel: Int[np.ndarray, " n"], cou
     width, most = len(texel), int(count[0])
     slot = np.arange(most)[:, None]
     real = (slot < count).ravel()
-    rows = np.where(real, (seen.start[texel] + slot).ravel(), 0)
+    # Half the memory of 64 bits, where they are not needed.
+    index = np.int32 if seen.start[-1] <= np.iinfo(np.int32).max else np.int64
+    rows = np.where(real, (seen.start[texel] + slot).ravel(), 0).astype(index)
     frame = points.frame[texel]
     chunk = {
         "texel": texel,

@@ -9,7 +9,7 @@ atlas of 3072², four views and 20,000 samples, and of 2048². Those of TILED co
 VGG-19 and the stylizers that need models count their own (run/generative.py).
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,8 +22,8 @@ from mistyle.run.settings import Settings
 
 class Need(NamedTuple):
     """A stage's peak: GB of the program, then bytes a texel, view pixel, crop pixel, surface sample, face, texel of the
-    textures as the views draw them (kept by the renderer) and as the report's close-ups do, and pixel of the
-    turntable's frames."""
+    textures as the views draw them (kept by the renderer) and as the report's close-ups do, pixel of the turntable's
+    frames, and texel times picture where texels are solved one by one."""
 
     program: float
     texel: float = 0
@@ -34,6 +34,7 @@ class Need(NamedTuple):
     viewed: float = 0
     drawn: float = 0
     frame: float = 0
+    look: float = 0
 
 
 # With every array in memory.
@@ -65,15 +66,15 @@ TILED = {
     "report": Need(0.65, texel=5, view=4, drawn=78, frame=24),
 }
 # A fit to pictures, without what is kept of the pictures' samples, up to `recover.memory`; the system does not get all
-# of that back after the stage. Read off `fit_512`, the report off `fit_256`: of other sizes less is known.
+# of that back after the stage. Read off `fit_512` and `fit_200`, the report off `fit_256`.
 MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
-    "recover": Need(0.75, texel=600),
-    "measure": Need(0.77, texel=300),
-    "asset": Need(0.80, texel=200),
-    "scene": Need(0.80, texel=200),
-    "report": Need(0.78, texel=200, drawn=70, frame=24),
+    "recover": Need(0.75, texel=446, look=9.6),
+    "measure": Need(0.77, texel=300, look=6),
+    "asset": Need(0.80, texel=200, look=6),
+    "scene": Need(0.80, texel=200, look=6),
+    "report": Need(0.78, texel=200, drawn=70, frame=24, look=6),
 }
 KEEPING = ("recover", "measure", "asset", "scene", "report")
 SAMPLE = 32  # bytes that are kept of a sample of a picture
@@ -92,6 +93,7 @@ class Counts(NamedTuple):
     viewed: int = 0
     drawn: int = 0
     frame: int = 0
+    look: int = 0
 
 
 def view_pixels(settings: Settings) -> int:
@@ -144,16 +146,21 @@ def memory_gb(settings: Settings, faces: int = 0, sets: int = 1) -> float:
     return round(whole, 2)
 
 
-def material_counts(settings: Any, pixels: int, faces: int = 0, sets: int = 1) -> Counts:
-    """The counts of a fit to pictures of so many pixels together."""
+def material_counts(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1) -> Counts:
+    """The counts of a fit to pictures of so many pixels each."""
     drawn, frame = shown(settings, sets)
-    return Counts(sets * settings.atlas.size**2, pixels, face=faces, drawn=drawn, frame=frame)
+    texel = solved = sets * settings.atlas.size**2
+    # Only covered texels are solved: half of them at least, as a rule.
+    while solved > 2 * settings.recover.solver_texels:
+        solved //= 4
+    looks = 0 if settings.recover.solver == "pictures" else solved * len(pixels)
+    return Counts(texel, sum(pixels), face=faces, drawn=drawn, frame=frame, look=looks)
 
 
-def material_gb(settings: Any, pixels: int, faces: int = 0, sets: int = 1) -> float:
-    """Peak memory of a fit to pictures of so many pixels together, GB."""
+def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1) -> float:
+    """Peak memory of a fit to pictures of so many pixels each, GB."""
     found = peaks(MATERIAL, material_counts(settings, pixels, faces, sets))
-    held = min(settings.recover.memory, SAMPLE * pixels * settings.recover.subsamples / 1e9)
+    held = min(settings.recover.memory, SAMPLE * sum(pixels) * settings.recover.subsamples / 1e9)
     found |= {stage: found[stage] + held for stage in KEEPING}
     return round(max(found.values()), 2)
 
@@ -188,7 +195,7 @@ def _free(settings: Settings) -> Settings:
     return settings.model_copy(update={"memory": 0})
 
 
-def check_material(settings: Any, pixels: int, faces: int = 0, sets: int = 1) -> Any:
+def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1) -> Any:
     """The settings of a fit to pictures with `recover.memory` cut to what its budget leaves; UsageError for none."""
     if not settings.memory:
         return settings

@@ -100,7 +100,9 @@ def gather(
             rgb, usable = captures.load(k)
             ids, values, bits, chosen = _observe(rgb, usable, lit, near, pixel, x, y)
             any_light[chosen] = True
-            parts.append((k, ids, values, bits, pixel[chosen], x[chosen], y[chosen], worth[chosen]))
+            # These are most of a fit's memory: nothing here is larger than it has to be.
+            where = pixel[chosen].astype(np.int32)
+            parts.append((k, ids.astype(np.int32), values, bits, where, x[chosen], y[chosen], worth[chosen]))
         views[near[any_light]] += 1
         progress((done + 1) / max(len(used) / max(len(group), 1), 1))
     soft = np.zeros(len(texel), np.int32)
@@ -215,8 +217,8 @@ def _usable(mask: Bool[np.ndarray, "h w"], pixel: Int[np.ndarray, " n"]) -> Bool
 
 
 def _assemble(texel, points, captures: Captures, parts, views, soft, noise: float, relative: float) -> Gathered:
-    """Sort the observations by texel; within a texel they follow the pictures' order."""
-    parts = sorted(parts, key=lambda part: part[0])
+    """Sort the observations by texel; within a texel they follow the pictures' order. `parts` is empty afterwards."""
+    parts.sort(key=lambda part: -part[0])
     count = np.zeros(len(texel), np.int64)
     for part in parts:
         count[part[1]] += 1
@@ -226,11 +228,13 @@ def _assemble(texel, points, captures: Captures, parts, views, soft, noise: floa
     rgb, worth = np.zeros((total, 3), np.float32), np.ones(total, np.float32)
     nothing = np.zeros(0, np.int64)
     sightings = [Sighting(nothing, nothing, nothing.astype(np.float32), nothing.astype(np.float32))] * len(captures)
-    for k, ids, values, bits, pixel, x, y, share in parts:
-        rows = filled[ids]
+    index = np.int32 if total <= np.iinfo(np.int32).max else np.int64
+    while parts:
+        k, ids, values, bits, pixel, x, y, share = parts.pop()
+        rows = filled[ids].astype(index)
         filled[ids] += 1
         picture[rows], lit[rows], rgb[rows], worth[rows] = k, bits, values, share
-        sightings[k] = Sighting(rows, pixel, x.astype(np.float32), y.astype(np.float32))
+        sightings[k] = Sighting(rows, pixel, x, y)
     level = np.maximum(rgb.max(axis=1, initial=0), 0)
     unit = float(np.percentile(level, PERCENTILE)) if total else 1.0
     weight = worth / (noise * max(unit, 1e-6) + relative * level)

@@ -28,8 +28,8 @@ STARTS = (0.25, 0.7)  # roughness has local minima
 RESTARTS = 3  # rounds in which texels also try what their neighbours found
 MISFIT = 0.1  # cost per observation above which a texel has less to say to its neighbours
 BLUR = 4  # steps of spreading, each to the four nearest texels
-WIDE = 24  # steps over which the surface's own variance is measured
-LEAST = 0.002  # of the standard deviation between a texel and the mean of its neighbours
+WIDE = 24  # steps over which it is measured how much the surface's tilt varies
+LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean of its neighbours
 
 Table = Float[np.ndarray, "a 8"]
 Values = Float[np.ndarray, "t 7"]
@@ -214,19 +214,20 @@ def sureness(solution: Solution, gathered: Gathered) -> Values:
 def belief(solution: Solution, mean: Values, gathered: Gathered, where: Atlas, neighbours: float) -> Values:
     """How firmly each texel is held to `mean`, as weights of (x - mean)²: one over the variance of the surface itself.
 
-    Empirical Bayes: that variance is what the texels around differ by from their means, less what their own
-    observations leave open, at most `neighbours`² and at least LEAST². Metallic, which is 0 or 1, has `neighbours`.
+    Of the tilt by empirical Bayes: that variance is what the texels around differ by from their means, less what their
+    own observations leave open, at most `neighbours`² and at least LEAST². Everything else has `neighbours`: albedo,
+    roughness and metallic can stand for each other, and held to its neighbours' albedo a texel becomes a metal.
     """
-    open_, gain = likelihood(solution)
+    open_, gain = (part[:, 3:5] for part in likelihood(solution))
     # Observations that do not fit say less than their number promises.
     open_ = open_ * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
-    apart = (solution.values - mean) / np.maximum(gain, 1e-3)
+    apart = (solution.values - mean)[:, 3:5] / np.maximum(gain, 1e-3)
     weight = (1 / (open_**2 + neighbours**2) ** 2).astype(np.float32)
     weight[gathered.seen == 0] = 0
     variance = neighbourhood((apart**2 - open_**2).astype(np.float32), weight, gathered, where, WIDE)
-    variance = np.clip(variance, min(LEAST, neighbours) ** 2, neighbours**2)
-    variance[:, 6] = neighbours**2
-    return (1 / variance).astype(np.float32)
+    prior = np.full(mean.shape, 1 / neighbours**2, np.float32)
+    prior[:, 3:5] = 1 / np.clip(variance, min(LEAST, neighbours) ** 2, neighbours**2)
+    return prior
 
 
 def likelihood(solution: Solution) -> tuple[Values, Values]:
