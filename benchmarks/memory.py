@@ -34,8 +34,7 @@ STYLIZE: dict[str, list[Any]] = {
     "views_64": ["stylize", SPOT, WAVE, *DRAFT, "--set", "rig.kind=turntable", "--set", "rig.views=64"],
 }
 TILED = [*DRAFT, "--atlas", "8192", "--set", "rig.kind=turntable", "--set", "rig.views=64"]
-# Atlas, pixels along a picture's side, pictures: looks at texels cost memory by their number, pictures by their size.
-FITS = {"fit_256": (256, 256, 16), "fit_512": (512, 256, 16), "fit_200": (1024, 128, 200), "fit_12mpx": (1024, 3464, 3)}
+FITS = {"fit_256": (256, 256, 16), "fit_512": (512, 256, 16), "fit_200": (1024, 128, 200)}  # atlas, pixels, pictures
 PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main())"
 
 

@@ -84,13 +84,7 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
     given.add_argument(
         "--align", action="store_true", default=None, help="find the similarity from the mesh to the cameras' space"
     )
-    given.add_argument(
-        "--refine-poses",
-        nargs="?",
-        const="outline",
-        choices=["outline", "shading"],
-        help="improve the cameras before fitting, by the mesh's outline (default) or by what its surface shows too",
-    )
+    given.add_argument("--refine-poses", action="store_true", default=None, help="improve the cameras before fitting")
     given.add_argument("--hold-out", type=int, metavar="N", help="keep N pictures from the fit, to measure it by")
     given.add_argument(
         "--hold-out-light", type=int, metavar="K", help="keep the pictures of the K-th light (from 0) from the fit"

@@ -15,7 +15,7 @@ from jaxtyping import Float
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, subset
-from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights
 from mistyle.core.maps import Maps, Texels
 from mistyle.files.textures import part_stems
@@ -102,11 +102,6 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     files = input_files(job.mesh)
     s = job.settings
     check(s)
-    if s.references.refine_poses == "shading" and job.lights == "unknown":
-        raise UsageError(
-            "--refine-poses shading compares the pictures with what the lights make of the mesh: they have to be known."
-            " With --light unknown use --refine-poses outline."
-        )
     captures = read_captures(
         job.references,
         lights=job.lights,
@@ -126,16 +121,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
             "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(job.mesh, s.read, s.atlas.size, r)
         )
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
-        seen = s.recover if s.references.refine_poses == "shading" else None
-        given = [
-            pictures,
-            [vars(c) for c in captures.cameras],
-            captures.lights,
-            s.references,
-            key_of(s.colour),
-            s.seed,
-            seen,
-        ]
+        given = [pictures, [vars(c) for c in captures.cameras], captures.lights, s.references, s.seed, key_of(s.colour)]
         placed = run.record("cameras", ["mesh"], given, lambda r: place(job, asset, captures, r))
         captures = replace(captures, cameras=placed.cameras, lights=placed.lights)
         if job.lights == "unknown":
@@ -189,19 +175,17 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) ->
     from mistyle.core.align import moved
     from mistyle.files.captures import camera_space, check_pixels, read_shots, silhouette, sparse_points
     from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
-    from mistyle.stages.poses import refine_by_shading
 
     chosen = job.settings.references
     figures: dict[str, float] = {}
     notes = list(check_pixels(captures, lambda done: report(0.3 * done)))
     masks, sparse = None, sparse_points(job.references) if chosen.align else None
-    refined_by = chosen.refine_poses
-    if chosen.align or refined_by != "off":
+    if chosen.align or chosen.refine_poses:
         shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
         try:
             masks = [silhouette(shot) for shot in shots]
         except InputRefused:
-            if sparse is None or refined_by != "off" or job.masks is not None:
+            if sparse is None or chosen.refine_poses or job.masks is not None:
                 raise
             notes.append("The pictures have no masks: the mesh was aligned to the model's points alone.")
     if chosen.align:
@@ -216,17 +200,13 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) ->
     elif camera_space(job.references) == "own":
         captures = moved(captures, asset.source.work_from_user)
     report(0.6)
-    if refined_by != "off":
-        rims = masks or ()
-        share = 0.4 if refined_by == "outline" else 0.1
-        refined = refine_poses(asset.mesh, captures.cameras, rims, progress=lambda done: report(0.6 + share * done))
-        captures, before, after = replace(captures, cameras=refined.cameras), refined.before, refined.after
-        if refined_by == "shading":
-            refined = refine_by_shading(
-                asset.mesh, captures, rims, job.settings.recover, job.settings.seed, lambda d: report(0.7 + 0.3 * d)
-            )
-            captures, after = replace(captures, cameras=refined.cameras), refined.after
-        figures |= {"pose_px_before": float(np.nanmean(before)), "pose_px_after": float(np.nanmean(after))}
+    if chosen.refine_poses:
+        refined = refine_poses(
+            asset.mesh, captures.cameras, masks or (), progress=lambda done: report(0.6 + 0.4 * done)
+        )
+        captures = replace(captures, cameras=refined.cameras)
+        before, after = (float(np.nanmean(each)) for each in (refined.before, refined.after))
+        figures |= {"pose_px_before": before, "pose_px_after": after}
     return Placed(captures.cameras, captures.lights, tuple(notes), figures)
 
 

@@ -19,10 +19,7 @@ class ReferenceSettings(BaseModel):
         default=1.0, gt=0, le=1, description="encoded value from which a channel is blown out (JPEGs stop short of 1)"
     )
     align: bool = Field(default=False, description="find the similarity that brings the mesh into the cameras' space")
-    refine_poses: Literal["off", "outline", "shading"] = Field(
-        default="off",
-        description="improve every camera before fitting, by the mesh's outline, or by its surface too (slow)",
-    )
+    refine_poses: bool = Field(default=False, description="improve every camera against the mesh before fitting")
     hold_out: int = Field(
         default=-1,
         ge=-1,

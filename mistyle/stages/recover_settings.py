@@ -40,7 +40,7 @@ class RecoverSettings(BaseModel):
     neighbours: float = Field(
         default=0.03,
         gt=0,
-        description="standard deviation between a texel and its neighbours' mean; for tilts the largest: smooth surfaces have less",
+        description="standard deviation between a texel and its neighbours' mean; of tilts at most, less where smooth",
     )
     noise: float = Field(default=0.002, gt=0, le=1, description="standard deviation of a pixel in the dark")
     relative: float = Field(default=0.01, ge=0, le=1, description="standard deviation of a pixel relative to its value")
