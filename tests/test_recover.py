@@ -152,6 +152,10 @@ def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
     count = np.zeros(size**2, np.int32)
     gathered = Gathered(np.arange(size**2), points, rig, seen, (), count, count)
     np.testing.assert_allclose(solving.likelihood(solution)[0], noise, rtol=1e-2)
+    own = noise**-2 / (noise**-2 + 0.03**-2)
+    np.testing.assert_allclose(solving.decided(solution, gathered.seen), own, rtol=1e-2)
+    # Seen in parts only, it is for the pictures to say.
+    assert (solving.decided(solution, 0 * gathered.seen) == 1).all()
     firm = 1 / np.sqrt(solving.belief(solution, mean, gathered, where, 0.03))
     wanted = np.clip(variation, solving.LEAST, 0.03)
     if variation > 0:

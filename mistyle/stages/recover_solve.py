@@ -28,6 +28,7 @@ STARTS = (0.25, 0.7)  # roughness has local minima
 RESTARTS = 3  # rounds in which texels also try what their neighbours found
 MISFIT = 0.1  # cost per observation above which a texel has less to say to its neighbours
 BLUR = 4  # steps of spreading, each to the four nearest texels
+LEAST_SEEN = 3  # times that a texel was seen, for what was seen to decide anything
 WIDE = 24  # steps over which it is measured how much the surface's tilt varies
 LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean of its neighbours
 
@@ -228,6 +229,12 @@ def belief(solution: Solution, mean: Values, gathered: Gathered, where: Atlas, n
     prior = np.full(mean.shape, 1 / neighbours**2, np.float32)
     prior[:, 3:5] = 1 / np.clip(variance, min(LEAST, neighbours) ** 2, neighbours**2)
     return prior
+
+
+def decided(solution: Solution, seen: Int[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """The share of a texel's tilt that its own pictures decide and not its neighbours, 0..1. Texels that too few saw
+    whole are left free (1): pictures show parts of them, of which the solver knows nothing."""
+    return np.where(seen >= LEAST_SEEN, likelihood(solution)[1][:, 3:5].mean(axis=1), 1).astype(np.float32)
 
 
 def likelihood(solution: Solution) -> tuple[Values, Values]:
