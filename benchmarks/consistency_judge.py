@@ -26,6 +26,7 @@ def judged(
     """All columns of a row but its time and memory; figures that mean nothing for the row are left out.
 
     warp_rmse_*       RMSE (sRGB 0..1) of what two views see of one place; short: 30 to 45 degrees apart, long: to 90
+    trip_rmse_*       the share of carrying over alone in it: pictures against themselves, carried over and back
     lpips_*           LPIPS-squeeze of the same
     patch_swd         sliced Wasserstein distance of 5 x 5 Lab patches at three scales to the painting, views pooled
     gram_vgg          relative distance of VGG-19's Gram matrices at relu1_1, relu2_1, relu3_1, pooled over views
@@ -62,6 +63,7 @@ def warps(views: Sequence, pictures: Sequence[np.ndarray]) -> dict[str, float]:
     for name, degrees in (("short", consistency.SHORT), ("long", consistency.LONG)):
         chosen = consistency.pairs(views, degrees)
         figures[f"warp_rmse_{name}"] = consistency.warp_rmse(views, pictures, chosen)
+        figures[f"trip_rmse_{name}"] = consistency.round_trip_rmse(views, pictures, chosen)
         figures[f"lpips_{name}"] = consistency.warp_lpips(views, pictures, chosen, lpips)
     return figures
 

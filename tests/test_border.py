@@ -2,6 +2,7 @@
 goes on with one sentence."""
 
 import ast
+import io
 import json
 import os
 import signal
@@ -18,7 +19,7 @@ from helpers import ROOT, data
 
 from mistyle.core import weights
 from mistyle.core.errors import InputRefused, MistyleError
-from mistyle.files import reader_process, wire
+from mistyle.files import lending, reader_process, wire
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.raw import RawMap, Textures, Tile
 from mistyle.files.read import read_exr, read_json, read_mesh, read_npy, read_picture, read_size, read_toml, read_yaml
@@ -368,6 +369,9 @@ def test_values_arrive_as_they_were_sent(rng: np.random.Generator):
         {"value": {"array": 0}, "arrays": [["|O", [1]]]},
         {"value": {"array": 0}, "arrays": [["<f4", [1 << 40]]]},
         {"value": {"array": 3}, "arrays": []},
+        {"value": {"array": 0}, "arrays": [["<f4", [4], 4096]]},
+        {"value": {"array": 0}, "arrays": [["<f4", [4], -8]]},
+        {"value": {"array": 0}, "arrays": [["<f4", [4], "a"]]},
         {"value": {"a": 1, "b": 2}, "arrays": []},
         {"value": [1], "arrays": []},
         {"arrays": []},
@@ -388,6 +392,44 @@ def test_a_captured_reader_cannot_make_the_job_build_things(head):
 
     with pytest.raises(wire.BrokenMessage):
         wire.receive(read)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="memory of another process is read on Linux only")
+def test_large_arrays_are_copied_from_the_senders_memory(rng):
+    large, small, sent = rng.random((300, 200)), rng.random(5), bytearray()
+    lent = wire.send(lambda part: sent.extend(part) or len(part), {"a": large, "b": [small, large]}, True)
+    assert [a is large for a in lent] == [True] and len(sent) < 1000
+    stream = io.BytesIO(bytes(sent))
+    found, _ = wire.receive(stream.readinto, lambda address, into: lending.copy_from(os.getpid(), address, into))
+    assert np.array_equal(found["a"], large) and np.array_equal(found["b"][0], small) and found["b"][1] is found["a"]
+    assert found["a"].ctypes.data != large.ctypes.data
+    with pytest.raises(OSError):
+        lending.copy_from(os.getpid(), 64, memoryview(bytearray(8)))
+
+
+@pytest.mark.parametrize("allowed", [True, False])
+def test_lent_or_through_the_pipe_a_picture_is_the_same(tmp_path, monkeypatch, rng, allowed):
+    pixels = rng.integers(0, 256, (400, 500, 3))
+    write_png(tmp_path / "a.png", pixels / 255)
+    reader_process.stop()
+    if not allowed:
+        monkeypatch.setattr(lending, "can_read", lambda process, address: False)
+    for _ in range(2):
+        assert np.array_equal(np.rint(read_picture(tmp_path / "a.png").rgb * 255), pixels)
+    assert reader_process._reader.lends == (allowed and sys.platform == "linux")
+    reader_process.stop()
+
+
+def test_memory_that_cannot_be_copied_is_a_refusal_and_the_next_file_gets_a_new_child(tmp_path, monkeypatch, rng):
+    write_png(tmp_path / "a.png", rng.random((400, 500, 3)))
+    read_size(tmp_path / "a.png")
+    if not reader_process._reader.lends:
+        pytest.skip("this system does not let a process read its child's memory")
+    with monkeypatch.context() as patch:
+        patch.setattr(lending, "copy_from", lambda process, address, into: (_ for _ in ()).throw(OSError(14, "no")))
+        with pytest.raises(InputRefused, match="its decoder ended"):
+            read_picture(tmp_path / "a.png")
+    assert read_picture(tmp_path / "a.png").rgb.shape == (400, 500, 3)
 
 
 # --- absurd files ---

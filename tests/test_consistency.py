@@ -35,6 +35,16 @@ def test_warp_rmse_by_hand():
     assert np.isnan(consistency.warp_rmse(views, own, []))
 
 
+def test_a_round_trip_knows_nothing_of_the_other_picture(rng):
+    views = [plane_view(0), plane_view(60)]
+    chosen = consistency.pairs(views, consistency.LONG)
+    assert consistency.round_trip_rmse(views, [GREY, LIGHT], chosen) < 1e-6
+    smooth, fine = [waves(view) for view in views], [noise(rng, sigma=0.7)] * 2
+    assert consistency.round_trip_rmse(views, smooth, chosen) < 0.002
+    assert consistency.round_trip_rmse(views, fine, chosen) > 0.04
+    assert np.isnan(consistency.round_trip_rmse(views, smooth, []))
+
+
 def test_pairs_are_pooled_by_pixels():
     """One view sees half of the plane: its pairs count half as many pixels."""
     half = plane_view(30)

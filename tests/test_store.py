@@ -97,13 +97,14 @@ def test_put_then_get(tmp_path):
         assert keeper.get("bake", "other") is None and folder.exists(), "another key leaves the folder alone"
 
 
-@pytest.mark.parametrize("damage", ["changed", "missing", "no_marker", "cut_marker", "odd_marker"])
+@pytest.mark.parametrize("damage", ["changed", "missing", "no_marker", "cut_marker", "odd_marker", "deep_marker"])
 def test_broken_stage_is_set_aside_not_deleted(tmp_path, damage):
     with Keeper(tmp_path) as keeper:
         for round_ in (1, 2):
             folder = keeper.put("bake", "k", text("content"))
             marker, file = folder / "done.json", folder / "a.txt"
             contents = {"changed": b"Content", "cut_marker": marker.read_bytes()[:30], "odd_marker": b"[1]"}
+            contents["deep_marker"] = b"[" * 100_000
             if damage in contents:
                 (file if damage == "changed" else marker).write_bytes(contents[damage])
             else:

@@ -114,6 +114,12 @@ def wrong_materialx(run: Path) -> tuple[str, ...]:
     return "ball.mtlx", "has no definition"
 
 
+def cut_list(run: Path) -> tuple[str, ...]:
+    path = run / "asset" / "ball.json"
+    path.write_bytes(path.read_bytes()[:200])
+    return "asset/ball.json", "no JSON"
+
+
 def broken_glb(run: Path) -> tuple[str, ...]:
     path = run / "asset" / "ball.glb"
     path.write_bytes(path.read_bytes()[:2000])
@@ -121,7 +127,8 @@ def broken_glb(run: Path) -> tuple[str, ...]:
 
 
 @pytest.mark.parametrize(
-    "spoil", [damaged_texture, cut_png, missing_file, lost_usd_texture, wrong_usd, wrong_materialx, broken_glb]
+    "spoil",
+    [damaged_texture, cut_png, missing_file, lost_usd_texture, wrong_usd, wrong_materialx, cut_list, broken_glb],
 )
 def test_damage_is_found_and_ends_with_5(run, spoil, capsys):
     words = spoil(run)

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
+from mistyle.files.own import read_own
 
 try:
     import fcntl
@@ -127,7 +128,7 @@ def _remove_dead_lock(lock: Path) -> None:
 
 def _owner(lock: Path) -> dict[str, Any]:
     """What the lock says of its holder. Raises ValueError where it says nothing that can be read."""
-    found = json.loads(lock.read_text(encoding="utf-8"))
+    found = read_own(lock)
     try:
         known = {k: kind(found[k]) for k, kind in (("pid", int), ("host", str), ("time", float))}
         return {"started": found["started"], "flock": found.get("flock") is True} | known

@@ -12,8 +12,10 @@ import sys
 from importlib import import_module
 from typing import Any
 
+import numpy as np
+
 from mistyle.core.errors import MistyleError
-from mistyle.files import wire
+from mistyle.files import lending, wire
 
 try:
     import resource
@@ -25,6 +27,7 @@ FORBIDDEN = (
     *("os.system", "os.exec", "os.posix_spawn", "os.spawn", "os.fork", "os.forkpty", "subprocess.Popen"),
     *("socket.__new__", "socket.connect", "socket.bind", "os.putenv", "os.kill", "signal.pthread_kill"),
 )
+MAX_THREADS = 4
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
@@ -36,10 +39,14 @@ def main() -> None:
     os.dup2(nothing, 1)  # what a library prints must not get among the answers
     for number in (signal.SIGINT, signal.SIGTERM):  # a whole group may get them; this process ends when its input does
         signal.signal(number, signal.SIG_IGN)
+    import OpenEXR
+
     from mistyle.files.reader_tasks import TASKS
 
+    OpenEXR.set_global_thread_count(_threads())
     base = _confine()
-    wire.send(lambda data: os.write(answers, data), None)
+    shown = np.frombuffer(lending.SIGN, np.uint8)  # where the parent tries whether it can read this process's memory
+    wire.send(lambda data: os.write(answers, data), None, sign=shown.ctypes.data)
     os.dup2(nothing, 2)
     while True:
         try:
@@ -49,14 +56,15 @@ def main() -> None:
         _limit(base + request["memory"], request["seconds"])
         value, entries, done = _answer(TASKS[request["task"]], arguments, request)
         try:
-            wire.send(lambda data: os.write(answers, data), value, peak=_peak(), **entries)
+            lent = wire.send(lambda data: os.write(answers, data), value, request["may_lend"], peak=_peak(), **entries)
         except MemoryError:
             wire.send(lambda data: os.write(answers, data), None, memory=True)
             return
         except BrokenPipeError:
             return
-        if done:
+        if done or lent and not requests.read(1):  # what is lent stays until the parent says that it has it
             return
+        del value, lent
 
 
 def _answer(task: Any, arguments: tuple[Any, ...], request: dict[str, Any]) -> tuple[Any, dict[str, Any], bool]:
@@ -83,6 +91,12 @@ def _out_of_memory(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
+
+
+def _threads() -> int:
+    """Threads that decode an EXR's blocks. Several make up for the way of the pixels to the job's process."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MAX_THREADS)
 
 
 def _confine() -> int:

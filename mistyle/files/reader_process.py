@@ -24,7 +24,7 @@ from typing import Any
 from mistyle.core import errors
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.core.paths import PACKAGE
-from mistyle.files import wire
+from mistyle.files import lending, wire
 from mistyle.files.bounds import MAX_FILE_BYTES, refuse
 
 MEMORY = 2 << 30
@@ -70,7 +70,7 @@ class Reader:
             ) from error
         assert self.process.stdin and self.process.stdout and self.process.stderr
         self.input, self.output, self.stderr = self.process.stdin, self.process.stdout, self.process.stderr
-        self.ready = False
+        self.ready = self.lends = self.borrowed = False
         self.peak = self.served = 0
         _widen(self.output.fileno())
 
@@ -79,20 +79,21 @@ class Reader:
         if self.ready:
             return
         try:
-            wire.receive(self.output.readinto)  # type: ignore[attr-defined]
+            _, head = wire.receive(self.output.readinto)  # type: ignore[attr-defined]
         except wire.BrokenMessage as error:
             said = self.stderr.read().decode("utf-8", "replace").strip().splitlines()[-1:] or ["no message"]
             self.close()
             raise EnvironmentMissing(
                 f"the process that reads files did not start ({said[0][:300]}); run `python -m mistyle doctor`"
             ) from error
+        self.lends = lending.can_read(self.process.pid, int(head.get("sign", 0)))
         self.ready = True
 
     def ask(self, path: Path, task: str, arguments: tuple[Any, ...], size: int) -> Any:
         """What the task gives for the file; see the function `ask`. After OutOfMemory, and after any other end than an
         answer, the child is gone."""
         memory, seconds = MEMORY + MEMORY_PER_BYTE * size, SECONDS + SECONDS_PER_MIB * size / 2**20
-        late = threading.Event()
+        late, self.borrowed = threading.Event(), False
 
         def stop() -> None:
             late.set()
@@ -103,8 +104,11 @@ class Reader:
         timer.start()
         try:
             request = {"task": task, "cwd": os.getcwd(), "limits": _bounds(), "memory": memory, "seconds": seconds}
+            request["may_lend"] = self.lends
             wire.send(self.input.write, (path, *arguments), **request)  # type: ignore[arg-type]
-            value, head = wire.receive(self.output.readinto)  # type: ignore[attr-defined]
+            value, head = wire.receive(self.output.readinto, self._copy)  # type: ignore[attr-defined]
+            if self.borrowed:
+                self.input.write(b"\0")
         except (wire.BrokenMessage, OSError) as error:
             raise refuse(path, self._end(late.is_set(), PATIENCE * seconds, seconds), WHOLE, AGAIN) from error
         except BaseException:  # an interrupt amid an answer: the rest of it must not be taken for the next one
@@ -123,6 +127,10 @@ class Reader:
             kind = getattr(errors, str(head.get("kind")), InputRefused)
             raise kind(str(head["refused"])) if issubclass(kind, errors.MistyleError) else InputRefused(value)
         return value
+
+    def _copy(self, address: int, place: memoryview) -> None:
+        self.borrowed = True
+        lending.copy_from(self.process.pid, address, place)
 
     def _end(self, late: bool, patience: float, seconds: float) -> str:
         """What became of the child that sent no answer."""

@@ -13,6 +13,7 @@ import numpy as np
 
 from mistyle.core import memory
 from mistyle.core.errors import InputRefused
+from mistyle.files.own import read_own
 
 
 def save_record(folder: Path, record: Any) -> None:
@@ -29,7 +30,7 @@ def load_record(folder: Path) -> Any:
     """The record that `save_record` wrote into `folder`."""
     path = folder / "record.json"
     try:
-        return _unpack(json.loads(path.read_text(encoding="utf-8")), folder)
+        return _unpack(read_own(path), folder)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputRefused(
             f"{path}: not a record of this version of mistyle ({error}); delete the folder and run again"

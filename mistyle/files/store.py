@@ -22,6 +22,7 @@ from pydantic import BaseModel
 
 from mistyle.core.errors import MistyleError
 from mistyle.files import faults, lock
+from mistyle.files.own import read_own
 
 DONE = "done.json"
 LOCK = ".mistyle.lock"
@@ -292,7 +293,7 @@ def carry_over(old: Path, new: Path, *, without: set[str]) -> None:
 def _done(folder: Path) -> tuple[str, dict[str, str]] | None:
     """Key and hashes of a finished stage's marker; None when there is no readable one."""
     try:
-        done = json.loads((folder / DONE).read_text(encoding="utf-8"))
+        done = read_own(folder / DONE)
         return str(done["key"]), {str(k): str(v) for k, v in done["files"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None

@@ -1,7 +1,8 @@
 """How values travel between the reader process and the job: a JSON tree and the raw bytes of its arrays, no pickle.
 
 A message is eight bytes of length (little endian), a JSON header, then each array's bytes in the order of the header's
-table [dtype, shape]. Only plain values, arrays of numbers and the records in RECORDS can be in it, and the receiving
+table [dtype, shape]; or [dtype, shape, address] for large arrays that the receiver copies from the sender's memory
+(files/lending.py). Only plain values, arrays of numbers and the records in RECORDS can be in it, and the receiving
 side builds nothing else: a process that a hostile file has taken over can send wrong numbers, but no code.
 """
 
@@ -16,6 +17,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from mistyle.files.lending import LENT
 
 # Records that may be sent, by the name they have on the way. A reader that returns another record adds it here.
 RECORDS = {
@@ -52,35 +55,47 @@ class Json:
 
 Read = Callable[[memoryview], int]
 Write = Callable[[memoryview], int]
+Copy = Callable[[int, memoryview], None]  # from an address in the sender's memory
 
 
-def send(write: Write, value: Any, **entries: Any) -> None:
-    """Write one message: `value`, and plain `entries` of its header."""
+def send(write: Write, value: Any, lend: bool = False, **entries: Any) -> list[np.ndarray]:
+    """Write one message: `value`, and plain `entries` of its header.
+
+    With `lend`, large arrays are not written but returned: they must live until the other side says that it has them.
+    """
     arrays: list[np.ndarray] = []
     seen: dict[int, int] = {}
     tree = _pack(value, arrays, seen)
-    table = [[array.dtype.str, array.shape] for array in arrays]
+    lent = [array for array in arrays if lend and array.nbytes >= LENT]
+    table = [[a.dtype.str, a.shape, *([a.ctypes.data] if lend and a.nbytes >= LENT else [])] for a in arrays]
     head = json.dumps({"value": tree, "arrays": table, **entries}).encode()
     _write_all(write, memoryview(len(head).to_bytes(8, "little") + head))
     for array in arrays:
-        if array.nbytes:
+        if array.nbytes and not (lend and array.nbytes >= LENT):
             _write_all(write, array.reshape(-1).view(np.uint8).data)
+    return lent
 
 
-def receive(read: Read) -> tuple[Any, dict[str, Any]]:
-    """The value of the next message and its header's other entries. Raises BrokenMessage."""
+def receive(read: Read, copy: Copy | None = None) -> tuple[Any, dict[str, Any]]:
+    """The value of the next message and its header's other entries. Raises BrokenMessage, and what `copy` raises."""
     size = int.from_bytes(_bytes(read, 8), "little")
     if size > MAX_HEADER:
         raise BrokenMessage(f"a header of {size} bytes")
     try:
         head = json.loads(_bytes(read, size))
-        arrays = [_empty(*entry) for entry in _allowed(head.pop("arrays"))]
+        table = _allowed(head.pop("arrays"))
+        arrays = [np.empty(shape, np.dtype(kind)) for kind, shape, _ in table]
         tree = head.pop("value")
     except (ValueError, TypeError, KeyError, AttributeError, RecursionError) as error:
         raise BrokenMessage(f"no message ({error})") from error
-    for array in arrays:
-        if array.nbytes:
-            _fill(read, array.reshape(-1).view(np.uint8).data)
+    for array, (_, _, address) in zip(arrays, table, strict=True):
+        place = array.reshape(-1).view(np.uint8).data
+        if address is not None and copy is None:
+            raise BrokenMessage("an array that was lent to no one")
+        elif address is not None and copy is not None:
+            copy(address, place)
+        elif array.nbytes:
+            _fill(read, place)
     try:
         return _unpack(tree, arrays), head
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
@@ -106,20 +121,18 @@ def _bytes(read: Read, size: int) -> bytearray:
     return data
 
 
-def _allowed(table: Iterable[Any]) -> list[tuple[str, tuple[int, ...]]]:
+def _allowed(table: Iterable[Any]) -> list[tuple[str, tuple[int, ...], int | None]]:
     entries, total = [], 0
-    for kind, shape in table:
+    for kind, shape, *address in table:
         if not DTYPE.fullmatch(kind) or not all(isinstance(n, int) and n >= 0 for n in shape) or len(shape) > 8:
             raise ValueError(f"an array of {kind!r} {shape!r}")
         total += np.dtype(kind).itemsize * math.prod(shape)
-        entries.append((kind, tuple(shape)))
+        if len(address) > 1 or not all(isinstance(a, int) and 0 < a < 1 << 63 for a in address):
+            raise ValueError(f"an array at {address!r}")
+        entries.append((kind, tuple(shape), address[0] if address else None))
     if total > MAX_ARRAYS:
         raise ValueError(f"arrays of {total} bytes")
     return entries
-
-
-def _empty(kind: str, shape: tuple[int, ...]) -> np.ndarray:
-    return np.empty(shape, np.dtype(kind))
 
 
 def _pack(value: Any, arrays: list[np.ndarray], seen: dict[int, int]) -> Any:

@@ -54,6 +54,26 @@ def warp_rmse(views: Sequence[View], pictures: Sequence[Float[np.ndarray, "h w 3
     return float(np.sqrt(squares / count)) if count else float("nan")
 
 
+def round_trip_rmse(
+    views: Sequence[View], pictures: Sequence[Float[np.ndarray, "h w 3"]], chosen: Sequence[Pair]
+) -> float:
+    """What carrying over alone costs, to be read beside `warp_rmse`: the same difference between a picture and itself
+    carried into the other view and back.
+
+    No view contradicts itself, so this is the blur of bilinear lookups and of a place seen at another scale. The
+    other view's own pixels are antialiased when they are drawn, and these are not, so it is no strict bound.
+    """
+    squares, count = 0.0, 0
+    for i, j in chosen:
+        there, seen = carried_over(views[j], views[i], pictures[i])
+        back, both = carried_over(views[i], views[j], np.concatenate([there, seen[..., None]], axis=-1))
+        if both.sum() >= max(LEAST_SHARED * views[i].mask.sum(), 1):
+            both &= back[..., 3] > 0.999  # nothing of what the other view does not show was mixed in
+            squares += float(((back[both][:, :3] - pictures[i][both]) ** 2).sum(dtype=np.float64))
+            count += 3 * int(both.sum())
+    return float(np.sqrt(squares / count)) if count else float("nan")
+
+
 def warp_lpips(
     views: Sequence[View], pictures: Sequence[Float[np.ndarray, "h w 3"]], chosen: Sequence[Pair], lpips: Lpips
 ) -> float:

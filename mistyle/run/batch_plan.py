@@ -12,12 +12,14 @@ from typing import Any
 
 from mistyle import __version__
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.files.own import read_own
 from mistyle.files.store import atomic_write
 from mistyle.run.batch_jobs import Record
 from mistyle.run.settings import validate
 
 PLAN = "plan.json"
 VERSION = 1
+MAX_PLAN_BYTES = 1 << 30  # some hundred thousand jobs
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> Plan:
     """A plan (the file or its folder), with its paths as this machine sees them. Raises InputRefused or UsageError."""
     path = path / PLAN if path.is_dir() else path
     try:
-        values = json.loads(path.read_text(encoding="utf-8"))
+        values = read_own(path, MAX_PLAN_BYTES)
     except FileNotFoundError:
         raise InputRefused(f"{path}: found nothing, expected the plan that `mistyle batch` writes") from None
     except (OSError, ValueError) as error:

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.errors import UsageError
 from mistyle.files.store import atomic_write, sha256_file
 from mistyle.run.compare_inputs import ENDINGS, pictures_of
 
@@ -54,15 +54,7 @@ def _some(names: Sequence[str] | dict) -> str:
 
 
 def _read(baseline: Path) -> dict[str, dict[str, str]]:
+    from mistyle.files.read import read_json
+
     path = baseline / RECORD
-    if not path.is_file():
-        return {}
-    try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise InputRefused(
-            f"{path}: found no readable JSON ({error}); expected an object. Repair or delete it."
-        ) from error
-    if not isinstance(found, dict):
-        raise InputRefused(f"{path}: found a {type(found).__name__}; expected an object. Repair or delete it.")
-    return found
+    return read_json(path) if path.is_file() else {}

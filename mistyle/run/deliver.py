@@ -17,6 +17,7 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.files.bounds import USD
+from mistyle.files.own import read_own
 from mistyle.files.packing import TARGETS
 from mistyle.files.store import atomic_folder, atomic_write, carry_over, digest, sha256_file
 from mistyle.files.textures import safe_name
@@ -66,7 +67,7 @@ def export(
     if not _whole(out, called, of):
         finished = read_finished(place)
         atomic_folder(out, lambda new: _deliver(new, out, finished, chosen, of))
-    record = json.loads((out / f"{called}.export.json").read_text(encoding="utf-8"))
+    record = read_own(out / f"{called}.export.json")
     return sorted([out / f"{called}.export.json", *(out / str(e["file"]) for e in record["files"])])
 
 
@@ -94,7 +95,7 @@ def _called(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tupl
 def _whole(out: Path, name: str, of: str) -> bool:
     """Whether this very delivery is there with every file as it was written."""
     try:
-        record = json.loads((out / f"{name}.export.json").read_text(encoding="utf-8"))
+        record = read_own(out / f"{name}.export.json")
         files = record["files"] if record["of"] == of else None
         return files is not None and all(
             (out / e["file"]).is_file() and (e.get("shared") or sha256_file(out / e["file"]) == e["sha256"])
@@ -126,7 +127,7 @@ def _earlier(out: Path, name: str) -> set[str]:
     """What an earlier delivery of this name wrote for itself."""
     listing = f"{name}.export.json"
     try:
-        files = json.loads((out / listing).read_text(encoding="utf-8"))["files"]
+        files = read_own(out / listing)["files"]
         return {listing, *(str(e["file"]) for e in files if not e.get("shared"))}
     except (OSError, ValueError, LookupError, TypeError):
         return {listing}

@@ -8,7 +8,6 @@ An edited file is noticed by its sha256, stays as it is, and what depends on it 
 folder may be edited: a finished stage with another changed file is set aside and made again.
 """
 
-import json
 import os
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -21,6 +20,7 @@ import numpy as np
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.maps import Maps
+from mistyle.files.own import read_own
 from mistyle.files.store import DONE, sha256_file
 
 # Stage -> names of its files that a person may edit.
@@ -50,7 +50,7 @@ def found(folder: Path, stage: str) -> tuple[dict[str, str], dict[str, str]]:
     the ending.
     """
     try:
-        done = json.loads((folder / DONE).read_text(encoding="utf-8"))
+        done = read_own(folder / DONE)
         taken_up, written = dict(done.get("edited", {})), dict(done["files"])
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return {}, {}

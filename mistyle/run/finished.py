@@ -1,6 +1,5 @@
 """A finished asset read back from a run folder, edits of its textures included."""
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -46,11 +45,17 @@ def read_finished(place: Path) -> Finished:
 
 def read_listing(place: Path) -> tuple[Path, dict[str, Any]]:
     """The asset folder and its list of files."""
+    from mistyle.files.read import read_json
+
     listing = _listing(place)
+    manifest = read_json(listing)
     try:
-        manifest = json.loads(listing.read_text(encoding="utf-8"))
-        _ = [(part["name"], part["textures"]) for part in manifest["parts"]], manifest["name"], manifest["files"]
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        stems = [str(part["textures"]) for part in manifest["parts"]]
+        _ = [part["name"] for part in manifest["parts"]], manifest["files"]
+        for name in (str(manifest["name"]), *stems):
+            if name != Path(name).name:
+                raise TypeError(f"{name[:80]!r} is no name of a file")
+    except (KeyError, TypeError) as error:
         raise InputRefused(
             f"{listing}: not the list of an asset of ours ({error}); export what mistyle wrote"
         ) from None

@@ -1,6 +1,5 @@
 """What the report of a job shows: its pictures are drawn here, its page is made by `run/report.py`."""
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ from mistyle.core.camera import Camera, orbit
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
+from mistyle.files.own import read_own
 from mistyle.run import report_overlays
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
@@ -280,7 +280,7 @@ def setting_groups(settings: BaseModel) -> dict[str, tuple[Setting, ...]]:
 
 def file_list(folder: Path, name: str) -> tuple[File, ...]:
     """The files of the asset as its own list names them."""
-    listed = json.loads((folder / f"{name}.json").read_text(encoding="utf-8"))["files"]
+    listed = read_own(folder / f"{name}.json")["files"]
     return tuple(
         File(
             f"asset/{entry['file']}",

@@ -17,6 +17,7 @@ from typing import Any
 from mistyle.core.errors import MistyleError, Stopped
 from mistyle.files import lock
 from mistyle.files.faults import unexpected
+from mistyle.files.own import read_own
 from mistyle.files.store import LOCK, atomic_write, digest, sha256_file
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import Plan
@@ -156,7 +157,7 @@ class FarmProgress(Progress):
 
 def _read(path: Path) -> dict[str, Any] | None:
     try:
-        told = json.loads(path.read_text(encoding="utf-8"))
+        told = read_own(path)
     except (OSError, ValueError):
         return None
     return told if isinstance(told, dict) else None

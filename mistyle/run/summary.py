@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from mistyle import __version__
 from mistyle.core import memory
+from mistyle.files.own import read_own
 from mistyle.files.store import atomic_write
 from mistyle.run.stages import Run
 
@@ -56,7 +57,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
 def earlier(path: Any) -> dict[str, Any]:
     """The `run.json` of the run before, or nothing."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return read_own(path)
     except (OSError, ValueError):
         return {}
 

@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from mistyle.core.errors import MistyleError
+from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.files.bounds import USD
 from mistyle.files.store import sha256_file
 from mistyle.run.blender import BLENDER, OPEN_WORKER, blender_command
@@ -48,14 +48,19 @@ def _row(file: str, check: str, complaints: Sequence[str], fine: str) -> Check:
 
 
 def listed_files(listing: Path, name: str) -> Check | None:
-    """The files that a list of ours (an asset's, a delivery's, a stage's) names, by their sha256; None for any other
-    file."""
+    """The files that a list of ours (an asset's, a delivery's, a stage's) names, by their sha256; None for a JSON file
+    that is no list."""
+    from mistyle.files.read import read_json
+
     try:
-        content = json.loads(listing.read_text(encoding="utf-8"))
+        content = read_json(listing)
+    except InputRefused as error:
+        return Check(name, "JSON", "failed", str(error))
+    try:
         given = content["files"]
         pairs = given.items() if isinstance(given, dict) else [(e["file"], e.get("sha256")) for e in given]
         wanted = {str(file): value for file, value in pairs if value is not None}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+    except (KeyError, TypeError, AttributeError):
         return None
     wrong = []
     for file, value in wanted.items():

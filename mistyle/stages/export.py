@@ -24,6 +24,7 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.files.gltf import patch_glb, write_glb
 from mistyle.files.gltf_alpha import Cutout, cutouts
 from mistyle.files.images import write_exr, write_png
+from mistyle.files.own import read_own
 from mistyle.files.store import atomic_folder, atomic_write, carry_over, sha256_file
 from mistyle.files.textures import Pictures, encode_pictures, normal_colours, orm_colours, part_stems, safe_name
 from mistyle.stages.texels import corner_weights
@@ -151,7 +152,7 @@ def _earlier(folder: Path, name: str) -> set[str]:
     """What an earlier export of this name wrote, by its list."""
     own = f"{name}.json"
     try:
-        listed = json.loads((folder / own).read_text(encoding="utf-8"))["files"]
+        listed = read_own(folder / own)["files"]
         return {own, *(str(entry["file"]) for entry in listed)}
     except (OSError, ValueError, LookupError, TypeError):
         return {own}
