@@ -22,7 +22,7 @@ MIDDLE = {
     "stylize": "paint the surface ...",
     "fit": "fit the material ...",
     "fit --scene": "fit the scene ...",
-    "batch": "demo_demo_style_2: begun",
+    "batch": "demo_demo_style_v1: begun",
 }
 CRASHES = """
 import ctypes, os, signal, sys, threading, time
@@ -71,8 +71,9 @@ def in_the_middle(job: Job, out: Path) -> tuple[subprocess.Popen, Path]:
     """The job, started, at the moment when it says that it is in the middle."""
     log = out.with_suffix(".log")
     child = begin(job.line(out), log)
-    until(child, lambda: MIDDLE[job.name] in log.read_text(errors="replace"), pause=0.02)
-    time.sleep(0.5)
+    if not until(child, lambda: MIDDLE[job.name] in log.read_text(errors="replace"), pause=0.02):
+        raise RuntimeError(f"{job.name} ended without having said {MIDDLE[job.name]!r}")
+    time.sleep(4.0 if job.name == "batch" else 0.5)  # its shards are processes that first have to start
     return child, log
 
 
@@ -140,7 +141,7 @@ def full_disks(wholes: Mapping[str, Whole], quick: Mapping[str, tuple[Job, Job]]
     """
     for number, (name, whole) in enumerate(wholes.items()):
         with disk(
-            folder / f"disk{number}", "200k" if name == "fit --scene" else "3m" if name == "stylize" else "1400k"
+            folder / f"disk{number}", "64k" if name == "fit --scene" else "3m" if name == "stylize" else "1400k"
         ) as out:
             code, words = finish(whole.job.line(out))
             rest = left_over(out)
