@@ -22,6 +22,8 @@ LINEAR = 21  # how many of them enter the squared distance with weight one; the 
 BORDER = 2  # half a patch: centres keep this far from a page's edge
 SIGMA = 1.6  # of the vote's Gaussian, in samples
 FOLLOW = (7, 11, 13, 17, 2, 10, 14, 22)  # table entries at distance 1 and 2 along the axes, whose place is continued
+BESIDE = (7, 11, 13, 17)  # table entries of the four nearest neighbours
+STAY = 0.1  # price of going on with a piece that is as large as it may get: more than any place is better than another
 PROBES = np.array(
     [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1), (0, 3), (0, -3), (3, 0), (-3, 0)], np.float32
 )
@@ -64,6 +66,14 @@ class Wanted:
 
     descriptor: Any
     band_weight: Any
+
+
+@dataclass(frozen=True)
+class Ends:
+    """1 for samples with whose picture nobody shall go on, else 0; and how far (pixels) about it that holds."""
+
+    sample: Any
+    around: Any
 
 
 def module(name: str) -> ModuleType:
@@ -276,6 +286,7 @@ def search(
     use: Any,
     prices: Any,
     also: Place | None,
+    ends: Ends | None = None,
 ) -> tuple[Any, Place]:
     """One round: every sample takes the best of its own place, those its neighbours suggest, and fixed steps about it.
 
@@ -288,7 +299,13 @@ def search(
     target = [dr.gather(dj.Array4f, wanted.descriptor, i * (WIDTH // 4) + k) for k in range(WIDTH // 4)]
     band_weight = dr.gather(dj.Float, wanted.band_weight, i)
     coherence, variety = dr.gather(dj.Float, prices, dj.UInt(0)), dr.gather(dj.Float, prices, dj.UInt(1))
-    beside = [continued(dj, table, book, place, i * 25 + slot) for slot in (7, 11, 13, 17)]
+    beside = [continued(dj, table, book, place, i * 25 + slot) for slot in BESIDE]
+    end = (
+        [dr.gather(dj.Float, ends.sample, dr.gather(dj.UInt, table.neighbour, i * 25 + s) & ~TURNED) for s in BESIDE]
+        if ends
+        else []
+    )
+    around = dr.square(dr.gather(dj.Float, ends.around, dj.UInt(0))) if ends else None
 
     def inside(page: Any, x: Any, y: Any) -> tuple[Any, Any]:
         width, height = dr.gather(dj.Float, book.width, page), dr.gather(dj.Float, book.height, page)
@@ -304,9 +321,13 @@ def search(
                 total += dr.squared_norm(gap)
             else:
                 total += dr.square(gap[0]) + band_weight * dr.square(gap[1])
-        for other, u, v in beside:
-            jump = dr.minimum(dr.square(u - x) + dr.square(v - y), 4) / 4
-            total += coherence * dr.select(other == page, jump, 1)
+        for k, (other, u, v) in enumerate(beside):
+            away = dr.square(u - x) + dr.square(v - y)
+            price = coherence * dr.select(other == page, dr.minimum(away, 4) / 4, 1)
+            if ends is not None:
+                near = dr.select(other == page, dr.maximum(1 - away / around, 0), 0)
+                price = dr.select(end[k] > 0, STAY * near, price)
+            total += price
         return total
 
     def better(best: tuple[Any, ...], page: Any, x: Any, y: Any) -> tuple[Any, ...]:

@@ -69,6 +69,13 @@ class SurfaceSettings(BaseModel):
         le=0.05,
         description="price of leaving a stroke: higher copies larger pieces of the painting",
     )
+    largest_piece: float = Field(
+        default=1.0,
+        gt=0.0,
+        le=1.0,
+        description="about how large a piece of the painting may be copied as it is, in shares of its long side: 0.1 "
+        "breaks up faces, houses and lettering; 1 sets no bound",
+    )
     variety: float = Field(
         default=0.016, ge=0.0, le=0.05, description="price of using a part of the painting more often than the others"
     )

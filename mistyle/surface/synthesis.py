@@ -7,8 +7,9 @@ place p (page, x, y) of the painting with the least
     |D_p - D_s|^2 + detail w(s) (band_p - relief std(band) d_s)^2 + variety use(p) / wanted use(p)
         + stroke_coherence * sum over 4 neighbours of [1 if on another page, else min(jump^2, 4) / 4]
 
-where D joins 16 principal components of the patch (Lab / 100, over 5), the large-area colour (weights 1, 0.6, 0.6
-times `palette`, five times that for paintings of two tones) and the stroke direction (`orientation`); d_s is the detail
+(about neighbours at which a copied piece has got too large, staying near costs instead: surface/pieces.py), where D
+joins 16 principal components of the patch (Lab / 100, over 5), the large-area colour (weights 1, 0.6, 0.6 times
+`palette`, five times that for paintings of two tones) and the stroke direction (`orientation`); d_s is the detail
 guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance in pixels from where the neighbour's picture would go on.
 
 The search is deterministic: all places are tried for all samples on the coarse levels; on every level a sample tries
@@ -29,6 +30,7 @@ from mistyle.surface.glaze import glaze
 from mistyle.surface.guides import Content, Guide, Occlusion, guides
 from mistyle.surface.linefield import Course, directions, line_field
 from mistyle.surface.lookup import Solution, solution
+from mistyle.surface.pieces import too_far
 from mistyle.surface.samples import Level, nearest, sample_normals, spread, with_tables
 from mistyle.surface.settings import SurfaceSettings
 
@@ -46,6 +48,7 @@ INITIAL_JITTER = 0.004
 CHROMA = 0.6
 TWO_TONES = 5.0  # how many times as much the large-area colour of a painting without middle tones counts
 LEAST_WANTED = 0.1
+LEAST_AROUND = 4.0  # pixels about the end of a piece that count as the same piece
 TYPICAL_LOAD = 0.35  # mean urgency of detail at which its weight is the setting's
 UNREACHABLE = 1e3  # descriptor of pixels that must not be used: farther than anything else
 
@@ -257,9 +260,21 @@ def paint_level(
             costs = settings.variety * usage(pages, on_host(place))[pages.origin]
             also = on_device(dj, exhaustive(asked, band_weight, described, costs, pages))
         for _ in range(SWEEPS):
-            use = kernels.floats(dj, usage(pages, on_host(place)))
-            place = kernels.search(dj, table, book, place, wanted, use, prices, also)[1]
+            here = on_host(place)
+            use = kernels.floats(dj, usage(pages, here))
+            # Only where all places are tried is there a way out of a piece; finer levels redraw what these decided.
+            bound = settings.largest_piece < 1 and complete > 0
+            ends = ends_of_pieces(level, pages, here, settings.largest_piece, dj) if bound else None
+            place = kernels.search(dj, table, book, place, wanted, use, prices, also, ends)[1]
     return on_host(place)
+
+
+def ends_of_pieces(level: Level, pages: style.Pages, choice: Choice, largest: float, dj: ModuleType) -> kernels.Ends:
+    """Where no neighbour shall go on with the picture, since the piece is as large as it may get."""
+    far = too_far(level, pages, choice.page, choice.x, choice.y, pixels(pages, choice), largest)
+    height, width = pages.size
+    around = max(largest * max(height, width), LEAST_AROUND)
+    return kernels.Ends(kernels.floats(dj, far.astype(np.float32)), kernels.floats(dj, np.array([around])))
 
 
 def guide_weights(settings: SurfaceSettings, pages: style.Pages) -> Float[np.ndarray, " 5"]:
