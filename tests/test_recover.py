@@ -150,7 +150,7 @@ def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
     points = Points(np.zeros((size**2, 3), np.float32), np.zeros((size**2, 3, 3), np.float32))
     rig = Rig(none, np.zeros(1, np.int32), none, none[:, 0], none)
     count = np.zeros(size**2, np.int32)
-    gathered = Gathered(np.arange(size**2), points, rig, seen, (), count, count)
+    gathered = Gathered(np.arange(size**2), points, rig, seen, (), count)
     np.testing.assert_allclose(solving.likelihood(solution)[0], noise, rtol=1e-2)
     own = noise**-2 / (noise**-2 + 0.03**-2)
     np.testing.assert_allclose(solving.decided(solution, gathered.seen), own, rtol=1e-2)

@@ -45,13 +45,8 @@ def sky(lights: Sequence[Light], directions: int = 128) -> Sky | None:
     soft = [light for light in lights if isinstance(light, SOFT)]
     if not soft:
         return None
-    finest = max((len(light.radiance) for light in soft if isinstance(light, Environment)), default=LEAST_ROWS)
-    rows = int(np.clip(finest, LEAST_ROWS, MOST_ROWS))
-    fine = -(-finest // rows)
-    radiance = _radiance(soft, _directions(rows * fine))
-    radiance = radiance.reshape(rows, fine, 2 * rows, fine, 3).mean(axis=(1, 3))
-    edges = np.cos(np.arange(rows + 1) / rows * np.pi)
-    angle = np.repeat(((edges[:-1] - edges[1:]) * np.pi / rows)[:, None], 2 * rows, axis=1)
+    radiance, angle = _map(soft)
+    rows = len(radiance)
     bright = (radiance @ REC709) * angle
     share = angle / (4 * np.pi)
     if bright.sum() > 0:
@@ -75,6 +70,61 @@ def sky(lights: Sequence[Light], directions: int = 128) -> Sky | None:
     centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
     solid = total(angle).sum(axis=1)
     return Sky(centre.astype(np.float32), energy.astype(np.float32), solid.astype(np.float32), radiance, cell)
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Soft light gathered in cells of the sphere, one directional light each.
+
+    direction  unit, from the surface, towards the centre of light of the cell
+    irradiance ∫ radiance dω over it, linear Rec.709
+    width2     mean square of the angle by which the light in it lies beside that direction, along one axis
+    """
+
+    direction: Float[np.ndarray, "k 3"]
+    irradiance: Float[np.ndarray, "k 3"]
+    width2: Float[np.ndarray, " k"]
+
+
+def even_directions(count: int) -> Float[np.ndarray, "k 3"]:
+    """Unit vectors spread evenly over the sphere (a Fibonacci spiral)."""
+    k = np.arange(count) + 0.5
+    y, phi = 1 - 2 * k / count, np.pi * (1 + 5**0.5) * k
+    side = np.sqrt(1 - y**2)
+    return np.stack([side * np.sin(phi), y, side * np.cos(phi)], axis=1).astype(np.float32)
+
+
+def gathered_in(lights: Sequence[Light], middles: Float[np.ndarray, "k 3"]) -> Cells:
+    """The soft light among `lights`, each direction's light counted to the nearest of `middles`."""
+    radiance, angle = _map([light for light in lights if isinstance(light, SOFT)])
+    rows = len(radiance)
+    towards = _directions(rows).reshape(-1, 3)
+    cell = np.concatenate([(part @ middles.T).argmax(axis=1) for part in np.array_split(towards, max(rows // 16, 1))])
+    flux = (radiance * angle[..., None]).reshape(-1, 3)
+    bright = flux @ REC709 + angle.ravel() * max(float((flux @ REC709).sum()), 1e-20) * 1e-9
+
+    def total(values: np.ndarray) -> np.ndarray:
+        return np.bincount(cell, values, minlength=len(middles))
+
+    weight = np.maximum(total(bright), 1e-30)
+    centre = np.stack([total(towards[:, c] * bright) for c in range(3)], axis=1) / weight[:, None]
+    length = np.linalg.norm(centre, axis=1)
+    return Cells(
+        (centre / np.maximum(length, 1e-9)[:, None]).astype(np.float32),
+        np.stack([total(flux[:, c]) for c in range(3)], axis=1).astype(np.float32),
+        np.clip(1 - length, 0, 1).astype(np.float32),
+    )
+
+
+def _map(soft: Sequence[Light]) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+    """Mean radiance of every pixel of a latitude-longitude map, and its solid angle."""
+    finest = max((len(light.radiance) for light in soft if isinstance(light, Environment)), default=LEAST_ROWS)
+    rows = int(np.clip(finest, LEAST_ROWS, MOST_ROWS))
+    fine = -(-finest // rows)
+    radiance = _radiance(soft, _directions(rows * fine))
+    edges = np.cos(np.arange(rows + 1) / rows * np.pi)
+    angle = np.repeat(((edges[:-1] - edges[1:]) * np.pi / rows)[:, None], 2 * rows, axis=1)
+    return radiance.reshape(rows, fine, 2 * rows, fine, 3).mean(axis=(1, 3)), angle
 
 
 def _partition(share: Float[np.ndarray, "h w"], count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,7 +1,8 @@
 """Material of every texel by itself, by a batched Levenberg–Marquardt solver: texels are the lanes.
 
 Where geometry, cameras and lights are known and light arrives from deltas, a texel's own observations determine its
-own unknowns x = (albedo r, g, b, tilt x, tilt y, roughness, metallic), and no picture has to be rendered. With the
+own unknowns x = (albedo r, g, b, tilt x, tilt y, roughness, metallic), and no picture has to be rendered. Soft light is
+taken for as many directional lights as the sky has cells, each of which widens a gloss by its own width. With the
 reflectance albedo · paint + gloss of `render/bsdf.py` and irradiance E the model of an observation is, per channel c,
 
     f_c(x) = sum over its lights of E_c (albedo_c paint(tilt, roughness, metallic) + gloss(tilt, roughness, metallic))
@@ -42,7 +43,7 @@ class Problem:
         import mitsuba
 
         mi: Any = mitsuba
-        self.options, self.single = options, rig.single
+        self.options, self.single, self.soft = options, rig.single, rig.cells is not None
         self.texels = len(points.position)
         count = np.diff(observations.start)
         self.order = np.argsort(-count, kind="stable")
@@ -51,6 +52,8 @@ class Problem:
             "first": mi.UInt32(aligned(rig.first, np.uint32)),
             "light": mi.Float(aligned(_light_rows(rig).ravel())),
         }
+        if rig.cells is not None:
+            self.rig["cells"] = mi.UInt32(aligned(rig.cells, np.uint32))
         self.chunks = []
         for low in range(0, self.texels, LANES):
             texel = self.order[low : low + LANES]
@@ -211,8 +214,15 @@ class Problem:
         width = 30 if slopes else 6
         zeros = tuple(dr.zeros(mi.Float, dr.width(chunk["lane"])) for _ in range(width))
 
+        cells = dr.gather(mi.UInt32, self.rig["cells"], picture) if self.soft else None
+
         def body(light, *flat):
-            shines = dr.select(((lit >> (light - first)) & 1) == 1, mi.Float(1), mi.Float(0))
+            word, bit = lit, light - first
+            if cells is not None:
+                cell = dr.select(light >= cells, light - cells, 0)
+                sky = dr.gather(mi.UInt32, chunk["open"], (cell >> 5) * chunk["width"] + chunk["lane"])
+                word, bit = dr.select(light >= cells, sky, lit), dr.select(light >= cells, cell & 31, bit)
+            shines = dr.select(((word >> bit) & 1) == 1, mi.Float(1), mi.Float(0))
             parts = self._light(chunk, light, shines, wi, x, slopes)
             return light + 1, *(a + b for a, b in zip(flat, _flat4(parts), strict=True))
 
@@ -233,7 +243,8 @@ class Problem:
         scale = scale * dr.select(near, 1 / distance2, 1)
         irradiance = [row[4 + c] * scale for c in range(3)]
         chosen = terms if not slopes else differences if self.options.differences else derivatives
-        paint, gloss, d_paint, d_gloss = chosen(self.options, wi, wo, x[3:])
+        width2 = dr.gather(mi.Float, self.rig["light"], light * 8 + 7) if self.soft else None
+        paint, gloss, d_paint, d_gloss = chosen(self.options, wi, wo, x[3:], width2)
         return (
             [e * paint for e in irradiance],
             [e * gloss for e in irradiance],
@@ -288,6 +299,7 @@ def _rows(columns: list) -> Float[np.ndarray, "n c"]:
 def _light_rows(rig: Rig) -> Float[np.ndarray, "l 8"]:
     rows = np.zeros((len(rig.vector), 8), np.float32)
     rows[:, :3], rows[:, 3], rows[:, 4:7] = rig.vector, rig.near, rig.irradiance
+    rows[:, 7] = 0 if rig.width2 is None else rig.width2
     return rows
 
 
@@ -318,6 +330,8 @@ def _chunk(points: Points, seen: Observations, texel: Int[np.ndarray, " n"], cou
         "lit": mi.UInt32(aligned(seen.lit[rows], np.uint32)),
         "rgb": _columns(seen.rgb[rows]),
     }
+    if points.open is not None:
+        chunk["open"] = mi.UInt32(aligned(points.open[texel].T.ravel(), np.uint32))
     dr.eval(chunk["lane"])
     dr.make_opaque(chunk["lane"])
     return chunk

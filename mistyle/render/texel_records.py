@@ -10,10 +10,14 @@ UNKNOWNS = ("albedo_r", "albedo_g", "albedo_b", "tilt_x", "tilt_y", "roughness",
 
 @dataclass(frozen=True)
 class Points:
-    """Surface points of t texels: position and tangent frame (rows: tangent, bitangent, normal; unit), in the world."""
+    """Surface points of t texels: position and tangent frame (rows: tangent, bitangent, normal; unit), in the world.
+
+    open  bit k % 32 of word k // 32 is set where cell k of the sky reaches the point; None where there is no soft light
+    """
 
     position: Float[np.ndarray, "t 3"]
     frame: Float[np.ndarray, "t 3 3"]
+    open: Integer[np.ndarray, "t w"] | None = None
 
 
 @dataclass(frozen=True)
@@ -24,6 +28,8 @@ class Rig:
     vector      unit direction towards the light, or where `near` the light's position, in the world
     near        1 for a point light, whose irradiance is that at distance 1
     irradiance  linear Rec.709
+    cells       from which light on those of picture v are the cells of the sky, in their order; None: nowhere
+    width2      of such a cell, see `sky.Cells`; 0 for other lights
     """
 
     eye: Float[np.ndarray, "v 3"]
@@ -31,11 +37,13 @@ class Rig:
     vector: Float[np.ndarray, "l 3"]
     near: Float[np.ndarray, " l"]
     irradiance: Float[np.ndarray, "l 3"]
+    cells: Int[np.ndarray, " v"] | None = None
+    width2: Float[np.ndarray, " l"] | None = None
 
     @property
     def single(self) -> bool:
-        """Whether every picture has exactly one light."""
-        return bool((np.diff(self.first) == 1).all())
+        """Whether every picture has exactly one light, and that is a delta."""
+        return self.cells is None and bool((np.diff(self.first) == 1).all())
 
 
 @dataclass(frozen=True)
@@ -44,7 +52,8 @@ class Observations:
 
     rgb     linear radiance that left the texel towards the camera
     weight  one over its standard deviation
-    lit     bit l is set where light l of the picture (counted within the picture) reaches the texel
+    lit     bit l is set where light l of the picture (counted within the picture) reaches the texel; of cells of the
+            sky the points' `open` says it
     """
 
     start: Int[np.ndarray, " t1"]

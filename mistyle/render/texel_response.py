@@ -9,22 +9,27 @@ STEP = 1e-3  # of central differences, the twin of the derivatives by AD
 MIN_Z2 = 1e-4
 
 
-def terms(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
+def terms(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tuple[Any, Any, list, list]:
+    """paint and gloss; light that comes from a cell of `width2` (`sky.Cells`) widens the gloss's lobe.
+
+    GGX's α² is twice the variance of the slopes that mirror, and these turn half as much as the light does.
+    """
     import drjit as dr
 
     z = dr.sqrt(dr.maximum(1 - dr.square(q[0]) - dr.square(q[1]), MIN_Z2))
     normal = type(wi)(q[0], q[1], z)
-    paint, gloss = bsdf.terms(options.model, wi, wo, normal, q[2], q[3])
+    roughness = q[2] if width2 is None else dr.sqrt(dr.sqrt(dr.square(dr.square(q[2])) + 0.5 * width2))
+    paint, gloss = bsdf.terms(options.model, wi, wo, normal, roughness, q[3])
     return paint, gloss, [], []
 
 
-def derivatives(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
+def derivatives(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tuple[Any, Any, list, list]:
     """By forward-mode AD: the operations that several directions share are compiled once."""
     import drjit as dr
 
     moving = [type(v)(v) for v in q]
     dr.enable_grad(moving)
-    paint, gloss, _, _ = terms(options, wi, wo, moving)
+    paint, gloss, _, _ = terms(options, wi, wo, moving, width2)
     d_paint, d_gloss = [], []
     for j, v in enumerate(moving):
         if j == 3 and not options.metallic:
@@ -42,17 +47,19 @@ def derivatives(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, 
     return dr.detach(paint), dr.detach(gloss), d_paint, d_gloss
 
 
-def differences(options: Options, wi: Any, wo: Any, q: list) -> tuple[Any, Any, list, list]:
+def differences(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tuple[Any, Any, list, list]:
     import drjit as dr
 
-    paint, gloss, _, _ = terms(options, wi, wo, q)
+    paint, gloss, _, _ = terms(options, wi, wo, q, width2)
     d_paint, d_gloss = [], []
     for j in range(4):
         if j == 3 and not options.metallic:
             d_paint.append(dr.zeros(type(q[j])))
             d_gloss.append(dr.zeros(type(q[j])))
             continue
-        high, low = (terms(options, wi, wo, [v + e if k == j else v for k, v in enumerate(q)]) for e in (STEP, -STEP))
+        high, low = (
+            terms(options, wi, wo, [v + e if k == j else v for k, v in enumerate(q)], width2) for e in (STEP, -STEP)
+        )
         d_paint.append((high[0] - low[0]) * (0.5 / STEP))
         d_gloss.append((high[1] - low[1]) * (0.5 / STEP))
     return paint, gloss, d_paint, d_gloss

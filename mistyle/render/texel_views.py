@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt32
 
 from mistyle.core.camera import Camera
 from mistyle.core.lanes import aligned
@@ -13,7 +13,10 @@ from mistyle.core.light import Directional, Light, Lights, Point, direction_in_w
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
 from mistyle.render.hits import BLOCK_RAYS
+from mistyle.render.sky import SOFT, even_directions, gathered_in
 from mistyle.render.texel_lm import Rig
+
+SKY_CELLS = 128
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,9 @@ def look(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> Look:
 
 
 def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
-    """The solver's record of pictures and their delta lights."""
-    vector, near, irradiance = [], [], []
+    """The solver's record of pictures and their lights; soft ones, where there are any, in SKY_CELLS cells."""
+    vector, near, irradiance, width2 = [], [], [], []
+    first, cells, known = [0], [], {}
     for camera, own in zip(cameras, lights, strict=True):
         for light in own:
             if isinstance(light, Directional):
@@ -78,16 +82,52 @@ def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
             elif isinstance(light, Point):
                 vector.append(position_in_world(light, camera))
                 irradiance.append(light.intensity)
+            elif isinstance(light, SOFT):
+                continue
             else:
-                raise ValueError(f"{type(light).__name__} is no delta light")
+                raise ValueError(f"{type(light).__name__} is no light that the solver knows")
             near.append(float(isinstance(light, Point)))
+            width2.append(0.0)
+        cells.append(len(near))
+        soft = tuple(light for light in own if isinstance(light, SOFT))
+        if soft:
+            key = tuple(map(id, soft))
+            if key not in known:
+                known[key] = gathered_in(soft, even_directions(SKY_CELLS))
+            sky = known[key]
+            vector.extend(sky.direction)
+            irradiance.extend(sky.irradiance)
+            near.extend([0.0] * SKY_CELLS)
+            width2.extend(sky.width2)
+        first.append(len(near))
     return Rig(
         eye=np.stack([camera.position for camera in cameras]).astype(np.float32),
-        first=np.cumsum([0] + [len(own) for own in lights]),
+        first=np.array(first),
         vector=np.array(vector, np.float32).reshape(-1, 3),
         near=np.array(near, np.float32),
         irradiance=np.array(irradiance, np.float32).reshape(-1, 3),
+        cells=np.array(cells) if known else None,
+        width2=np.array(width2, np.float32) if known else None,
     )
+
+
+def open_sky(
+    traced: Tracer, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]
+) -> UInt32[np.ndarray, "n w"]:
+    """Which of the SKY_CELLS even directions nothing of the mesh hides from points just above the surface: bit k % 32
+    of word k // 32."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    device.use()
+    origin = mi.Point3f(*(mi.Float(aligned(c)) for c in (position + 1e-3 * normal).T))
+    words = np.zeros((len(position), -(-SKY_CELLS // 32)), np.uint32)
+    for k, direction in enumerate(even_directions(SKY_CELLS)):
+        away = dr.opaque(mi.Vector3f, direction.tolist())
+        free = ~np.array(traced.scene.ray_test(mi.Ray3f(origin, away)))
+        words[:, k // 32] |= free.astype(np.uint32) << np.uint32(k % 32)
+    return words
 
 
 def reaches(

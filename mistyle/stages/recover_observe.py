@@ -17,10 +17,12 @@ from mistyle.core.image import erode
 from mistyle.core.light import Directional, Point
 from mistyle.core.maps import Texels
 from mistyle.render.draw import Tracer
+from mistyle.render.sky import SOFT
 from mistyle.render.texel_lm import Observations, Points, Rig
-from mistyle.render.texel_views import look, rig
+from mistyle.render.texel_views import look, open_sky, rig
 from mistyle.stages.frames import texel_frames
 
+DELTA = (Directional, Point)
 REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
 LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane
 PERCENTILE = 95.0  # of the observed radiance: the unit of the noise
@@ -43,7 +45,6 @@ class Gathered:
     texel     flat index of each into the concatenated sets
     sightings per picture
     views     how many different cameras observed each texel
-    soft      how many pictures with other than delta lights show each texel; they are no observations of the solver
     """
 
     texel: Int[np.ndarray, " t"]
@@ -52,7 +53,6 @@ class Gathered:
     observations: Observations
     sightings: tuple[Sighting, ...]
     views: Int[np.ndarray, " t"]
-    soft: Int[np.ndarray, " t"]
 
     @property
     def seen(self) -> Int[np.ndarray, " t"]:
@@ -71,7 +71,7 @@ def gather(
     relative: float = 0.01,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Gathered:
-    """All observations under delta lights; of pictures with any other light only which texels they show.
+    """All observations of the pictures whose lights are known (a light from a scene file is none of them).
 
     `facing` is the least cosine between the texel's normal and the camera; the standard deviation of an observation of
     radiance y is noise · (the brightest radiance, robustly) + relative · y, larger where the surface turns away and
@@ -83,38 +83,31 @@ def gather(
     face = np.concatenate([t.face[c] for t, c in zip(texels, covered, strict=True)])
     normal = np.concatenate([t.normal[c] for t, c in zip(texels, covered, strict=True)])
     size = np.concatenate([texel_sizes(t) for t in texels])[texel]
-    points = Points(position, texel_frames(traced.mesh, face, position, normal, tangents))
-    used = [k for k, own in enumerate(captures.lights) if all(isinstance(s, Directional | Point) for s in own)]
+    used = [k for k, own in enumerate(captures.lights) if all(isinstance(s, DELTA + SOFT) for s in own)]
+    soft = [any(isinstance(s, SOFT) for s in captures.lights[k]) for k in range(len(captures))]
+    sky = open_sky(traced, position, normal) if any(soft[k] for k in used) else None
+    points = Points(position, texel_frames(traced.mesh, face, position, normal, tangents), sky)
     parts: list[tuple] = []
     views = np.zeros(len(texel), np.int32)
     for done, group in enumerate(_by_camera(captures.cameras, used)):
         camera = captures.cameras[group[0]]
-        beams = [light for k in group for light in captures.lights[k]]
+        beams = [light for k in group for light in captures.lights[k] if isinstance(light, DELTA)]
         seen = look(traced, camera, beams)
         near, pixel, x, y, worth = _visible(camera, seen, position, normal, size, facing)
         any_light, first = np.zeros(len(near), bool), 0
         for k in group:
-            count = len(captures.lights[k])
+            count = sum(isinstance(light, DELTA) for light in captures.lights[k])
             lit = [_steady(mask, seen.mask) for mask in seen.lit[first : first + count]]
             first += count
             rgb, usable = captures.load(k)
-            ids, values, bits, chosen = _observe(rgb, usable, lit, near, pixel, x, y)
+            ids, values, bits, chosen = _observe(rgb, usable, lit, soft[k], near, pixel, x, y)
             any_light[chosen] = True
             # These are most of a fit's memory: nothing here is larger than it has to be.
             where = pixel[chosen].astype(np.int32)
             parts.append((k, ids.astype(np.int32), values, bits, where, x[chosen], y[chosen], worth[chosen]))
         views[near[any_light]] += 1
         progress((done + 1) / max(len(used) / max(len(group), 1), 1))
-    soft = np.zeros(len(texel), np.int32)
-    for group in _by_camera(captures.cameras, [k for k in range(len(captures)) if k not in used]):
-        camera = captures.cameras[group[0]]
-        near, pixel, *_ = _visible(camera, look(traced, camera, []), position, normal, size, facing)
-        counts = np.zeros(len(near), np.int32)
-        for k in group:
-            counts += _usable(captures.load(k)[1], pixel)
-        soft[near] += counts
-        views[near[counts > 0]] += 1
-    return _assemble(texel, points, captures, parts, views, soft, noise, relative)
+    return _assemble(texel, points, captures, parts, views, noise, relative)
 
 
 def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, "n 3"]:
@@ -184,8 +177,9 @@ def _steady(lit: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> Int[
     return np.where(whole, 1, np.where(none, 0, -1)).astype(np.int8)
 
 
-def _observe(rgb, usable, lit, near, pixel, x, y) -> tuple[np.ndarray, ...]:
-    """Texels that one picture observes in the light: index, radiance, light bits, which of `near`."""
+def _observe(rgb, usable, lit, soft: bool, near, pixel, x, y) -> tuple[np.ndarray, ...]:
+    """Texels that one picture observes in the light: index, radiance, light bits, which of `near`. Soft light, where
+    the picture has it too, is taken to reach them all."""
     usable = erode(usable & np.isfinite(rgb).all(axis=-1), 1)
     width = rgb.shape[1]
     good, bits = np.ones(len(near), bool), np.zeros(len(near), np.uint32)
@@ -197,7 +191,7 @@ def _observe(rgb, usable, lit, near, pixel, x, y) -> tuple[np.ndarray, ...]:
         on, off = (four == 1).all(axis=0), (four == 0).all(axis=0)
         good &= on | off
         bits |= np.where(on, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
-    chosen = np.flatnonzero(good & (bits != 0))
+    chosen = np.flatnonzero(good & ((bits != 0) | soft))
     values = _bilinear(rgb, pixel[chosen], x[chosen], y[chosen])
     return near[chosen], values, bits[chosen], chosen
 
@@ -210,13 +204,7 @@ def _bilinear(image: Float[np.ndarray, "h w 3"], pixel, x, y) -> Float[np.ndarra
     return top * (1 - y) + bottom * y
 
 
-def _usable(mask: Bool[np.ndarray, "h w"], pixel: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Whether all four pixels from `pixel`, the top left, on count."""
-    width, flat = mask.shape[1], mask.ravel()
-    return np.all([flat.take(pixel + step) for step in (0, 1, width, width + 1)], axis=0)
-
-
-def _assemble(texel, points, captures: Captures, parts, views, soft, noise: float, relative: float) -> Gathered:
+def _assemble(texel, points, captures: Captures, parts, views, noise: float, relative: float) -> Gathered:
     """Sort the observations by texel; within a texel they follow the pictures' order. `parts` is empty afterwards."""
     parts.sort(key=lambda part: -part[0])
     count = np.zeros(len(texel), np.int64)
@@ -239,8 +227,5 @@ def _assemble(texel, points, captures: Captures, parts, views, soft, noise: floa
     unit = float(np.percentile(level, PERCENTILE)) if total else 1.0
     weight = worth / (noise * max(unit, 1e-6) + relative * level)
     observations = Observations(start, picture, rgb, weight.astype(np.float32), lit)
-    return Gathered(texel, points, rig(captures.cameras, _delta(captures)), observations, tuple(sightings), views, soft)
-
-
-def _delta(captures: Captures) -> list:
-    return [own if all(isinstance(s, Directional | Point) for s in own) else () for own in captures.lights]
+    known = [own if all(isinstance(s, DELTA + SOFT) for s in own) else () for own in captures.lights]
+    return Gathered(texel, points, rig(captures.cameras, known), observations, tuple(sightings), views)

@@ -9,14 +9,14 @@ from jaxtyping import Float, Int
 
 from mistyle.core.capture import Captures
 from mistyle.core.image import resize
-from mistyle.core.light import Directional, Point
 from mistyle.core.maps import Maps, Texels
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust
-from mistyle.stages.recover_observe import Gathered, fetch
+from mistyle.stages.recover_observe import DELTA, SOFT, Gathered, fetch
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
 
+SOFT_COST = 64  # times as long as under one light a texel takes under a sky, nearly
 DOUBT = 0.3  # standard deviation of an estimate of indirect light, relative to it
 
 
@@ -54,7 +54,9 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
 
     by, settings = 1, work.settings
     sides = [side for size in work.where.sizes for side in size]
-    while sum(int(c.sum()) for c in work.where.covered) / by**2 > settings.solver_texels:
+    soft = any(isinstance(light, SOFT) for own in work.captures.lights for light in own)
+    most = settings.solver_texels / (SOFT_COST if soft else 1)
+    while sum(int(c.sum()) for c in work.where.covered) / by**2 > most:
         if any(side % (2 * by) or side // (2 * by) < 8 for side in sides):
             break
         by *= 2
@@ -159,12 +161,12 @@ def solve_texels(
             values = np.where(bad.reshape(-1, 1), mean, values)
             spread = np.where(bad.reshape(-1, 1), np.array(solving.PRIOR_SPREAD, np.float32), spread)
     elif settings.solver != "pictures":
-        work.notes.append("No picture is lit by directional or point lights alone: texels were not solved one by one.")
+        work.notes.append("No texel was observed under lights that are known: texels were not solved one by one.")
     return Found(
         solving.spread_out(values, gathered, where),
         _placed(spread, gathered.texel, where, np.array(solving.PRIOR_SPREAD, np.float32)),
         _placed(decided, gathered.texel, where, 1),
-        _placed(gathered.seen + gathered.soft, gathered.texel, where, 0),
+        _placed(gathered.seen, gathered.texel, where, 0),
         _placed(gathered.views, gathered.texel, where, 0),
         solved,
     )
@@ -179,7 +181,7 @@ def take_off_indirect(work: Work, shade, table: np.ndarray, indirect: dict[int, 
     maps = unpack(table, work.where.sizes)
     scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for k, (camera, lights) in enumerate(zip(work.captures.cameras, work.captures.lights, strict=True)):
-        if all(isinstance(light, Directional | Point) for light in lights):
+        if all(isinstance(light, DELTA + SOFT) for light in lights):
             indirect[k] = scene.picture(camera, lights, settings.bounce_samples, seed + k)
             retarget(shade, k, work.captures.load(k)[0], weights(k))
 
