@@ -4,10 +4,10 @@
 
 Every object stands twice: with its own maps, and ("_strong") with synthetic ones that no constant comes near. What is
 rendered, at which resolution and with which texels: `recovery_truth.py`, `recovery_pictures.py`. Fitted from grey, with
-metallic unknown; 16 evenly spread views x 3 camera-fixed lights one at a time, and ("_paper") the paper's own rig with
-its lights together. Texel figures are over the surface that at least three cameras see, weighted by area;
-"confident_" ones over the 95 % of it that the fit trusts most. Relit: four lights of no reference, cameras between
-theirs, mean over the pictures.
+metallic unknown; 16 evenly spread views x 3 camera-fixed lights one at a time, ("_paper") the paper's own rig with its
+lights together, and ("_soft", no rivals) 16 views x an environment map in 3 positions. Texel figures are over the
+surface that at least three cameras see, weighted by area; "confident_" ones over the 95 % of it that the fit trusts
+most. Relit: four lights of no reference, cameras between theirs, mean over the pictures.
 
 `figures` are ours. `baselines`: "constant" is the best map of one value; "together" is ours from the same pictures
 summed by view (all lights on); "naive" and "naive_pyramid" are `naive_fit.py` for as many seconds as ours took.
@@ -47,6 +47,7 @@ class Row:
     uv: UV
     strong: bool
     paper: bool = False
+    soft: bool = False
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -69,7 +70,7 @@ def main(argv: list[str] | None = None) -> None:
         if not quiet:
             print(report.table(name, methods))
             print("\n".join(f"  {line}" for line in said))
-            if not row.paper and not options.quick:
+            if not (row.paper or row.soft or options.quick):
                 print("\n".join(report.verdicts(methods, row.strong)))
             print(flush=True)
         # After every row, so that a run that is stopped leaves what it had.
@@ -105,7 +106,8 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--cache", type=Path, default=Path(gettempdir(), "mistyle_recovery"), help="rendered pictures")
     parser.add_argument("--data", type=Path, default=data_folder(), help="folder of the real data (MISTYLE_DATA)")
     parser.add_argument("--assets", nargs="+", choices=list(ASSETS), default=None)
-    parser.add_argument("--maps", nargs="+", choices=["real", "strong", "paper"], default=["real", "strong", "paper"])
+    kinds = ["real", "strong", "paper", "soft"]
+    parser.add_argument("--maps", nargs="+", choices=kinds, default=kinds)
     parser.add_argument("--mesh", type=Path, metavar="FILE", help="any textured glTF instead of the assets")
     parser.add_argument("--uv", choices=["own", "new"], default="own", help="the file's UVs where usable, or ours")
     parser.add_argument("--frame", choices=["mikkt", "mitsuba"], default="mikkt", help="frame of the normal maps")
@@ -132,17 +134,17 @@ def rows(options: argparse.Namespace) -> list[Row]:
     else:
         names = options.assets or list(ASSETS)
         files = [(n, find_asset(n, options.data), ASSETS[n][1]) for n in names]
-    kinds = [("real", False, False), ("strong", True, False), ("paper", True, True)]
+    kinds = ("real", "strong", "paper", "soft")
     return [
-        Row(name, file, "new" if options.uv == "new" else uv, strong, paper)
+        Row(name, file, "new" if options.uv == "new" else uv, kind != "real", kind == "paper", kind == "soft")
         for name, file, uv in files
-        for kind, strong, paper in kinds
+        for kind in kinds
         if kind in options.maps
     ]
 
 
 def label(row: Row) -> str:
-    return f"{row.name}{'_strong' if row.strong else ''}{'_paper' if row.paper else ''}"
+    return f"{row.name}{'_strong' if row.strong else ''}{'_paper' if row.paper else '_soft' if row.soft else ''}"
 
 
 def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, float]], list[str]]:
@@ -150,24 +152,24 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
     size, frame = options.resolution, options.frame
     cameras = drawing.paper_cameras(size) if row.paper else drawing.fibonacci(options.views, size)
     known = truth(row.file, row.name, drawing.fibonacci(1, size)[0], row.uv, row.strong)
-    shots = drawing.one_at_a_time(cameras)
+    sky = options.data / "hdri" / "aircraft_workshop_01_1k.hdr"
+    shots = drawing.turned(cameras, sky) if row.soft else drawing.one_at_a_time(cameras)
     pictures = drawing.render(known.mesh, known.maps, shots, frame=frame, spp=options.spp, cache=options.cache)
     counts = seen(known, cameras)
     weights = [a * (n >= LEAST_VIEWS) for a, n in zip(known.areas, counts, strict=True)]
-    summed = drawing.together(shots, pictures)
-    main_shots, main_pictures = summed if row.paper else (shots, pictures)
+    main_shots, main_pictures = drawing.together(shots, pictures) if row.paper else (shots, pictures)
 
     judge = Judge(known, weights, options)
     fitted = ours(known, main_shots, main_pictures, frame)
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
-    if not row.paper and "together" in options.rivals:
-        other = ours(known, *summed, frame)
+    if not (row.paper or row.soft) and "together" in options.rivals:
+        other = ours(known, *drawing.together(shots, pictures), frame)
         methods["together"] = judge(other.maps, frame, "together") | {"seconds": other.seconds}
     steps = {}
     loops = {"naive": (), "naive_pyramid": ("--pyramid",)}
-    if wanted := [method for method in loops if method in options.rivals]:
+    if wanted := [method for method in loops if method in options.rivals and not row.soft]:
         with TemporaryDirectory() as folder:
             write_job(Path(folder), known, main_shots, main_pictures)
             for method in wanted:

@@ -76,6 +76,14 @@ def paper_cameras(resolution: int) -> list[Camera]:
     return rig(RigSettings(resolution=resolution))
 
 
+def turned(cameras: Sequence[Camera], hdri: Path, times: int = 3) -> list[Shot]:
+    """Every camera under an environment alone, which stands in `times` positions about the object."""
+    radiance = read_hdr(hdri)
+    scale = HDRI_MEAN / float(radiance.mean())
+    skies = [Environment(radiance, turn=360.0 * k / times, scale=scale, file=hdri.name) for k in range(times)]
+    return [Shot(replace(c, name=f"{c.name}_sky{k}"), (sky,)) for c in cameras for k, sky in enumerate(skies)]
+
+
 def unseen(hdri: Path, resolution: int, views: int) -> dict[str, list[Shot]]:
     """The four lights of no reference, from cameras between those of the references: a studio's environment map, a key
     from the side, a light that grazes what faces the camera, and a warm and a cool one over a dim blue sky."""

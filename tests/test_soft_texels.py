@@ -94,6 +94,7 @@ def test_the_model_is_the_sum_over_cells(rng, model):
     solver, points, own, seen = problem(Options(model, metallic=True), rng)
     x = values(rng)
     found = solver.predict(x)
+    assert own.cells is not None and own.width2 is not None and points.open is not None
     expected = np.zeros((len(seen.rgb), 3))
     for row, picture in enumerate(seen.picture):
         texel = row // 4
