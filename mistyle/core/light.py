@@ -107,6 +107,8 @@ class SceneLights:
 
 Light = Directional | Point | Environment | Ambient | SphericalGaussian | SceneLights
 Lights = tuple[Light, ...]
+DELTA = (Directional, Point)
+SOFT = (Environment, Ambient, SphericalGaussian)
 # Gives the radiance of an environment's file, as named in lights.json.
 Load = Callable[[str], Float[np.ndarray, "eh ew 3"]]
 NAMES = {

@@ -7,18 +7,17 @@ import numpy as np
 
 from mistyle.core.camera import Camera
 from mistyle.core.light import (
+    SOFT,
     Ambient,
     Directional,
     Environment,
     Light,
     Point,
-    SphericalGaussian,
     bake_environment,
     direction_in_world,
     position_in_world,
 )
 
-SOFT = (Ambient, Environment, SphericalGaussian)
 ROWS = 256  # of the map that several soft lights become
 
 

@@ -24,12 +24,12 @@ from jaxtyping import Float
 
 from mistyle.core.capture import Captures
 from mistyle.core.lanes import aligned
-from mistyle.core.light import Lights
+from mistyle.core.light import SOFT, Lights
 from mistyle.core.maps import Maps
 from mistyle.render import bsdf, device, shading
 from mistyle.render import hits as collecting
 from mistyle.render.draw import Tracer
-from mistyle.render.sky import SOFT, Sky, sky
+from mistyle.render.sky import Sky, sky
 
 Loss = Literal["l2", "log_srgb_l1"]
 Table = Float[np.ndarray, "t 8"]

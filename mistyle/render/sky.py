@@ -13,9 +13,16 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.light import Ambient, Environment, Light, SphericalGaussian, environment_radiance, spherical_gaussian
+from mistyle.core.light import (
+    SOFT,
+    Ambient,
+    Environment,
+    Light,
+    SphericalGaussian,
+    environment_radiance,
+    spherical_gaussian,
+)
 
-SOFT = (Ambient, Environment, SphericalGaussian)
 REC709 = np.array([0.2126, 0.7152, 0.0722])
 # Rows of the map: coarser environments are interpolated, finer ones averaged.
 LEAST_ROWS, MOST_ROWS = 128, 512

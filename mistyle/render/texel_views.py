@@ -9,11 +9,11 @@ from jaxtyping import Bool, Float, UInt32
 
 from mistyle.core.camera import Camera
 from mistyle.core.lanes import aligned
-from mistyle.core.light import Directional, Light, Lights, Point, direction_in_world, position_in_world
+from mistyle.core.light import SOFT, Directional, Light, Lights, Point, direction_in_world, position_in_world
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
 from mistyle.render.hits import BLOCK_RAYS
-from mistyle.render.sky import SOFT, even_directions, gathered_in
+from mistyle.render.sky import even_directions, gathered_in
 from mistyle.render.texel_lm import Rig
 
 SKY_CELLS = 128

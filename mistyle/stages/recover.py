@@ -1,6 +1,6 @@
 """Recovering materials: albedo, normal, roughness and metallic from pictures of known cameras under known light.
 
-First texel by texel (`recover_solve.py`): with geometry, cameras and delta lights known nothing has to be rendered to
+First texel by texel (`recover_solve.py`): with geometry, cameras and lights known nothing has to be rendered to
 solve for one texel, and Levenberg-Marquardt gets in twenty steps where gradient descent on pictures does not get in
 hundreds. Then on whole pictures, by Adam through `render/shade.py`, which models pixels and interpolation exactly.
 Light that reaches the surface by way of other surfaces can be estimated with the maps found and taken off the

@@ -14,15 +14,13 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures
 from mistyle.core.image import erode
-from mistyle.core.light import Directional, Point
+from mistyle.core.light import DELTA, SOFT
 from mistyle.core.maps import Texels
 from mistyle.render.draw import Tracer
-from mistyle.render.sky import SOFT
 from mistyle.render.texel_lm import Observations, Points, Rig
 from mistyle.render.texel_views import look, open_sky, rig
 from mistyle.stages.frames import texel_frames
 
-DELTA = (Directional, Point)
 REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
 LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane
 PERCENTILE = 95.0  # of the observed radiance: the unit of the noise

@@ -9,10 +9,11 @@ from jaxtyping import Float, Int
 
 from mistyle.core.capture import Captures
 from mistyle.core.image import resize
+from mistyle.core.light import DELTA, SOFT
 from mistyle.core.maps import Maps, Texels
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust
-from mistyle.stages.recover_observe import DELTA, SOFT, Gathered, fetch
+from mistyle.stages.recover_observe import Gathered, fetch
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
 
