@@ -59,7 +59,8 @@ def read_gltf(path: Path, max_faces: int) -> Raw:
     used = sorted({p.material for p in pieces})
     place = {m: i for i, m in enumerate(used)}
     counts = [len(p.faces) for p in pieces]
-    material = np.repeat([place[p.material] for p in pieces], counts)
+    # 32 bits are enough for all that a file may hold, and all of it goes from one process to another.
+    material = np.repeat(np.array([place[p.material] for p in pieces], np.int32), counts)
     budget = Budget(path)
     materials = tuple(read_material(tree, buffers, path, m, _other_sets(pieces, m), budget) for m in used)
     starts = np.cumsum([0, *counts])
@@ -71,7 +72,7 @@ def read_gltf(path: Path, max_faces: int) -> Raw:
     return Raw(
         kind="glb" if path.suffix.lower() == ".glb" else "gltf",
         positions=np.concatenate(positions),
-        faces=np.concatenate([p.faces for p in pieces]),
+        faces=np.concatenate([p.faces for p in pieces], dtype=np.int32, casting="same_kind"),
         normals=np.concatenate([p.normals for p in pieces]),
         uvs=uvs if np.isfinite(uvs).any() else None,
         material=material,
@@ -266,8 +267,11 @@ def _other_sets(pieces: list[_Piece], material: int) -> dict[int, Float[np.ndarr
     return {n: np.concatenate([p.other_uvs.get(n, no) for p, no in zip(pieces, nothing, strict=True)]) for n in numbers}
 
 
-def _twins(pieces: list[_Piece], starts: Int[np.ndarray, " n"]) -> Int[np.ndarray, " f"]:
-    """For each face the first face that the file's same primitive gave; instances share the file's UVs."""
+def _twins(pieces: list[_Piece], starts: Int[np.ndarray, " n"]) -> Int[np.ndarray, " f"] | None:
+    """For each face the first face that the file's same primitive gave; instances share the file's UVs. None where
+    there are no instances."""
+    if len({(piece.mesh, piece.primitive) for piece in pieces}) == len(pieces):
+        return None
     twin = np.arange(starts[-1])
     first: dict[tuple[int, int], int] = {}
     for piece, a, b in zip(pieces, starts[:-1], starts[1:], strict=True):
