@@ -28,7 +28,10 @@ class RecoverSettings(BaseModel):
         description="texel by texel (Levenberg-Marquardt), then whole pictures (Adam), or one of them alone",
     )
     solver_texels: int = Field(
-        default=2_000_000, ge=1, description="most texels solved one by one; a finer atlas is solved at a coarser level"
+        default=2_000_000,
+        ge=1,
+        description="most texels solved one by one, under soft light a 64th of it; a finer atlas is solved at a coarser "
+        "level",
     )
     solver_iterations: int = Field(default=12, ge=1, le=1000, description="steps from each start")
     rounds: int = Field(
