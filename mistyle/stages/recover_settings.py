@@ -30,8 +30,8 @@ class RecoverSettings(BaseModel):
     solver_texels: int = Field(
         default=2_000_000,
         ge=1,
-        description="most texels solved one by one, under soft light a 64th of it; a finer atlas is solved at a coarser "
-        "level",
+        description="most texels solved one by one, under soft light a 64th of it; a finer atlas is solved at a "
+        "coarser level",
     )
     solver_iterations: int = Field(default=12, ge=1, le=1000, description="steps from each start")
     rounds: int = Field(
