@@ -14,9 +14,10 @@ import time
 from pathlib import Path
 
 from benchmarks.common import arguments, finish
+from mistyle.core.cores import cores
 from mistyle.core.paths import scenes
 from mistyle.run import engines
-from mistyle.run.batch import Choices, cores, planned, run_batch
+from mistyle.run.batch import Choices, planned, run_batch
 from mistyle.run.batch_plan import Plan, write_plan
 from mistyle.run.shard import outcome
 

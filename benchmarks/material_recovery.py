@@ -35,6 +35,7 @@ from mistyle.measure.material_metrics import best_constant, confident, map_error
 from mistyle.render.scene import Frame
 
 LEAST_VIEWS = 3
+KINDS = ("real", "strong", "paper", "soft")
 RIVALS = ("together", "naive", "naive_pyramid")
 
 
@@ -106,8 +107,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--cache", type=Path, default=Path(gettempdir(), "mistyle_recovery"), help="rendered pictures")
     parser.add_argument("--data", type=Path, default=data_folder(), help="folder of the real data (MISTYLE_DATA)")
     parser.add_argument("--assets", nargs="+", choices=list(ASSETS), default=None)
-    kinds = ["real", "strong", "paper", "soft"]
-    parser.add_argument("--maps", nargs="+", choices=kinds, default=kinds)
+    parser.add_argument("--maps", nargs="+", choices=KINDS, default=KINDS)
     parser.add_argument("--mesh", type=Path, metavar="FILE", help="any textured glTF instead of the assets")
     parser.add_argument("--uv", choices=["own", "new"], default="own", help="the file's UVs where usable, or ours")
     parser.add_argument("--frame", choices=["mikkt", "mitsuba"], default="mikkt", help="frame of the normal maps")
@@ -134,11 +134,10 @@ def rows(options: argparse.Namespace) -> list[Row]:
     else:
         names = options.assets or list(ASSETS)
         files = [(n, find_asset(n, options.data), ASSETS[n][1]) for n in names]
-    kinds = ("real", "strong", "paper", "soft")
     return [
         Row(name, file, "new" if options.uv == "new" else uv, kind != "real", kind == "paper", kind == "soft")
         for name, file, uv in files
-        for kind in kinds
+        for kind in KINDS
         if kind in options.maps
     ]
 

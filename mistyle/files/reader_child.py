@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.core.cores import cores
 from mistyle.core.errors import MistyleError
 from mistyle.files import lending, wire
 
@@ -43,7 +44,8 @@ def main() -> None:
 
     from mistyle.files.reader_tasks import TASKS
 
-    OpenEXR.set_global_thread_count(_threads())
+    # Several make up for the way of the pixels to the job's process.
+    OpenEXR.set_global_thread_count(min(cores(), MAX_THREADS))
     base = _confine()
     shown = np.frombuffer(lending.SIGN, np.uint8)  # where the parent tries whether it can read this process's memory
     wire.send(lambda data: os.write(answers, data), None, sign=shown.ctypes.data)
@@ -91,12 +93,6 @@ def _out_of_memory(error: BaseException | None) -> bool:
             return True
         error = error.__cause__ or error.__context__
     return False
-
-
-def _threads() -> int:
-    """Threads that decode an EXR's blocks. Several make up for the way of the pixels to the job's process."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MAX_THREADS)
 
 
 def _confine() -> int:

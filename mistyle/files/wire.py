@@ -66,14 +66,14 @@ def send(write: Write, value: Any, lend: bool = False, **entries: Any) -> list[n
     arrays: list[np.ndarray] = []
     seen: dict[int, int] = {}
     tree = _pack(value, arrays, seen)
-    lent = [array for array in arrays if lend and array.nbytes >= LENT]
-    table = [[a.dtype.str, a.shape, *([a.ctypes.data] if lend and a.nbytes >= LENT else [])] for a in arrays]
+    least = LENT if lend else math.inf
+    table = [[a.dtype.str, a.shape, *([a.ctypes.data] if a.nbytes >= least else [])] for a in arrays]
     head = json.dumps({"value": tree, "arrays": table, **entries}).encode()
     _write_all(write, memoryview(len(head).to_bytes(8, "little") + head))
     for array in arrays:
-        if array.nbytes and not (lend and array.nbytes >= LENT):
+        if 0 < array.nbytes < least:
             _write_all(write, array.reshape(-1).view(np.uint8).data)
-    return lent
+    return [array for array in arrays if array.nbytes >= least]
 
 
 def receive(read: Read, copy: Copy | None = None) -> tuple[Any, dict[str, Any]]:
@@ -90,12 +90,12 @@ def receive(read: Read, copy: Copy | None = None) -> tuple[Any, dict[str, Any]]:
         raise BrokenMessage(f"no message ({error})") from error
     for array, (_, _, address) in zip(arrays, table, strict=True):
         place = array.reshape(-1).view(np.uint8).data
-        if address is not None and copy is None:
-            raise BrokenMessage("an array that was lent to no one")
-        elif address is not None and copy is not None:
-            copy(address, place)
-        elif array.nbytes:
+        if address is None:
             _fill(read, place)
+        elif copy is None:
+            raise BrokenMessage("an array that was lent to no one")
+        else:
+            copy(address, place)
     try:
         return _unpack(tree, arrays), head
     except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:

@@ -18,6 +18,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core.cores import cores
+
 BAND = 384  # rows
 SHARE = 0.6  # of the rows that the second process gets where the first has other things to do
 LARGE = 400_000  # pixels times exposures: below it a second process costs more than it saves
@@ -48,8 +50,7 @@ def flip_maps(
     `meanwhile` runs first and then the upper rows."""
     height, width = next(iter(pairs.values())).reference.shape[:2]
     work = sum(height * width * (p.exposures[2] if p.exposures else 1) for p in pairs.values())
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if work < LARGE or cores < 2 or height < 64:
+    if work < LARGE or cores() < 2 or height < 64:
         if meanwhile is not None:
             meanwhile()
         return {k: rows_of(p.reference, p.test, ppd, p.exposures, 0, height) for k, p in pairs.items()}

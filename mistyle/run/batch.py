@@ -7,7 +7,6 @@ OUT/batch.json, OUT/batch.html   the summary for programs and for people
 """
 
 import json
-import os
 import shlex
 import sys
 import time
@@ -16,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mistyle.core.cores import cores
 from mistyle.core.errors import UsageError
 from mistyle.files.store import Keeper, atomic_write, clean_leftovers
 from mistyle.run import engines
@@ -52,11 +52,6 @@ def planned(jobs: Path, out: Path | None, choices: Choices) -> Plan:
     if out is None:
         raise UsageError(f"{jobs}: a new batch needs -o OUT, the folder for everything it makes")
     return Plan(out.absolute(), read_jobs(jobs, threads_each(choices)))
-
-
-def cores() -> int:
-    """Cores that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def workers_of(choices: Choices) -> int:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from mistyle import __version__, bootstrap, install, llvm
+from mistyle.core.cores import cores
 
 State = Literal["ok", "missing", "optional"]
 
@@ -71,11 +72,10 @@ def _machine() -> list[Row]:
         except (OSError, KeyError):
             pass
     memory = _memory()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return [
         Row("mistyle", f"{__version__} in {bootstrap.PACKAGE}", "ok"),
         Row("Python", f"{platform.python_version()} ({sys.executable})", "ok"),
-        Row("system", f"{system}, {cores} cores{f', {memory:.0f} GB' if memory else ''}", "ok"),
+        Row("system", f"{system}, {cores()} cores{f', {memory:.0f} GB' if memory else ''}", "ok"),
     ]
 
 

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, Paint3dSettings, TrainSettings
 from mistyle.core.camera import RigSettings
+from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.stages.backproject import BakeSettings
@@ -135,7 +136,7 @@ def thread_count(settings: Any) -> int:
     """The threads a job uses: as set, else the cores that this process may run on."""
     if settings.threads:
         return settings.threads
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return cores()
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

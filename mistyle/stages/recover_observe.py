@@ -67,10 +67,12 @@ def gather(
     facing: float = 0.2,
     noise: float = 0.002,
     relative: float = 0.01,
+    skies: bool = True,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Gathered:
-    """All observations of the pictures whose lights are known (a light from a scene file is none of them).
+    """All observations of all pictures. ValueError for lights that only a scene file describes.
 
+    `skies` False leaves out what hides the sky from each texel, which only the solver asks for.
     `facing` is the least cosine between the texel's normal and the camera; the standard deviation of an observation of
     radiance y is noise · (the brightest radiance, robustly) + relative · y, larger where the surface turns away and
     where the texel is smaller than the pixel, which then says more about its neighbours.
@@ -81,13 +83,12 @@ def gather(
     face = np.concatenate([t.face[c] for t, c in zip(texels, covered, strict=True)])
     normal = np.concatenate([t.normal[c] for t, c in zip(texels, covered, strict=True)])
     size = np.concatenate([texel_sizes(t) for t in texels])[texel]
-    used = [k for k, own in enumerate(captures.lights) if all(isinstance(s, DELTA + SOFT) for s in own)]
-    soft = [any(isinstance(s, SOFT) for s in captures.lights[k]) for k in range(len(captures))]
-    sky = open_sky(traced, position, normal) if any(soft[k] for k in used) else None
+    soft = [any(isinstance(light, SOFT) for light in own) for own in captures.lights]
+    sky = open_sky(traced, position, normal) if skies and any(soft) else None
     points = Points(position, texel_frames(traced.mesh, face, position, normal, tangents), sky)
     parts: list[tuple] = []
     views = np.zeros(len(texel), np.int32)
-    for done, group in enumerate(_by_camera(captures.cameras, used)):
+    for done, group in enumerate(_by_camera(captures.cameras)):
         camera = captures.cameras[group[0]]
         beams = [light for k in group for light in captures.lights[k] if isinstance(light, DELTA)]
         seen = look(traced, camera, beams)
@@ -104,7 +105,7 @@ def gather(
             where = pixel[chosen].astype(np.int32)
             parts.append((k, ids.astype(np.int32), values, bits, where, x[chosen], y[chosen], worth[chosen]))
         views[near[any_light]] += 1
-        progress((done + 1) / max(len(used) / max(len(group), 1), 1))
+        progress((done + 1) / max(len(captures) / max(len(group), 1), 1))
     return _assemble(texel, points, captures, parts, views, noise, relative)
 
 
@@ -128,11 +129,10 @@ def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
 
 
-def _by_camera(cameras: Sequence[Camera], used: Sequence[int]) -> list[list[int]]:
+def _by_camera(cameras: Sequence[Camera]) -> list[list[int]]:
     """Pictures taken from one place with one lens belong together."""
     groups: dict[tuple, list[int]] = {}
-    for k in used:
-        camera = cameras[k]
+    for k, camera in enumerate(cameras):
         key = (camera.world_from_cam.tobytes(), camera.focal, camera.centre, camera.size)
         groups.setdefault(key, []).append(k)
     return list(groups.values())
@@ -225,5 +225,4 @@ def _assemble(texel, points, captures: Captures, parts, views, noise: float, rel
     unit = float(np.percentile(level, PERCENTILE)) if total else 1.0
     weight = worth / (noise * max(unit, 1e-6) + relative * level)
     observations = Observations(start, picture, rgb, weight.astype(np.float32), lit)
-    known = [own if all(isinstance(s, DELTA + SOFT) for s in own) else () for own in captures.lights]
-    return Gathered(texel, points, rig(captures.cameras, known), observations, tuple(sightings), views)
+    return Gathered(texel, points, rig(captures.cameras, captures.lights), observations, tuple(sightings), views)

@@ -9,7 +9,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.capture import Captures
 from mistyle.core.image import resize
-from mistyle.core.light import DELTA, SOFT
+from mistyle.core.light import SOFT
 from mistyle.core.maps import Maps, Texels
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust
@@ -118,7 +118,7 @@ def solve_texels(
     gathered = gather(
         work.traced, work.texels, work.captures, work.tangents,
         facing=settings.facing, noise=settings.noise, relative=settings.relative,
-        progress=lambda done: progress(0.3 * done),
+        skies=settings.solver != "pictures", progress=lambda done: progress(0.3 * done),
     )  # fmt: skip
     mean = np.tile(np.array(solving.PRIOR_MEAN, np.float32), (len(gathered.texel), 1))
     first = mean.copy() if start is None else pack(start)[gathered.texel, :7].copy()
@@ -162,7 +162,7 @@ def solve_texels(
             values = np.where(bad.reshape(-1, 1), mean, values)
             spread = np.where(bad.reshape(-1, 1), np.array(solving.PRIOR_SPREAD, np.float32), spread)
     elif settings.solver != "pictures":
-        work.notes.append("No texel was observed under lights that are known: texels were not solved one by one.")
+        work.notes.append("No texel was observed in the light: texels were not solved one by one.")
     return Found(
         solving.spread_out(values, gathered, where),
         _placed(spread, gathered.texel, where, np.array(solving.PRIOR_SPREAD, np.float32)),
@@ -182,9 +182,8 @@ def take_off_indirect(work: Work, shade, table: np.ndarray, indirect: dict[int, 
     maps = unpack(table, work.where.sizes)
     scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for k, (camera, lights) in enumerate(zip(work.captures.cameras, work.captures.lights, strict=True)):
-        if all(isinstance(light, DELTA + SOFT) for light in lights):
-            indirect[k] = scene.picture(camera, lights, settings.bounce_samples, seed + k)
-            retarget(shade, k, work.captures.load(k)[0], weights(k))
+        indirect[k] = scene.picture(camera, lights, settings.bounce_samples, seed + k)
+        retarget(shade, k, work.captures.load(k)[0], weights(k))
 
 
 def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> np.ndarray:

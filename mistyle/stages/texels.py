@@ -5,7 +5,6 @@ The paper maps rows as r = (1 - v) H and says that glTF puts (0, 0) at the botto
 the row formula holds, but glTF files have their origin at the top left (glTF 2.0, 3.8.4): the writers turn it.
 """
 
-import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -17,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core import memory
 from mistyle.core.asset import Material
+from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import nearest, resize
 from mistyle.core.maps import Maps, Texels
@@ -46,8 +46,7 @@ def bands(height: int, width: int, count: int = BAND_TEXELS) -> Iterator[slice]:
 
 def threaded(work: Callable[[int], None], count: int, progress: Callable[[float], None] = lambda done: None) -> None:
     """Call work(0) … work(count - 1), each writing its own part of a result, on all cores, in any order."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    with ThreadPoolExecutor(max_workers=max(1, min(cores, 8))) as pool:
+    with ThreadPoolExecutor(max_workers=max(1, min(cores(), 8))) as pool:
         for k, _ in enumerate(pool.map(work, range(count))):
             progress((k + 1) / count)
 
