@@ -127,35 +127,44 @@ def test_says_how_sure_it_is(world, recovered):
     assert not recovered.maps[0].known[~texels.covered].any()
 
 
-@pytest.mark.parametrize(("variation", "noise"), [(0.0, 0.01), (0.01, 0.01), (0.02, 0.005), (0.2, 0.01)])
-def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
-    """Texels that differ by `variation`, found with `noise` under a prior that has drawn them to their mean."""
+SIDE = 64
+
+
+def found_texels(values: np.ndarray, noise: float, prior: float, seen: np.ndarray):
+    """What a solver would say of an atlas of SIDE² texels without seams: solution, observations, neighbours."""
     from mistyle.render.texel_lm import Observations, Points, Rig, Solution
     from mistyle.stages import recover_solve as solving
 
-    size, mean = 64, np.full((64 * 64, 7), 0.5, np.float32)
+    count = SIDE * SIDE
+    priors, alone = np.full(values.shape, 1 / prior**2, np.float32), np.where(seen[:, None] > 0, 1 / noise**2, 1e-9)
+    spread = np.broadcast_to(1 / np.sqrt(alone + priors), values.shape).astype(np.float32)
+    solution = Solution(values.astype(np.float32), np.zeros(count, np.float32), spread, spread, priors)
+    grid = np.ones((SIDE, SIDE - 1), bool), np.ones((SIDE - 1, SIDE), bool)
+    whole = (np.ones((SIDE, SIDE), bool),)
+    where = solving.Atlas(((SIDE, SIDE),), whole, grid[:1], grid[1:], (np.arange(count),))
+    start = np.concatenate([[0], np.cumsum(seen)])
+    zeros, none = np.zeros(start[-1], np.float32), np.zeros((0, 3), np.float32)
+    rgb = np.zeros((start[-1], 3), np.float32)
+    observations = Observations(start, zeros.astype(np.int32), rgb, zeros, zeros.astype(np.int32))
+    points = Points(np.zeros((count, 3), np.float32), np.zeros((count, 3, 3), np.float32))
+    rig = Rig(none, np.zeros(1, np.int32), none, none[:, 0], none)
+    return solution, Gathered(np.arange(count), points, rig, observations, (), np.zeros(count, np.int32)), where
+
+
+@pytest.mark.parametrize(("variation", "noise"), [(0.0, 0.01), (0.01, 0.01), (0.02, 0.005), (0.2, 0.01)])
+def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
+    """Texels that differ by `variation`, found with `noise` under a prior that has drawn them to their mean."""
+    from mistyle.stages import recover_solve as solving
+
+    mean = np.full((SIDE * SIDE, 7), 0.5, np.float32)
     truth = mean + variation * rng.standard_normal(mean.shape)
     found = truth + noise * rng.standard_normal(mean.shape)
-    prior, alone = np.full(mean.shape, 1 / 0.03**2, np.float32), 1 / noise**2
-    values = ((found * alone + mean * prior) / (alone + prior)).astype(np.float32)
-    spread = (1 / np.sqrt(alone + prior)).astype(np.float32)
-    solution = Solution(values, np.zeros(len(mean), np.float32), spread, spread, prior)
-    grid = np.ones((size, size - 1), bool), np.ones((size - 1, size), bool)
-    where = solving.Atlas(((size, size),), (np.ones((size, size), bool),), grid[:1], grid[1:], (np.arange(size**2),))
-    nine = 9 * np.arange(size**2 + 1)
-    zeros, none = np.zeros(nine[-1], np.float32), np.zeros((0, 3), np.float32)
-    seen = Observations(
-        nine, np.zeros(nine[-1], np.int32), np.zeros((nine[-1], 3), np.float32), zeros, zeros.astype(np.int32)
-    )
-    points = Points(np.zeros((size**2, 3), np.float32), np.zeros((size**2, 3, 3), np.float32))
-    rig = Rig(none, np.zeros(1, np.int32), none, none[:, 0], none)
-    count = np.zeros(size**2, np.int32)
-    gathered = Gathered(np.arange(size**2), points, rig, seen, (), count)
+    prior, alone = 0.03**-2, noise**-2
+    values = (found * alone + mean * prior) / (alone + prior)
+    solution, gathered, where = found_texels(values, noise, 0.03, np.full(SIDE * SIDE, 9))
     np.testing.assert_allclose(solving.likelihood(solution)[0], noise, rtol=1e-2)
     own = noise**-2 / (noise**-2 + 0.03**-2)
-    np.testing.assert_allclose(solving.decided(solution, gathered.seen), own, rtol=1e-2)
-    # Seen in parts only, it is for the pictures to say.
-    assert (solving.decided(solution, 0 * gathered.seen) == 1).all()
+    np.testing.assert_allclose(solving.decided(solution, gathered), own, rtol=1e-2)
     firm = 1 / np.sqrt(solving.belief(solution, mean, gathered, where, 0.03))
     wanted = np.clip(variation, solving.LEAST, 0.03)
     if variation > 0:
@@ -163,6 +172,49 @@ def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
     else:
         assert np.median(firm[:, 3:5]) < noise / 3
     np.testing.assert_allclose(firm[:, [0, 1, 2, 5, 6]], 0.03, rtol=1e-5)
+
+
+@pytest.mark.parametrize("tilt", [0.02, 0.15])
+def test_where_nothing_is_known_a_surface_is_level(rng, tilt):
+    """The half that nobody saw has wild tilts, as neighbours of badly seen texels get: they are drawn to none, and what
+    is left open is how much tilts vary where they are known. The half that was seen keeps its neighbours' mean."""
+    from mistyle.stages import recover_solve as solving
+
+    values = np.full((SIDE * SIDE, 7), 0.5, np.float32)
+    values[:, 3:5] = np.hypot(tilt, 0.01) * rng.standard_normal((SIDE * SIDE, 2))
+    half = np.arange(SIDE * SIDE) < SIDE * SIDE // 2
+    values[~half, 3:5] = 0.4
+    solution, gathered, where = found_texels(values, 0.01, 0.6, np.where(half, 9, 0))
+    np.testing.assert_allclose(solving.varied(solution, gathered), tilt**2, rtol=0.15)
+    mean, firm = values.copy(), np.full(values.shape, 1 / 0.01**2, np.float32)
+    mean[:, 3:5] = np.where(half[:, None], 0.1, 0.4)
+    level, prior = solving.levelled(solution, mean, firm, gathered, where)
+    far = solving.BLUR * SIDE  # rows next to the border have neighbours from both halves
+    np.testing.assert_allclose(level[: SIDE * SIDE // 2 - far, 3:5], 0.1, rtol=0.05)
+    assert (np.abs(level[SIDE * SIDE // 2 + far :, 3:5]) < 1e-3).all()
+    np.testing.assert_allclose(prior[-1, 3:5] ** -0.5, np.hypot(0.01, tilt), rtol=0.1)
+    np.testing.assert_array_equal(level[:, [0, 1, 2, 5, 6]], mean[:, [0, 1, 2, 5, 6]])
+    solution.cost[:] = 3 * (9 - 7 / 3)  # what does not fit, here 3 times what it should, holds them more firmly
+    again = solving.levelled(solution, mean, firm, gathered, where)[1]
+    np.testing.assert_allclose((again / prior)[: SIDE * SIDE // 2 - far, 3:5], 2, rtol=0.15)
+    solution.cost[:] = 0
+    # Seen in parts only, it is for the pictures to say what tilts there are, where there are any.
+    share = solving.decided(solution, gathered)
+    assert (share[half] > 0.9).all()
+    np.testing.assert_allclose(share[~half], tilt**2 / (tilt**2 + solving.KNOWN**2), rtol=0.1)
+
+
+def test_misfit_is_of_those_that_could_contradict_themselves():
+    """A texel seen once has a cost of zero whatever it saw: its misfit is its neighbours'."""
+    from mistyle.stages import recover_solve as solving
+
+    seen = np.where(np.arange(SIDE * SIDE) % 2 == 0, 1, 9)
+    values = np.full((SIDE * SIDE, 7), 0.5, np.float32)
+    solution, gathered, where = found_texels(values, 0.01, 0.6, seen)
+    solution.cost[seen == 9] = 20.0
+    np.testing.assert_allclose(solving.misfit(solution, gathered, where), 20 / (9 - 7 / 3), rtol=1e-4)
+    solution, gathered, where = found_texels(values, 0.01, 0.6, np.ones_like(seen))
+    assert (solving.misfit(solution, gathered, where) == 0).all()
 
 
 def test_the_same_bytes_again_and_after_an_interruption(world):

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels
-from mistyle.render.texel_lm import Problem, Solution
+from mistyle.render.texel_lm import UNKNOWNS, Problem, Solution
 from mistyle.stages.recover_observe import Gathered, fetch
 from mistyle.stages.recover_settings import RecoverSettings
 
@@ -28,8 +28,11 @@ STARTS = (0.25, 0.7)  # roughness has local minima
 RESTARTS = 3  # rounds in which texels also try what their neighbours found
 MISFIT = 0.1  # cost per observation above which a texel has less to say to its neighbours
 BLUR = 4  # steps of spreading, each to the four nearest texels
-LEAST_SEEN = 3  # times that a texel was seen, for what was seen to decide anything
+AMONG = 4 * np.pi * BLUR / 3  # how many texels such a mean is one of
 WIDE = 24  # steps over which it is measured how much the surface's tilt varies
+LEAST_SEEN = 3  # times that a texel was seen, for what was seen to decide anything
+AROUND = 8  # steps over which it is measured how badly observations fit
+KNOWN = 0.05  # what a texel may leave open of its tilt and still say how much tilts vary at all
 LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean of its neighbours
 
 Table = Float[np.ndarray, "a 8"]
@@ -183,6 +186,7 @@ def another_round(
     problem.retarget(target)
     mean = neighbourhood(solution.values, sureness(solution, gathered), gathered, where, BLUR)
     prior = belief(solution, mean, gathered, where, settings.neighbours)
+    mean, prior = levelled(solution, mean, prior, gathered, where)
 
     def tried(start: Values, steps: int, metal: Float[np.ndarray, " t"]) -> tuple[Solution, Float[np.ndarray, " t"]]:
         if not settings.metallic:
@@ -219,9 +223,7 @@ def belief(solution: Solution, mean: Values, gathered: Gathered, where: Atlas, n
     own observations leave open, at most `neighbours`² and at least LEAST². Everything else has `neighbours`: albedo,
     roughness and metallic can stand for each other, and held to its neighbours' albedo a texel becomes a metal.
     """
-    open_, gain = (part[:, 3:5] for part in likelihood(solution))
-    # Observations that do not fit say less than their number promises.
-    open_ = open_ * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
+    open_, gain = open_tilts(solution, gathered), likelihood(solution)[1][:, 3:5]
     apart = (solution.values - mean)[:, 3:5] / np.maximum(gain, 1e-3)
     weight = (1 / (open_**2 + neighbours**2) ** 2).astype(np.float32)
     weight[gathered.seen == 0] = 0
@@ -231,10 +233,59 @@ def belief(solution: Solution, mean: Values, gathered: Gathered, where: Atlas, n
     return prior
 
 
-def decided(solution: Solution, seen: Int[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+def levelled(
+    solution: Solution, mean: Values, prior: Values, gathered: Gathered, where: Atlas
+) -> tuple[Values, Values]:
+    """`mean` and `prior` with the tilt drawn towards none where little is known of the texels around.
+
+    All that is known of a tilt there is how much tilts vary at all: the variance V among texels that are known. Of a
+    mean of precision P the share P / (P + 1 / V) is kept, and 1 / (P + 1 / V) of variance is left open. Where
+    observations do not fit, tilts would take up what the model lacks, and are held by the root of `misfit` more firmly:
+    more costs strong relief, less lets light between surfaces through.
+    """
+    precision = np.where(gathered.seen[:, None] > 0, 1 / open_tilts(solution, gathered) ** 2, 0).astype(np.float32)
+    precision = AMONG * neighbourhood(precision, np.ones_like(precision), gathered, where, BLUR)
+    left = 1 / (precision + 1 / varied(solution, gathered))
+    mean, prior = mean.copy(), prior.copy()
+    mean[:, 3:5] *= precision * left
+    prior[:, 3:5] = 1 / (1 / prior[:, 3:5] + left)
+    prior[:, 3:5] *= np.sqrt(1 + misfit(solution, gathered, where))[:, None]
+    return mean, prior
+
+
+def varied(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "2"]:
+    """The variance of tilts over the whole surface, by texels that are known: that of what was found, less what was
+    left open."""
+    open_ = open_tilts(solution, gathered)
+    weight = np.where(gathered.seen[:, None] > 0, 1 / (open_**2 + KNOWN**2) ** 2, 0)
+    mean = ((solution.values[:, 3:5] ** 2 - open_**2) * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
+    return np.clip(mean, LEAST**2, PRIOR_SPREAD[3] ** 2)
+
+
+def open_tilts(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "t 2"]:
+    """Standard deviations of the tilt that a texel's observations leave open; observations that do not fit say less
+    than their number promises."""
+    return likelihood(solution)[0][:, 3:5] * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
+
+
+def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.ndarray, " t"]:
+    """Cost per observation that is one too many, of the texels around each one together; 0 where there is none.
+
+    An observation has three channels and a texel UNKNOWNS unknowns: one that few saw can explain whatever they saw, so
+    only those around it tell how far its model can be believed.
+    """
+    spare = np.maximum(gathered.seen - len(UNKNOWNS) / 3, 0)
+    each = np.where(spare[:, None] > 0, np.stack([solution.cost, spare], axis=1), 0).astype(np.float32)
+    cost, count = neighbourhood(each, np.ones_like(each), gathered, where, AROUND).T
+    return np.where(count > 1e-6, cost / np.maximum(count, 1e-6), 0).astype(np.float32)
+
+
+def decided(solution: Solution, gathered: Gathered) -> Float[np.ndarray, " t"]:
     """The share of a texel's tilt that its own pictures decide and not its neighbours, 0..1. Texels that too few saw
-    whole are left free (1): pictures show parts of them, of which the solver knows nothing."""
-    return np.where(seen >= LEAST_SEEN, likelihood(solution)[1][:, 3:5].mean(axis=1), 1).astype(np.float32)
+    whole are left to the pictures, which show parts of them that the solver knows nothing of, as far as tilts vary."""
+    spread = float(varied(solution, gathered).mean())
+    share = likelihood(solution)[1][:, 3:5].mean(axis=1)
+    return np.where(gathered.seen >= LEAST_SEEN, share, spread / (spread + KNOWN**2)).astype(np.float32)
 
 
 def likelihood(solution: Solution) -> tuple[Values, Values]:

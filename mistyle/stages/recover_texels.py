@@ -154,7 +154,7 @@ def solve_texels(
             progress(0.5 + 0.5 * (number + 1) / total)
         # Observations that do not fit say less than their number promises.
         values = solution.values
-        decided = solving.decided(solution, gathered.seen)
+        decided = solving.decided(solution, gathered)
         spread = solution.spread * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
         bad = np.asarray(~np.isfinite(values).all(axis=1))
         if bad.any():
