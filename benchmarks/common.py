@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from mistyle.core.cores import cores
+
 T = TypeVar("T")
 
 
@@ -44,12 +46,11 @@ def peak_gb() -> float:
 
 def machine() -> dict[str, Any]:
     """Where the figures were measured; `load` above `cores` means that others were working too."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else 0.0
     return {
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
-        "cores": cores,
+        "cores": cores(),
         "load": round(load, 1),
         "python": platform.python_version(),
     }

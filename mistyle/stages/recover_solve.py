@@ -210,8 +210,8 @@ def sureness(solution: Solution, gathered: Gathered) -> Values:
     """What a texel counts in its neighbours' means: by its spread, and less where its observations do not fit."""
     sure = 1 / np.maximum(solution.spread, 1e-4) ** 2
     sure = np.minimum(sure, np.quantile(sure, 0.9, axis=0))
-    misfit = solution.cost / np.maximum(gathered.seen, 1) / MISFIT
-    sure = (sure / (1 + misfit[:, None]) ** 2).astype(np.float32)
+    wrong = solution.cost / np.maximum(gathered.seen, 1) / MISFIT
+    sure = (sure / (1 + wrong[:, None]) ** 2).astype(np.float32)
     sure[gathered.seen == 0] = 1e-6
     return sure
 
@@ -263,9 +263,13 @@ def varied(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "2"]:
 
 
 def open_tilts(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "t 2"]:
-    """Standard deviations of the tilt that a texel's observations leave open; observations that do not fit say less
-    than their number promises."""
-    return likelihood(solution)[0][:, 3:5] * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
+    """Standard deviations of the tilt that a texel's observations leave open."""
+    return likelihood(solution)[0][:, 3:5] * inflation(solution, gathered)
+
+
+def inflation(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "t 1"]:
+    """What standard deviations are multiplied by: observations that do not fit say less than their number promises."""
+    return np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
 
 
 def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.ndarray, " t"]:
@@ -283,9 +287,9 @@ def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.nda
 def decided(solution: Solution, gathered: Gathered) -> Float[np.ndarray, " t"]:
     """The share of a texel's tilt that its own pictures decide and not its neighbours, 0..1. Texels that too few saw
     whole are left to the pictures, which show parts of them that the solver knows nothing of, as far as tilts vary."""
-    spread = float(varied(solution, gathered).mean())
+    variance = float(varied(solution, gathered).mean())
     share = likelihood(solution)[1][:, 3:5].mean(axis=1)
-    return np.where(gathered.seen >= LEAST_SEEN, share, spread / (spread + KNOWN**2)).astype(np.float32)
+    return np.where(gathered.seen >= LEAST_SEEN, share, variance / (variance + KNOWN**2)).astype(np.float32)
 
 
 def likelihood(solution: Solution) -> tuple[Values, Values]:

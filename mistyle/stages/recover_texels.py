@@ -152,10 +152,9 @@ def solve_texels(
             solution = solving.another_round(problem, gathered, where, solution, differences, settings, number)
             trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
             progress(0.5 + 0.5 * (number + 1) / total)
-        # Observations that do not fit say less than their number promises.
         values = solution.values
         decided = solving.decided(solution, gathered)
-        spread = solution.spread * np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
+        spread = solution.spread * solving.inflation(solution, gathered)
         bad = np.asarray(~np.isfinite(values).all(axis=1))
         if bad.any():
             work.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
