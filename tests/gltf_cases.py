@@ -91,7 +91,7 @@ def from_gltf(path: Path, *, new_uvs: bool = False) -> Asset:
     """A glTF file as it is, one part per material; with `new_uvs` every face gets a cell of its own in the square."""
     from mistyle.files.gltf_read import read_gltf
 
-    raw = read_gltf(path, 1_000_000)
+    raw = read_gltf(path, 1_000_000).finished()
     uvs, kind = raw.uvs, "kept"
     if new_uvs:
         side = int(np.ceil(np.sqrt(len(raw.faces))))

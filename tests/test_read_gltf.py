@@ -18,6 +18,7 @@ from test_read import check_asset
 
 from mistyle.core.errors import InputRefused
 from mistyle.files.gltf_read import read_gltf, world_matrices
+from mistyle.files.raw import Corners
 from mistyle.files.read import load_gltf, read_mesh
 
 Tree = dict[str, Any]
@@ -178,14 +179,14 @@ def test_strips_and_fans(mode: int, index: list[int] | None, faces: list[list[in
         del file.tree["meshes"][0]["primitives"][0]["indices"]
     else:
         file.tree["meshes"][0]["primitives"][0]["indices"] = file.accessor(np.array(index, np.uint8))
-    assert read_gltf(file.save(tmp_path / "a.gltf"), 100).faces.tolist() == faces
+    assert read_gltf(file.save(tmp_path / "a.gltf"), 100).raw.faces.tolist() == faces
 
 
 def test_points_and_lines_are_left_out(tmp_path: Path) -> None:
     file = square()
     line = copy.deepcopy(file.tree["meshes"][0]["primitives"][0]) | {"mode": 1}
     file.tree["meshes"][0]["primitives"].insert(0, line)
-    raw = read_gltf(file.save(tmp_path / "a.gltf"), 100)
+    raw = read_gltf(file.save(tmp_path / "a.gltf"), 100).finished()
     assert len(raw.faces) == 2 and raw.primitives[0].primitive == 1 and "Points and lines" in raw.notes[0]
 
 
@@ -204,10 +205,31 @@ def test_packed_accessors(tmp_path: Path) -> None:
     view = file.view(loose.tobytes(), byteStride=20)
     file.tree["accessors"].append({"bufferView": view, "componentType": 5126, "count": 4, "type": "VEC3"})
     attributes["NORMAL"] = len(file.tree["accessors"]) - 1
-    raw = read_gltf(file.save(tmp_path / "a.gltf"), 100)
+    raw = read_gltf(file.save(tmp_path / "a.gltf"), 100).finished()
     assert raw.positions[2].tolist() == [5, 5, 5] and raw.positions[1].tolist() == [2, 0, 0]
     assert raw.uvs is not None and raw.uvs[1] == pytest.approx(np.array([[0, 0], [1, 1], [0, 0.8]]))
     assert raw.normals is not None and raw.normals[1].tolist() == [[0, 0, 1]] * 3
+
+
+def test_corners_are_sent_as_indices(tmp_path: Path) -> None:
+    """Primitives that share positions, one of them without UVs and normals, and an index that no reader would send."""
+    file = square()
+    first = file.tree["meshes"][0]["primitives"][0]
+    bare = copy.deepcopy(first)
+    bare["attributes"] = {"POSITION": first["attributes"]["POSITION"]}
+    one = read_gltf(file.save(tmp_path / "a.gltf"), 100)
+    assert one.normals.index is one.raw.faces and one.uvs is not None and one.uvs.index is one.raw.faces
+    file.tree["meshes"][0]["primitives"] = [first, bare, copy.deepcopy(first)]
+    found = read_gltf(file.save(tmp_path / "b.gltf"), 100)
+    raw, alone = found.finished(), one.finished()
+    assert len(raw.positions) == 4 and raw.faces.dtype == np.int32 and np.array_equal(raw.faces[4:], alone.faces)
+    for name in ("normals", "uvs"):
+        corners, expected = getattr(raw, name), getattr(alone, name)
+        assert np.array_equal(corners[:2], expected) and np.array_equal(corners[4:], expected)
+    assert raw.uvs is not None and np.isnan(raw.uvs[2:4]).all()
+    assert raw.normals is not None and np.allclose(np.abs(raw.normals[2:4] @ alone.normals[0, 0]), 1)
+    wild = Corners(found.normals.values, np.array([[0, -5, 10**9]], np.int32))
+    assert np.array_equal(wild.finished()[0], found.normals.values[[0, 0, -1]])
 
 
 def test_missing_normals_are_flat(tmp_path: Path) -> None:
@@ -233,7 +255,7 @@ def test_a_skinned_mesh_stands_in_its_bind_pose(tmp_path: Path) -> None:
         {"translation": [0, 7, 0]},
     ]
     file.tree["scenes"][0]["nodes"] = [0, 1]
-    raw = read_gltf(file.save(tmp_path / "a.gltf"), 100)
+    raw = read_gltf(file.save(tmp_path / "a.gltf"), 100).finished()
     assert raw.positions == pytest.approx(POSITION * 0.5 + [1, 0, 0])
 
 
@@ -452,7 +474,7 @@ def test_damaged_files_open_or_are_refused(edits: list[tuple[int, bytes, int]], 
     path = tmp_path_factory.getbasetemp() / "damaged.glb"
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
     try:
-        raw = read_gltf(path, 1000)
+        raw = read_gltf(path, 1000).finished()
     except InputRefused:
         return
     assert raw.faces.max(initial=-1) < len(raw.positions)

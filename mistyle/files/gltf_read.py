@@ -16,14 +16,14 @@ from mistyle.files.gltf_materials import base_set, read_material, wanted_sets
 from mistyle.files.gltf_vertices import triangles
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_indices, check_positions, too_many
-from mistyle.files.raw import Raw
+from mistyle.files.raw import Corners, Indexed, Raw
 
 Tree = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class _Piece:
-    """One primitive under one node."""
+    """One primitive under one node; `uvs` are those of its base set."""
 
     node: int
     mesh: int
@@ -32,12 +32,12 @@ class _Piece:
     texcoord: int
     first_vertex: int
     faces: np.ndarray
-    normals: np.ndarray
-    uvs: np.ndarray
+    normals: Corners
+    uvs: Corners | None
     other_uvs: dict[int, np.ndarray]
 
 
-def read_gltf(path: Path, max_faces: int) -> Raw:
+def read_gltf(path: Path, max_faces: int) -> Indexed:
     """Triangles of the default scene (of all nodes where there is none), in node order and file order.
 
     Positions are in world space, node transforms applied. A skinned mesh comes in its bind pose: its own node's
@@ -68,19 +68,30 @@ def read_gltf(path: Path, max_faces: int) -> Raw:
         Primitive(p.node, p.mesh, p.primitive, int(a), int(b), p.material, p.texcoord, -1, p.first_vertex)
         for p, a, b in zip(pieces, starts[:-1], starts[1:], strict=True)
     )
-    uvs = np.concatenate([p.uvs for p in pieces])
-    return Raw(
+    faces = np.concatenate([p.faces for p in pieces])
+    raw = Raw(
         kind="glb" if path.suffix.lower() == ".glb" else "gltf",
         positions=np.concatenate(positions),
-        faces=np.concatenate([p.faces for p in pieces], dtype=np.int32, casting="same_kind"),
-        normals=np.concatenate([p.normals for p in pieces]),
-        uvs=uvs if np.isfinite(uvs).any() else None,
+        faces=faces,
+        normals=None,
+        uvs=None,
         material=material,
         materials=materials,
         primitives=primitives,
         twin=_twins(pieces, starts),
         notes=tuple(dict.fromkeys(notes)),
     )
+    without = [Corners(np.full((1, 2), np.nan, np.float32), np.zeros((n, 3), np.int32)) for n in counts]
+    uvs = _joined([p.uvs or nothing for p, nothing in zip(pieces, without, strict=True)], faces)
+    return Indexed(raw, _joined([p.normals for p in pieces], faces), uvs if np.isfinite(uvs.values).any() else None)
+
+
+def _joined(corners: list[Corners], faces: Int[np.ndarray, "f 3"]) -> Corners:
+    """One behind the other. Indices that are the faces' own are the same array, which is sent once."""
+    starts = np.cumsum([0, *(len(c.values) for c in corners)])
+    index = np.concatenate([c.index + np.int32(start) for c, start in zip(corners, starts[:-1], strict=True)])
+    same = np.array_equal(index, faces)
+    return Corners(np.concatenate([c.values for c in corners]), faces if same else index)
 
 
 def _pieces(
@@ -130,6 +141,7 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
     attributes = primitive["attributes"]
     count = tree["accessors"][attributes["POSITION"]]["count"]
     check_indices(index, count, path, "vertex")
+    index = index.astype(np.int32)
     if np.linalg.det(matrix[:3, :3]) < 0:
         index = index[:, [0, 2, 1]]
     if "COLOR_0" in attributes:
@@ -137,20 +149,20 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
     local = _vectors(tree, buffers, attributes["POSITION"], 3, path).astype(np.float64)
     if "NORMAL" in attributes:
         vectors = _vectors(tree, buffers, attributes["NORMAL"], 3, path).astype(np.float64)
-        normals = (vectors @ np.linalg.pinv(matrix[:3, :3]))[index]  # the inverse transpose, for row vectors
+        vectors = vectors @ np.linalg.pinv(matrix[:3, :3])  # the inverse transpose, for row vectors
+        corner = index
     else:
         notes.append("A primitive has no normals: its faces are shaded flat, as glTF demands.")
-        flat = area_vectors(local @ matrix[:3, :3].T, index)
-        normals = np.repeat(flat[:, None], 3, axis=1)
-    length = np.linalg.norm(normals, axis=2, keepdims=True)
-    normals = normals / np.where(length > 0, length, 1)
+        vectors = area_vectors(local @ matrix[:3, :3].T, index)
+        corner = np.repeat(np.arange(len(index), dtype=np.int32)[:, None], 3, axis=1)
+    length = np.linalg.norm(vectors, axis=1, keepdims=True)
+    normals = Corners((vectors / np.where(length > 0, length, 1)).astype(np.float32), corner)
     sets = {
-        n: _texcoords(tree, buffers, attributes[f"TEXCOORD_{n}"], path)[index]
+        n: Corners(_texcoords(tree, buffers, attributes[f"TEXCOORD_{n}"], path), index)
         for n in wanted_sets(tree, primitive.get("material"))
         if f"TEXCOORD_{n}" in attributes
     }
     base = base_set(tree, primitive.get("material"))
-    nothing = np.full((len(index), 3, 2), np.nan, np.float32)
     start = first[where[0], attributes["POSITION"]]
     return _Piece(
         node=where[0],
@@ -159,10 +171,10 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
         material=primitive.get("material", -1),
         texcoord=base if base in sets else -1,
         first_vertex=start,
-        faces=index + start,
-        normals=normals.astype(np.float32),
-        uvs=sets.get(base, nothing),
-        other_uvs={n: uvs for n, uvs in sets.items() if n != base},
+        faces=index + np.int32(start),
+        normals=normals,
+        uvs=sets.get(base),
+        other_uvs={n: uvs.finished() for n, uvs in sets.items() if n != base},
     )
 
 

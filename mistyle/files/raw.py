@@ -97,6 +97,32 @@ class Raw:
     notes: tuple[str, ...] = field(default=())
 
 
+@dataclass(frozen=True)
+class Corners:
+    """What several corners share, stored once: corner c of face f has `values[index[f, c]]`."""
+
+    values: Float[np.ndarray, "n k"]
+    index: Int[np.ndarray, "f 3"]
+
+    def finished(self) -> Float[np.ndarray, "f 3 k"]:
+        """Corner by corner."""
+        # Clipped: whoever sent the index may have sent anything.
+        return self.values.take(self.index, axis=0, mode="clip")
+
+
+@dataclass(frozen=True)
+class Indexed:
+    """A Raw on its way from one process to another: its normals and uvs, several times smaller, beside it."""
+
+    raw: Raw
+    normals: Corners
+    uvs: Corners | None
+
+    def finished(self) -> Raw:
+        """As everything after the border has it."""
+        return replace(self.raw, normals=self.normals.finished(), uvs=None if self.uvs is None else self.uvs.finished())
+
+
 def no_textures(tile: int) -> tuple[Maps, tuple[str, ...]]:
     """The `load` of a material without textures."""
     return {}, ()

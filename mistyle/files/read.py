@@ -20,6 +20,7 @@ from mistyle.core.asset import Asset, Picture
 from mistyle.files.bounds import refuse
 from mistyle.files.layers import Frame, frame_of
 from mistyle.files.pictures import picture_of
+from mistyle.files.raw import Indexed
 from mistyle.files.reader_process import ask
 
 __all__ = [
@@ -58,7 +59,7 @@ MESHES = {
     ".usdc": "mistyle.files.usd_read:read_usd",
     ".usdz": "mistyle.files.usd_read:read_usd",
 }
-"""Who reads a mesh file, by its ending: "module:function" of (path: Path, max_faces: int) -> files/raw.py Raw.
+"""Who reads a mesh file, by its ending: "module:function" of (path: Path, max_faces: int) -> what files/raw.py has.
 
 The function runs in the reader process, which imports its module then: it refuses with InputRefused, opens other files
 only through files/bounds.py (`read_bytes`, `beside`), checks indices and positions (files/polygons.py), and leaves its
@@ -97,7 +98,8 @@ def read_mesh(
     from mistyle.files.polygons import check_indices
     from mistyle.files.prepare import prepare
 
-    raw = ask("mesh", path, MESHES[kind], max_faces)
+    found = ask("mesh", path, MESHES[kind], max_faces)
+    raw = found.finished() if isinstance(found, Indexed) else found
     check_indices(raw.faces, len(raw.positions), path, "vertex")
     return prepare(raw, path, uv, up, size, progress)
 

@@ -21,25 +21,29 @@ from mistyle.core.errors import InputRefused
 from mistyle.files import hdr, pictures
 from mistyle.files.bounds import MAX_DEPTH, MAX_SETTINGS_BYTES, MAX_VALUES, read_bytes, refuse
 from mistyle.files.gltf_check import load_gltf, read_json
-from mistyle.files.raw import Raw, RawMaterial, Textures, Tile
+from mistyle.files.raw import Indexed, Raw, RawMaterial, Textures, Tile
 from mistyle.files.wire import Json
 
 TILES = 10  # a UDIM layout has at most so many tiles along u and along v
 AGAIN = "Write it again"
 
 
-def mesh(path: Path, reader: str, max_faces: int) -> Raw:
+def mesh(path: Path, reader: str, max_faces: int) -> Raw | Indexed:
     """The mesh with all its textures decoded. `reader` is "module:function" of (path, max_faces), files/read.py."""
     module, _, function = reader.partition(":")
     if not module.startswith("mistyle.files."):
         raise ValueError(f"{reader} is no reader of mistyle")
     with _usd(path):
-        raw: Raw = getattr(import_module(module), function)(path, max_faces)
+        found: Raw | Indexed = getattr(import_module(module), function)(path, max_faces)
+        raw = found.raw if isinstance(found, Indexed) else found
         if len(raw.faces) == 0:
             raise refuse(path, "no triangles", "at least one", "Export the mesh with its faces")
-        uvs = [None if raw.uvs is None else raw.uvs[raw.material == k] for k in range(len(raw.materials))]
-        pairs = zip(raw.materials, uvs, strict=True)
-        return replace(raw, materials=tuple(replace(m, load=Textures(_tiles(m, uv))) for m, uv in pairs))
+        # glTF, whose UVs are no part of `raw` yet, has no tiles.
+        uvs = raw.uvs
+        tiled = [uvs[raw.material == k] if m.udim and uvs is not None else None for k, m in enumerate(raw.materials)]
+        pairs = zip(raw.materials, tiled, strict=True)
+        raw = replace(raw, materials=tuple(replace(m, load=Textures(_tiles(m, uv))) for m, uv in pairs))
+        return replace(found, raw=raw) if isinstance(found, Indexed) else raw
 
 
 @contextmanager

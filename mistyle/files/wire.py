@@ -25,6 +25,8 @@ RECORDS = {
     "Picture": "mistyle.core.asset:Picture",
     "Primitive": "mistyle.core.asset:Primitive",
     "Lens": "mistyle.core.distortion:Lens",
+    "Corners": "mistyle.files.raw:Corners",
+    "Indexed": "mistyle.files.raw:Indexed",
     "CameraFrame": "mistyle.files.cameras:Frame",
     "SparsePoints": "mistyle.files.colmap:SparsePoints",
     "Frame": "mistyle.files.layers:Frame",
