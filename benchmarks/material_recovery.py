@@ -5,9 +5,9 @@
 Every object stands twice: with its own maps, and ("_strong") with synthetic ones that no constant comes near. What is
 rendered, at which resolution and with which texels: `recovery_truth.py`, `recovery_pictures.py`. Fitted from grey, with
 metallic unknown; 16 evenly spread views x 3 camera-fixed lights one at a time, ("_paper") the paper's own rig with its
-lights together, and ("_soft", no rivals) 16 views x an environment map in 3 positions. Texel figures are over the
-surface that at least three cameras see, weighted by area; "confident_" ones over the 95 % of it that the fit trusts
-most. Relit: four lights of no reference, cameras between theirs, mean over the pictures.
+lights together, ("_soft", no rivals) 16 views x an environment map in 3 positions, and ("_unknown", no rivals) 16 views
+under one that stands still and is solved for too. Texel figures are over the surface that at least three cameras see,
+weighted by area; "confident_" ones over the 95 % of it that the fit trusts most. Relit: four lights of no reference, cameras between theirs, mean over the pictures.
 
 `figures` are ours. `baselines`: "constant" is the best map of one value; "together" is ours from the same pictures
 summed by view (all lights on); "naive" and "naive_pyramid" are `naive_fit.py` for as many seconds as ours took.
@@ -35,7 +35,7 @@ from mistyle.measure.material_metrics import best_constant, confident, map_error
 from mistyle.render.scene import Frame
 
 LEAST_VIEWS = 3
-KINDS = ("real", "strong", "paper", "soft")
+KINDS = ("real", "strong", "paper", "soft", "unknown")
 RIVALS = ("together", "naive", "naive_pyramid")
 
 
@@ -49,6 +49,7 @@ class Row:
     strong: bool
     paper: bool = False
     soft: bool = False
+    unknown: bool = False
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -71,7 +72,7 @@ def main(argv: list[str] | None = None) -> None:
         if not quiet:
             print(report.table(name, methods))
             print("\n".join(f"  {line}" for line in said))
-            if not (row.paper or row.soft or options.quick):
+            if not (row.paper or row.soft or row.unknown or options.quick):
                 print("\n".join(report.verdicts(methods, row.strong)))
             print(flush=True)
         # After every row, so that a run that is stopped leaves what it had.
@@ -135,7 +136,15 @@ def rows(options: argparse.Namespace) -> list[Row]:
         names = options.assets or list(ASSETS)
         files = [(n, find_asset(n, options.data), ASSETS[n][1]) for n in names]
     return [
-        Row(name, file, "new" if options.uv == "new" else uv, kind != "real", kind == "paper", kind == "soft")
+        Row(
+            name,
+            file,
+            "new" if options.uv == "new" else uv,
+            kind != "real",
+            kind == "paper",
+            kind == "soft",
+            kind == "unknown",
+        )  # fmt: skip
         for name, file, uv in files
         for kind in KINDS
         if kind in options.maps
@@ -143,7 +152,8 @@ def rows(options: argparse.Namespace) -> list[Row]:
 
 
 def label(row: Row) -> str:
-    return f"{row.name}{'_strong' if row.strong else ''}{'_paper' if row.paper else '_soft' if row.soft else ''}"
+    kinds = {"_strong": row.strong, "_paper": row.paper, "_soft": row.soft, "_unknown": row.unknown}
+    return row.name + "".join(name for name, chosen in kinds.items() if chosen)
 
 
 def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, float]], list[str]]:
@@ -152,23 +162,24 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
     cameras = drawing.paper_cameras(size) if row.paper else drawing.fibonacci(options.views, size)
     known = truth(row.file, row.name, drawing.fibonacci(1, size)[0], row.uv, row.strong)
     sky = options.data / "hdri" / "aircraft_workshop_01_1k.hdr"
-    shots = drawing.turned(cameras, sky) if row.soft else drawing.one_at_a_time(cameras)
+    alone = row.soft or row.unknown
+    shots = drawing.turned(cameras, sky, 3 if row.soft else 1) if alone else drawing.one_at_a_time(cameras)
     pictures = drawing.render(known.mesh, known.maps, shots, frame=frame, spp=options.spp, cache=options.cache)
     counts = seen(known, cameras)
     weights = [a * (n >= LEAST_VIEWS) for a, n in zip(known.areas, counts, strict=True)]
     main_shots, main_pictures = drawing.together(shots, pictures) if row.paper else (shots, pictures)
 
     judge = Judge(known, weights, options)
-    fitted = ours(known, main_shots, main_pictures, frame)
+    fitted = ours(known, main_shots, main_pictures, frame, unknown=row.unknown)
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
-    if not (row.paper or row.soft) and "together" in options.rivals:
+    if not (row.paper or alone) and "together" in options.rivals:
         other = ours(known, *drawing.together(shots, pictures), frame)
         methods["together"] = judge(other.maps, frame, "together") | {"seconds": other.seconds}
     steps = {}
     loops = {"naive": (), "naive_pyramid": ("--pyramid",)}
-    if wanted := [method for method in loops if method in options.rivals and not row.soft]:
+    if wanted := [method for method in loops if method in options.rivals and not alone]:
         with TemporaryDirectory() as folder:
             write_job(Path(folder), known, main_shots, main_pictures)
             for method in wanted:

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from mistyle.core.maps import Maps
 from mistyle.render.scene import Frame
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.unknown_light import find_light
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,26 @@ class Fitted:
 
 
 def ours(
-    known: Truth, shots: Sequence[Shot], pictures: Sequence[np.ndarray], frame: Frame, seed: int = 0, **chosen: Any
+    known: Truth,
+    shots: Sequence[Shot],
+    pictures: Sequence[np.ndarray],
+    frame: Frame,
+    seed: int = 0,
+    *,
+    unknown: bool = False,
+    **chosen: Any,
 ) -> Fitted:
-    """Fit from scratch, metallic unknown, default settings but for `chosen`. The truth lends mesh and atlas only."""
+    """Fit from scratch, metallic unknown, default settings but for `chosen`. The truth lends mesh and atlas only; the
+    pictures' light too, unless it is `unknown`."""
     cameras = [s.camera for s in shots]
-    captures = in_memory(cameras, [s.lights for s in shots], [np.ascontiguousarray(p[..., :3]) for p in pictures])
+    masks = [p[..., 3] > 0.999 for p in pictures] if unknown else None
+    captures = in_memory(
+        cameras, [s.lights for s in shots], [np.ascontiguousarray(p[..., :3]) for p in pictures], masks
+    )
     settings = RecoverSettings(**({"metallic": True, "frame": frame} | chosen))
     start = time.perf_counter()
+    if unknown:
+        light = find_light(known.mesh, captures, settings).light
+        captures = replace(captures, lights=tuple((light,) for _ in cameras))
     found = recover(known.mesh, known.texels, captures, settings, seed)
     return Fitted(found.maps, found.confidence, time.perf_counter() - start, found.notes)

@@ -50,8 +50,9 @@ class Problem:
         self.rig = {
             "eye": mi.Float(aligned(rig.eye.ravel())),
             "first": mi.UInt32(aligned(rig.first, np.uint32)),
-            "light": mi.Float(aligned(_light_rows(rig).ravel())),
         }
+        self.lights = _light_rows(rig)
+        self.relight(rig.irradiance)
         if rig.cells is not None:
             self.rig["cells"] = mi.UInt32(aligned(rig.cells, np.uint32))
         self.chunks = []
@@ -65,6 +66,14 @@ class Problem:
         """Replace what was observed; rows in the order of the Observations."""
         for chunk in self.chunks:
             chunk["rgb"] = _columns(rgb[chunk["rows"]])
+
+    def relight(self, irradiance: Float[np.ndarray, "l 3"]) -> None:
+        """Replace the lights' irradiance; rows in the order of the Rig."""
+        import mitsuba
+
+        mi: Any = mitsuba
+        self.lights[:, 4:7] = irradiance
+        self.rig["light"] = mi.Float(aligned(self.lights.ravel()))
 
     def reweight(self, weight: Float[np.ndarray, " o"]) -> None:
         """Replace the weights."""
@@ -206,7 +215,7 @@ class Problem:
         mi: Any = mitsuba
         picture = dr.gather(mi.UInt32, chunk["picture"], index)
         eye = dr.gather(mi.Point3f, self.rig["eye"], picture)
-        wi = _local(chunk["frame"], dr.normalize(eye - chunk["position"]))
+        wi = local(chunk["frame"], dr.normalize(eye - chunk["position"]))
         first = dr.gather(mi.UInt32, self.rig["first"], picture)
         if self.single:
             return self._light(chunk, first, mi.Float(1), wi, x, slopes)
@@ -239,7 +248,7 @@ class Problem:
         vector = mi.Vector3f(row[0], row[1], row[2])
         to_light = vector - dr.select(near, mi.Vector3f(chunk["position"]), mi.Vector3f(0))
         distance2 = dr.squared_norm(to_light)
-        wo = _local(chunk["frame"], to_light * dr.rsqrt(distance2))
+        wo = local(chunk["frame"], to_light * dr.rsqrt(distance2))
         scale = scale * dr.select(near, 1 / distance2, 1)
         irradiance = [row[4 + c] * scale for c in range(3)]
         chosen = terms if not slopes else differences if self.options.differences else derivatives
@@ -279,7 +288,8 @@ def _unflat4(flat: Any, slopes: bool) -> tuple[list, list, list, list]:
     )
 
 
-def _local(frame: tuple, vector: Any) -> Any:
+def local(frame: tuple, vector: Any) -> Any:
+    """A world vector in the texels' frames."""
     import drjit as dr
 
     return type(vector)(dr.dot(frame[0], vector), dr.dot(frame[1], vector), dr.dot(frame[2], vector))

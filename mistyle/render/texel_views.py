@@ -112,18 +112,22 @@ def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
 
 
 def open_sky(
-    traced: Tracer, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"]
+    traced: Tracer,
+    position: Float[np.ndarray, "n 3"],
+    normal: Float[np.ndarray, "n 3"],
+    directions: Float[np.ndarray, "k 3"] | None = None,
 ) -> UInt32[np.ndarray, "n w"]:
-    """Which of the SKY_CELLS even directions nothing of the mesh hides from points just above the surface: bit k % 32
-    of word k // 32."""
+    """Which of some directions, by default the SKY_CELLS even ones, nothing of the mesh hides from points just above
+    the surface: bit k % 32 of word k // 32."""
     import drjit as dr
     import mitsuba
 
     mi: Any = mitsuba
     device.use()
     origin = mi.Point3f(*(mi.Float(aligned(c)) for c in (position + 1e-3 * normal).T))
-    words = np.zeros((len(position), -(-SKY_CELLS // 32)), np.uint32)
-    for k, direction in enumerate(even_directions(SKY_CELLS)):
+    directions = even_directions(SKY_CELLS) if directions is None else directions
+    words = np.zeros((len(position), -(-len(directions) // 32)), np.uint32)
+    for k, direction in enumerate(directions):
         away = dr.opaque(mi.Vector3f, direction.tolist())
         free = ~np.array(traced.scene.ray_test(mi.Ray3f(origin, away)))
         words[:, k // 32] |= free.astype(np.uint32) << np.uint32(k % 32)

@@ -215,9 +215,7 @@ def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
     from mistyle.stages.unknown_light import find_light
 
     s: MaterialSettings = run.job.settings
-    found = run.record(
-        "light", ["cameras"], [s.recover, s.seed], lambda r: find_light(asset.mesh, captures, s.recover, s.seed, r)
-    )
+    found = run.record("light", ["cameras"], [s.recover], lambda r: find_light(asset.mesh, captures, s.recover, r))
     return replace(captures, lights=tuple((found.light,) for _ in captures.cameras))
 
 
