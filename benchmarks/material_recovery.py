@@ -7,7 +7,8 @@ rendered, at which resolution and with which texels: `recovery_truth.py`, `recov
 metallic unknown; 16 evenly spread views x 3 camera-fixed lights one at a time, ("_paper") the paper's own rig with its
 lights together, ("_soft", no rivals) 16 views x an environment map in 3 positions, and ("_unknown", no rivals) 16 views
 under one that stands still and is solved for too. Texel figures are over the surface that at least three cameras see,
-weighted by area; "confident_" ones over the 95 % of it that the fit trusts most. Relit: four lights of no reference, cameras between theirs, mean over the pictures.
+weighted by area; "confident_" ones over the 95 % of it that the fit trusts most. Relit: four lights of no reference,
+cameras between theirs, mean over the pictures.
 
 `figures` are ours. `baselines`: "constant" is the best map of one value; "together" is ours from the same pictures
 summed by view (all lights on); "naive" and "naive_pyramid" are `naive_fit.py` for as many seconds as ours took.

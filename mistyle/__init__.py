@@ -40,6 +40,7 @@ def fit(
     mesh: str | PathLike,
     references: str | PathLike,
     out: str | PathLike,
+    /,
     *,
     lights: str | PathLike | None = None,
     masks: str | PathLike | None = None,
@@ -51,8 +52,9 @@ def fit(
 
     `references` is a folder with camera.json, transforms.json or a COLMAP model, and the pictures; `lights` a
     lights.json (None: the one in the folder; "unknown": solved for). `settings` are nested as `mistyle fit
-    --print-config` prints them, for example `recover={"metallic": True}`. Returns the paths of what was written and
-    the figures of `run.json`. Raises `mistyle.core.errors.MistyleError`.
+    --print-config` prints them, for example `recover={"metallic": True}` or `references={"hold_out": 2}`, for
+    which mesh, references and out are given by position. Returns the paths of what was written and the figures of
+    `run.json`. Raises `mistyle.core.errors.MistyleError`.
     """
     from pathlib import Path
 

@@ -12,7 +12,7 @@ from mistyle.core.camera import look_at
 from mistyle.core.capture import in_memory
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import gaussian, srgb_from_linear
-from mistyle.core.light import Directional, to_json
+from mistyle.core.light import Ambient, Directional, SphericalGaussian, to_json
 from mistyle.core.maps import flat_maps
 from mistyle.core.view import View
 from mistyle.files.images import write_png
@@ -23,6 +23,7 @@ from mistyle.run.charts import Chart, svg
 from mistyle.run.cli import main
 from mistyle.run.material import hold_out, lights_in_order
 from mistyle.run.material_settings import ReferenceSettings
+from mistyle.stages import unknown_light
 
 SIZE, SIDE = 64, 112
 KEYS = [
@@ -135,6 +136,36 @@ def test_a_second_run_takes_everything_over(fitted, shots):
     assert {p.name: p.read_bytes() for p in (out / "asset" / "textures").iterdir()} == before
     assert again["figures"]["psnr_held_out"] > 40
     assert not list((out / "work").glob("checkpoint-*"))
+
+
+def test_a_light_that_nobody_knows(shots, tmp_path, monkeypatch):
+    """A sun in a dim sky, found beside the material, explains pictures that the fit has not seen."""
+    asset = read_mesh(shots / "bowl.obj", size=SIZE)
+    sun = SphericalGaussian(axis=(0.36, 0.48, 0.8), sharpness=20.0, amplitude=(4.0, 4.0, 4.0))
+    cameras = []
+    for k in range(14):
+        angle, high = 2.4 * k, 0.5 + 0.35 * (k % 3)
+        place = 4 * np.array([np.cos(angle) * np.cos(high), np.sin(angle) * np.cos(high), np.sin(high)])
+        cameras.append(look_at(place.tolist(), fov=30, size=(64, 64), name=f"c{k:02d}"))
+    blank = [np.zeros((64, 64, 3), np.float32)] * len(cameras)
+    traced, rigs = draw.tracer(asset.mesh), [(sun, Ambient((0.2, 0.2, 0.2)))] * len(cameras)
+    shader = shade.Shade(traced, in_memory(cameras, rigs, blank), [(SIZE, SIZE)], subsamples=4)
+    shader.table = shade.pack([truth()])
+    views = []
+    for k, camera in enumerate(cameras):
+        hits = draw.gbuffer(traced, camera)
+        fields = (shader.image(k), hits.depth, hits.normal, hits.uv, hits.part, hits.mask, shader.coverage(k))
+        views.append(View(camera, *fields))
+    write_views(tmp_path / "shots", views, ())
+    monkeypatch.setattr(unknown_light, "OBSERVATIONS", 6000)
+    monkeypatch.setattr(unknown_light, "STEPS", (5, 3))
+    few = QUICK | {"recover": {"iterations": 24, "rounds": 1, "bounces": 0, "solver_iterations": 6}}
+    summary = mistyle.fit(
+        shots / "bowl.obj", tmp_path / "shots", tmp_path / "out", lights="unknown", atlas={"size": SIZE},
+        references={"hold_out": 2}, **few,
+    )  # fmt: skip
+    assert summary["figures"]["psnr_held_out"] > 30
+    assert "envmap" in Path(summary["scene"]).read_text()
 
 
 def test_pictures_are_held_out_evenly_and_by_light():

@@ -23,13 +23,14 @@ from mistyle.core.mesh import Mesh
 from mistyle.stages import light_cells, light_solve
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.light_solve import Bundle, State
-from mistyle.stages.recover_observe import gather
+from mistyle.stages.recover_observe import Gathered, gather
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
 
 SIDE = 192  # pixels along the longer side of the small pictures
-ATLAS = 96  # texels along the coarse atlas's side, of all sets together
+ATLAS, LEAST = 96, 16  # texels along the coarse atlas's side: of all sets together, and of each at least
 PICTURES = 48  # at most, spread evenly over those that there are
+OBSERVATIONS = 30_000  # of which about so many are enough, and time hangs on them
 STEPS = (10, 12)  # with even cells, and with finer ones
 NOISE, RELATIVE = 0.01, 0.03  # standard deviation of a small picture's pixels: the model is coarse
 FLOOR = 0.1  # least roughness, below which a highlight is narrower than the finest cells
@@ -68,12 +69,18 @@ def find_light(
         [rgb for _, rgb, _ in small],
         [mask for _, _, mask in small],
     )
-    side = max(16, int(ATLAS / len(mesh.parts) ** 0.5))
-    texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
-    traced = tracer(mesh)
-    gathered = gather(
-        traced, texels, lit, tangents_of(mesh, settings.frame), facing=settings.facing, noise=NOISE, relative=RELATIVE
-    )
+    traced, tangents = tracer(mesh), tangents_of(mesh, settings.frame)
+
+    def observed(side: int) -> tuple[list[Texels], Gathered]:
+        texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
+        return texels, gather(
+            traced, texels, lit, tangents, facing=settings.facing, noise=NOISE, relative=RELATIVE, skies=False
+        )
+
+    side = max(LEAST, int(ATLAS / len(mesh.parts) ** 0.5))
+    texels, gathered = observed(side)
+    if len(gathered.observations.rgb) > OBSERVATIONS:
+        texels, gathered = observed(max(LEAST, int(side * (OBSERVATIONS / len(gathered.observations.rgb)) ** 0.5)))
     if not (gathered.seen >= light_solve.LEAST_SEEN).any():
         raise InputRefused(
             f"found no place of the mesh that {light_solve.LEAST_SEEN} of the pictures show, expected pictures from "
