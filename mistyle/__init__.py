@@ -38,9 +38,8 @@ def stylize(
 
 def fit(
     mesh: str | PathLike,
-    references: str | PathLike,
+    pictures: str | PathLike,
     out: str | PathLike,
-    /,
     *,
     lights: str | PathLike | None = None,
     masks: str | PathLike | None = None,
@@ -50,11 +49,10 @@ def fit(
 ) -> dict[str, Any]:
     """Albedo, normal, roughness (and metallic) of a mesh from pictures of known cameras under known light.
 
-    `references` is a folder with camera.json, transforms.json or a COLMAP model, and the pictures; `lights` a
+    `pictures` is a folder with camera.json, transforms.json or a COLMAP model, and the pictures; `lights` a
     lights.json (None: the one in the folder; "unknown": solved for). `settings` are nested as `mistyle fit
-    --print-config` prints them, for example `recover={"metallic": True}` or `references={"hold_out": 2}`, for
-    which mesh, references and out are given by position. Returns the paths of what was written and the figures of
-    `run.json`. Raises `mistyle.core.errors.MistyleError`.
+    --print-config` prints them, for example `recover={"metallic": True}` or `references={"hold_out": 2}`.
+    Returns the paths of what was written and the figures of `run.json`. Raises `mistyle.core.errors.MistyleError`.
     """
     from pathlib import Path
 
@@ -66,7 +64,7 @@ def fit(
     mesh = Path(mesh)
     job = MaterialJob(
         mesh,
-        Path(references),
+        Path(pictures),
         Path(out),
         resolve(preset, None, settings, root=MaterialSettings, presets=MATERIAL_PRESETS),
         name or mesh.stem,

@@ -16,21 +16,21 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.render.draw import Tracer
 from mistyle.render.texel_lm import Options, Points, Problem, Rig
 from mistyle.render.texel_shares import shares
 from mistyle.render.texel_views import open_sky
 from mistyle.stages.light_cells import Cells, Radiance
 from mistyle.stages.recover_observe import Gathered
+from mistyle.stages.recover_solve import LEAST_SEEN
 
 # Of a texel's unknowns: where they are thought to be, and standard deviations. Tilts are small on the whole, or the
 # whole surface would lean towards where the light is wrong.
 MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.6, 0.0)
 SPREAD = (1.0, 1.0, 1.0, 0.1, 0.1, 0.3, 0.1)
-LEAST_SEEN = 3  # observations, for a texel to say anything of the light
 SMOOTH = 0.05  # weight of the squared relative difference between neighbouring cells
 FLAT = 0.05  # of the mean radiance: differences below it count in full
 CONVENTION = 0.1  # weight of the mean light's squared relative distance from the convention, per observation
-HUBER = 3.0  # standard deviations, as in the texels' solver
 STEP = 0.01  # of differences by tilt, roughness and metallic
 BLOCK = 1024  # texels at once
 TRIES, STEPS = 5, 15  # dampings that a step tries; iterations of the texels' solver after it
@@ -63,7 +63,9 @@ class State:
     residual: float
 
 
-def bundle(traced, gathered: Gathered, normal: Float[np.ndarray, "t 3"], cells: Cells, options: Options) -> Bundle:
+def bundle(
+    traced: Tracer, gathered: Gathered, normal: Float[np.ndarray, "t 3"], cells: Cells, options: Options
+) -> Bundle:
     """The problem with these cells for a sky; `normal` is the texels' geometric one."""
     points, count, number = gathered.points, len(cells.angle), len(gathered.rig.eye)
     words = open_sky(traced, points.position, normal, cells.direction.astype(np.float32))
@@ -170,7 +172,7 @@ def _system(bundled: Bundle, radiance: Radiance, values: Values, *, follow: bool
     wrong = seen.rgb - np.stack([by_light[c] @ radiance[:, c] for c in range(3)], axis=1)
     size = np.sqrt(((wrong * seen.weight[:, None]) ** 2).sum(axis=1))
     # Robust, and at first, when nothing fits yet, no more so than the middle one of all.
-    most = HUBER * max(1.0, float(np.median(size[bundled.used])) / 1.5)
+    most = bundled.problem.options.huber * max(1.0, float(np.median(size[bundled.used])) / 1.5)
     weight = seen.weight * np.sqrt(np.minimum(1, most / np.maximum(size, 1e-9)) * bundled.used)
     wrong = wrong * weight[:, None]
     by_light = [(part * weight[:, None]).astype(np.float32) for part in by_light]

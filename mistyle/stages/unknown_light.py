@@ -81,9 +81,9 @@ def find_light(
     texels, gathered = observed(side)
     if len(gathered.observations.rgb) > OBSERVATIONS:
         texels, gathered = observed(max(LEAST, int(side * (OBSERVATIONS / len(gathered.observations.rgb)) ** 0.5)))
-    if not (gathered.seen >= light_solve.LEAST_SEEN).any():
+    if not (gathered.seen >= solving.LEAST_SEEN).any():
         raise InputRefused(
-            f"found no place of the mesh that {light_solve.LEAST_SEEN} of the pictures show, expected pictures from "
+            f"found no place of the mesh that {solving.LEAST_SEEN} of the pictures show, expected pictures from "
             "around it. Check the cameras (--align where they are in other units than the mesh) and the masks."
         )
     normal = np.concatenate([t.normal[t.covered] for t in texels])
