@@ -42,15 +42,22 @@ RIVALS = ("together", "naive", "naive_pyramid")
 
 @dataclass(frozen=True)
 class Row:
-    """One line of the table to make: an object, its maps, where the pictures are taken from."""
+    """One line of the table to make: an object and what is asked of it, one of KINDS."""
 
     name: str
     file: Path
     uv: UV
-    strong: bool
-    paper: bool = False
-    soft: bool = False
-    unknown: bool = False
+    kind: str
+
+    @property
+    def strong(self) -> bool:
+        """Whether its maps are the synthetic ones."""
+        return self.kind != "real"
+
+    @property
+    def soft(self) -> bool:
+        """Whether an environment lights it, which no rival can take."""
+        return self.kind in ("soft", "unknown")
 
 
 def main(argv: list[str] | None = None) -> None:
@@ -73,7 +80,7 @@ def main(argv: list[str] | None = None) -> None:
         if not quiet:
             print(report.table(name, methods))
             print("\n".join(f"  {line}" for line in said))
-            if not (row.paper or row.soft or row.unknown or options.quick):
+            if row.kind in ("real", "strong") and not options.quick:
                 print("\n".join(report.verdicts(methods, row.strong)))
             print(flush=True)
         # After every row, so that a run that is stopped leaves what it had.
@@ -137,15 +144,7 @@ def rows(options: argparse.Namespace) -> list[Row]:
         names = options.assets or list(ASSETS)
         files = [(n, find_asset(n, options.data), ASSETS[n][1]) for n in names]
     return [
-        Row(
-            name,
-            file,
-            "new" if options.uv == "new" else uv,
-            kind != "real",
-            kind == "paper",
-            kind == "soft",
-            kind == "unknown",
-        )  # fmt: skip
+        Row(name, file, "new" if options.uv == "new" else uv, kind)
         for name, file, uv in files
         for kind in KINDS
         if kind in options.maps
@@ -153,34 +152,34 @@ def rows(options: argparse.Namespace) -> list[Row]:
 
 
 def label(row: Row) -> str:
-    kinds = {"_strong": row.strong, "_paper": row.paper, "_soft": row.soft, "_unknown": row.unknown}
-    return row.name + "".join(name for name, chosen in kinds.items() if chosen)
+    return row.name + {"real": "", "strong": "_strong"}.get(row.kind, f"_strong_{row.kind}")
 
 
 def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, float]], list[str]]:
     """All methods' figures of one row, ours first, and what there is to say about it."""
     size, frame = options.resolution, options.frame
-    cameras = drawing.paper_cameras(size) if row.paper else drawing.fibonacci(options.views, size)
+    cameras = drawing.paper_cameras(size) if row.kind == "paper" else drawing.fibonacci(options.views, size)
     known = truth(row.file, row.name, drawing.fibonacci(1, size)[0], row.uv, row.strong)
     sky = options.data / "hdri" / "aircraft_workshop_01_1k.hdr"
-    alone = row.soft or row.unknown
-    shots = drawing.turned(cameras, sky, 3 if row.soft else 1) if alone else drawing.one_at_a_time(cameras)
+    shots = (
+        drawing.turned(cameras, sky, 1 if row.kind == "unknown" else 3) if row.soft else drawing.one_at_a_time(cameras)
+    )
     pictures = drawing.render(known.mesh, known.maps, shots, frame=frame, spp=options.spp, cache=options.cache)
     counts = seen(known, cameras)
     weights = [a * (n >= LEAST_VIEWS) for a, n in zip(known.areas, counts, strict=True)]
-    main_shots, main_pictures = drawing.together(shots, pictures) if row.paper else (shots, pictures)
+    main_shots, main_pictures = drawing.together(shots, pictures) if row.kind == "paper" else (shots, pictures)
 
     judge = Judge(known, weights, options)
-    fitted = ours(known, main_shots, main_pictures, frame, unknown=row.unknown)
+    fitted = ours(known, main_shots, main_pictures, frame, unknown=row.kind == "unknown")
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
-    if not (row.paper or alone) and "together" in options.rivals:
+    if row.kind in ("real", "strong") and "together" in options.rivals:
         other = ours(known, *drawing.together(shots, pictures), frame)
         methods["together"] = judge(other.maps, frame, "together") | {"seconds": other.seconds}
     steps = {}
     loops = {"naive": (), "naive_pyramid": ("--pyramid",)}
-    if wanted := [method for method in loops if method in options.rivals and not alone]:
+    if wanted := [method for method in loops if method in options.rivals and not row.soft]:
         with TemporaryDirectory() as folder:
             write_job(Path(folder), known, main_shots, main_pictures)
             for method in wanted:

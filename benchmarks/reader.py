@@ -126,7 +126,7 @@ def run(quick: bool) -> dict[str, float]:
     from mistyle.files import reader_tasks
     from mistyle.files.images import write_png
     from mistyle.files.pictures import picture_of
-    from mistyle.files.raw import Indexed
+    from mistyle.files.raw import spelled
     from mistyle.files.read import MESHES, read_exr, read_picture
     from mistyle.files.reader_process import ask
 
@@ -147,9 +147,6 @@ def run(quick: bool) -> dict[str, float]:
 
         def sent(path: Path) -> Any:
             return spelled(ask("mesh", path, MESHES[path.suffix], 5_000_000))
-
-        def spelled(found: Any) -> Any:
-            return found.finished() if isinstance(found, Indexed) else found
 
         cases: dict[str, tuple[Path, Callable[[Path], Any], Callable[[Path], Any]]] = {
             "obj": (there["a.obj"], decoded, sent),

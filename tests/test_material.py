@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import mistyle
-from mistyle.core.camera import look_at
+from mistyle.core.camera import Camera, look_at
 from mistyle.core.capture import in_memory
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import gaussian, srgb_from_linear
-from mistyle.core.light import Ambient, Directional, SphericalGaussian, to_json
+from mistyle.core.light import Ambient, Directional, Lights, SphericalGaussian, to_json
 from mistyle.core.maps import flat_maps
+from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.files.images import write_png
 from mistyle.files.read import read_mesh
@@ -65,21 +66,20 @@ def truth() -> object:
     return replace(flat_maps(SIZE), albedo=albedo, normal=normal, roughness=roughness)
 
 
-@pytest.fixture(scope="module")
-def shots(tmp_path_factory):
-    """A mesh file and a folder of 24 references, EXR, of 12 cameras under two lights, with their lights.json."""
-    folder = tmp_path_factory.mktemp("material")
-    bowl(folder / "bowl.obj")
-    asset = read_mesh(folder / "bowl.obj", size=SIZE)
-    cameras, rigs = [], []
-    for k in range(12):
-        angle, high = 2.4 * k, 0.55 + 0.35 * (k % 3)
+def orbit(count: int, low: float, side: int) -> list[Camera]:
+    """Cameras around the bowl, at three heights from `low` (radians) on."""
+    cameras = []
+    for k in range(count):
+        angle, high = 2.4 * k, low + 0.35 * (k % 3)
         place = 4 * np.array([np.cos(angle) * np.cos(high), np.sin(angle) * np.cos(high), np.sin(high)])
-        for j, light in enumerate(KEYS):
-            cameras.append(look_at(place.tolist(), fov=30, size=(SIDE, SIDE), name=f"c{k:02d}_{j}"))
-            rigs.append((light,))
-    blank = [np.zeros((SIDE, SIDE, 3), np.float32)] * len(cameras)
-    traced = draw.tracer(asset.mesh)
+        cameras.append(look_at(place.tolist(), fov=30, size=(side, side), name=f"c{k:02d}"))
+    return cameras
+
+
+def photographed(mesh: Mesh, cameras: list[Camera], rigs: list[Lights]) -> list[View]:
+    """The true material from every camera under its lights."""
+    blank = [np.zeros((*camera.size, 3), np.float32) for camera in cameras]
+    traced = draw.tracer(mesh)
     shader = shade.Shade(traced, in_memory(cameras, rigs, blank), [(SIZE, SIZE)], subsamples=4)
     shader.table = shade.pack([truth()])
     views = []
@@ -87,7 +87,21 @@ def shots(tmp_path_factory):
         hits = draw.gbuffer(traced, camera)
         fields = (shader.image(k), hits.depth, hits.normal, hits.uv, hits.part, hits.mask, shader.coverage(k))
         views.append(View(camera, *fields))
-    write_views(folder / "shots", views, ())
+    return views
+
+
+@pytest.fixture(scope="module")
+def shots(tmp_path_factory):
+    """A mesh file and a folder of 24 references, EXR, of 12 cameras under two lights, with their lights.json."""
+    folder = tmp_path_factory.mktemp("material")
+    bowl(folder / "bowl.obj")
+    asset = read_mesh(folder / "bowl.obj", size=SIZE)
+    cameras, rigs = [], []
+    for camera in orbit(12, 0.55, SIDE):
+        for j, light in enumerate(KEYS):
+            cameras.append(replace(camera, name=f"{camera.name}_{j}"))
+            rigs.append((light,))
+    write_views(folder / "shots", photographed(asset.mesh, cameras, rigs), ())
     named = {camera.name: rig for camera, rig in zip(cameras, rigs, strict=True)}
     (folder / "shots" / "lights.json").write_text(json.dumps(to_json((), named)))
     return folder
@@ -142,21 +156,9 @@ def test_a_light_that_nobody_knows(shots, tmp_path, monkeypatch):
     """A sun in a dim sky, found beside the material, explains pictures that the fit has not seen."""
     asset = read_mesh(shots / "bowl.obj", size=SIZE)
     sun = SphericalGaussian(axis=(0.36, 0.48, 0.8), sharpness=20.0, amplitude=(4.0, 4.0, 4.0))
-    cameras = []
-    for k in range(14):
-        angle, high = 2.4 * k, 0.5 + 0.35 * (k % 3)
-        place = 4 * np.array([np.cos(angle) * np.cos(high), np.sin(angle) * np.cos(high), np.sin(high)])
-        cameras.append(look_at(place.tolist(), fov=30, size=(64, 64), name=f"c{k:02d}"))
-    blank = [np.zeros((64, 64, 3), np.float32)] * len(cameras)
-    traced, rigs = draw.tracer(asset.mesh), [(sun, Ambient((0.2, 0.2, 0.2)))] * len(cameras)
-    shader = shade.Shade(traced, in_memory(cameras, rigs, blank), [(SIZE, SIZE)], subsamples=4)
-    shader.table = shade.pack([truth()])
-    views = []
-    for k, camera in enumerate(cameras):
-        hits = draw.gbuffer(traced, camera)
-        fields = (shader.image(k), hits.depth, hits.normal, hits.uv, hits.part, hits.mask, shader.coverage(k))
-        views.append(View(camera, *fields))
-    write_views(tmp_path / "shots", views, ())
+    cameras = orbit(14, 0.5, 64)
+    rigs = [(sun, Ambient((0.2, 0.2, 0.2)))] * len(cameras)
+    write_views(tmp_path / "shots", photographed(asset.mesh, cameras, rigs), ())
     monkeypatch.setattr(unknown_light, "OBSERVATIONS", 6000)
     monkeypatch.setattr(unknown_light, "STEPS", (5, 3))
     few = QUICK | {"recover": {"iterations": 24, "rounds": 1, "bounces": 0, "solver_iterations": 6}}

@@ -81,9 +81,12 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
         twin=_twins(pieces, starts),
         notes=tuple(dict.fromkeys(notes)),
     )
-    without = [Corners(np.full((1, 2), np.nan, np.float32), np.zeros((n, 3), np.int32)) for n in counts]
-    uvs = _joined([p.uvs or nothing for p, nothing in zip(pieces, without, strict=True)], faces)
+    uvs = _joined([p.uvs or _no_uvs(len(p.faces)) for p in pieces], faces)
     return Indexed(raw, _joined([p.normals for p in pieces], faces), uvs if np.isfinite(uvs.values).any() else None)
+
+
+def _no_uvs(faces: int) -> Corners:
+    return Corners(np.full((1, 2), np.nan, np.float32), np.zeros((faces, 3), np.int32))
 
 
 def _joined(corners: list[Corners], faces: Int[np.ndarray, "f 3"]) -> Corners:

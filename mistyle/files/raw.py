@@ -123,6 +123,11 @@ class Indexed:
         return replace(self.raw, normals=self.normals.finished(), uvs=None if self.uvs is None else self.uvs.finished())
 
 
+def spelled(found: Raw | Indexed) -> Raw:
+    """What a reader gave, corner by corner."""
+    return found.finished() if isinstance(found, Indexed) else found
+
+
 def no_textures(tile: int) -> tuple[Maps, tuple[str, ...]]:
     """The `load` of a material without textures."""
     return {}, ()

@@ -20,7 +20,7 @@ from mistyle.core.asset import Asset, Picture
 from mistyle.files.bounds import refuse
 from mistyle.files.layers import Frame, frame_of
 from mistyle.files.pictures import picture_of
-from mistyle.files.raw import Indexed
+from mistyle.files.raw import spelled
 from mistyle.files.reader_process import ask
 
 __all__ = [
@@ -98,8 +98,7 @@ def read_mesh(
     from mistyle.files.polygons import check_indices
     from mistyle.files.prepare import prepare
 
-    found = ask("mesh", path, MESHES[kind], max_faces)
-    raw = found.finished() if isinstance(found, Indexed) else found
+    raw = spelled(ask("mesh", path, MESHES[kind], max_faces))
     check_indices(raw.faces, len(raw.positions), path, "vertex")
     return prepare(raw, path, uv, up, size, progress)
 

@@ -307,8 +307,9 @@ def _rows(columns: list) -> Float[np.ndarray, "n c"]:
 
 
 def _light_rows(rig: Rig) -> Float[np.ndarray, "l 8"]:
+    """Of every light vector, near, irradiance (which `relight` fills in) and width2."""
     rows = np.zeros((len(rig.vector), 8), np.float32)
-    rows[:, :3], rows[:, 3], rows[:, 4:7] = rig.vector, rig.near, rig.irradiance
+    rows[:, :3], rows[:, 3] = rig.vector, rig.near
     rows[:, 7] = 0 if rig.width2 is None else rig.width2
     return rows
 

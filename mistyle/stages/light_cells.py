@@ -1,6 +1,7 @@
 """An unknown sky as cells of even radiance: their geometry, how they are refined where light is, their map."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -29,6 +30,10 @@ class Cells:
     angle: Float[np.ndarray, " k"]
     pairs: Int[np.ndarray, "p 2"]
 
+    def mean(self, radiance: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "3"]:
+        """Of a radiance of every cell, over the sphere."""
+        return (radiance * (self.angle / self.angle.sum())[:, None]).sum(axis=0)
+
     @property
     def width2(self) -> Float[np.ndarray, " k"]:
         """Mean square of the angle from the middle, along one axis: a disc of that solid angle has radius²/4."""
@@ -41,9 +46,8 @@ Radiance = Float[np.ndarray, "k 3"]
 def cells_at(directions: Float[np.ndarray, "k 3"]) -> Cells:
     """The cells of these directions."""
     towards, angle = _sphere()
-    tree = KDTree(directions)
-    own = np.bincount(tree.query(towards)[1], angle, minlength=len(directions))
-    near = np.asarray(tree.query(directions, AROUND + 1)[1])[:, 1:]
+    own = np.bincount(_owners(directions, towards), angle, minlength=len(directions))
+    near = np.asarray(KDTree(directions).query(directions, AROUND + 1)[1])[:, 1:]
     both = np.stack([np.repeat(np.arange(len(directions)), AROUND), near.ravel()], axis=1)
     return Cells(directions, np.maximum(own, 1e-6), np.unique(np.sort(both, axis=1), axis=0))
 
@@ -62,7 +66,7 @@ def refined(cells: Cells, radiance: Radiance) -> tuple[Cells, Float[np.ndarray, 
     inside = [_within(cells, k, int(count[k])) for k in np.flatnonzero(count).tolist()]
     new = cells_at(np.concatenate([even_directions(CELLS), *inside]))
     towards, angle = _sphere()
-    old, own = radiance[KDTree(cells.direction).query(towards)[1]], KDTree(new.direction).query(towards)[1]
+    old, own = radiance[_owners(cells.direction, towards)], _owners(new.direction, towards)
     total = [np.bincount(own, angle * old[:, c], minlength=len(new.angle)) for c in range(3)]
     return new, np.stack(total, axis=1) / new.angle[:, None]
 
@@ -70,8 +74,13 @@ def refined(cells: Cells, radiance: Radiance) -> tuple[Cells, Float[np.ndarray, 
 def environment_of(cells: Cells, radiance: Radiance) -> Environment:
     """The map of the cells' light."""
     towards = environment_directions(ROWS, 2 * ROWS)
-    own = KDTree(cells.direction).query(towards.reshape(-1, 3))[1]
+    own = _owners(cells.direction, towards.reshape(-1, 3))
     return Environment(radiance[own].reshape(towards.shape).astype(np.float32))
+
+
+def _owners(middles: Float[np.ndarray, "k 3"], towards: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
+    """To which cell each direction belongs."""
+    return np.asarray(KDTree(middles).query(towards)[1])
 
 
 def _within(cells: Cells, k: int, count: int) -> Float[np.ndarray, "n 3"]:
@@ -86,6 +95,7 @@ def _within(cells: Cells, k: int, count: int) -> Float[np.ndarray, "n 3"]:
     return found / np.linalg.norm(found, axis=1, keepdims=True)
 
 
+@cache
 def _sphere() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Directions all over the sphere, and the solid angle that each stands for."""
     towards = environment_directions(GRID, 2 * GRID).reshape(-1, 3)

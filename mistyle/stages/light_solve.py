@@ -115,17 +115,17 @@ def light_over(bundled: Bundle, radiance: Radiance, values: Values) -> Radiance:
 def together(
     bundled: Bundle,
     state: State,
-    convention: Callable[[State], Float[np.ndarray, "3"]],
+    convention: Callable[[Bundle, State], Float[np.ndarray, "3"]],
     steps: int,
     progress: Callable[[State], None],
 ) -> State:
-    """At most `steps` steps of both; `convention` says of a state which mean radiance it would have by convention."""
+    """At most `steps` steps of both; `convention` says which mean radiance a state would have by it."""
     damping = 1e-2
     weight = CONVENTION * int(bundled.used.sum())
     for _ in range(steps):
         matrix, gradient = _system(bundled, state.radiance, state.values, follow=True)
         smooth, flat = _smoothness(bundled.cells, state.radiance), state.radiance.T.ravel()
-        means = _means(bundled.cells, convention(state))
+        means = _means(bundled.cells, convention(bundled, state))
 
         def total(at: State, smooth=smooth, means=means) -> float:
             x = at.radiance.T.ravel()

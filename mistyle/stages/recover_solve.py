@@ -76,6 +76,14 @@ def spread_out(values: Values, gathered: Gathered, where: Atlas) -> Table:
     return fill(table, where)
 
 
+def placed(values: np.ndarray, gathered: Gathered, where: Atlas, otherwise) -> np.ndarray:
+    """The covered texels' values in an array of the whole atlas, which has `otherwise` elsewhere."""
+    result = np.zeros((where.offsets[-1], *values.shape[1:]), values.dtype)
+    result[...] = otherwise
+    result[gathered.texel] = values
+    return result
+
+
 def fill(table: Table, where: Atlas, only: np.ndarray | None = None) -> Table:
     """Uncovered texels (of `only`, where given) take the values of the nearest covered one of their set."""
     result = table.copy()

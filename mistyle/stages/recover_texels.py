@@ -164,10 +164,10 @@ def solve_texels(
         work.notes.append("No texel was observed in the light: texels were not solved one by one.")
     return Found(
         solving.spread_out(values, gathered, where),
-        _placed(spread, gathered.texel, where, np.array(solving.PRIOR_SPREAD, np.float32)),
-        _placed(decided, gathered.texel, where, 1),
-        _placed(gathered.seen, gathered.texel, where, 0),
-        _placed(gathered.views, gathered.texel, where, 0),
+        solving.placed(spread, gathered, where, np.array(solving.PRIOR_SPREAD, np.float32)),
+        solving.placed(decided, gathered, where, 1),
+        solving.placed(gathered.seen, gathered, where, 0),
+        solving.placed(gathered.views, gathered, where, 0),
         solved,
     )
 
@@ -193,10 +193,3 @@ def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarr
         taken = fetch(resize(light, captures.cameras[k].size), sighting).max(axis=1)
         weight[sighting.rows] /= 1 + weight[sighting.rows] * DOUBT * taken
     return weight
-
-
-def _placed(values: np.ndarray, texel: np.ndarray, where: solving.Atlas, otherwise) -> np.ndarray:
-    result = np.zeros((where.offsets[-1], *values.shape[1:]), values.dtype)
-    result[...] = otherwise
-    result[texel] = values
-    return result

@@ -20,6 +20,7 @@ from mistyle.core.image import luminance
 from mistyle.core.light import Ambient, Environment
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
+from mistyle.render.draw import Tracer
 from mistyle.stages import light_cells, light_solve
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.light_solve import Bundle, State
@@ -58,34 +59,10 @@ def find_light(
     are modelled, light between surfaces is not. Raises InputRefused where no texel is seen.
     """
     from mistyle.render.draw import tracer
-    from mistyle.render.hits import tangents_of
     from mistyle.render.texel_lm import Options
 
-    chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
-    small = [_small(captures, int(k)) for k in chosen]
-    lit = in_memory(
-        [camera for camera, _, _ in small],
-        [(Ambient((1.0, 1.0, 1.0)),)] * len(small),
-        [rgb for _, rgb, _ in small],
-        [mask for _, _, mask in small],
-    )
-    traced, tangents = tracer(mesh), tangents_of(mesh, settings.frame)
-
-    def observed(side: int) -> tuple[list[Texels], Gathered]:
-        texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
-        return texels, gather(
-            traced, texels, lit, tangents, facing=settings.facing, noise=NOISE, relative=RELATIVE, skies=False
-        )
-
-    side = max(LEAST, int(ATLAS / len(mesh.parts) ** 0.5))
-    texels, gathered = observed(side)
-    if len(gathered.observations.rgb) > OBSERVATIONS:
-        texels, gathered = observed(max(LEAST, int(side * (OBSERVATIONS / len(gathered.observations.rgb)) ** 0.5)))
-    if not (gathered.seen >= solving.LEAST_SEEN).any():
-        raise InputRefused(
-            f"found no place of the mesh that {solving.LEAST_SEEN} of the pictures show, expected pictures from "
-            "around it. Check the cameras (--align where they are in other units than the mesh) and the masks."
-        )
+    traced = tracer(mesh)
+    texels, gathered = _observations(traced, captures, settings)
     normal = np.concatenate([t.normal[t.covered] for t in texels])
     options = Options(settings.model, settings.metallic, floor=max(FLOOR, settings.roughness_floor))
     residuals: list[float] = []
@@ -98,19 +75,45 @@ def find_light(
     bundled = light_solve.bundle(traced, gathered, normal, cells, options)
     state = _begin(bundled)
     heard(state)
-    state = light_solve.together(bundled, state, _conventional(bundled), STEPS[0], heard)
+    state = light_solve.together(bundled, state, _conventional, STEPS[0], heard)
     cells, radiance = light_cells.refined(cells, state.radiance)
     bundled = light_solve.bundle(traced, gathered, normal, cells, options)
     values = state.values
     for _ in range(3):
         radiance = light_solve.light_over(bundled, radiance, values)
     state = light_solve.texels_under(bundled, radiance, values, 8)
-    state = light_solve.together(bundled, state, _conventional(bundled), STEPS[1], heard)
+    state = light_solve.together(bundled, state, _conventional, STEPS[1], heard)
     progress(1.0)
-    table = solving.spread_out(state.values, gathered, solving.atlas(texels))
-    return FoundLight(
-        light_cells.environment_of(cells, state.radiance), tuple(residuals), _maps(table, texels, gathered.seen > 0)
-    )
+    light = light_cells.environment_of(cells, state.radiance)
+    return FoundLight(light, tuple(residuals), _maps(state, gathered, texels))
+
+
+def _observations(traced: Tracer, captures: Captures, settings: RecoverSettings) -> tuple[list[Texels], Gathered]:
+    """What small pictures say of a coarse atlas, as fine as OBSERVATIONS allows."""
+    from mistyle.render.hits import tangents_of
+
+    chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
+    cameras, pictures, masks = zip(*(_small(captures, int(k)) for k in chosen), strict=True)
+    lit = in_memory(cameras, [(Ambient((1.0, 1.0, 1.0)),)] * len(cameras), pictures, masks)
+    mesh, tangents = traced.mesh, tangents_of(traced.mesh, settings.frame)
+
+    def observed(side: int) -> tuple[list[Texels], Gathered]:
+        texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
+        return texels, gather(
+            traced, texels, lit, tangents, facing=settings.facing, noise=NOISE, relative=RELATIVE, skies=False
+        )
+
+    side = max(LEAST, int(ATLAS / len(mesh.parts) ** 0.5))
+    texels, gathered = observed(side)
+    count = len(gathered.observations.rgb)
+    if count > OBSERVATIONS:
+        texels, gathered = observed(max(LEAST, int(side * (OBSERVATIONS / count) ** 0.5)))
+    if not (gathered.seen >= solving.LEAST_SEEN).any():
+        raise InputRefused(
+            f"found no place of the mesh that {solving.LEAST_SEEN} of the pictures show, expected pictures from "
+            "around it. Check the cameras (--align where they are in other units than the mesh) and the masks."
+        )
+    return texels, gathered
 
 
 def _begin(bundled: Bundle) -> State:
@@ -129,33 +132,25 @@ def _begin(bundled: Bundle) -> State:
 
 def _factor(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
     """What albedo would be multiplied by, and light divided, to be as the convention has them."""
-    share = bundled.cells.angle / bundled.cells.angle.sum()
-    mean = (state.radiance * share[:, None]).sum(axis=0)
+    mean = bundled.cells.mean(state.radiance)
     colour = mean / max(float(luminance(mean[None])[0]), 1e-9)
     seen = state.values[bundled.gathered.seen > 0, :3]
     bright = float(np.quantile(luminance(seen * colour), 0.95))
     return np.maximum(colour, 1e-3) * BRIGHT / max(bright, 1e-6)
 
 
-def _conventional(bundled: Bundle) -> Callable[[State], Float[np.ndarray, "3"]]:
-    def wanted(state: State) -> Float[np.ndarray, "3"]:
-        share = bundled.cells.angle / bundled.cells.angle.sum()
-        return (state.radiance * share[:, None]).sum(axis=0) / _factor(bundled, state)
-
-    return wanted
+def _conventional(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
+    """The mean radiance that the light would then have."""
+    return bundled.cells.mean(state.radiance) / _factor(bundled, state)
 
 
-def _maps(table: np.ndarray, texels: Sequence[Texels], seen: Bool[np.ndarray, " t"]) -> tuple[Maps, ...]:
+def _maps(state: State, gathered: Gathered, texels: Sequence[Texels]) -> tuple[Maps, ...]:
     from mistyle.render.shade import unpack
 
-    found = unpack(table, [t.covered.shape for t in texels])
-    known = np.split(seen, np.cumsum([int(t.covered.sum()) for t in texels])[:-1])
-    result = []
-    for maps, where, told in zip(found, texels, known, strict=True):
-        mask = np.zeros(where.covered.shape, bool)
-        mask[where.covered] = told
-        result.append(replace(maps, known=mask))
-    return tuple(result)
+    where = solving.atlas(texels)
+    known = np.split(solving.placed(gathered.seen > 0, gathered, where, False), where.offsets[1:-1])
+    found = unpack(solving.spread_out(state.values, gathered, where), where.sizes)
+    return tuple(replace(m, known=k.reshape(m.known.shape)) for m, k in zip(found, known, strict=True))
 
 
 def _small(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
