@@ -19,10 +19,10 @@ from benchmarks.recovery_pictures import Shot, render
 from benchmarks.recovery_truth import fitted_size
 from mistyle.core.align import moved
 from mistyle.core.asset import Asset
-from mistyle.core.capture import Captures, subset
+from mistyle.core.capture import Captures, shrunk, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps
-from mistyle.files.datasets import TENSOIR_LIGHTS, read_stanford_orb, read_tensoir, shrunk
+from mistyle.files.datasets import TENSOIR_LIGHTS, read_stanford_orb, read_tensoir
 from mistyle.files.read import read_mesh
 from mistyle.measure.material_metrics import align_channels, orb_mask, psnr_hdr, psnr_ldr
 from mistyle.render.scene import Frame
@@ -30,7 +30,7 @@ from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
 
-QUARTER = 4
+QUARTER = 4  # Stanford-ORB is scored at a quarter of its size
 Figures = dict[str, float]
 
 
@@ -53,11 +53,15 @@ def stanford_orb(
         if not train.captures.lights[0]:
             raise InputRefused(f"{root}: scene {name} has no ground_truth/{name}/env_map; unpack the ground truth too.")
         asset = read_mesh(train.mesh, uv="auto")
-        maps = fit(asset, shrunk(train.captures, QUARTER), frame)
-        novel = shrunk(read_stanford_orb(root, name, "novel").captures, QUARTER)
+        maps = fit(asset, quartered(train.captures), frame)
+        novel = quartered(read_stanford_orb(root, name, "novel").captures)
         found = compare(asset, maps, _first(novel, limit), frame, spp, _orb)
         figures |= {f"{name}.relight_psnr_h": found[0], f"{name}.relight_psnr_l": found[1]}
     return figures | _means(figures, "stanford_orb")
+
+
+def quartered(captures: Captures) -> Captures:
+    return shrunk(captures, [QUARTER] * len(captures))
 
 
 def tensoir(

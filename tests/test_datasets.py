@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from mistyle.core.camera import OPENGL_FROM_OPENCV, Camera, orbit, pixel_centres, px_from_world
-from mistyle.core.capture import in_memory
+from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Environment, environment_radiance
-from mistyle.files.datasets import read_stanford_orb, read_tensoir, shrunk
+from mistyle.files.datasets import read_stanford_orb, read_tensoir
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.read import read_npy
 
@@ -252,7 +252,7 @@ def test_shrunk_pictures_see_the_same(rng):
     camera = orbit(30, 10, distance=4.0, fov=30.0, size=(10, 13))
     picture, counts = rng.random((10, 13, 3)).astype(np.float32), np.ones((10, 13), bool)
     counts[4, 4] = False
-    small = shrunk(in_memory([camera], [()], [picture], [counts]), 3)
+    small = shrunk(in_memory([camera], [()], [picture], [counts]), [3])
     rgb, left = small.load(0)
     assert small.cameras[0].size == (3, 4) == left.shape
     assert rgb[2, 3] == pytest.approx(picture[6:9, 9:12].mean(axis=(0, 1)), rel=1e-5)

@@ -85,7 +85,8 @@ def photographed(mesh: Mesh, cameras: list[Camera], rigs: list[Lights]) -> list[
     views = []
     for k, camera in enumerate(cameras):
         hits = draw.gbuffer(traced, camera)
-        fields = (shader.image(k), hits.depth, hits.normal, hits.uv, hits.part, hits.mask, shader.coverage(k))
+        image, coverage = shader.image_and_coverage(k)
+        fields = (image, hits.depth, hits.normal, hits.uv, hits.part, hits.mask, coverage)
         views.append(View(camera, *fields))
     return views
 

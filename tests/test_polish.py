@@ -146,7 +146,7 @@ def test_emitters_light_a_surface_as_the_records_say(lights):
     captures = in_memory([camera], [lights], [shown])
     shade = Shade(tracer(mesh), captures, [(SIZE, SIZE)], subsamples=4, directions=512)
     shade.table = pack([maps])
-    inside = shade.coverage(0) > 0.999
+    inside = shade.image_and_coverage(0)[1] > 0.999
     # Each pixel sees a few of the soft light's directions, its neighbours others: their mean is what has to agree.
     blurred = [
         gaussian(np.where(inside[..., None], p, 0).astype(np.float32), 2.0)[inside] for p in (shade.image(0), shown)

@@ -163,7 +163,8 @@ def loss_of(ours, loss, pictures, weights) -> float:
     """The loss as `step` describes it, in float64 NumPy."""
     total = 0.0
     for k in pictures:
-        image, covered = ours.image(k).astype(np.float64), ours.coverage(k) > 0
+        image, coverage = ours.image_and_coverage(k)
+        image, covered = image.astype(np.float64), coverage > 0
         reference = ours.captures.load(k)[0].astype(np.float64)
         if loss == "l2":
             lost = (image - reference) ** 2
@@ -179,7 +180,8 @@ def test_loss_counts_covered_pixels_of_the_mask_with_their_weights(traced, rng, 
     camera = crop(32)
     weight = rng.random(camera.size).astype(np.float32)
     ours = made(traced, rng, [camera], (KEY,), subsamples, weights=lambda k: weight)
-    dark = ((ours.image(0) == 0).all(axis=-1) & (ours.coverage(0) > 0)).mean()
+    image, coverage = ours.image_and_coverage(0)
+    dark = ((image == 0).all(axis=-1) & (coverage > 0)).mean()
     assert dark > 0.02  # pixels in shadow count as well
     assert float(ours.step([0], loss)[0][0]) == pytest.approx(loss_of(ours, loss, [0], [weight]), rel=2e-5)
     mask = rng.random(camera.size) < 0.5
@@ -253,7 +255,7 @@ def test_same_bytes_frozen_kept_recomputed_and_again(traced, lights, subsamples,
         for _ in range(2):
             value, gradient = ours.step([1, 0], "log_srgb_l1")
         adjoint = rng.normal(size=(40, 40, 3)).astype(np.float32)
-        found = [value, gradient, ours.pull(1, adjoint), ours.image(1), ours.coverage(1)]
+        found = [value, gradient, ours.pull(1, adjoint), *ours.image_and_coverage(1)]
         results.append([np.array(v).tobytes() for v in found])
         assert bool(ours._kept) == ("memory" not in options)
     assert all(result == results[0] for result in results[1:])

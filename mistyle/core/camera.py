@@ -198,6 +198,13 @@ def resized(camera: Camera, size: tuple[int, int]) -> Camera:
     return zoom(camera, 0.0, 0.0, float(camera.size[1]), size)
 
 
+def binned(camera: Camera, by: int) -> Camera:
+    """The camera whose pixels are blocks of `by` x `by`; what is left over at the right and the bottom is dropped."""
+    size = (camera.size[0] // by, camera.size[1] // by)
+    centre = (camera.centre[0] / by, camera.centre[1] / by)
+    return replace(camera, focal=camera.focal / by, centre=centre, size=size)
+
+
 def in_frame(camera: Camera, px: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
     """Which pixel coordinates lie inside the image."""
     return (px[..., 0] >= 0) & (px[..., 1] >= 0) & (px[..., 0] < camera.size[1]) & (px[..., 1] < camera.size[0])

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.camera import Camera
+from mistyle.core.camera import Camera, binned
 from mistyle.core.light import Lights
 
 Loaded = tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]
@@ -56,3 +56,22 @@ def subset(captures: Captures, chosen: Sequence[int]) -> Captures:
         tuple(captures.lights[k] for k in rows),
         lambda k: captures.load(rows[k]),
     )
+
+
+def shrunk(captures: Captures, by: Sequence[int]) -> Captures:
+    """Picture k with blocks of by[k] x by[k] pixels averaged.
+
+    A block counts when all its pixels do. What is left over at the right and the bottom is dropped.
+    """
+    cameras = tuple(binned(camera, times) for camera, times in zip(captures.cameras, by, strict=True))
+
+    def load(k: int) -> Loaded:
+        (rgb, counts), times = captures.load(k), by[k]
+        if times == 1:
+            return rgb, counts
+        height, width = cameras[k].size
+        rgb, counts = rgb[: height * times, : width * times], counts[: height * times, : width * times]
+        means = rgb.reshape(height, times, width, times, 3).mean(axis=(1, 3))
+        return means.astype(np.float32), np.asarray(counts.reshape(height, times, width, times).all(axis=(1, 3)))
+
+    return Captures(cameras, captures.lights, load)

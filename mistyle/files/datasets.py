@@ -34,7 +34,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mistyle.core.align import turned
 from mistyle.core.camera import MITSUBA_FROM_OPENCV, OPENGL_FROM_OPENCV, Camera
-from mistyle.core.capture import Captures, Loaded
+from mistyle.core.capture import Captures
 from mistyle.core.distortion import Lens
 from mistyle.core.image import bilinear, linear_from_srgb
 from mistyle.core.light import Environment, Lights
@@ -132,27 +132,6 @@ def read_tensoir(
     shots = [_tensoir_shot(place, light) for place in places]
     rig: Lights = () if maps is None else (_tensoir_light(Path(maps), light),)
     return Dataset(_captures(shots, [rig] * len(shots)), lambda k: _tensoir_truth(shots[k]), None)
-
-
-def shrunk(captures: Captures, times: int) -> Captures:
-    """References with blocks of `times` x `times` pixels averaged (Stanford-ORB is scored at a quarter of its size).
-
-    A block counts when all its pixels do. What is left over at the right and the bottom is dropped.
-    """
-    cameras = []
-    for camera in captures.cameras:
-        height, width = (side // times for side in camera.size)
-        centre = (camera.centre[0] / times, camera.centre[1] / times)
-        cameras.append(replace(camera, focal=camera.focal / times, centre=centre, size=(height, width)))
-
-    def load(k: int) -> Loaded:
-        rgb, counts = captures.load(k)
-        height, width = cameras[k].size
-        rgb, counts = rgb[: height * times, : width * times], counts[: height * times, : width * times]
-        means = rgb.reshape(height, times, width, times, 3).mean(axis=(1, 3))
-        return means.astype(np.float32), np.asarray(counts.reshape(height, times, width, times).all(axis=(1, 3)))
-
-    return Captures(tuple(cameras), captures.lights, load)
 
 
 def _captures(shots: list[Shot], rigs: list[Lights]) -> Captures:

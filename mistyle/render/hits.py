@@ -17,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
-from mistyle.core.camera import Camera
+from mistyle.core.camera import Camera, px_from_world
 from mistyle.core.lanes import aligned
 from mistyle.core.light import Directional, Lights, Point, SceneLights, direction_in_world, position_in_world
 from mistyle.core.mesh import Mesh
@@ -93,6 +93,7 @@ class Transpose:
 class Hits:
     """One block of a picture. `counts` are the samples, pixels and texels without padding.
 
+    transpose only where gradients were asked for
     lights    colour of each delta light (irradiance, or intensity of a point), linear Rec.709
     sky       the soft light
     covered   samples on the mesh of the block's pixels, lit or not; row 0 of it is row `row` of the picture
@@ -102,7 +103,7 @@ class Hits:
 
     samples: Samples
     pixels: Pixels
-    transpose: Transpose
+    transpose: Transpose | None
     lights: Float[np.ndarray, "l 3"]
     sky: Sky | None
     row: int
@@ -165,28 +166,44 @@ def collect(
     subsamples: int = 4,
     shadows: bool = True,
     soft: Sky | None = None,
+    gradients: bool = True,
 ) -> Iterator[Hits]:
     """The blocks of one picture, top to bottom, without those that see nothing of the mesh.
 
     `tangents` as of `tangents_of`; `sizes` (rows, columns) of the texture sets; `soft` is `sky.sky(lights)`, made here
-    if it is not given. Shadow rays start where Mitsuba's start. ValueError for lights that only a scene file describes.
+    if it is not given. Without `gradients` the blocks are good for pictures only, and sooner there. Shadow rays start
+    where Mitsuba's start. ValueError for lights that only a scene file describes.
     """
     device.use()
-    height, width = camera.size
     if mask.shape != camera.size:
         raise ValueError(f"{camera.name}: a mask of {mask.shape} pixels came for a camera of {camera.size}")
     known = [light for light in lights if isinstance(light, Directional | Point)]
     if any(isinstance(light, SceneLights) for light in lights):
         raise ValueError(f"{camera.name}: light that only a scene file describes cannot be collected")
     soft = soft or sky(lights)
-    rows = max(1, BLOCK_RAYS // (width * subsamples))
-    for row in range(0, height, rows):
-        block = _block(traced, camera, known, mask[row : row + rows], row, sizes, tangents, subsamples, shadows, soft)
+    down, across = _window(traced.mesh, camera)
+    near = np.zeros_like(mask)
+    near[down, across] = mask[down, across]
+    rows = max(1, BLOCK_RAYS // (max(1, across.stop - across.start) * subsamples))
+    options = (sizes, tangents, subsamples, shadows, soft, gradients)
+    for row in range(down.start, down.stop, rows):
+        block = _block(traced, camera, known, near[row : min(row + rows, down.stop)], row, *options)
         if block is not None:
             yield block
 
 
-def _block(traced, camera, lights, mask, row, sizes, tangents, subsamples, shadows, soft) -> Hits | None:
+def _window(mesh: Mesh, camera: Camera) -> tuple[slice, slice]:
+    """Rows and columns of the picture that the mesh can be seen in: all, where some of it is behind the camera."""
+    px, depth = px_from_world(camera, mesh.positions.astype(np.float64))
+    if len(px) == 0 or not (depth > 0).all():
+        return slice(0, camera.size[0]), slice(0, camera.size[1])
+    # A pixel more on each side, for what single precision may put there.
+    low, high = np.floor(px.min(axis=0)) - 1, np.ceil(px.max(axis=0)) + 1
+    (left, top), (right, bottom) = (np.clip(edge, 0, camera.size[::-1]).astype(int).tolist() for edge in (low, high))
+    return slice(top, bottom), slice(left, right)
+
+
+def _block(traced, camera, lights, mask, row, sizes, tangents, subsamples, shadows, soft, gradients) -> Hits | None:
     import drjit as dr
     import mitsuba as mi
 
@@ -223,7 +240,10 @@ def _block(traced, camera, lights, mask, row, sizes, tangents, subsamples, shado
     size = padded(len(kept))
     where = own(mi.UInt32, _pad(kept, size))
     real = dr.arange(mi.UInt32, size) < len(kept)
-    lit_pixels, first, slot, count = np.unique(pixel[kept], return_index=True, return_inverse=True, return_counts=True)
+    # Samples come pixel after pixel.
+    begins = np.concatenate([[True], np.diff(pixel[kept]) > 0])[: len(kept)]
+    first, slot = np.flatnonzero(begins), np.cumsum(begins) - 1
+    lit_pixels, count = pixel[kept][first], np.diff(first, append=len(kept))
     axes: Any = None
     variant, visible = None, None
     if soft is not None:
@@ -246,8 +266,10 @@ def _block(traced, camera, lights, mask, row, sizes, tangents, subsamples, shado
     )
     p = padded(len(lit_pixels))
     pixels = Pixels(*(own(mi.UInt32, _pad(a.astype(np.uint32), p)) for a in (lit_pixels, first, count)))
-    transpose, touched = _transpose(texel, step, place, sizes, size)
+    transpose, touched = _transpose(texel, step, place, sizes, size) if gradients else (None, 0)
     dr.make_opaque(samples, pixels, transpose)
+    dark = hit.ravel() > 0
+    dark[lit_pixels - np.uint32(row * width)] = False
     soft_bytes = 37 + 4 * -(-len(soft.direction) // 32) if soft is not None else 0
     return Hits(
         samples=samples,
@@ -257,9 +279,11 @@ def _block(traced, camera, lights, mask, row, sizes, tangents, subsamples, shado
         sky=soft,
         row=row,
         covered=hit.astype(np.uint16),
-        dark=np.setdiff1d(np.unique(pixel[on]), lit_pixels),
+        dark=np.flatnonzero(dark) + row * width,
         counts=(len(kept), len(lit_pixels), touched),
-        bytes=size * (61 + 16 * len(lights) + soft_bytes) + 12 * p + 12 * padded(touched),
+        bytes=size * (29 + 16 * len(lights) + soft_bytes)
+        + 12 * p
+        + (0 if transpose is None else 32 * size + 12 * padded(touched)),
     )
 
 

@@ -143,7 +143,12 @@ class Fast:
             fine = [64 if np.prod(captures.cameras[k].size) <= MANY_PIXELS else 16 for k in looked]
             shade = renderer(*variant, subsamples=min(fine), memory=0)
             shade.table = self._table({})
-            return max(_beyond_noise(shade.image(k), pairs[k], captures.load(k)[1], shade.coverage(k)) for k in looked)
+
+            def wrong(k: int) -> float:
+                image, coverage = shade.image_and_coverage(k)
+                return _beyond_noise(image, pairs[k], captures.load(k)[1], coverage)
+
+            return max(wrong(k) for k in looked)
 
         variants = [(f, s) for f in (False, True) for s in (False, True)] if bumped else [(False, False)]
         errors = [error(variant) for variant in variants]

@@ -105,6 +105,7 @@ class Shade:
         self._terms = partial(bsdf.terms, model, **options)
         self._steps = _steps(self.sizes)
         self._kept: dict[int, list[Block]] = {}
+        self._too_large: set[int] = set()
         self._skies: dict[Any, tuple[Sky | None, Any]] = {}
         self._frozen: dict[Any, Any] = {}
         self._freeze = freeze
@@ -136,21 +137,19 @@ class Shade:
 
         Pixels that do not count for the fit (outside the picture's mask) are black.
         """
-        result = np.zeros((int(np.prod(self.captures.cameras[picture].size)), 3), np.float32)
-        for block in self.blocks(picture):
-            run = self._function(block, "image", shading.image, self._terms, self.subsamples)
-            rgb = np.array(run(self._textures, block.hits.samples, block.hits.pixels, block.lights)).reshape(-1, 4)
-            lit = block.hits.counts[1]
-            result[block.pixel] = rgb[:lit, :3]
-        return result.reshape(*self.captures.cameras[picture].size, 3)
+        return self.image_and_coverage(picture)[0]
 
-    def coverage(self, picture: int) -> Float[np.ndarray, "h w"]:
-        """Which share of each pixel's samples meets the mesh, 0..1; 0 outside the picture's mask."""
-        result = np.zeros(self.captures.cameras[picture].size, np.float32)
-        for block in self.blocks(picture):
-            row, covered = block.hits.row, block.hits.covered
-            result[row : row + len(covered)] = covered / np.float32(self.subsamples)
-        return result
+    def image_and_coverage(self, picture: int) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
+        """`image`, and which share of each pixel's samples meets the mesh, 0..1 (0 outside the picture's mask)."""
+        size = self.captures.cameras[picture].size
+        rgb, share = np.zeros((size[0] * size[1], 3), np.float32), np.zeros(size, np.float32)
+        for block in self.blocks(picture, gradients=False):
+            run = self._function(block, "image", shading.image, self._terms, self.subsamples)
+            lit, row, covered = block.hits.counts[1], block.hits.row, block.hits.covered
+            found = np.array(run(self._textures, block.hits.samples, block.hits.pixels, block.lights)).reshape(-1, 4)
+            rgb[block.pixel] = found[:lit, :3]
+            share[row : row + len(covered)] = covered / np.float32(self.subsamples)
+        return rgb.reshape(*size, 3), share
 
     def step(self, pictures: Sequence[int], loss: Loss = "log_srgb_l1") -> tuple[Any, Any]:
         """(loss, gradient by the table) over some pictures, both Dr.Jit and not yet waited for.
@@ -226,8 +225,8 @@ class Shade:
             self._frozen[key] = device.Frozen(lambda *arguments: function(*fixed, *arguments))
         return self._frozen[key]
 
-    def blocks(self, picture: int) -> Iterator["Block"]:
-        """What is kept of a picture, top to bottom; collected now if it is not kept."""
+    def blocks(self, picture: int, gradients: bool = True) -> Iterator["Block"]:
+        """What is kept of a picture, top to bottom; collected now if it is not kept, then perhaps for pictures only."""
         if picture in self._kept:
             yield from self._kept[picture]
             return
@@ -236,13 +235,15 @@ class Shade:
         weights = self.weights(picture) if self.weights is not None else np.ones(camera.size, np.float32)
         soft, soft_light = self._sky(lights)
         options = {"subsamples": self.subsamples, "shadows": self.shadows, "soft": soft}
-        kept: list[Block] | None = []
+        kept: list[Block] | None = None if picture in self._too_large else []
+        options["gradients"] = gradients or kept is not None
         for hits in collecting.collect(self.traced, camera, lights, mask, self.sizes, self._tangents, **options):
             block = Block(hits, soft_light, rgb, weights)
             if kept is not None:
                 kept.append(block)
                 if self._held() + sum(b.bytes for b in kept) > self.memory:
                     kept = None
+                    self._too_large.add(picture)
             yield block
         if kept is not None:
             self._kept[picture] = kept
@@ -273,7 +274,7 @@ class Block:
         self.widths = (
             dr.width(hits.samples.slot),
             dr.width(hits.pixels.index),
-            dr.width(hits.transpose.texel),
+            dr.width(hits.transpose.texel) if hits.transpose is not None else 0,
             len(hits.lights),
             len(hits.sky.direction) if hits.sky is not None else 0,
         )

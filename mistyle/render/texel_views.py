@@ -46,9 +46,10 @@ def look(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> Look:
     height, width = camera.size
     position, normal = np.zeros((height * width, 3), np.float32), np.zeros((height * width, 3), np.float32)
     mask, lit = np.zeros(height * width, bool), np.zeros((len(lights), height * width), bool)
-    right, down, forward = (mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T)
     for low in range(0, height * width, BLOCK_RAYS):
         part = slice(low, min(low + BLOCK_RAYS, height * width))
+        # Made for every block: a product with a literal zero, as upright cameras have one, resizes that zero.
+        right, down, forward = (mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T)
         index = dr.arange(mi.UInt32, part.start, part.stop)
         x = (mi.Float(index % width) + 0.5 - camera.centre[0]) / camera.focal
         y = (mi.Float(index // width) + 0.5 - camera.centre[1]) / camera.focal

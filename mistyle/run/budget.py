@@ -70,6 +70,7 @@ TILED = {
 MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
+    "pictures": Need(0.75, texel=150),
     "recover": Need(0.75, texel=446, look=9.6),
     "measure": Need(0.77, texel=300, look=6),
     "asset": Need(0.80, texel=200, look=6),

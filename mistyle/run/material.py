@@ -24,6 +24,7 @@ from mistyle.run.budget import check_material
 from mistyle.run.edits import asset_stage, tell_edits
 from mistyle.run.inputs import input_files
 from mistyle.run.material_files import scene, write
+from mistyle.run.material_pictures import look_through, looked
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 from mistyle.run.progress import Progress, Report
 from mistyle.run.stages import MATERIAL_STAGES, Run
@@ -123,12 +124,14 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
         given = [pictures, [vars(c) for c in captures.cameras], captures.lights, s.references, s.seed, key_of(s.colour)]
         placed = run.record("cameras", ["mesh"], given, lambda r: place(job, asset, captures, r))
-        captures = replace(captures, cameras=placed.cameras, lights=placed.lights)
+        whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
+        captures, said = no_finer(run, texels, whole)
+        placed = replace(placed, notes=(*placed.notes, *said))
         if job.lights == "unknown":
             captures = with_light(run, asset, captures)
         kept, _ = hold_out(captures, s.references)
         inputs = [s.recover, s.references, s.start, s.seed]
-        after = ["texels", "cameras", *(["light"] if job.lights == "unknown" else [])]
+        after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
         recovered = run.record("recover", after, inputs, lambda r: solve(run, asset, texels, subset(captures, kept), r))
         checkpoint.clear(job.out)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
@@ -136,7 +139,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         tell_edits(run)
         maps = edited(part_stems(job.name, asset.mesh.parts), recovered.maps)[0]
         recovered = replace(recovered, maps=tuple(maps))
-        run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, captures))
+        run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, whole))
         made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder, tuple(run.notes))
         run.stage(
             "report",
@@ -173,12 +176,12 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
 def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) -> Placed:
     """The cameras in working space: as they are, through the mesh's own units, or aligned and refined on request."""
     from mistyle.core.align import moved
-    from mistyle.files.captures import camera_space, check_pixels, read_shots, silhouette, sparse_points
+    from mistyle.files.captures import camera_space, read_shots, silhouette, sparse_points
     from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
 
     chosen = job.settings.references
     figures: dict[str, float] = {}
-    notes = list(check_pixels(captures, lambda done: report(0.3 * done)))
+    notes: list[str] = []
     masks, sparse = None, sparse_points(job.references) if chosen.align else None
     if chosen.align or chosen.refine_poses:
         shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
@@ -199,10 +202,10 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) ->
             figures |= {"align_px": float(np.nanmean(found.after))}
     elif camera_space(job.references) == "own":
         captures = moved(captures, asset.source.work_from_user)
-    report(0.6)
+    report(0.3)
     if chosen.refine_poses:
         refined = refine_poses(
-            asset.mesh, captures.cameras, masks or (), progress=lambda done: report(0.6 + 0.4 * done)
+            asset.mesh, captures.cameras, masks or (), progress=lambda done: report(0.3 + 0.7 * done)
         )
         captures = replace(captures, cameras=refined.cameras)
         before, after = (float(np.nanmean(each)) for each in (refined.before, refined.after))
@@ -210,12 +213,21 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) ->
     return Placed(captures.cameras, captures.lights, tuple(notes), figures)
 
 
+def no_finer(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:
+    """The captures with pixels no finer than the texels, and what there is to say of them."""
+    average = run.job.settings.references.average
+    folder = run.stage(
+        "pictures", ["texels", "cameras"], [], lambda f, r: look_through(f, texels, captures, average, r)
+    )
+    return looked(folder, captures)
+
+
 def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
     """The captures lit by an environment that is solved for together with a first material."""
     from mistyle.stages.unknown_light import find_light
 
     s: MaterialSettings = run.job.settings
-    found = run.record("light", ["cameras"], [s.recover], lambda r: find_light(asset.mesh, captures, s.recover, r))
+    found = run.record("light", ["pictures"], [s.recover], lambda r: find_light(asset.mesh, captures, s.recover, r))
     return replace(captures, lights=tuple((found.light,) for _ in captures.cameras))
 
 
@@ -325,4 +337,4 @@ def picture_of(traced: Any, captures: Captures, sizes, table, model: str, chosen
 
     shade = Shade(traced, captures, sizes, model=model, frame=chosen.frame, subsamples=chosen.subsamples)
     shade.table = table
-    return shade.image(0), shade.coverage(0)
+    return shade.image_and_coverage(0)

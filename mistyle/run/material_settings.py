@@ -20,6 +20,12 @@ class ReferenceSettings(BaseModel):
     )
     align: bool = Field(default=False, description="find the similarity that brings the mesh into the cameras' space")
     refine_poses: bool = Field(default=False, description="improve every camera against the mesh before fitting")
+    average: int = Field(
+        default=0,
+        ge=0,
+        le=64,
+        description="average blocks of so many pixels a side of every picture; 0: as many as are no wider than a texel",
+    )
     hold_out: int = Field(
         default=-1,
         ge=-1,

@@ -36,6 +36,7 @@ MATERIAL_STAGES = {
     "mesh": "read the mesh",
     "texels": "lay out the texture",
     "cameras": "place the cameras",
+    "pictures": "look through the pictures",
     "light": "find the light",
     "recover": "fit the material",
     "measure": "measure the fit",

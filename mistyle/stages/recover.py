@@ -26,6 +26,7 @@ from mistyle.stages.recover_texels import Found, Work, solve_level
 
 __all__ = ["RecoverSettings", "Recovered", "recover"]
 
+JUDGES = 48  # pictures that say whether the steps on whole pictures helped
 DAMPING = 0.3  # of a descent that begins from nothing
 # And multiples of the rate by channel: soft light says little of normals, less of roughness, most of albedo.
 SHARES = (2, 2, 2, 0.2, 0.2, 0.6, 0.6, 0)
@@ -211,17 +212,19 @@ def _note_stopped(work: Work, stopped: list[tuple[int, str, int]]) -> None:
 
 
 def total_loss(shade, table: Float[np.ndarray, "a 8"], settings: RecoverSettings) -> float:
-    """Mean loss over all pictures."""
+    """Mean loss over the pictures, or over JUDGES of them, evenly chosen."""
     shade.table = table
-    count = len(shade.captures)
-    return float(np.mean([np.array(shade.step([k], settings.loss)[0])[0] for k in range(count)]))
+    last = len(shade.captures) - 1
+    chosen = np.unique(np.linspace(0, last, min(JUDGES, last + 1)).round().astype(int)).tolist()
+    return float(np.mean([np.array(shade.step([k], settings.loss)[0])[0] for k in chosen]))
 
 
 def _residual(shade, k: int) -> float:
     rgb, mask = shade.captures.load(k)
-    inside = mask & (shade.coverage(k) > 0.999)
+    image, coverage = shade.image_and_coverage(k)
+    inside = mask & (coverage > 0.999)
     reference = rgb[inside].astype(np.float64)
-    wrong = reference - shade.image(k)[inside]
+    wrong = reference - image[inside]
     return float(np.sqrt((wrong**2).sum() / max((reference**2).sum(), 1e-30)))
 
 

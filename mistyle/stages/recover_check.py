@@ -1,6 +1,6 @@
 """Which reference pictures say something, and what is taken off them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from jaxtyping import Float
@@ -10,9 +10,12 @@ from mistyle.core.capture import Captures, Loaded, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import resize
 from mistyle.core.light import Lights
+from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 
 LEAST_VIEWS = 3
+FINE = 0.25  # share of the texels that may be narrower than a block of averaged pixels
+LEAST_PIXELS = 32  # along the shorter side of a picture that is left
 DISTRUST = 10.0  # of indirect light: what a pixel counts is halved by one tenth of the direct light
 
 
@@ -58,6 +61,30 @@ def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: 
     if not (rgb[mask] > 0).any():
         return "it is all black"
     return ""
+
+
+def blocks(texels: Sequence[Texels], captures: Captures) -> list[int]:
+    """How many pixels of each picture, along a side, can be averaged without losing what the texels could hold.
+
+    A block is no wider than three in four of the texels that face its camera, hidden ones too.
+    """
+    from mistyle.stages.recover_observe import texel_sizes
+
+    covered = [t.covered for t in texels]
+    position, normal = (
+        np.concatenate([field[c] for field, c in zip(fields, covered, strict=True)])
+        for fields in ([t.position for t in texels], [t.normal for t in texels])
+    )
+    size = np.concatenate([texel_sizes(t)[c.ravel()] for t, c in zip(texels, covered, strict=True)])
+    result = []
+    for camera in captures.cameras:
+        px, depth = px_from_world(camera, position)
+        facing = ((camera.position - position) * normal).sum(axis=1) > 0
+        there = facing & (depth > 0) & (size > 0) & in_frame(camera, px)
+        wide = size[there] * camera.focal / depth[there]
+        most = max(1, min(camera.size) // LEAST_PIXELS)
+        result.append(int(np.clip(np.quantile(wide, FINE), 1, most)) if len(wide) else 1)
+    return result
 
 
 def without(captures: Captures, indirect: dict[int, np.ndarray]) -> Captures:

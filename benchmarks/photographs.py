@@ -1,0 +1,199 @@
+"""Fitting to photographs that are finer than the texels: `python -m benchmarks.photographs [--quick] [--json FILE]`
+
+`large`: JPEGs of 12 megapixels of the water bottle by a lens that bends lines, 8 views under 3 lights one at a time,
+fitted by `mistyle fit` with an atlas of 1024². Figures: `large.pictures`, `large.megapixels`, `large.seconds`,
+`large.peak_gb`, `large.estimate_gb`, `large.psnr_held_out`; with one picture, seconds that it takes to be read and
+undistorted (`read_seconds`) and to be predicted (`predict_seconds`) as it is and averaged (`averaged.…`).
+
+`strong`: Suzanne with strong synthetic maps, 16 views x 3 lights by `path`, pictures three times as fine as the texels.
+The same fit to them as they are (`whole`), averaged (`averaged`), and to pictures rendered no finer than the texels
+(`coarse`): `normal_mean_deg`, `roughness_mse`, `albedo_psnr` and `seconds` of each. --quick runs a small `strong`, and
+a `large` of 6 pictures of 3 megapixels.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from benchmarks import recovery_pictures as drawing
+from benchmarks.common import finish
+from benchmarks.recovery_truth import data_folder, find_asset, truth
+from mistyle.core.camera import Camera, pixel_centres
+from mistyle.core.capture import Captures, in_memory, shrunk
+from mistyle.core.distortion import Lens, undistort
+from mistyle.core.image import srgb_from_linear
+from mistyle.core.light import Directional, to_json
+from mistyle.files.cameras import transforms
+from mistyle.files.captures import read_captures
+from mistyle.files.read import read_mesh
+from mistyle.measure.material_metrics import map_errors
+from mistyle.run.budget import material_gb
+from mistyle.run.material_settings import MaterialSettings
+from mistyle.stages.recover import recover
+from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.texels import rasterise, start_maps
+
+RADIAL = (0.04, -0.02, 0.0)
+ATLAS = 1024
+FINER = 3
+PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main())"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.photographs", description=__doc__)
+    parser.add_argument("--quick", action="store_true", help="small sizes")
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--only", choices=("large", "strong"), action="append", help="only this part (repeatable)")
+    parser.add_argument("--keep", type=Path, help="folder for the photographs and the run, to look at afterwards")
+    options = parser.parse_args()
+    figures: dict[str, float] = {}
+    with tempfile.TemporaryDirectory() as scratch:
+        if "large" in (options.only or ["large"]):
+            figures |= large(options.keep or Path(scratch), *((2, 1732) if options.quick else (8, 3464)))
+        if "strong" in (options.only or ["strong"]):
+            figures |= strong(64 if options.quick else 128)
+    finish(figures, options.json)
+
+
+def large(place: Path, views: int, side: int) -> dict[str, float]:
+    """Photographs made, read, predicted once as they are and averaged, and fitted to."""
+    mesh, folder = find_asset("waterbottle", data_folder()), place / "photographs"
+    count = photograph(mesh, folder, views, side)
+    captures = read_captures(folder, saturation=0.99)
+    asset = read_mesh(mesh)
+    from mistyle.stages.recover_check import blocks
+
+    by = blocks([rasterise(asset.mesh, 0, ATLAS)], captures)
+    figures = {"large.pictures": float(count), "large.megapixels": side * side / 1e6, "large.block": float(by[0])}
+    figures["large.read_seconds"] = _seconds(lambda: captures.load(0))
+    for name, seen in (("large", captures), ("large.averaged", shrunk(captures, by))):
+        held = in_memory(seen.cameras[:1], seen.lights[:1], [seen.load(0)[0]], [seen.load(0)[1]])
+        figures[f"{name}.predict_seconds"] = _prediction(asset.mesh, held)
+    words = ["fit", mesh, folder, "-o", place / "run", "--set", "references.saturation=0.99", "--atlas", ATLAS]
+    start = time.perf_counter()
+    made = _mistyle(*words)
+    figures |= {"large.seconds": time.perf_counter() - start, "large.peak_gb": made["peak_gb"]}
+    told = json.loads((place / "run" / "run.json").read_text())
+    settings = MaterialSettings.model_validate(told["settings"])
+    figures["large.estimate_gb"] = material_gb(settings, [side * side] * count)
+    print(json.dumps(told["seconds"]), file=sys.stderr)
+    return figures | {f"large.{key}": value for key, value in told["figures"].items() if key.startswith("psnr")}
+
+
+def photograph(mesh: Path, folder: Path, views: int, side: int) -> int:
+    """Write JPEGs of the object in its own material, their cameras and lights; how many. Direct light only."""
+    folder.mkdir(parents=True, exist_ok=True)
+    asset = read_mesh(mesh)
+    cameras = [replace(c, focal=1.25 * c.focal) for c in drawing.fibonacci(views, side)]
+    lens = Lens((cameras[0].focal,) * 2, cameras[0].centre, cameras[0].size, RADIAL)
+    where = _bent(lens, cameras[0])
+    shots = drawing.one_at_a_time(cameras)
+    exposure = None
+    lit, files = {}, []
+    for shot, picture in zip(shots, _pictures(asset, shots), strict=True):
+        if exposure is None:
+            exposure = 0.8 / float(np.quantile(picture[picture.max(axis=-1) > 0], 0.999))
+        bent = cv2.remap(picture * exposure, *where, cv2.INTER_LINEAR)
+        name = f"{shot.camera.name}.jpg"
+        encoded = (255 * srgb_from_linear(np.clip(bent, 0, 1)) + 0.5).astype(np.uint8)
+        cv2.imwrite(str(folder / name), encoded[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 95])
+        files.append(name)
+        lit[shot.camera.name] = tuple(
+            replace(light, irradiance=tuple(exposure * x for x in light.irradiance))
+            for light in shot.lights
+            if isinstance(light, Directional)
+        )
+    tree = transforms([shot.camera for shot in shots], files)
+    tree |= {"camera_model": "OPENCV", "k1": RADIAL[0], "k2": RADIAL[1], "k3": RADIAL[2]}
+    (folder / "transforms.json").write_text(json.dumps(tree))
+    (folder / "lights.json").write_text(json.dumps(to_json((), lit)))
+    return len(shots)
+
+
+def _pictures(asset, shots) -> Iterator[np.ndarray]:
+    from mistyle.render.draw import tracer
+    from mistyle.render.shade import Shade, pack
+
+    maps = [start_maps(m, rasterise(asset.mesh, p, 2048), 2048) for p, m in enumerate(asset.materials)]
+    traced, table = tracer(asset.mesh), pack(maps)
+    for shot in shots:
+        empty = np.zeros((*shot.camera.size, 3), np.float32)
+        shade = Shade(traced, in_memory([shot.camera], [shot.lights], [empty]), [m.roughness.shape for m in maps],
+                      subsamples=1, memory=0)  # fmt: skip
+        shade.table = table
+        yield shade.image(0)
+
+
+def _bent(lens: Lens, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """Where in the camera's picture each pixel of the photograph lies (OpenCV's pixels), from every 16th of them."""
+    height, width = lens.size
+    coarse = pixel_centres((height // 16 + 2, width // 16 + 2)) * 16 - 16
+    px = undistort(lens, (coarse - np.asarray(lens.centre)) / lens.focal) * camera.focal + np.asarray(camera.centre)
+    grid = (pixel_centres(lens.size) + 16) / 16 - 0.5
+    x, y = grid[..., 0].astype(np.float32), grid[..., 1].astype(np.float32)
+    return tuple(cv2.remap((px[..., axis] - 0.5).astype(np.float32), x, y, cv2.INTER_CUBIC) for axis in (0, 1))
+
+
+def _prediction(mesh, captures: Captures) -> float:
+    """Seconds that the picture takes which is too large to be kept, after everything was compiled."""
+    from mistyle.render.draw import tracer
+    from mistyle.render.shade import Shade
+
+    shade = Shade(tracer(mesh), captures, [(ATLAS, ATLAS)] * len(mesh.parts), subsamples=9, memory=0)
+    shade.image(0)
+    return _seconds(lambda: shade.image(0))
+
+
+def strong(size: int) -> dict[str, float]:
+    """The errors of fits to fine pictures as they are, to their averages, and to pictures as coarse as those."""
+    known = truth(find_asset("suzanne", data_folder()), "suzanne", drawing.fibonacci(1, size)[0], "auto", True)
+    figures: dict[str, float] = {}
+
+    def taken(side: int, spp: int) -> Captures:
+        shots = drawing.one_at_a_time(drawing.fibonacci(16, side))
+        pictures = drawing.render(known.mesh, known.maps, shots, frame="mikkt", spp=spp)
+        masks = [picture[..., 3] > 0.999 for picture in pictures]
+        return in_memory([s.camera for s in shots], [s.lights for s in shots], [p[..., :3] for p in pictures], masks)
+
+    fine = taken(FINER * size, 32)
+    cases = {
+        "whole": fine,
+        "averaged": shrunk(fine, [FINER] * len(fine)),
+        "coarse": taken(size, 32 * FINER**2),
+    }
+    for name, captures in cases.items():
+        start = time.perf_counter()
+        found = recover(known.mesh, known.texels, captures, RecoverSettings(metallic=True), 0)
+        figures[f"{name}.seconds"] = time.perf_counter() - start
+        errors = asdict(map_errors(known.maps, found.maps, known.areas))
+        figures |= {f"{name}.{key}": errors[key] for key in ("normal_mean_deg", "roughness_mse", "albedo_psnr")}
+        print(name, {k: round(v, 4) for k, v in errors.items()}, file=sys.stderr, flush=True)
+    return figures
+
+
+def _seconds(work) -> float:
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
+def _mistyle(*words) -> dict:
+    command = [sys.executable, "-c", PROGRAM, *map(str, words), "--json"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, env=os.environ)
+    if done.returncode != 0:
+        raise SystemExit(f"mistyle {' '.join(map(str, words))} ended with {done.returncode}")
+    return json.loads(done.stdout)
+
+
+if __name__ == "__main__":
+    main()
