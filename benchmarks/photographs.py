@@ -1,14 +1,15 @@
 """Fitting to photographs that are finer than the texels: `python -m benchmarks.photographs [--quick] [--json FILE]`
 
 `large`: JPEGs of 12 megapixels of the water bottle by a lens that bends lines, 8 views under 3 lights one at a time,
-fitted by `mistyle fit` with an atlas of 1024². Figures: `large.pictures`, `large.megapixels`, `large.seconds`,
-`large.peak_gb`, `large.estimate_gb`, `large.psnr_held_out`; with one picture, seconds that it takes to be read and
-undistorted (`read_seconds`) and to be predicted (`predict_seconds`) as it is and averaged (`averaged.…`).
+fitted by `mistyle fit` with an atlas of 1024². Figures: `large.pictures`, `large.megapixels`, `large.block` (pixels a
+side that were averaged), `large.seconds`, `large.peak_gb`, `large.estimate_gb`, `large.psnr_held_out`; and seconds that
+one picture takes to be read and made straight (`large.read_seconds`), and where it is not kept to be predicted as it is
+(`large.predict_seconds`) and averaged (`large.averaged.predict_seconds`).
 
-`strong`: Suzanne with strong synthetic maps, 16 views x 3 lights by `path`, pictures three times as fine as the texels.
-The same fit to them as they are (`whole`), averaged (`averaged`), and to pictures rendered no finer than the texels
-(`coarse`): `normal_mean_deg`, `roughness_mse`, `albedo_psnr` and `seconds` of each. --quick runs a small `strong`, and
-a `large` of 6 pictures of 3 megapixels.
+`strong`: Suzanne with strong synthetic maps, 16 views x 3 lights by `path`, pictures in which a texel is about four
+pixels wide, and the same averaged until it is two and one: `texel_of_4.…`, `texel_of_2.…`, `texel_of_1.…` with
+`normal_mean_deg`, `roughness_mse`, `albedo_psnr` and `seconds`. --quick runs it small, and a `large` of 6 pictures of 3
+megapixels.
 """
 
 import argparse
@@ -45,7 +46,7 @@ from mistyle.stages.texels import rasterise, start_maps
 
 RADIAL = (0.04, -0.02, 0.0)
 ATLAS = 1024
-FINER = 3
+FINEST = 4
 PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main())"
 
 
@@ -73,7 +74,7 @@ def large(place: Path, views: int, side: int) -> dict[str, float]:
     asset = read_mesh(mesh)
     from mistyle.stages.recover_check import blocks
 
-    by = blocks([rasterise(asset.mesh, 0, ATLAS)], captures)
+    by = blocks([rasterise(asset.mesh, 0, ATLAS)], captures.cameras)
     figures = {"large.pictures": float(count), "large.megapixels": side * side / 1e6, "large.block": float(by[0])}
     figures["large.read_seconds"] = _seconds(lambda: captures.load(0))
     for name, seen in (("large", captures), ("large.averaged", shrunk(captures, by))):
@@ -155,29 +156,20 @@ def _prediction(mesh, captures: Captures) -> float:
 
 
 def strong(size: int) -> dict[str, float]:
-    """The errors of fits to fine pictures as they are, to their averages, and to pictures as coarse as those."""
+    """The errors of fits to pictures that are finer than the texels, and to averages of them."""
     known = truth(find_asset("suzanne", data_folder()), "suzanne", drawing.fibonacci(1, size)[0], "auto", True)
+    shots = drawing.one_at_a_time(drawing.fibonacci(16, FINEST * size))
+    pictures = drawing.render(known.mesh, known.maps, shots, frame="mikkt", spp=32)
+    masks = [picture[..., 3] > 0.999 for picture in pictures]
+    fine = in_memory([s.camera for s in shots], [s.lights for s in shots], [p[..., :3] for p in pictures], masks)
     figures: dict[str, float] = {}
-
-    def taken(side: int, spp: int) -> Captures:
-        shots = drawing.one_at_a_time(drawing.fibonacci(16, side))
-        pictures = drawing.render(known.mesh, known.maps, shots, frame="mikkt", spp=spp)
-        masks = [picture[..., 3] > 0.999 for picture in pictures]
-        return in_memory([s.camera for s in shots], [s.lights for s in shots], [p[..., :3] for p in pictures], masks)
-
-    fine = taken(FINER * size, 32)
-    cases = {
-        "whole": fine,
-        "averaged": shrunk(fine, [FINER] * len(fine)),
-        "coarse": taken(size, 32 * FINER**2),
-    }
-    for name, captures in cases.items():
-        start = time.perf_counter()
+    for by in (1, 2, 4):
+        name, start = f"texel_of_{FINEST // by}", time.perf_counter()
+        captures = shrunk(fine, [by] * len(fine))
         found = recover(known.mesh, known.texels, captures, RecoverSettings(metallic=True), 0)
         figures[f"{name}.seconds"] = time.perf_counter() - start
         errors = asdict(map_errors(known.maps, found.maps, known.areas))
         figures |= {f"{name}.{key}": errors[key] for key in ("normal_mean_deg", "roughness_mse", "albedo_psnr")}
-        print(name, {k: round(v, 4) for k, v in errors.items()}, file=sys.stderr, flush=True)
     return figures
 
 

@@ -4,6 +4,7 @@
 """
 
 import os
+import shutil
 import signal
 import sys
 import threading
@@ -47,7 +48,11 @@ def test_killed_at_random_moments_stopped_and_run_to_the_end(made, tmp_path, nam
     for turn in range(kills):
         moment = Moment(seconds * (0.3 + 0.4 * rng.random()), int(rng.integers(1, 4)) if turn % 2 else 0)
         child = jobs.begin(job.line(out), tmp_path / "log")
-        assert jobs.until(child, moment.reached(out)), "it was done before it could be killed"
+        while not jobs.until(child, moment.reached(out)):
+            # It was done before the moment came: the machine is faster now, or less was left to do than thought.
+            shutil.rmtree(out)
+            moment = moment.earlier()
+            child = jobs.begin(job.line(out), tmp_path / "log")
         child.kill()
         child.wait()
     child = jobs.begin(job.line(out), tmp_path / "log")

@@ -139,7 +139,8 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         tell_edits(run)
         maps = edited(part_stems(job.name, asset.mesh.parts), recovered.maps)[0]
         recovered = replace(recovered, maps=tuple(maps))
-        run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, whole))
+        shown = replace(captures, cameras=whole.cameras)
+        run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, shown))
         made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder, tuple(run.notes))
         run.stage(
             "report",
@@ -214,7 +215,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) ->
 
 
 def no_finer(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:
-    """The captures with pixels no finer than the texels, and what there is to say of them."""
+    """The captures with pixels not much finer than the texels, and what there is to say of them."""
     average = run.job.settings.references.average
     folder = run.stage(
         "pictures", ["texels", "cameras"], [], lambda f, r: look_through(f, texels, captures, average, r)

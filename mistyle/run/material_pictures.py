@@ -1,7 +1,7 @@
-"""The references of `mistyle fit` as the fit looks at them: checked once, and no finer than the texels.
+"""The references of `mistyle fit` as the fit looks at them: checked once, not much finer than the texels.
 
 A photograph of 12 megapixels shows each texel of a usual atlas many times over, and everything that a fit does costs
-by the pixel. Blocks of pixels that together are no wider than a texel are averaged, once, and kept in the run folder.
+by the pixel. Blocks of pixels are averaged that leave a texel about two of them wide, once, and kept in the run folder.
 """
 
 from collections.abc import Sequence
@@ -34,7 +34,7 @@ def look_through(folder: Path, texels: Sequence[Texels], captures: Captures, ave
     from mistyle.files.captures import check_pixels
     from mistyle.stages.recover_check import blocks
 
-    by = [average] * len(captures) if average else blocks(texels, captures)
+    by = [average] * len(captures) if average else blocks(texels, captures.cameras)
     small = shrunk(captures, by)
 
     def load(k: int) -> Loaded:
@@ -78,6 +78,6 @@ def _said(by: Sequence[int]) -> tuple[str, ...]:
     size = " or ".join(f"{times} x {times}" for times in averaged[:: max(1, len(averaged) - 1)])
     count = sum(times > 1 for times in by)
     return (
-        f"Blocks of {size} pixels were averaged in {count} of {len(by)} pictures, which are finer than the texels; "
-        "figures are of the averages (--set references.average=1 leaves the pictures as they are).",
+        f"Blocks of {size} pixels were averaged in {count} of {len(by)} pictures, which are much finer than the texels;"
+        " figures are of the averages (--set references.average=1 leaves the pictures as they are).",
     )

@@ -24,7 +24,7 @@ class ReferenceSettings(BaseModel):
         default=0,
         ge=0,
         le=64,
-        description="average blocks of so many pixels a side of every picture; 0: as many as are no wider than a texel",
+        description="average blocks of so many pixels a side of each picture; 0: such that texels stay two blocks wide",
     )
     hold_out: int = Field(
         default=-1,

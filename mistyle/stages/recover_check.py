@@ -14,7 +14,8 @@ from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 
 LEAST_VIEWS = 3
-FINE = 0.25  # share of the texels that may be narrower than a block of averaged pixels
+FINE = 0.25  # share of the texels that may be narrower than ACROSS blocks of averaged pixels
+ACROSS = 2
 LEAST_PIXELS = 32  # along the shorter side of a picture that is left
 DISTRUST = 10.0  # of indirect light: what a pixel counts is halved by one tenth of the direct light
 
@@ -63,10 +64,11 @@ def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: 
     return ""
 
 
-def blocks(texels: Sequence[Texels], captures: Captures) -> list[int]:
-    """How many pixels of each picture, along a side, can be averaged without losing what the texels could hold.
+def blocks(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
+    """How many pixels of each camera's picture, along a side, can be averaged and leave texels at least ACROSS blocks wide.
 
-    A block is no wider than three in four of the texels that face its camera, hidden ones too.
+    Three in four of the texels that face the camera are, hidden ones too. Texels as wide as one block are known half as
+    well, those four blocks wide a little better (`python -m benchmarks.photographs`).
     """
     from mistyle.stages.recover_observe import texel_sizes
 
@@ -77,11 +79,11 @@ def blocks(texels: Sequence[Texels], captures: Captures) -> list[int]:
     )
     size = np.concatenate([texel_sizes(t)[c.ravel()] for t, c in zip(texels, covered, strict=True)])
     result = []
-    for camera in captures.cameras:
+    for camera in cameras:
         px, depth = px_from_world(camera, position)
         facing = ((camera.position - position) * normal).sum(axis=1) > 0
         there = facing & (depth > 0) & (size > 0) & in_frame(camera, px)
-        wide = size[there] * camera.focal / depth[there]
+        wide = size[there] * camera.focal / depth[there] / ACROSS
         most = max(1, min(camera.size) // LEAST_PIXELS)
         result.append(int(np.clip(np.quantile(wide, FINE), 1, most)) if len(wide) else 1)
     return result
