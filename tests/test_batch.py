@@ -12,7 +12,7 @@ from PIL import Image
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.run import engines
-from mistyle.run.batch import Choices, describe, dry_run, planned, run_batch, summarise
+from mistyle.run.batch import Choices, describe, describe_dry_run, dry_run, planned, run_batch, summarise
 from mistyle.run.batch_jobs import read_jobs
 from mistyle.run.batch_page import write_page
 from mistyle.run.batch_plan import PLAN, indices, path_maps, read_plan, replaced, write_plan
@@ -310,6 +310,31 @@ def test_the_dry_run_adds_up(props, tmp_path):
     assert [row["done"] for row in told["jobs"]] == [True, False, False, False]
     assert told["seconds"] == round(sum(r["seconds"] for r in told["jobs"][1:]) / 2)
     assert told["memory_gb"] == pytest.approx(2 * told["jobs"][1]["memory_gb"], abs=0.1)
+
+
+def test_the_dry_run_knows_fits_and_what_will_be_refused(props, tmp_path):
+    for name in ("shots", "empty"):
+        (props / name).mkdir()
+    image = Image.fromarray(np.full((96, 128, 3), 90, np.uint8))
+    frames = []
+    for k in range(4):
+        image.save(props / "shots" / f"p{k}.png")
+        matrix = np.eye(4)
+        matrix[2, 3] = 4.0 + k
+        frames.append({"file_path": f"p{k}.png", "transform_matrix": matrix.tolist()})
+    (props / "shots" / "transforms.json").write_text(json.dumps({"camera_angle_x": 0.6, "frames": frames}))
+    sun = {"type": "directional", "direction": [0, 0, 1], "irradiance": [3, 3, 3]}
+    (props / "shots" / "lights.json").write_text(json.dumps({"lights": [sun]}))
+    text = "".join(
+        f'[[job]]\nmesh = "meshes/cube.obj"\nname = "{name}"\nreferences = "{name}"\n' for name in ("shots", "empty")
+    )
+    plan = planned(jobs_file(props, text), tmp_path / "out", Choices(threads=2))
+    told = dry_run(plan, Choices(threads=2))
+    good, bad = told["jobs"]
+    assert good["seconds"] > 10 and good["memory_gb"] > 0.5 and good["refused"] is None
+    assert bad["seconds"] == 0 and "camera.json" in bad["refused"]
+    assert told["seconds"] == good["seconds"]
+    assert f"about {good['seconds']} s" in describe_dry_run(told) and "will be refused: " in describe_dry_run(told)
 
 
 def test_slurm_and_command_lines_name_every_shard(props, tmp_path):

@@ -24,6 +24,7 @@ from mistyle.run.charts import Chart, svg
 from mistyle.run.cli import main
 from mistyle.run.material import hold_out, lights_in_order
 from mistyle.run.material_settings import ReferenceSettings
+from mistyle.run.stages import MATERIAL_STAGES
 from mistyle.stages import unknown_light
 
 SIZE, SIDE = 64, 112
@@ -151,6 +152,20 @@ def test_a_second_run_takes_everything_over(fitted, shots):
     assert {p.name: p.read_bytes() for p in (out / "asset" / "textures").iterdir()} == before
     assert again["figures"]["psnr_held_out"] > 40
     assert not list((out / "work").glob("checkpoint-*"))
+
+
+def test_a_dry_run_counts_and_makes_nothing(shots, tmp_path, capsys):
+    words = ["fit", str(shots / "bowl.obj"), str(shots / "shots"), "-o", str(tmp_path / "out"), "--dry-run"]
+    assert main([*words, "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["pictures"] == 24 and told["megapixels"] == pytest.approx(24 * SIDE**2 / 1e6, abs=0.1)
+    assert [row["stage"] for row in told["stages"]] == [s for s in MATERIAL_STAGES if s != "light"]
+    assert 5 < told["seconds"] < 1000 and told["memory_gb"] >= max(told["peaks_gb"].values()) - 0.01
+    assert main([*words, "--set", "recover.iterations=4800"]) == 0
+    text = capsys.readouterr().out
+    assert "24 pictures" in text and "memory at most about" in text
+    assert main([*words, "--memory", "0.3G"]) == 2 and "the fit needs" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 def test_a_light_that_nobody_knows(shots, tmp_path, monkeypatch):

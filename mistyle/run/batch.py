@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.cores import cores
-from mistyle.core.errors import UsageError
+from mistyle.core.errors import MistyleError, UsageError
 from mistyle.files.store import Keeper, atomic_write, clean_leftovers
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs
 from mistyle.run.batch_plan import PLAN, Plan, read_plan, write_plan
-from mistyle.run.shard import SHARDS, finished, marker, outcome
+from mistyle.run.shard import SHARDS, finished, job_of, marker, outcome
 
 
 @dataclass(frozen=True)
@@ -155,28 +155,28 @@ def describe(summary: dict[str, Any]) -> str:
 
 def dry_run(plan: Plan, choices: Choices) -> dict[str, Any]:
     """What the batch would do: estimated seconds, disk and memory of every job that is not done yet."""
-    from mistyle.run.plan import plan as estimate
-    from mistyle.run.settings import Settings
-    from mistyle.run.stages import Job
+    from mistyle.run.plan import plan as plan_style
+    from mistyle.run.plan import plan_material
 
     rows = []
     for job in plan.jobs:
         done = finished(plan, job) is not None
-        row: dict[str, Any] = {"name": job.name, "kind": job.kind, "done": done}
-        if job.kind == "stylize" and job.style is not None:
-            settings = Settings.model_validate(job.settings)
-            told = estimate(Job(job.mesh, job.style, plan.out / job.name, settings, job.name))
-            row |= {"seconds": told["seconds"], "disk_gb": told["disk_gb"], "memory_gb": told["memory_gb"]}
-        rows.append(row)
+        row: dict[str, Any] = {"name": job.name, "kind": job.kind, "done": done, "refused": None}
+        try:
+            told = (plan_material if job.kind == "fit" else plan_style)(job_of(plan, job))
+        except MistyleError as error:
+            told = {"seconds": 0, "disk_gb": 0.0, "memory_gb": 0.0}
+            row["refused"] = str(error)
+        rows.append(row | {key: told[key] for key in ("seconds", "disk_gb", "memory_gb")})
     left = [row for row in rows if not row["done"]]
     workers = min(workers_of(choices), max(len(left), 1))
     return {
         "out": str(plan.out),
         "jobs": rows,
         "workers": workers,
-        "seconds": round(sum(row.get("seconds", 0) for row in left) / workers),
-        "disk_gb": round(sum(row.get("disk_gb", 0) for row in left), 2),
-        "memory_gb": round(sum(sorted((row.get("memory_gb", 0) for row in left), reverse=True)[:workers]), 1),
+        "seconds": round(sum(row["seconds"] for row in left) / workers),
+        "disk_gb": round(sum(row["disk_gb"] for row in left), 2),
+        "memory_gb": round(sum(sorted((row["memory_gb"] for row in left), reverse=True)[:workers]), 1),
     }
 
 
@@ -184,8 +184,10 @@ def describe_dry_run(told: dict[str, Any]) -> str:
     """The same as a person reads it."""
     lines = []
     for row in told["jobs"]:
-        cost = f"about {row['seconds']} s, {row['disk_gb']} GB of disk" if "seconds" in row else "no estimate"
-        lines.append(f"  {row['name']:<40} {row['kind']:<8} {'done before' if row['done'] else cost}")
+        cost = "done before" if row["done"] else f"about {row['seconds']} s, {row['disk_gb']} GB of disk"
+        if row["refused"]:
+            cost = f"will be refused: {row['refused']}"
+        lines.append(f"  {row['name']:<40} {row['kind']:<8} {cost}")
     lines.append(
         f"{sum(not row['done'] for row in told['jobs'])} jobs, {told['workers']} at a time: about {told['seconds']} s, "
         f"{told['disk_gb']} GB of disk, {told['memory_gb']} GB of memory -> {told['out']}"

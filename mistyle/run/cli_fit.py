@@ -49,6 +49,7 @@ def add_fit(verbs: Any) -> None:
             mistyle fit chair.glb photographs/ -o fitted/                    camera.json or transforms.json, lights.json
             mistyle fit chair.glb colmap/ -o fitted/ --align --light unknown  a COLMAP model, light not known
             mistyle fit helmet.glb renders/ -o fitted/ --uv new --metallic --material gltf
+            mistyle fit chair.glb photographs/ -o fitted/ --dry-run          how long, how much memory and disk
             mistyle fit --scene room.xml --list                              what could be fitted in a Mitsuba scene
             mistyle fit --scene room.xml --references shots/ -o out/ --optimize 'chair.*.base_color' wall.bsdf.roughness
             """
@@ -63,6 +64,9 @@ def add_fit(verbs: Any) -> None:
         help="a folder with camera.json, transforms.json or a COLMAP model, and its pictures",
     )
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; the same command again goes on there")
+    verb.add_argument(
+        "--dry-run", action="store_true", help="print the plan with estimated time, memory and disk, and stop"
+    )
     add_job_options(verb, ("draft", "standard"), "draft: a texture of 512²; standard (default): 1024²")
     add_memory_option(verb)
     add_mesh_options(verb)
@@ -155,6 +159,7 @@ def material_settings(options: argparse.Namespace) -> Any:
 
 def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
     from mistyle.run.material import MaterialJob, fit_material
+    from mistyle.run.plan import describe_plan, plan_material
     from mistyle.run.progress import Progress
 
     job = MaterialJob(
@@ -169,6 +174,10 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
         options.pictures,
         options.redo_from,
     )
+    if options.dry_run:
+        estimate = plan_material(job)
+        print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
+        return 0
     summary = fit_material(job, Progress())
     if options.json:
         print(json.dumps(summary))

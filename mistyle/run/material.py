@@ -95,7 +95,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
 
     Raises a MistyleError for everything that a user can mend; what was finished before stays.
     """
-    from mistyle.files.captures import read_captures, read_shots
+    from mistyle.files.captures import read_shots
     from mistyle.run.colour import in_working_space, key_of
     from mistyle.run.deliver import check, deliver
     from mistyle.run.material_report import material_report, write_summary
@@ -103,15 +103,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     files = input_files(job.mesh)
     s = job.settings
     check(s)
-    captures = read_captures(
-        job.references,
-        lights=job.lights,
-        masks=job.masks,
-        exposure=job.exposure,
-        pictures=job.pictures,
-        saturation=s.references.saturation,
-    )
-    refuse_scene_lights(captures, job.references)
+    captures = references_of(job)
     check_material(s, pixels_of(captures))
     shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
     captures = in_working_space(captures, shots, s.colour)
@@ -149,6 +141,22 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
             lambda f, r: material_report(f, made, progress, r),
         )
         return deliver(job, progress) | write_summary(made, run)
+
+
+def references_of(job: MaterialJob) -> Captures:
+    """The job's pictures; cameras, lights and headers are read now, pixels one picture at a time."""
+    from mistyle.files.captures import read_captures
+
+    captures = read_captures(
+        job.references,
+        lights=job.lights,
+        masks=job.masks,
+        exposure=job.exposure,
+        pictures=job.pictures,
+        saturation=job.settings.references.saturation,
+    )
+    refuse_scene_lights(captures, job.references)
+    return captures
 
 
 def refuse_scene_lights(captures: Captures, references: Path) -> None:

@@ -6,14 +6,27 @@ run folder.
 """
 
 import shutil
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused
-from mistyle.run.budget import PLAIN, TILED, counts, memory_gb, peaks, tiles, view_pixels
+from mistyle.run.budget import (
+    MATERIAL,
+    PLAIN,
+    TILED,
+    check_material,
+    counts,
+    material_counts,
+    material_gb,
+    memory_gb,
+    peaks,
+    tiles,
+    view_pixels,
+)
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import thread_count
-from mistyle.run.stages import STAGES, Job
+from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -22,6 +35,13 @@ PER_SURFACE_SAMPLE = 1.3e-4
 PER_TEXEL = 1.0e-6
 PER_VIEW_PIXEL = 8.0e-7
 PER_CROP_PIXEL = 1.6e-6
+# Of fits to pictures: a pixel read and made straight; a sample of one predicted, or stepped on; a texel in a picture.
+PER_READ_PIXEL = 6e-7
+PER_LOOK = 2e-7
+PER_STEP_LOOK = 4e-7
+PER_OBSERVATION = 4e-7
+# Shares of a picture that show the object, of the atlas that is covered, and of that what one picture sees.
+SHOWN, COVERED, SEEN = 0.25, 0.55, 0.35
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
 BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}
@@ -38,8 +58,7 @@ def plan(job: Job) -> dict[str, Any]:
     s = job.settings
     pixels = view_pixels(s)
     texels = s.atlas.size**2
-    faces = sum(f.stat().st_size for f in files if f.suffix.lower() in (*BYTES_PER_FACE, ".bin"))
-    faces = faces // BYTES_PER_FACE.get(job.mesh.suffix.lower(), 50)
+    faces = _faces(files)
     crops = (s.fit.iterations1 + (s.fit.iterations2 if s.fit.refine == "all" else 0)) * s.fit.crops
     crops *= s.fit.refine != "off"
     frames = s.report.frames * s.report.resolution**2 * s.report.spp
@@ -56,18 +75,77 @@ def plan(job: Job) -> dict[str, Any]:
         "asset": 2 * texels * PER_TEXEL,
         "report": 5 + frames * PER_SAMPLE_RAY,
     }
-    scale = 2 / thread_count(s)
     return {
         "mesh": str(job.mesh),
         "style": str(job.style),
-        "out": str(job.out),
-        "name": job.name,
-        "stages": [{"stage": k, "what": STAGES[k], "seconds": round(v * scale, 1)} for k, v in seconds.items()],
-        "seconds": round(sum(seconds.values()) * scale),
+        **_costs(job, STAGES, seconds),
         "memory_gb": memory_gb(s, faces),
         "in_files": tiles(s, faces),
         "peaks_gb": peaks(TILED if tiles(s, faces) else PLAIN, counts(s, faces)),
         "disk_gb": round((texels * BYTES_PER_TEXEL + 2 * pixels * BYTES_PER_VIEW_PIXEL) / 1e9, 2),
+    }
+
+
+def plan_material(job: Any) -> dict[str, Any]:
+    """The same for a `MaterialJob`, whose cameras, lights and pictures' headers are read and refused as it does.
+
+    How much of the pictures shows the object is not known yet: SHOWN is taken, as of the atlas COVERED.
+    """
+    from mistyle.run.material import pixels_of, references_of
+
+    s, files = job.settings, input_files(job.mesh)
+    sizes = pixels_of(references_of(job))
+    faces, texels = _faces(files), s.atlas.size**2
+    check_material(s, sizes, faces)
+    averaged = [n / _block(n, texels, s.references.average) ** 2 for n in sizes]
+    looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
+    rounds = 0 if s.recover.solver == "pictures" else s.recover.rounds * (1 + s.recover.bounces)
+    steps = 0 if s.recover.solver == "texels" else s.recover.iterations
+    seconds = {
+        "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),
+        "texels": texels * PER_TEXEL,
+        "cameras": 1,
+        "pictures": sum(sizes) * PER_READ_PIXEL,
+        "recover": (rounds + 2) * looked * PER_LOOK
+        + steps * looked / len(sizes) * PER_STEP_LOOK
+        + (1 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION,
+        "measure": 2 * looked * PER_LOOK,
+        "asset": 2 * texels * PER_TEXEL,
+        "scene": 2 * texels * PER_TEXEL,
+        "report": 5 + s.report.frames * s.report.resolution**2 * s.report.spp * PER_SAMPLE_RAY,
+    }
+    kept = sum(12 * n for n, whole in zip(averaged, sizes, strict=True) if n < whole)
+    return {
+        "mesh": str(job.mesh),
+        "references": str(job.references),
+        "pictures": len(sizes),
+        "megapixels": round(sum(sizes) / 1e6, 1),
+        **_costs(job, MATERIAL_STAGES, seconds),
+        "memory_gb": material_gb(s, [round(n) for n in averaged], faces),
+        "in_files": False,
+        "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, faces)),
+        "disk_gb": round((texels * BYTES_PER_TEXEL + kept) / 1e9, 2),
+    }
+
+
+def _block(pixels: int, texels: int, average: int) -> int:
+    """Pixels a side that will be averaged (stages/recover_check.py, for an object that fills SHOWN of the picture)."""
+    return average or max(1, int((SHOWN * pixels / (COVERED * SEEN * texels)) ** 0.5 / 2))
+
+
+def _faces(files: Sequence[Path]) -> int:
+    """Of a mesh in these files, by their size."""
+    size = sum(f.stat().st_size for f in files if f.suffix.lower() in (*BYTES_PER_FACE, ".bin"))
+    return size // BYTES_PER_FACE.get(files[0].suffix.lower(), 50)
+
+
+def _costs(job: Any, stages: Mapping[str, str], seconds: Mapping[str, float]) -> dict[str, Any]:
+    scale = 2 / thread_count(job.settings)
+    return {
+        "out": str(job.out),
+        "name": job.name,
+        "stages": [{"stage": k, "what": stages[k], "seconds": round(v * scale, 1)} for k, v in seconds.items()],
+        "seconds": round(sum(seconds.values()) * scale),
         "free_gb": round(shutil.disk_usage(_existing(job.out)).free / 1e9, 1),
     }
 
@@ -80,7 +158,12 @@ def _existing(folder: Path) -> Path:
 
 def describe_plan(estimate: dict[str, Any]) -> str:
     """The plan as a person reads it."""
-    lines = [f"{estimate['mesh']} in the style of {estimate['style']} -> {estimate['out']}"]
+    if "style" in estimate:
+        relation = f"in the style of {estimate['style']}"
+    else:
+        told = f"{estimate['pictures']} pictures, {estimate['megapixels']} megapixels"
+        relation = f"from {told} of {estimate['references']}"
+    lines = [f"{estimate['mesh']} {relation} -> {estimate['out']}"]
     lines += [f"  {row['what']:<36} about {row['seconds']:7.1f} s" for row in estimate["stages"]]
     lines.append(f"  in all about {estimate['seconds']} s, if one texture set is made and nothing is taken over")
     files = ", large arrays in files" if estimate["in_files"] else ""

@@ -117,24 +117,34 @@ def _wait_for_folder(folder: Path, progress: Progress, seconds: float = 30.0) ->
         time.sleep(0.2)
 
 
-def _run(plan: Plan, job: Record, progress: Progress) -> dict[str, Any]:
-    out = plan.out / job.name
-    if job.kind == "fit":
-        from mistyle.run.material import MaterialJob, fit_material
+def job_of(plan: Plan, record: Record) -> Any:
+    """The `Job` or `MaterialJob` that a record of the plan says."""
+    out = plan.out / record.name
+    if record.kind == "fit":
+        from mistyle.run.material import MaterialJob
         from mistyle.run.material_settings import MaterialSettings
 
-        assert job.references is not None
-        lights = "unknown" if job.lights == "unknown" else None if job.lights is None else Path(job.lights)
-        settings = MaterialSettings.model_validate(job.settings)
-        return fit_material(
-            MaterialJob(job.mesh, job.references, out, settings, job.name, lights, job.masks, job.exposure), progress
+        assert record.references is not None
+        lights = record.lights if record.lights in (None, "unknown") else Path(record.lights)
+        settings = MaterialSettings.model_validate(record.settings)
+        return MaterialJob(
+            record.mesh, record.references, out, settings, record.name, lights, record.masks, record.exposure
         )
-    from mistyle.run.pipeline import stylize
     from mistyle.run.settings import Settings
     from mistyle.run.stages import Job
 
-    assert job.style is not None
-    return stylize(Job(job.mesh, job.style, out, Settings.model_validate(job.settings), job.name), progress)
+    assert record.style is not None
+    return Job(record.mesh, record.style, out, Settings.model_validate(record.settings), record.name)
+
+
+def _run(plan: Plan, record: Record, progress: Progress) -> dict[str, Any]:
+    if record.kind == "fit":
+        from mistyle.run.material import fit_material
+
+        return fit_material(job_of(plan, record), progress)
+    from mistyle.run.pipeline import stylize
+
+    return stylize(job_of(plan, record), progress)
 
 
 def stages_of(job: Record) -> Sequence[str]:

@@ -65,10 +65,10 @@ def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: 
 
 
 def blocks(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
-    """How many pixels of each camera's picture, along a side, can be averaged and leave texels at least ACROSS blocks wide.
+    """How many pixels of each camera's picture, along a side, can be averaged and leave texels ACROSS blocks wide.
 
-    Three in four of the texels that face the camera are, hidden ones too. Texels as wide as one block are known half as
-    well, those four blocks wide a little better (`python -m benchmarks.photographs`).
+    Of the texels that face the camera, hidden ones too, three in four are at least that wide. With texels as wide as
+    one block the normals are nearly twice as wrong, with four a quarter less (`python -m benchmarks.photographs`).
     """
     from mistyle.stages.recover_observe import texel_sizes
 
