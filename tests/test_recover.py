@@ -13,11 +13,11 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import erode, gaussian
 from mistyle.core.light import Directional, Point
 from mistyle.core.maps import Maps
-from mistyle.render import device, draw
+from mistyle.render import device, draw, indirect
 from mistyle.render import hits as collecting
 from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
-from mistyle.render.indirect import Indirect, averaged
+from mistyle.render.indirect import MOST, Indirect, averaged, enlarged
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
@@ -293,10 +293,12 @@ def hollow():
     )
 
 
-def test_indirect_light_is_what_path_sees_beyond_direct(rng):
+@pytest.mark.parametrize("most", [MOST, 32])
+def test_indirect_light_is_what_path_sees_beyond_direct(rng, monkeypatch, most):
+    monkeypatch.setattr(indirect, "MOST", most)
     device.use()
     mesh, maps = hollow(), replace(strong_maps(3), roughness=np.full((SIZE, SIZE), 0.7, np.float32))
-    camera = look_at([0.6, 0.4, 4], fov=30, size=(64, 64))
+    camera = look_at([0.6, 0.4, 4], fov=30, size=(64, 63))
     lights = (directional(*LIGHTS[0]), Point((1.0, 1.0, 3.0), (4.0, 4.0, 4.0)))
     both = [
         photographs(mesh, [maps], [camera], [lights], "mikkt", {"type": "path", "max_depth": d, "rr_depth": 100}, 256)[
@@ -305,7 +307,9 @@ def test_indirect_light_is_what_path_sees_beyond_direct(rng):
         for d in (2, 5)
     ]
     difference = both[1] - both[0]
-    estimate = Indirect(mesh, [maps]).picture(camera, lights, 256, 3)
+    coarse = Indirect(mesh, [maps]).picture(camera, lights, 256, 3)
+    assert coarse.shape[:2] == ((64, 63) if most == MOST else (32, 32))
+    estimate = enlarged(coarse, camera.size)
     assert estimate.shape == difference.shape
     # Pixels on the silhouette show less of what the estimate says of the surface.
     inside = erode(difference.sum(-1) > 0.01, 1)

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.camera import Camera, resized
-from mistyle.core.image import nearest_fill
+from mistyle.core.camera import Camera, binned
+from mistyle.core.image import nearest_fill, resize
 from mistyle.core.lanes import aligned
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
@@ -23,8 +23,9 @@ from mistyle.render import device
 from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
 
-COARSER = 2  # pixels along a side of the picture that one pixel of the estimate covers, at most
+COARSER = 2  # pixels along a side of the picture that one pixel of the estimate covers
 LEAST = 128  # pixels along a side of the estimate, at least, where the picture has so many
+MOST = 256  # and at most along the longer side, however large the picture is
 ROUGH = 0.25  # least roughness: light that mirrors carry comes in few bright samples and adds little
 DEPTH = 5  # path segments: light comes over up to four surface points
 ALIKE = 0.15  # length of the difference of two unit normals at which pixels hardly belong together any more
@@ -52,7 +53,7 @@ class Indirect:
         self.integrators = [mi.load_dict(guides), mi.load_dict(whole)]
 
     def picture(self, camera: Camera, lights: Lights, samples: int, seed: int) -> Float[np.ndarray, "h w 3"]:
-        """Indirect radiance, linear Rec.709, of a coarser picture of the camera, to be enlarged; beside the object
+        """Indirect radiance, linear Rec.709, of a coarser picture of the camera, for `enlarged`; beside the object
         that of the nearest pixel on it.
 
         Lights of a scene file raise ValueError. `samples` are those of a pixel of the coarse
@@ -61,10 +62,9 @@ class Indirect:
         import mitsuba
 
         mi: Any = mitsuba
-        by = next(
-            f for f in range(COARSER, 0, -1) if f == 1 or all(n % f == 0 and n // f >= LEAST for n in camera.size)
-        )
-        small = resized(camera, (camera.size[0] // by, camera.size[1] // by))
+        by = max(COARSER if min(camera.size) >= COARSER * LEAST else 1, -(-max(camera.size) // MOST))
+        # Pixels that begin inside the picture and end beside it belong to the estimate.
+        small = replace(binned(camera, by), size=(-(-camera.size[0] // by), -(-camera.size[1] // by)))
         count = scenery.samples(samples)
         described = {"type": "scene", "sensor": scenery.sensor_dict(small, count), **self.shapes}
         described |= {f"light{k}": light for k, light in enumerate(emitters(lights, camera))}
@@ -83,6 +83,12 @@ class Indirect:
         unit = np.linalg.norm(position - camera.position.astype(np.float32), axis=-1) / small.focal
         smooth = averaged(light / covered / albedo, position, normal, unit, inside) * albedo
         return nearest_fill(np.ascontiguousarray(smooth, np.float32), inside)
+
+
+def enlarged(light: Float[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float[np.ndarray, "H W 3"]:
+    """What `Indirect.picture` made, as large as the picture that it is of."""
+    by = max(-(-whole // part) for whole, part in zip(size, light.shape, strict=False))
+    return resize(light, (light.shape[0] * by, light.shape[1] * by))[: size[0], : size[1]]
 
 
 def averaged(
@@ -126,7 +132,7 @@ def retarget(shade: Any, picture: int, rgb: Float[np.ndarray, "h w 3"], weight: 
     import mitsuba
 
     mi: Any = mitsuba
-    for block in shade.blocks(picture):
+    for block in shade.kept(picture):
         target = np.array(block.target).reshape(-1, 4)
         target[: len(block.pixel), :3] = rgb.reshape(-1, 3)[block.pixel]
         target[: len(block.pixel), 3] = weight.ravel()[block.pixel]

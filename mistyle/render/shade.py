@@ -248,6 +248,10 @@ class Shade:
         if kept is not None:
             self._kept[picture] = kept
 
+    def kept(self, picture: int) -> Sequence["Block"]:
+        """The blocks of a picture that is kept; of others none."""
+        return self._kept.get(picture, ())
+
     def _sky(self, lights: Lights) -> tuple[Sky | None, Any]:
         """The soft light, as cells and as the arrays that shade; made once for pictures of the same records."""
         soft = tuple(light for light in lights if isinstance(light, SOFT))

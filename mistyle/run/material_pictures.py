@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from mistyle.core import memory
 from mistyle.core.camera import binned
 from mistyle.core.capture import Captures, Loaded, shrunk
 from mistyle.core.maps import Texels
@@ -56,9 +57,9 @@ def looked(folder: Path, captures: Captures) -> tuple[Captures, tuple[str, ...]]
     def load(k: int) -> Loaded:
         if found.by[k] == 1:
             return captures.load(k)
-        rgb = np.load(_file(folder, k), allow_pickle=False)
-        counts = np.asarray(np.isfinite(rgb).all(axis=-1))
-        rgb[~counts] = 0
+        stored = memory.load(_file(folder, k))
+        counts = np.asarray(np.isfinite(stored).all(axis=-1))
+        rgb = np.where(counts[..., None], stored, np.float32(0))
         for array in (rgb, counts):
             array.setflags(write=False)  # shared with whoever asks next
         return rgb, counts

@@ -62,7 +62,7 @@ class MaterialSettings(BaseModel):
     references: ReferenceSettings = ReferenceSettings()
     atlas: AtlasSettings = AtlasSettings(size=1024)
     recover: RecoverSettings = RecoverSettings()
-    report: ReportSettings = ReportSettings(frames=12, resolution=384, spp=16)
+    report: ReportSettings = ReportSettings(frames=12, resolution=384)
     deliver: DeliverSettings = DeliverSettings()
     colour: ColourSettings = ColourSettings()
 

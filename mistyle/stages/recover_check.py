@@ -8,10 +8,10 @@ from jaxtyping import Float
 from mistyle.core.camera import Camera, in_frame, px_from_world
 from mistyle.core.capture import Captures, Loaded, subset
 from mistyle.core.errors import InputRefused
-from mistyle.core.image import resize
 from mistyle.core.light import Lights
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
+from mistyle.render.indirect import enlarged
 
 LEAST_VIEWS = 3
 FINE = 0.25  # share of the texels that may be narrower than ACROSS blocks of averaged pixels
@@ -95,7 +95,7 @@ def without(captures: Captures, indirect: dict[int, np.ndarray]) -> Captures:
     def load(k: int) -> Loaded:
         rgb, mask = captures.load(k)
         if k in indirect:
-            rgb = rgb - resize(indirect[k], captures.cameras[k].size)
+            rgb = rgb - enlarged(indirect[k], captures.cameras[k].size)
         return rgb, mask
 
     return Captures(captures.cameras, captures.lights, load)
@@ -108,7 +108,7 @@ def trust(captures: Captures, indirect: dict[int, np.ndarray]) -> Callable[[int]
         size = captures.cameras[k].size
         if k not in indirect:
             return np.ones(size, np.float32)
-        taken = resize(indirect[k], size).max(axis=-1)
+        taken = enlarged(indirect[k], size).max(axis=-1)
         direct = np.maximum(np.nan_to_num(captures.load(k)[0]).max(axis=-1), 0)
         return (direct / np.maximum(direct + DISTRUST * taken, 1e-9)).astype(np.float32)
 

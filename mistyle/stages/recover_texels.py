@@ -11,6 +11,7 @@ from mistyle.core.capture import Captures
 from mistyle.core.image import resize
 from mistyle.core.light import SOFT
 from mistyle.core.maps import Maps, Texels
+from mistyle.render.indirect import enlarged
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust
 from mistyle.stages.recover_observe import Gathered, fetch
@@ -137,8 +138,12 @@ def solve_texels(
         total = settings.rounds * (1 + settings.bounces)
         for number in range(total):
             table = solving.spread_out(solution.values, gathered, where)
+
+            def heard(done: float, number=number) -> None:
+                progress(0.5 + 0.5 * (number + done) / total)
+
             if number and number % settings.rounds == 0:
-                take_off_indirect(work, shade, table, indirect, seed)
+                take_off_indirect(work, shade, table, indirect, seed, lambda done: heard(0.7 * done))
                 problem.reweight(doubted(gathered, work.captures, indirect))
             shade.table = table
             lost: list[float] = []
@@ -151,7 +156,7 @@ def solve_texels(
 
             solution = solving.another_round(problem, gathered, where, solution, differences, settings, number)
             trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
-            progress(0.5 + 0.5 * (number + 1) / total)
+            heard(1.0)
         values = solution.values
         decided = solving.decided(solution, gathered)
         spread = solution.spread * solving.inflation(solution, gathered)
@@ -172,7 +177,14 @@ def solve_texels(
     )
 
 
-def take_off_indirect(work: Work, shade, table: np.ndarray, indirect: dict[int, np.ndarray], seed: int) -> None:
+def take_off_indirect(
+    work: Work,
+    shade,
+    table: np.ndarray,
+    indirect: dict[int, np.ndarray],
+    seed: int,
+    progress: Callable[[float], None] = lambda done: None,
+) -> None:
     """Estimate the indirect light of every picture with the maps found so far; `indirect` then holds it."""
     from mistyle.render.indirect import Indirect, retarget
     from mistyle.render.shade import unpack
@@ -183,6 +195,7 @@ def take_off_indirect(work: Work, shade, table: np.ndarray, indirect: dict[int, 
     for k, (camera, lights) in enumerate(zip(work.captures.cameras, work.captures.lights, strict=True)):
         indirect[k] = scene.picture(camera, lights, settings.bounce_samples, seed + k)
         retarget(shade, k, work.captures.load(k)[0], weights(k))
+        progress((k + 1) / len(work.captures))
 
 
 def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> np.ndarray:
@@ -190,6 +203,6 @@ def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarr
     weight = gathered.observations.weight.copy()
     for k, light in indirect.items():
         sighting = gathered.sightings[k]
-        taken = fetch(resize(light, captures.cameras[k].size), sighting).max(axis=1)
+        taken = fetch(enlarged(light, captures.cameras[k].size), sighting).max(axis=1)
         weight[sighting.rows] /= 1 + weight[sighting.rows] * DOUBT * taken
     return weight
