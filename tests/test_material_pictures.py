@@ -95,13 +95,14 @@ def test_a_fit_to_fine_pictures(bowls, tmp_path):
     assert 'value="240"' in (tmp_path / "out" / "scene" / "bowl.xml").read_text()
 
 
-def test_a_picture_that_is_not_kept_is_the_same_picture(rng):
-    """Collected without what gradients need, the second time."""
+@pytest.mark.parametrize("memory", [0, 1])
+def test_a_picture_that_is_not_kept_is_the_same_picture(rng, memory):
+    """Collected without what gradients need, at once or the second time."""
     camera = crop(48)
     captures = in_memory([camera], [(KEY,)], [np.zeros((*camera.size, 3), np.float32)])
     table = shade.pack(random_maps(rng, SIZES))
     traced = draw.tracer(torus())
-    kept, lost = (shade.Shade(traced, captures, SIZES, subsamples=4, memory=m) for m in (1e9, 0))
+    kept, lost = (shade.Shade(traced, captures, SIZES, subsamples=4, memory=m) for m in (1e9, memory))
     kept.table = lost.table = table
     first = kept.image(0)
     for _ in range(2):

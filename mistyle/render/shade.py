@@ -169,6 +169,7 @@ class Shade:
                 run = self._function(block, loss, shading.step, self._terms, self.subsamples, loss)
                 scale = self._scale(1 / (3 * np.prod(self.captures.cameras[k].size) * len(pictures)))
                 h = block.hits
+                assert h.transpose is not None
                 value, rows = run(self._textures, h.samples, h.pixels, h.transpose, block.lights, block.target, scale)
                 total += value + block.dark[loss] * scale
                 shading.add_rows(gradient, rows, h.transpose)
@@ -187,6 +188,7 @@ class Shade:
         for block in self.blocks(picture):
             run = self._function(block, "pull", shading.pull, self._terms, self.subsamples)
             h = block.hits
+            assert h.transpose is not None
             rows = run(self._textures, h.samples, h.pixels, h.transpose, block.lights, values)
             shading.add_rows(gradient, rows, h.transpose)
         return mi.TensorXf(gradient, (self.texels, 8))
@@ -235,7 +237,7 @@ class Shade:
         weights = self.weights(picture) if self.weights is not None else np.ones(camera.size, np.float32)
         soft, soft_light = self._sky(lights)
         options = {"subsamples": self.subsamples, "shadows": self.shadows, "soft": soft}
-        kept: list[Block] | None = None if picture in self._too_large else []
+        kept: list[Block] | None = [] if self.memory and picture not in self._too_large else None
         options["gradients"] = gradients or kept is not None
         for hits in collecting.collect(self.traced, camera, lights, mask, self.sizes, self._tangents, **options):
             block = Block(hits, soft_light, rgb, weights)

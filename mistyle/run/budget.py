@@ -23,7 +23,8 @@ from mistyle.run.settings import Settings
 class Need(NamedTuple):
     """A stage's peak: GB of the program, then bytes a texel, view pixel, crop pixel, surface sample, face, texel of the
     textures as the views draw them (kept by the renderer) and as the report's close-ups do, pixel of the turntable's
-    frames, and texel times picture where texels are solved one by one."""
+    frames, texel times picture where texels are solved one by one, and pixel of the largest picture, as the fit looks
+    at it and as it was taken."""
 
     program: float
     texel: float = 0
@@ -35,6 +36,8 @@ class Need(NamedTuple):
     drawn: float = 0
     frame: float = 0
     look: float = 0
+    picture: float = 0
+    photograph: float = 0
 
 
 # With every array in memory.
@@ -66,18 +69,21 @@ TILED = {
     "report": Need(0.65, texel=5, view=4, drawn=78, frame=24),
 }
 # A fit to pictures, without what is kept of the pictures' samples, up to `recover.memory`; the system does not get all
-# of that back after the stage. Read off `fit_512` and `fit_200`, the report off `fit_256`.
+# of that back after the stage. Read off `fit_512` and `fit_200`, the report off `fit_256`, what hangs on large pictures
+# off `large` of `python -m benchmarks.photographs`.
 MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
-    "pictures": Need(0.75, texel=150),
-    "recover": Need(0.75, texel=446, look=9.6),
-    "measure": Need(0.77, texel=300, look=6),
-    "asset": Need(0.80, texel=200, look=6),
-    "scene": Need(0.80, texel=200, look=6),
-    "report": Need(0.78, texel=200, drawn=70, frame=24, look=6),
+    "pictures": Need(0.53, texel=71, photograph=97),
+    "recover": Need(0.75, texel=446, look=9.6, picture=620),
+    "measure": Need(0.77, texel=300, look=6, picture=620),
+    "asset": Need(0.80, texel=200, look=6, picture=570),
+    "scene": Need(0.80, texel=200, look=6, picture=570),
+    "report": Need(0.78, texel=200, drawn=70, frame=24, look=6, picture=570),
 }
 KEEPING = ("recover", "measure", "asset", "scene", "report")
+# Shares of a picture that show the object, of the atlas that is covered, and of that what one picture sees.
+SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
 SAMPLE = 32  # bytes that are kept of a sample of a picture
 # Pages come in during a call into the renderer, faster than they are let go: a budget must be that much larger.
 MARGIN = 1.03
@@ -95,6 +101,8 @@ class Counts(NamedTuple):
     drawn: int = 0
     frame: int = 0
     look: int = 0
+    picture: int = 0
+    photograph: int = 0
 
 
 def view_pixels(settings: Settings) -> int:
@@ -155,13 +163,27 @@ def material_counts(settings: Any, pixels: Sequence[int], faces: int = 0, sets: 
     while solved > 2 * settings.recover.solver_texels:
         solved //= 4
     looks = 0 if settings.recover.solver == "pictures" else solved * len(pixels)
-    return Counts(texel, sum(pixels), face=faces, drawn=drawn, frame=frame, look=looks)
+    looked = looked_at(settings, pixels)
+    return Counts(
+        texel, sum(looked), face=faces, drawn=drawn, frame=frame, look=looks,
+        picture=max(looked, default=0), photograph=max(pixels, default=0),
+    )  # fmt: skip
+
+
+def looked_at(settings: Any, pixels: Sequence[int]) -> list[int]:
+    """Pixels that are left of pictures of so many after blocks of them were averaged (stages/recover_check.py).
+
+    By the setting; else for an object that fills SHOWN of each picture, with COVERED of its atlas, SEEN by one, turned
+    away from the camera such that half of its area is left.
+    """
+    texels, average = 0.5 * COVERED * SEEN * settings.atlas.size**2, settings.references.average
+    return [n // max(1, average or int((SHOWN * n / texels) ** 0.5 / 2)) ** 2 for n in pixels]
 
 
 def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1) -> float:
     """Peak memory of a fit to pictures of so many pixels each, GB."""
     found = peaks(MATERIAL, material_counts(settings, pixels, faces, sets))
-    held = min(settings.recover.memory, SAMPLE * sum(pixels) * settings.recover.subsamples / 1e9)
+    held = min(settings.recover.memory, SAMPLE * sum(looked_at(settings, pixels)) * settings.recover.subsamples / 1e9)
     found |= {stage: found[stage] + held for stage in KEEPING}
     return round(max(found.values()), 2)
 

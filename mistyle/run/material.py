@@ -282,7 +282,8 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
         start = [start_maps(m, t, s.atlas.size) for m, t in zip(asset.materials, texels, strict=True)]
     folder = checkpoint.place(run.job.out, run.keys["recover"])
     # What is kept of the pictures' samples changes how long the fit takes and nothing else.
-    within = check_material(s, pixels_of(captures), len(asset.mesh.faces), len(texels))
+    looked = s.model_copy(update={"references": s.references.model_copy(update={"average": 1})})
+    within = check_material(looked, pixels_of(captures), len(asset.mesh.faces), len(texels))
     return recover(
         asset.mesh,
         texels,
@@ -344,6 +345,6 @@ def picture_of(traced: Any, captures: Captures, sizes, table, model: str, chosen
     """The one picture of `captures` as the maps predict it, and its coverage."""
     from mistyle.render.shade import Shade
 
-    shade = Shade(traced, captures, sizes, model=model, frame=chosen.frame, subsamples=chosen.subsamples)
+    shade = Shade(traced, captures, sizes, model=model, frame=chosen.frame, subsamples=chosen.subsamples, memory=0)
     shade.table = table
     return shade.image_and_coverage(0)

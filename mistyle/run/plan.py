@@ -1,8 +1,8 @@
 """What a job will do and what it will cost, before it does it (`--dry-run`). Imports nothing heavy.
 
-The times are products of counts and constants that were read off `python -m benchmarks.pipeline` on two cores of a
-2.6 GHz server; they are guides of a factor of two, not promises. Memory is `run/budget.py`'s. Disk is what stays in the
-run folder.
+The times are products of counts and constants that were read off `python -m benchmarks.pipeline` and
+`benchmarks.photographs` on two cores of a server; they are guides of a factor of two, not promises. Memory is
+`run/budget.py`'s. Disk is what stays in the run folder.
 """
 
 import shutil
@@ -12,11 +12,15 @@ from typing import Any
 
 from mistyle.core.errors import InputRefused
 from mistyle.run.budget import (
+    COVERED,
     MATERIAL,
     PLAIN,
+    SEEN,
+    SHOWN,
     TILED,
     check_material,
     counts,
+    looked_at,
     material_counts,
     material_gb,
     memory_gb,
@@ -36,12 +40,10 @@ PER_TEXEL = 1.0e-6
 PER_VIEW_PIXEL = 8.0e-7
 PER_CROP_PIXEL = 1.6e-6
 # Of fits to pictures: a pixel read and made straight; a sample of one predicted, or stepped on; a texel in a picture.
-PER_READ_PIXEL = 6e-7
+PER_READ_PIXEL = 8e-7
 PER_LOOK = 2e-7
-PER_STEP_LOOK = 4e-7
+PER_STEP_LOOK = 2e-7
 PER_OBSERVATION = 4e-7
-# Shares of a picture that show the object, of the atlas that is covered, and of that what one picture sees.
-SHOWN, COVERED, SEEN = 0.25, 0.55, 0.35
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
 BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}
@@ -89,7 +91,7 @@ def plan(job: Job) -> dict[str, Any]:
 def plan_material(job: Any) -> dict[str, Any]:
     """The same for a `MaterialJob`, whose cameras, lights and pictures' headers are read and refused as it does.
 
-    How much of the pictures shows the object is not known yet: SHOWN is taken, as of the atlas COVERED.
+    How much of the pictures shows the object is not known yet: run/budget.py's shares are taken.
     """
     from mistyle.run.material import pixels_of, references_of
 
@@ -97,7 +99,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     sizes = pixels_of(references_of(job))
     faces, texels = _faces(files), s.atlas.size**2
     check_material(s, sizes, faces)
-    averaged = [n / _block(n, texels, s.references.average) ** 2 for n in sizes]
+    averaged = looked_at(s, sizes)
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     rounds = 0 if s.recover.solver == "pictures" else s.recover.rounds * (1 + s.recover.bounces)
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
@@ -121,16 +123,11 @@ def plan_material(job: Any) -> dict[str, Any]:
         "pictures": len(sizes),
         "megapixels": round(sum(sizes) / 1e6, 1),
         **_costs(job, MATERIAL_STAGES, seconds),
-        "memory_gb": material_gb(s, [round(n) for n in averaged], faces),
+        "memory_gb": material_gb(s, sizes, faces),
         "in_files": False,
         "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, faces)),
         "disk_gb": round((texels * BYTES_PER_TEXEL + kept) / 1e9, 2),
     }
-
-
-def _block(pixels: int, texels: int, average: int) -> int:
-    """Pixels a side that will be averaged (stages/recover_check.py, for an object that fills SHOWN of the picture)."""
-    return average or max(1, int((SHOWN * pixels / (COVERED * SEEN * texels)) ** 0.5 / 2))
 
 
 def _faces(files: Sequence[Path]) -> int:
