@@ -75,11 +75,11 @@ MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
     "pictures": Need(0.53, texel=71, photograph=97),
-    "recover": Need(0.75, texel=446, look=9.6, picture=620),
-    "measure": Need(0.77, texel=300, look=6, picture=620),
-    "asset": Need(0.80, texel=200, look=6, picture=570),
-    "scene": Need(0.80, texel=200, look=6, picture=570),
-    "report": Need(0.78, texel=200, drawn=70, frame=24, look=6, picture=570),
+    "recover": Need(0.71, texel=446, look=9.6, picture=620),
+    "measure": Need(0.73, texel=300, look=6, picture=620),
+    "asset": Need(0.76, texel=200, look=6, picture=570),
+    "scene": Need(0.76, texel=200, look=6, picture=570),
+    "report": Need(0.74, texel=200, drawn=70, frame=24, look=6, picture=570),
 }
 KEEPING = ("recover", "measure", "asset", "scene", "report")
 # Shares of a picture that show the object, of the atlas that is covered, and of that what one picture sees.
