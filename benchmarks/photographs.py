@@ -39,9 +39,12 @@ from mistyle.files.cameras import transforms
 from mistyle.files.captures import read_captures
 from mistyle.files.read import read_mesh
 from mistyle.measure.material_metrics import map_errors
+from mistyle.render.draw import tracer
+from mistyle.render.shade import Shade, pack
 from mistyle.run.budget import material_gb
 from mistyle.run.material_settings import MaterialSettings
 from mistyle.stages.recover import recover
+from mistyle.stages.recover_check import blocks
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise, start_maps
 
@@ -73,13 +76,12 @@ def large(place: Path, views: int, side: int) -> dict[str, float]:
     count = photograph(mesh, folder, views, side)
     captures = read_captures(folder, saturation=0.99)
     asset = read_mesh(mesh)
-    from mistyle.stages.recover_check import blocks
-
     by = blocks([rasterise(asset.mesh, 0, ATLAS)], captures.cameras)
     figures = {"large.pictures": float(count), "large.megapixels": side * side / 1e6, "large.block": float(by[0])}
     figures["large.read_seconds"] = _seconds(lambda: captures.load(0))
     for name, seen in (("large", captures), ("large.averaged", shrunk(captures, by))):
-        held = in_memory(seen.cameras[:1], seen.lights[:1], [seen.load(0)[0]], [seen.load(0)[1]])
+        rgb, counts = seen.load(0)
+        held = in_memory(seen.cameras[:1], seen.lights[:1], [rgb], [counts])
         figures[f"{name}.predict_seconds"] = _prediction(asset.mesh, held)
     words = ["fit", mesh, folder, "-o", place / "run", "--set", "references.saturation=0.99", "--atlas", ATLAS]
     start = time.perf_counter()
@@ -124,9 +126,6 @@ def photograph(mesh: Path, folder: Path, views: int, side: int) -> int:
 
 
 def _pictures(asset, shots) -> Iterator[np.ndarray]:
-    from mistyle.render.draw import tracer
-    from mistyle.render.shade import Shade, pack
-
     maps = [start_maps(m, rasterise(asset.mesh, p, 2048), 2048) for p, m in enumerate(asset.materials)]
     traced, table = tracer(asset.mesh), pack(maps)
     for shot in shots:
@@ -149,9 +148,6 @@ def _bent(lens: Lens, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 def _prediction(mesh, captures: Captures) -> float:
     """Seconds that the picture takes which is too large to be kept, after everything was compiled."""
-    from mistyle.render.draw import tracer
-    from mistyle.render.shade import Shade
-
     shade = Shade(tracer(mesh), captures, [(ATLAS, ATLAS)] * len(mesh.parts), subsamples=9, memory=0)
     shade.image(0)
     return _seconds(lambda: shade.image(0))

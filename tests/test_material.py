@@ -92,20 +92,21 @@ def photographed(mesh: Mesh, cameras: list[Camera], rigs: list[Lights]) -> list[
     return views
 
 
+def one_by_one(folder: Path, mesh: Mesh, places: list[Camera]) -> None:
+    """References from every place under each of KEYS, with their lights.json."""
+    cameras = [replace(camera, name=f"{camera.name}_{j}") for camera in places for j in range(len(KEYS))]
+    rigs: list[Lights] = [(light,) for _ in places for light in KEYS]
+    write_views(folder, photographed(mesh, cameras, rigs), ())
+    named = {camera.name: rig for camera, rig in zip(cameras, rigs, strict=True)}
+    (folder / "lights.json").write_text(json.dumps(to_json((), named)))
+
+
 @pytest.fixture(scope="module")
 def shots(tmp_path_factory):
     """A mesh file and a folder of 24 references, EXR, of 12 cameras under two lights, with their lights.json."""
     folder = tmp_path_factory.mktemp("material")
     bowl(folder / "bowl.obj")
-    asset = read_mesh(folder / "bowl.obj", size=SIZE)
-    cameras, rigs = [], []
-    for camera in orbit(12, 0.55, SIDE):
-        for j, light in enumerate(KEYS):
-            cameras.append(replace(camera, name=f"{camera.name}_{j}"))
-            rigs.append((light,))
-    write_views(folder / "shots", photographed(asset.mesh, cameras, rigs), ())
-    named = {camera.name: rig for camera, rig in zip(cameras, rigs, strict=True)}
-    (folder / "shots" / "lights.json").write_text(json.dumps(to_json((), named)))
+    one_by_one(folder / "shots", read_mesh(folder / "bowl.obj", size=SIZE).mesh, orbit(12, 0.55, SIDE))
     return folder
 
 

@@ -1,20 +1,17 @@
 """Pictures that are much finer than the texels: averaged once, kept, and fitted to."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from test_material import KEYS, QUICK, bowl, orbit, photographed
+from test_material import QUICK, bowl, one_by_one, orbit
 from test_seam import KEY, SIZES, crop, random_maps, torus
 
 import mistyle
 from mistyle.core.camera import Camera, look_at
 from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
-from mistyle.core.light import to_json
 from mistyle.files.read import read_mesh
-from mistyle.files.views import write_views
 from mistyle.render import draw, hits, shade, texel_views
 from mistyle.run.material_pictures import look_through, looked
 from mistyle.stages.recover_check import LEAST_PIXELS, blocks
@@ -77,14 +74,7 @@ def test_pictures_that_are_asked_for_as_they_are_are_not_copied(bowls, tmp_path)
 
 
 def test_a_fit_to_fine_pictures(bowls, tmp_path):
-    cameras, rigs = [], []
-    for camera in orbit(8, 0.55, 240):
-        for j, light in enumerate(KEYS):
-            cameras.append(replace(camera, name=f"{camera.name}_{j}"))
-            rigs.append((light,))
-    write_views(tmp_path / "shots", photographed(read_mesh(bowls, size=64).mesh, cameras, rigs), ())
-    named = {camera.name: rig for camera, rig in zip(cameras, rigs, strict=True)}
-    (tmp_path / "shots" / "lights.json").write_text(json.dumps(to_json((), named)))
+    one_by_one(tmp_path / "shots", read_mesh(bowls, size=64).mesh, orbit(8, 0.55, 240))
     summary = mistyle.fit(
         bowls, tmp_path / "shots", tmp_path / "out", atlas={"size": 32}, references={"hold_out": 2}, **QUICK
     )
@@ -113,7 +103,7 @@ def test_a_picture_that_is_not_kept_is_the_same_picture(rng, memory):
     assert blocks[0].hits.bytes < next(iter(kept.blocks(0))).hits.bytes
 
 
-def test_rays_beside_the_mesh_are_not_traced(monkeypatch, rng):
+def test_rays_beside_the_mesh_are_not_traced():
     """Samples of a mesh that fills little of the picture are those of a crop about it, wherever the mesh is."""
     traced, camera = draw.tracer(torus()), look_at((0.5, 3, 14), fov=40, size=(60, 90))
     down, across = hits._window(traced.mesh, camera)

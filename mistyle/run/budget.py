@@ -182,8 +182,9 @@ def looked_at(settings: Any, pixels: Sequence[int]) -> list[int]:
 
 def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1) -> float:
     """Peak memory of a fit to pictures of so many pixels each, GB."""
-    found = peaks(MATERIAL, material_counts(settings, pixels, faces, sets))
-    held = min(settings.recover.memory, SAMPLE * sum(looked_at(settings, pixels)) * settings.recover.subsamples / 1e9)
+    count = material_counts(settings, pixels, faces, sets)
+    found = peaks(MATERIAL, count)
+    held = min(settings.recover.memory, SAMPLE * count.view * settings.recover.subsamples / 1e9)
     found |= {stage: found[stage] + held for stage in KEEPING}
     return round(max(found.values()), 2)
 
@@ -224,7 +225,7 @@ def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: i
         return settings
 
     def least(chosen: Any) -> float:
-        return material_gb(_with(chosen, "recover.memory", 1e-9), pixels, faces, sets)
+        return material_gb(with_setting(chosen, "recover.memory", 1e-9), pixels, faces, sets)
 
     left = settings.memory - max(peaks(MATERIAL, material_counts(settings, pixels, faces, sets)).values())
     if least(settings) > settings.memory or left <= 0:
@@ -233,7 +234,7 @@ def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: i
             f"--memory {settings.memory:g}G: the fit needs {needed:.2f} GB even if it keeps nothing of the pictures' "
             f"samples; give it --memory {rounded_up(needed)}G or more, or {_smaller(settings, least)}"
         )
-    return _with(settings, "recover.memory", min(settings.recover.memory, left))
+    return with_setting(settings, "recover.memory", min(settings.recover.memory, left))
 
 
 def rounded_up(gb: float) -> float:
@@ -246,7 +247,7 @@ def _smaller(settings: Any, least: Callable[[Any], float]) -> str:
     halves = {"atlas.size": 16, "surface.samples": 1000, "fit.crop_size": 32, "recover.subsamples": 1}
     there = {key: low for key, low in halves.items() if hasattr(settings, key.split(".")[0])}
     tried = {
-        key: (half := max(_value(settings, key) // 2, low), least(_with(settings, key, half)))
+        key: (half := max(_value(settings, key) // 2, low), least(with_setting(settings, key, half)))
         for key, low in there.items()
     }
     best = min(tried, key=lambda key: tried[key][1])
@@ -258,7 +259,8 @@ def _value(settings: Any, key: str) -> int:
     return getattr(getattr(settings, group), name)
 
 
-def _with(settings: Any, key: str, value: float) -> Any:
+def with_setting(settings: Any, key: str, value: float) -> Any:
+    """The settings with one, named group.name, changed."""
     group, name = key.split(".")
     return settings.model_copy(update={group: getattr(settings, group).model_copy(update={name: value})})
 

@@ -20,7 +20,7 @@ from mistyle.core.light import Lights, SceneLights
 from mistyle.core.maps import Maps, Texels
 from mistyle.files.textures import part_stems
 from mistyle.run import checkpoint
-from mistyle.run.budget import check_material
+from mistyle.run.budget import check_material, with_setting
 from mistyle.run.edits import asset_stage, tell_edits
 from mistyle.run.inputs import input_files
 from mistyle.run.material_files import scene, write
@@ -282,8 +282,8 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
         start = [start_maps(m, t, s.atlas.size) for m, t in zip(asset.materials, texels, strict=True)]
     folder = checkpoint.place(run.job.out, run.keys["recover"])
     # What is kept of the pictures' samples changes how long the fit takes and nothing else.
-    looked = s.model_copy(update={"references": s.references.model_copy(update={"average": 1})})
-    within = check_material(looked, pixels_of(captures), len(asset.mesh.faces), len(texels))
+    looked_at = with_setting(s, "references.average", 1)  # they are averaged already
+    within = check_material(looked_at, pixels_of(captures), len(asset.mesh.faces), len(texels))
     return recover(
         asset.mesh,
         texels,

@@ -12,7 +12,6 @@ from pathlib import Path
 import numpy as np
 
 from mistyle.core import memory
-from mistyle.core.camera import binned
 from mistyle.core.capture import Captures, Loaded, shrunk
 from mistyle.core.maps import Texels
 from mistyle.files.records import load_record, save_record
@@ -39,6 +38,7 @@ def look_through(folder: Path, texels: Sequence[Texels], captures: Captures, ave
     small = shrunk(captures, by)
 
     def load(k: int) -> Loaded:
+        # The check asks for every picture, once.
         rgb, counts = small.load(k)
         if by[k] > 1:
             # What does not count is no number: one array says both.
@@ -52,11 +52,12 @@ def look_through(folder: Path, texels: Sequence[Texels], captures: Captures, ave
 def looked(folder: Path, captures: Captures) -> tuple[Captures, tuple[str, ...]]:
     """The captures that `look_through` was given as the fit is to see them, and what there is to say of them."""
     found: Looked = load_record(folder / "record")
+    small = shrunk(captures, found.by)
 
     @lru_cache(maxsize=KEPT)
     def load(k: int) -> Loaded:
         if found.by[k] == 1:
-            return captures.load(k)
+            return small.load(k)
         stored = memory.load(_file(folder, k))
         counts = np.asarray(np.isfinite(stored).all(axis=-1))
         rgb = np.where(counts[..., None], stored, np.float32(0))
@@ -64,8 +65,7 @@ def looked(folder: Path, captures: Captures) -> tuple[Captures, tuple[str, ...]]
             array.setflags(write=False)  # shared with whoever asks next
         return rgb, counts
 
-    cameras = tuple(binned(camera, times) for camera, times in zip(captures.cameras, found.by, strict=True))
-    return Captures(cameras, captures.lights, load), found.notes
+    return Captures(small.cameras, small.lights, load), found.notes
 
 
 def _file(folder: Path, k: int) -> Path:

@@ -42,7 +42,6 @@ PER_CROP_PIXEL = 1.6e-6
 # Of fits to pictures: a pixel read and made straight; a sample of one predicted, or stepped on; a texel in a picture.
 PER_READ_PIXEL = 8e-7
 PER_LOOK = 2e-7
-PER_STEP_LOOK = 2e-7
 PER_OBSERVATION = 4e-7
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
@@ -108,8 +107,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "texels": texels * PER_TEXEL,
         "cameras": 1,
         "pictures": sum(sizes) * PER_READ_PIXEL,
-        "recover": (rounds + 2) * looked * PER_LOOK
-        + steps * looked / len(sizes) * PER_STEP_LOOK
+        "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
         + (1 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION,
         "measure": 2 * looked * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,

@@ -183,7 +183,7 @@ def take_off_indirect(
     table: np.ndarray,
     indirect: dict[int, np.ndarray],
     seed: int,
-    progress: Callable[[float], None] = lambda done: None,
+    progress: Callable[[float], None],
 ) -> None:
     """Estimate the indirect light of every picture with the maps found so far; `indirect` then holds it."""
     from mistyle.render.indirect import Indirect, retarget
