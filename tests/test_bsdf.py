@@ -205,8 +205,10 @@ def test_gltf_equals_the_specification(rng):
     given = cases(rng)
     mine, exact = ours("gltf", given), reference64("gltf", given)
     np.testing.assert_array_equal(mine == 0, exact == 0)
-    assert relative(mine, exact).max() < 3e-5
-    assert np.quantile(relative(mine, exact), 0.998) < 1e-5
+    # A cosine is rounded by float32's 6e-8, whatever its size: what it is relative to is the cosine's own height.
+    error, seen = relative(mine, exact), (exact > 0).any(-1)
+    assert (error[seen] < 2e-5 + 6e-8 / heights(given, False)[seen]).all()
+    assert np.quantile(error, 0.998) < 1e-5
     front = cases(rng, 2000, both_sides=False) | {"normal": np.tile(UP, (2000, 1))}
     plain = {name: value for name, value in loaded(front).items() if name != "normal"}
     np.testing.assert_allclose(np.array(bsdf.gltf(**plain)).T, ours("gltf", front), rtol=1e-6, atol=0)

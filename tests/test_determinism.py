@@ -2,7 +2,7 @@
 
 Two processes run every stage once (determinism_child.py) under circumstances that must not matter: another working
 folder, another order of hashes, memory that is handed out filled with other values, so that what is read before it is
-written shows, and a budget of memory, for which arrays lie in files.
+written shows, a budget of memory, for which arrays lie in files, and what the environment tells BLAS of threads.
 """
 
 import json
@@ -66,9 +66,10 @@ def twice(tmp_path_factory) -> tuple[Path, Path]:
     """The folders of two runs, side by side."""
     place = tmp_path_factory.mktemp("twice")
     outs = place / "first", place / "second"
+    other = {"PYTHONHASHSEED": "4711", MALLOC_FILL: "85", "OPENBLAS_NUM_THREADS": "1"}
     running = [
         start(place / "here", outs[0], PYTHONHASHSEED="0"),
-        start(place / "else where", outs[1], "1", PYTHONHASHSEED="4711", **{MALLOC_FILL: "85"}),
+        start(place / "else where", outs[1], "1", **other),
     ]
     for child in running:
         said = child.communicate(timeout=300)[1]

@@ -1,4 +1,4 @@
-"""How many processor cores this process may use."""
+"""How many processor cores this process may use, and how many it does."""
 
 import os
 
@@ -6,3 +6,19 @@ import os
 def cores() -> int:
     """Those that the system lets it run on, which in a container or on a farm are fewer than the machine has."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def use_threads(count: int) -> None:
+    """Have torch, OpenCV and the BLAS of NumPy and SciPy work on `count` threads from here on, in this process.
+
+    A product of matrices has other last digits at another count, and a BLAS left alone takes all cores, however many
+    shards share them. Dr.Jit has its own count: `render/device.use`.
+    """
+    import cv2
+    import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS, which could not be told later)
+    import torch
+    from threadpoolctl import threadpool_limits
+
+    torch.set_num_threads(count)
+    cv2.setNumThreads(count)
+    threadpool_limits(limits=count, user_api="blas")

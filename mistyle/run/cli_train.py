@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from mistyle.core.cores import use_threads
 from mistyle.core.errors import UsageError
 from mistyle.run.cli_models import add_model_options
 from mistyle.run.options import add_job_options, examples, said_settings
@@ -61,12 +62,10 @@ def run_train(options: argparse.Namespace) -> int:
 
     need_extra()
     wanted = lessons(options.kind, options.source, settings.word)
-    import torch
-
     from mistyle.backends.consislora_make import check as check_models
     from mistyle.backends.consislora_make import make_all
 
-    torch.set_num_threads(thread_count(settings))
+    use_threads(thread_count(settings))
     check_models(settings.models, settings.train)
     progress = Progress()
     with bar(progress.say) as watch:

@@ -8,6 +8,7 @@ import numpy as np
 
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera, rig
+from mistyle.core.cores import use_threads
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.run.made import Atlas
@@ -16,18 +17,14 @@ from mistyle.run.settings import ReadSettings, Settings, thread_count
 
 
 def start_engines(settings: Any) -> str:
-    """Choose the Mitsuba variant and set the thread counts of Dr.Jit, torch and OpenCV; returns the variant.
+    """Choose the Mitsuba variant and set the thread counts of everything that computes; returns the variant.
 
     `settings` is the root record of any kind of job: its `threads` and `variant` count.
     """
-    import cv2
-    import torch
-
     from mistyle.render import device
 
     threads = thread_count(settings)
-    torch.set_num_threads(threads)
-    cv2.setNumThreads(threads)
+    use_threads(threads)
     return device.use(None if settings.variant == "auto" else settings.variant, threads)
 
 
