@@ -5,6 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.rows import distinct
+
 
 @dataclass(frozen=True)
 class Mesh:
@@ -43,9 +45,9 @@ def weld(mesh: Mesh, part: int | None = None) -> Welded:
     uvs = mesh.corner_uvs[chosen].reshape(-1, 2).astype(np.float32)
     # Adding 0 turns -0.0 into 0.0, which compare equal but differ in bytes.
     keys = np.concatenate(
-        [vertex[:, None].astype(np.int64), (normals + 0.0).view(np.int32), (uvs + 0.0).view(np.int32)], axis=1
+        [vertex[:, None].astype(np.int32), (normals + 0.0).view(np.int32), (uvs + 0.0).view(np.int32)], axis=1
     )
-    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    first, inverse = distinct(keys)
     return Welded(
         positions=mesh.positions[vertex[first]].astype(np.float32),
         normals=normals[first],

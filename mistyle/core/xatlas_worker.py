@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.children import end_with_parent
 from mistyle.core.raster import fragments
+from mistyle.core.rows import distinct
 from mistyle.core.uvs import signed_areas
 
 # Charts may deviate this much before a new one begins. xatlas's own default of 2 gives half as many charts again for
@@ -166,8 +167,7 @@ def _steps(uvs: Float[np.ndarray, "f 3 2"]) -> Int[np.ndarray, " f"]:
     from scipy.sparse.csgraph import breadth_first_order
 
     count = len(uvs)
-    _, node = np.unique(uvs.reshape(-1, 2), axis=0, return_inverse=True)
-    node = node.reshape(-1)
+    node = distinct(uvs.reshape(-1, 2))[1]
     size = count + int(node.max()) + 1
     face = np.repeat(np.arange(count), 3)
     graph = coo_matrix((np.ones(len(face), np.int8), (face, count + node)), shape=(size, size)).tocsr()
@@ -212,8 +212,8 @@ def pack(
         return result
     faces = uvs[placed]
     keys = np.concatenate([np.repeat(chart[placed], 3)[:, None], faces.reshape(-1, 2)], axis=1)
-    unique, index = np.unique(keys, axis=0, return_inverse=True)
-    result[placed] = _pack_to(unique[:, 1:], index.reshape(-1, 3), chart[placed], resolution, padding)
+    first, index = distinct(keys)
+    result[placed] = _pack_to(keys[first, 1:], index.reshape(-1, 3), chart[placed], resolution, padding)
     return result
 
 

@@ -14,6 +14,7 @@ from mistyle import __version__
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import weld
+from mistyle.core.rows import distinct
 from mistyle.core.tangents import mikktspace
 from mistyle.files.glb import Builder, Tree, unit_normals
 from mistyle.files.gltf_patch import patch_tree
@@ -143,7 +144,7 @@ def split_corners(
     """Give corners of one vertex with different tangents vertices of their own: old vertex of each new, new faces."""
     flat = faces.reshape(-1)
     keys = np.concatenate([flat[:, None].astype(np.int32), (tangents.reshape(-1, 4) + np.float32(0)).view(np.int32)], 1)
-    _, first, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
+    first, inverse = distinct(keys)
     return flat[first], inverse.reshape(-1, 3).astype(np.int32)
 
 
@@ -152,8 +153,7 @@ def _material(asset: Asset, part: int, textures: dict[str, int]) -> Tree:
     set_textures(material, textures)
     faces = asset.mesh.faces[asset.mesh.part == part]
     edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    _, count = np.unique(edges, axis=0, return_counts=True)
-    if (count == 1).any():
+    if (np.bincount(distinct(edges)[1]) == 1).any():
         material["doubleSided"] = True  # an open surface is seen from behind as well, as its renders here show it
     return material
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.rows import distinct
 from mistyle.core.tangents import mikktspace
 from mistyle.files.glb import FAN, STRIP, TRIANGLES, Builder, Tree, element_bytes, unit_normals, values
 
@@ -169,11 +170,11 @@ def split(
     """
     bits = np.ascontiguousarray(keys.astype(np.float32) + np.float32(0)).view(np.int32)
     rows = np.concatenate([corner_vertex[:, None].astype(np.int32), bits], axis=1)
-    found, chosen, inverse = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-    old = found[:, 0].astype(np.int64)
+    chosen, inverse = distinct(rows)
+    old = rows[chosen, 0].astype(np.int64)
     again = np.r_[False, old[1:] == old[:-1]]
     number = np.where(again, count + np.cumsum(again) - 1, old)
-    return number[inverse.reshape(-1)], old[again], chosen
+    return number[inverse], old[again], chosen
 
 
 def _filler(name: str, count: int) -> np.ndarray:

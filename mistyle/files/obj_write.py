@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.mesh import Mesh
+from mistyle.core.rows import distinct
 from mistyle.files.materialx import Look
 from mistyle.files.store import atomic_write
 
@@ -56,5 +57,6 @@ def _materials(looks: Sequence[Look]) -> str:
 
 def _shared(rows: Float[np.ndarray, "n c"]) -> tuple[np.ndarray, np.ndarray]:
     """Distinct rows, and which of them each row is."""
-    distinct, index = np.unique(np.round(rows, 9) + 0.0, axis=0, return_inverse=True)
-    return distinct, index.reshape(-1)
+    rounded = np.round(rows, 9) + 0.0
+    first, index = distinct(rounded)
+    return rounded[first], index

@@ -200,7 +200,9 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
     shapes = scenery.object_shapes(mesh, chosen, flip_invalid=True, frame="mikkt")
     del chosen
     memory.let_go()
-    for camera in cameras:
+
+    def drawn(camera):
+        # A function, so that its scene goes before the next comes: where two live, other kernels have to be compiled.
         described = scenery.scene_dict(
             mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes
         )
@@ -210,4 +212,6 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
         for k in range(times):
             # Seeds of passes must not meet those of a neighbouring seed: an odd step visits every number once.
             total += np.array(mi.render(scene, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32), dtype=np.float32)
-        yield total / np.float32(times)
+        return total / np.float32(times)
+
+    yield from map(drawn, cameras)

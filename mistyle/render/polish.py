@@ -5,6 +5,7 @@ rendered as it came about, with all bounces, and Adam on the Laplacian pyramid o
 the maps found. Gradients are Monte Carlo estimates, so it is slow and the steps are small.
 """
 
+import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -102,6 +103,7 @@ class _Job:
         parts = [p for p in range(len(maps)) if f"part{p}" in self.shapes]
         wanted = {scenery.parameters(p)[name]: (p, name) for p in parts for name in moving}
         found = scene_keys.match(self.scene(0), list(wanted))
+        gc.collect()  # that scene; kernels are other ones, to be compiled anew, while two scenes live
         self.places = [wanted[p.key] for p in found]
         self.names = [name for _, name in self.places]
         # What holds a normal map is known here; its plugin may be ours.
@@ -174,13 +176,15 @@ class _Job:
 
     def judge(self, values, pictures: Sequence[int], spp: int, seed: int) -> float:
         """Mean loss of some pictures, with the same random numbers each time."""
-        losses = []
-        for k in pictures:
+
+        def one(k: int) -> float:
+            # A function, so that its scene goes before the next comes.
             scene = self.scene(k)
             scene_grad.put(self._table(scene), self.chosen, values)
             shown, view = self._look(scene, k, 4 * spp, scene_grad.seeds(seed, 2**31 + k)[0])
-            losses.append(scene_grad.compare(shown, view, self.loss)[0])
-        return float(np.mean(losses))
+            return scene_grad.compare(shown, view, self.loss)[0]
+
+        return float(np.mean([one(k) for k in pictures]))
 
     def _table(self, scene: Any) -> Any:
         table = self.mi.traverse(scene)

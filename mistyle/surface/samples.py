@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
 from mistyle.core.normals import crease_normals, same_points
+from mistyle.core.rows import distinct
 from mistyle.surface import cells, kernels
 
 OVERSAMPLING = 5  # candidates per sample asked for
@@ -173,7 +174,7 @@ def first_per_cell(
     octant = (normals > 0) @ np.array([1, 2, 4])
     key = np.concatenate([cell, octant[:, None]], axis=1)
     kept = np.zeros(len(positions), bool)
-    kept[np.unique(key, axis=0, return_index=True)[1]] = True
+    kept[distinct(key)[0]] = True
     return kept
 
 
