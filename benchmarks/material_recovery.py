@@ -123,6 +123,9 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--resolution", type=int, default=None)
     parser.add_argument("--views", type=int, default=None)
     parser.add_argument("--spp", type=int, default=None, help="samples of the references; the relit have a quarter")
+    parser.add_argument(
+        "--direct", action="store_true", help="references without light between surfaces, to see what that costs"
+    )
     parser.add_argument("--stanford-orb", type=Path, metavar="FOLDER", help="this data set instead, where you have it")
     parser.add_argument("--tensoir", type=Path, metavar="FOLDER", help="a scene of TensoIR-Synthetic instead")
     parser.add_argument("--environments", type=Path, metavar="FOLDER", help="TensoIR's environment maps")
@@ -164,18 +167,21 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
     shots = (
         drawing.turned(cameras, sky, 1 if row.kind == "unknown" else 3) if row.soft else drawing.one_at_a_time(cameras)
     )
-    pictures = drawing.render(known.mesh, known.maps, shots, frame=frame, spp=options.spp, cache=options.cache)
+    depth, chosen = (2, {"bounces": 0}) if options.direct else (drawing.DEPTH, {})
+    pictures = drawing.render(
+        known.mesh, known.maps, shots, frame=frame, spp=options.spp, depth=depth, cache=options.cache
+    )
     counts = seen(known, cameras)
     weights = [a * (n >= LEAST_VIEWS) for a, n in zip(known.areas, counts, strict=True)]
     main_shots, main_pictures = drawing.together(shots, pictures) if row.kind == "paper" else (shots, pictures)
 
     judge = Judge(known, weights, options)
-    fitted = ours(known, main_shots, main_pictures, frame, unknown=row.kind == "unknown")
+    fitted = ours(known, main_shots, main_pictures, frame, unknown=row.kind == "unknown", **chosen)
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
     if row.kind in ("real", "strong") and "together" in options.rivals:
-        other = ours(known, *drawing.together(shots, pictures), frame)
+        other = ours(known, *drawing.together(shots, pictures), frame, **chosen)
         methods["together"] = judge(other.maps, frame, "together") | {"seconds": other.seconds}
     steps = {}
     loops = {"naive": (), "naive_pyramid": ("--pyramid",)}

@@ -113,19 +113,20 @@ def render(
     frame: Frame,
     spp: int,
     seed: int = 0,
+    depth: int = DEPTH,
     cache: Path | None = None,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[np.ndarray]:
     """Linear radiance (premultiplied) and coverage, (h, w, 4) float32, of every shot. Environment light takes four
     times the `spp` of a delta light. With `cache`, what was rendered once is read from there."""
-    file = cache / f"{_key(mesh, maps, shots, frame, spp, seed)}.npy" if cache else None
+    file = cache / f"{_key(mesh, maps, shots, frame, spp, seed, depth)}.npy" if cache else None
     if file is not None and file.is_file():
         return list(np.load(file, allow_pickle=False))
     device.use()
     shapes = object_shapes(mesh, maps, frame=frame)
     result = []
     for k, shot in enumerate(shots):
-        result.append(_render(shapes, shot, spp, seed))
+        result.append(_render(shapes, shot, spp, seed, depth))
         progress((k + 1) / len(shots))
     if file is not None:
         file.parent.mkdir(parents=True, exist_ok=True)
@@ -135,7 +136,7 @@ def render(
     return result
 
 
-def _render(shapes: dict[str, Any], shot: Shot, spp: int, seed: int) -> np.ndarray:
+def _render(shapes: dict[str, Any], shot: Shot, spp: int, seed: int, depth: int) -> np.ndarray:
     import mitsuba
 
     mi: Any = mitsuba  # its type stubs know one variant only
@@ -143,7 +144,7 @@ def _render(shapes: dict[str, Any], shot: Shot, spp: int, seed: int) -> np.ndarr
     for light in shot.lights:
         samples = spp if isinstance(light, Directional) else 4 * spp
         times, each = passes(samples)
-        integrator = {"type": "path", "max_depth": DEPTH, "hide_emitters": True}
+        integrator = {"type": "path", "max_depth": depth, "hide_emitters": True}
         scene: Any = mi.load_dict(
             {"type": "scene", "integrator": integrator, "light": emitter(light, shot.camera), **shapes}
         )
@@ -185,11 +186,11 @@ def sensor_to_world(camera: Camera) -> np.ndarray:
     return camera.world_from_cam @ MITSUBA_FROM_OPENCV
 
 
-def _key(mesh: Mesh, maps: Sequence[Maps], shots: Sequence[Shot], frame: str, spp: int, seed: int) -> str:
+def _key(mesh: Mesh, maps: Sequence[Maps], shots: Sequence[Shot], frame: str, spp: int, seed: int, depth: int) -> str:
     """A hash of everything that decides the pictures."""
     import mitsuba as mi
 
-    digest = hashlib.sha256(repr((mi.__version__, DEPTH, frame, spp, seed, mesh.parts)).encode())
+    digest = hashlib.sha256(repr((mi.__version__, depth, frame, spp, seed, mesh.parts)).encode())
 
     def add(value: Any) -> None:
         if isinstance(value, np.ndarray):
