@@ -7,8 +7,8 @@ from jaxtyping import Int, Shaped
 def distinct(rows: Shaped[np.ndarray, "n k"]) -> tuple[Int[np.ndarray, " d"], Int[np.ndarray, " n"]]:
     """The first of every kind of row, in ascending order of the rows, and which kind each row is.
 
-    The indices and inverse of `np.unique(rows, axis=0)` in a fifth of its time, which compares whole rows as bytes
-    instead of sorting by one column after the other. NaN equals nothing.
+    These are the indices and the inverse of `np.unique(rows, axis=0)`. Sorting by one column after the other takes a
+    fifth of the time of comparing whole rows, as that does. NaN equals nothing.
     """
     order = np.lexsort(rows.T[::-1])
     begins = np.ones(len(rows), bool)
