@@ -16,7 +16,7 @@ from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
 from mistyle.render.polish import polish
 
-SIZE, RESOLUTION, ROOM = 24, 48, 32  # the room is rendered with gradients, many times
+SIZE, RESOLUTION = 24, 48
 
 
 def corner() -> Mesh:
@@ -76,7 +76,7 @@ def room():
     device.use()
     mesh, maps = corner(), coloured()
     eyes = ((2.5, 2, 2.2), (1.5, 3, 2), (3, 1.4, 1.5), (2, 1.5, 3))
-    size = (ROOM, ROOM)
+    size = (RESOLUTION, RESOLUTION)
     cameras = [look_at(eye, fov=22, size=size, name=f"v{k}") for k, eye in enumerate(eyes)]
     lights = [(Directional((0.577, 0.577, 0.577), (2.5, 2.5, 2.5)),)] * len(cameras)
     pictures = [picture(mesh, maps, c, rig) for c, rig in zip(cameras, lights, strict=True)]

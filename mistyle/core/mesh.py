@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.rows import distinct
+from mistyle.core.rows import corner_rows, distinct
 
 
 @dataclass(frozen=True)
@@ -43,11 +43,7 @@ def weld(mesh: Mesh, part: int | None = None) -> Welded:
     vertex = mesh.faces[chosen].reshape(-1)
     normals = mesh.corner_normals[chosen].reshape(-1, 3).astype(np.float32)
     uvs = mesh.corner_uvs[chosen].reshape(-1, 2).astype(np.float32)
-    # Adding 0 turns -0.0 into 0.0, which compare equal but differ in bytes.
-    keys = np.concatenate(
-        [vertex[:, None].astype(np.int32), (normals + 0.0).view(np.int32), (uvs + 0.0).view(np.int32)], axis=1
-    )
-    first, inverse = distinct(keys)
+    first, inverse = distinct(corner_rows(vertex, normals, uvs))
     return Welded(
         positions=mesh.positions[vertex[first]].astype(np.float32),
         normals=normals[first],

@@ -14,7 +14,7 @@ from mistyle import __version__
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import weld
-from mistyle.core.rows import distinct
+from mistyle.core.rows import corner_rows, distinct
 from mistyle.core.tangents import mikktspace
 from mistyle.files.glb import Builder, Tree, unit_normals
 from mistyle.files.gltf_patch import patch_tree
@@ -143,8 +143,7 @@ def split_corners(
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, "f 3"]]:
     """Give corners of one vertex with different tangents vertices of their own: old vertex of each new, new faces."""
     flat = faces.reshape(-1)
-    keys = np.concatenate([flat[:, None].astype(np.int32), (tangents.reshape(-1, 4) + np.float32(0)).view(np.int32)], 1)
-    first, inverse = distinct(keys)
+    first, inverse = distinct(corner_rows(flat, tangents.reshape(-1, 4)))
     return flat[first], inverse.reshape(-1, 3).astype(np.int32)
 
 

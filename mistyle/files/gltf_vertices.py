@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.rows import distinct
+from mistyle.core.rows import corner_rows, distinct
 from mistyle.core.tangents import mikktspace
 from mistyle.files.glb import FAN, STRIP, TRIANGLES, Builder, Tree, element_bytes, unit_normals, values
 
@@ -168,8 +168,7 @@ def split(
     Returns the new vertex of every corner, the old vertex of every appended one (numbers from `count` on), and one
     corner of every vertex in use. One key of each old vertex keeps its number.
     """
-    bits = np.ascontiguousarray(keys.astype(np.float32) + np.float32(0)).view(np.int32)
-    rows = np.concatenate([corner_vertex[:, None].astype(np.int32), bits], axis=1)
+    rows = corner_rows(corner_vertex, keys)
     chosen, inverse = distinct(rows)
     old = rows[chosen, 0].astype(np.int64)
     again = np.r_[False, old[1:] == old[:-1]]

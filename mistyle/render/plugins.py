@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.mesh import Welded
-from mistyle.core.rows import distinct
+from mistyle.core.rows import corner_rows, distinct
 from mistyle.render import bsdf, device
 
 GLTF, NORMALMAP = "mistyle_gltf", "mistyle_normalmap"
@@ -42,9 +42,7 @@ def register() -> None:
 def with_tangents(welded: Welded, tangents: Float[np.ndarray, "f 3 4"]) -> tuple[Welded, dict[str, np.ndarray]]:
     """Split the indices whose corners differ in tangent; second, the attributes of the indices that result."""
     index, corners = welded.faces.reshape(-1), tangents.reshape(-1, 4).astype(np.float32)
-    # Adding 0 turns -0.0 into 0.0, which compare equal but differ in bytes.
-    keys = np.concatenate([index[:, None], (corners + np.float32(0)).view(np.int32)], axis=1)
-    first, inverse = distinct(keys)
+    first, inverse = distinct(corner_rows(index, corners))
     old, found = index[first], corners[first]
     split = Welded(
         positions=welded.positions[old],
