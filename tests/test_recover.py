@@ -11,7 +11,7 @@ from mistyle.core.camera import look_at
 from mistyle.core.capture import in_memory, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import erode, gaussian
-from mistyle.core.light import Directional, Point
+from mistyle.core.light import Directional, Environment, Point
 from mistyle.core.maps import Maps
 from mistyle.render import device, draw, indirect
 from mistyle.render import hits as collecting
@@ -23,6 +23,7 @@ from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
 from mistyle.stages.recover_observe import Gathered, gather
 from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.recover_texels import alike
 from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
@@ -295,27 +296,51 @@ def hollow():
 
 @pytest.mark.parametrize("most", [MOST, 32])
 def test_indirect_light_is_what_path_sees_beyond_direct(rng, monkeypatch, most):
+    """Under delta lights, and under a sky with a lamp in it, in pictures that share their paths."""
     monkeypatch.setattr(indirect, "MOST", most)
     device.use()
     mesh, maps = hollow(), replace(strong_maps(3), roughness=np.full((SIZE, SIZE), 0.7, np.float32))
     camera = look_at([0.6, 0.4, 4], fov=30, size=(64, 63))
-    lights = (directional(*LIGHTS[0]), Point((1.0, 1.0, 3.0), (4.0, 4.0, 4.0)))
-    both = [
-        photographs(mesh, [maps], [camera], [lights], "mikkt", {"type": "path", "max_depth": d, "rr_depth": 100}, 256)[
-            0
-        ]
-        for d in (2, 5)
-    ]
-    difference = both[1] - both[0]
-    coarse = Indirect(mesh, [maps]).picture(camera, lights, 256, 3)
-    assert coarse.shape[:2] == ((64, 63) if most == MOST else (32, 32))
-    estimate = enlarged(coarse, camera.size)
-    assert estimate.shape == difference.shape
-    # Pixels on the silhouette show less of what the estimate says of the surface.
-    inside = erode(difference.sum(-1) > 0.01, 1)
-    assert inside.mean() > 0.1
-    wrong = gaussian((difference - estimate) * inside[..., None], 2.0)[inside]
-    assert np.sqrt((wrong**2).mean()) < 0.1 * np.sqrt((difference[inside] ** 2).mean())
+    radiance = np.full((16, 32, 3), (0.3, 0.4, 0.5), np.float32)
+    radiance[4:7, 2:5] = 20
+    many = [(directional(*LIGHTS[0]), Point((1.0, 1.0, 3.0), (4.0, 4.0, 4.0))), (Environment(radiance),)]
+    path = {"type": "path", "rr_depth": 100}
+    direct, whole = (
+        photographs(mesh, [maps], [camera] * 2, many, "mikkt", path | {"max_depth": d}, 256) for d in (2, 5)
+    )
+    found = Indirect(mesh, [maps]).pictures(camera, many, 256, 3)
+    for part, all_of_it, coarse in zip(direct, whole, found, strict=True):
+        difference = all_of_it - part
+        assert coarse.shape[:2] == ((64, 63) if most == MOST else (32, 32))
+        estimate = enlarged(coarse, camera.size)
+        assert estimate.shape == difference.shape
+        # Pixels on the silhouette show less of what the estimate says of the surface.
+        inside = erode(difference.sum(-1) > 0.01, 1)
+        assert inside.mean() > 0.1
+        wrong = gaussian((difference - estimate) * inside[..., None], 2.0)[inside]
+        assert np.sqrt((wrong**2).mean()) < 0.05 * np.sqrt((difference[inside] ** 2).mean())
+        np.testing.assert_allclose(estimate[inside].mean(axis=0), difference[inside].mean(axis=0), rtol=0.02)
+
+
+def test_pictures_of_one_place_share_their_paths(monkeypatch):
+    """One camera under more lights than go into one kernel, each as if it were alone."""
+    monkeypatch.setattr(indirect, "TOGETHER", 2)
+    device.use()
+    mesh, maps = hollow(), strong_maps(3)
+    camera = look_at([0.6, 0.4, 4], fov=30, size=(32, 32))
+    many = [(directional(*light),) for light in LIGHTS[:3]]
+    estimate = Indirect(mesh, [maps])
+    found = estimate.pictures(camera, many, 16, 3)
+    assert len(found) == len(many)
+    for own, picture in zip(many, found, strict=True):
+        np.testing.assert_allclose(picture, estimate.pictures(camera, [own], 16, 3)[0], rtol=1e-3, atol=1e-5)
+    assert np.abs(found[0] - found[1]).max() > 0.01
+
+
+def test_cameras_of_one_place_are_found():
+    one, other = look_at([0, 0, 4], fov=30, size=(32, 32)), look_at([0, 1, 4], fov=30, size=(32, 32))
+    wider = replace(one, size=(32, 40))
+    assert alike([one, other, replace(one, name="again"), wider]) == [[0, 2], [1], [3]]
 
 
 def test_averages_stay_on_their_surface(rng):

@@ -1,9 +1,10 @@
 """Light that reaches the camera by way of more than one surface point: what a fit under direct light must take off.
 
-Mitsuba's `path` renders every picture twice with the same samples, once with all its bounces and once without; the
-difference is the indirect light, free of the noise that both share, and of most of what smooth surfaces mirror of each
-other. What arrives is smooth along the surface, so a coarse picture of few samples says enough, once it is divided by
-the albedo, averaged over pixels that show the same surface, and multiplied again (Dammertz et al. 2010).
+Paths begin at the pixels of a coarse picture and follow the reflectance; wherever they come after the first point, the
+lights are looked for. What they carry does not depend on the lights until then, so pictures of one camera under several
+lights share their paths, which are most of the work. What arrives is smooth along the surface, so a coarse picture of
+few samples says enough, once it is divided by the albedo, averaged over pixels that show the same surface, and
+multiplied again (Dammertz et al. 2010).
 """
 
 from collections.abc import Sequence
@@ -26,6 +27,7 @@ from mistyle.render.emitters import emitters
 COARSER = 2  # pixels along a side of the picture that one pixel of the estimate covers
 LEAST = 128  # pixels along a side of the estimate, at least, where the picture has so many
 MOST = 256  # and at most along the longer side, however large the picture is
+TOGETHER = 6  # pictures of one camera that share their paths; more make the kernel long
 ROUGH = 0.25  # least roughness: light that mirrors carry comes in few bright samples and adds little
 DEPTH = 5  # path segments: light comes over up to four surface points
 ALIKE = 0.15  # length of the difference of two unit normals at which pixels hardly belong together any more
@@ -45,48 +47,137 @@ class Indirect:
 
         mi: Any = mitsuba
         matt = [replace(m, roughness=np.maximum(m.roughness, np.float32(ROUGH))) for m in maps]
-        self.shapes = scenery.object_shapes(mesh, matt, model=model, frame=frame)
-        direct, whole = (
-            {"type": "path", "max_depth": depth, "rr_depth": 100, "hide_emitters": True} for depth in (2, DEPTH)
-        )
-        guides = {"type": "aov", "aovs": "p:position,n:sh_normal,a:albedo", "nested": direct}
-        self.integrators = [mi.load_dict(guides), mi.load_dict(whole)]
+        shapes = scenery.object_shapes(mesh, matt, model=model, frame=frame)
+        self.scene = mi.load_dict({"type": "scene", **shapes}, optimize=False)
 
-    def picture(self, camera: Camera, lights: Lights, samples: int, seed: int) -> Float[np.ndarray, "h w 3"]:
-        """Indirect radiance, linear Rec.709, of a coarser picture of the camera, for `enlarged`; beside the object
-        that of the nearest pixel on it.
+    def pictures(
+        self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
+    ) -> list[Float[np.ndarray, "h w 3"]]:
+        """Indirect radiance, linear Rec.709, of coarser pictures of the camera, for `enlarged`, under each of `many`;
+        beside the object that of the nearest pixel on it.
 
-        Lights of a scene file raise ValueError. `samples` are those of a pixel of the coarse
-        picture.
+        Lights of a scene file raise ValueError. `samples` are those of a pixel of the coarse picture.
         """
+        found = []
+        for k in range(0, len(many), TOGETHER):
+            found += self._pictures(camera, many[k : k + TOGETHER], samples, seed)
+        return found
+
+    def _pictures(self, camera: Camera, many: Sequence[Lights], samples: int, seed: int) -> list[np.ndarray]:
         import mitsuba
 
         mi: Any = mitsuba
         by = max(COARSER if min(camera.size) >= COARSER * LEAST else 1, -(-max(camera.size) // MOST))
         # Pixels that begin inside the picture and end beside it belong to the estimate.
         small = replace(binned(camera, by), size=(-(-camera.size[0] // by), -(-camera.size[1] // by)))
-        count = scenery.samples(samples)
-        described = {"type": "scene", "sensor": scenery.sensor_dict(small, count), **self.shapes}
-        described |= {f"light{k}": light for k, light in enumerate(emitters(lights, camera))}
-        scene = mi.load_dict(described, optimize=False)
-        direct, whole = (
-            np.array(mi.render(scene, integrator=integrator, spp=count, seed=seed)) for integrator in self.integrators
-        )
-        share = whole[..., 3:4]
-        inside = np.isfinite(whole).all(axis=-1) & (share[..., 0] > 0)
-        light = np.where(inside[..., None], np.maximum(whole[..., :3] - direct[..., :3], 0), 0).astype(np.float32)
+        lit = [[mi.load_dict(light) for light in emitters(lights, camera)] for lights in many]
+        for emitter in (e for own in lit for e in own):
+            emitter.set_scene(self.scene)
+        times, each = scenery.passes(samples)
+        sensor = mi.load_dict(scenery.sensor_dict(small, each))
+        passes = [_traced(self.scene, sensor, lit, each, seed + k * 7919) for k in range(times)]
+        whole = np.mean(passes, axis=0)
+        share = whole[..., 0]
+        inside = np.isfinite(whole).all(axis=-1) & (share > 0)
         if not inside.any():
-            return np.zeros((*small.size, 3), np.float32)
-        covered = np.where(inside, np.maximum(share[..., 0], 0.05), 1)[..., None]
-        position, normal, albedo = (direct[..., k : k + 3] / covered for k in (4, 7, 10))
+            return [np.zeros((*small.size, 3), np.float32) for _ in many]
+        covered = np.where(inside, np.maximum(share, 0.05), 1)[..., None]
+        position, normal, albedo, *light = (whole[..., k : k + 3] / covered for k in range(1, whole.shape[-1], 3))
         albedo = np.maximum(np.nan_to_num(albedo), 0) + PALE
         unit = np.linalg.norm(position - camera.position.astype(np.float32), axis=-1) / small.focal
-        smooth = averaged(light / covered / albedo, position, normal, unit, inside) * albedo
-        return nearest_fill(np.ascontiguousarray(smooth, np.float32), inside)
+
+        def smooth(light: np.ndarray) -> np.ndarray:
+            irradiance = np.where(inside[..., None], light, 0) / albedo
+            radiance = averaged(irradiance.astype(np.float32), position, normal, unit, inside) * albedo
+            return nearest_fill(np.ascontiguousarray(radiance, np.float32), inside)
+
+        return [smooth(one) for one in light]
+
+
+def _traced(scene: Any, sensor: Any, lit: Sequence[Sequence[Any]], each: int, seed: int) -> np.ndarray:
+    """(h, w, 10 + 3 n) float32, means of `each` samples a pixel: coverage, position, shading normal and diffuse albedo
+    of the first surface point, and indirect radiance under each of n = len(lit) sets of emitters."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    width, height = (int(n) for n in sensor.film().size())
+    count = width * height * each
+    sampler = sensor.sampler()
+    sampler.set_samples_per_wavefront(each)
+    sampler.seed(seed, count)
+    pixel = dr.arange(mi.UInt32, count) // each
+    row = pixel // width
+    place = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row)) + sampler.next_2d()
+    ray, _ = sensor.sample_ray(0.0, 0.0, place / mi.Point2f(width, height), mi.Point2f(0.5))
+    context = mi.BSDFContext()
+    first = scene.ray_intersect(ray)
+    seen = first.is_valid()
+
+    def onward(si: Any, through: Any, active: Any, sampler: Any) -> tuple[Any, ...]:
+        """The next ray, what it carries, its density, where it begins, and whether it goes on."""
+        sample, weight = si.bsdf().sample(context, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        through = dr.select(active, through * weight, 0)
+        ray = si.spawn_ray(si.to_world(sample.wo))
+        return ray, through, mi.Float(sample.pdf), mi.Interaction3f(si), active & (dr.max(through) > 0)
+
+    def body(*state: Any) -> tuple[Any, ...]:
+        k, ray, through, density, last, active, sampler, *sums = state
+        si = scene.ray_intersect(ray, active)
+        # What escapes from the first point is direct light; what escapes from the last is looked for, no more points.
+        escaped, hit = active & ~si.is_valid() & (k > 0), active & si.is_valid() & (k < points)
+        arriving = (
+            sum((_arriving(scene, e, ray, si, last, density, escaped, hit, sampler) for e in own), mi.Color3f(0))
+            for own in lit
+        )
+        more = (total + through * light for total, light in zip(sums, arriving, strict=True))
+        return k + 1, *onward(si, through, hit, sampler), sampler, *more
+
+    points, soft = DEPTH - 2, any(emitter.is_environment() for own in lit for emitter in own)
+    start = (mi.UInt32(0), *onward(first, mi.Color3f(1), seen, sampler), sampler, *(mi.Color3f(0) for _ in lit))
+    ended = dr.while_loop(start, lambda k, *rest: rest[4] & (k < points + soft), body, label="indirect")
+    albedo = first.bsdf().eval_diffuse_reflectance(first, seen)
+    values = [mi.Float(1)]
+    for vector in (first.p, first.sh_frame.n, albedo, *ended[7:]):
+        values += [vector.x, vector.y, vector.z]
+    sums = [dr.zeros(mi.Float, width * height) for _ in values]
+    for total, value in zip(sums, values, strict=True):
+        dr.scatter_add(total, value / each, pixel, seen)
+    dr.eval(sums)
+    return np.stack([np.array(total) for total in sums], axis=-1).reshape(height, width, -1)
+
+
+def _arriving(
+    scene: Any, emitter: Any, ray: Any, si: Any, last: Any, density: Any, escaped: Any, hit: Any, sampler: Any
+) -> Any:
+    """Radiance that one emitter sends back along `ray`: over the surface point `si`, or past all of them.
+
+    Soft light is looked for both ways and weighted by the power heuristic (Veach and Guibas 1995).
+    """
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    soft = emitter.is_environment()
+    place = sampler.next_2d(hit) if soft else mi.Point2f(0.5)
+    towards, power = emitter.sample_direction(si, place, hit)
+    free = hit & (towards.pdf > 0)
+    free &= ~scene.ray_test(si.spawn_ray_to(towards.p), free)
+    reflected, other = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(towards.d), free)
+    if not soft:
+        return dr.select(free, reflected * power, 0)
+    along = dr.zeros(mi.DirectionSample3f)
+    along.d = ray.d
+    past = emitter.eval(si, escaped) * _heuristic(density, emitter.pdf_direction(last, along, escaped))
+    return dr.select(free, reflected * power * _heuristic(towards.pdf, other), 0) + dr.select(escaped, past, 0)
+
+
+def _heuristic(own: Any, other: Any) -> Any:
+    return own**2 / (own**2 + other**2)
 
 
 def enlarged(light: Float[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float[np.ndarray, "H W 3"]:
-    """What `Indirect.picture` made, as large as the picture that it is of."""
+    """What `Indirect.pictures` made, as large as the picture that it is of."""
     by = max(-(-whole // part) for whole, part in zip(size, light.shape, strict=False))
     return resize(light, (light.shape[0] * by, light.shape[1] * by))[: size[0], : size[1]]
 

@@ -39,10 +39,12 @@ PER_SURFACE_SAMPLE = 1.3e-4
 PER_TEXEL = 1.0e-6
 PER_VIEW_PIXEL = 8.0e-7
 PER_CROP_PIXEL = 1.6e-6
-# Of fits to pictures: a pixel read and made straight; a sample of one predicted, or stepped on; a texel in a picture.
+# Of fits to pictures: a pixel read and made straight; a sample of one predicted, or stepped on; a texel in a picture; a
+# path of light between surfaces.
 PER_READ_PIXEL = 8e-7
 PER_LOOK = 2e-7
 PER_OBSERVATION = 4e-7
+PER_BOUNCED_PATH = 1e-7
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
 BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}
@@ -100,7 +102,10 @@ def plan_material(job: Any) -> dict[str, Any]:
     check_material(s, sizes, faces)
     averaged = looked_at(s, sizes)
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
-    rounds = 0 if s.recover.solver == "pictures" else s.recover.rounds * (1 + s.recover.bounces)
+    bounces = 0 if s.recover.solver == "pictures" else s.recover.bounces
+    rounds = 0 if s.recover.solver == "pictures" else s.recover.rounds * (1 + bounces)
+    # render/indirect.py's pictures are half as wide, and never wider than 256 pixels.
+    paths = bounces * s.recover.bounce_samples * sum(min(n / 4, 2**16) for n in sizes)
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
     seconds = {
         "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),
@@ -108,7 +113,8 @@ def plan_material(job: Any) -> dict[str, Any]:
         "cameras": 1,
         "pictures": sum(sizes) * PER_READ_PIXEL,
         "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
-        + (1 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION,
+        + (1 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
+        + paths * PER_BOUNCED_PATH,
         "measure": 2 * looked * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,
         "scene": 2 * texels * PER_TEXEL,

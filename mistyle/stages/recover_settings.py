@@ -69,9 +69,9 @@ class RecoverSettings(BaseModel):
         default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
     )
     bounces: int = Field(
-        default=2, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
+        default=4, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
     )
-    bounce_samples: int = Field(default=64, ge=1, le=4096, description="samples a pixel of that estimate")
+    bounce_samples: int = Field(default=128, ge=1, le=4096, description="samples a pixel of that estimate")
     polish: int = Field(
         default=0,
         ge=0,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures
 from mistyle.core.image import resize
 from mistyle.core.light import SOFT
@@ -192,10 +193,24 @@ def take_off_indirect(
     settings, weights = work.settings, trust(work.captures, indirect)
     maps = unpack(table, work.where.sizes)
     scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
-    for k, (camera, lights) in enumerate(zip(work.captures.cameras, work.captures.lights, strict=True)):
-        indirect[k] = scene.picture(camera, lights, settings.bounce_samples, seed + k)
-        retarget(shade, k, work.captures.load(k)[0], weights(k))
-        progress((k + 1) / len(work.captures))
+    captures, done = work.captures, 0
+    for group in alike(captures.cameras):
+        many = [captures.lights[k] for k in group]
+        found = scene.pictures(captures.cameras[group[0]], many, settings.bounce_samples, seed + group[0])
+        for k, light in zip(group, found, strict=True):
+            indirect[k] = light
+            retarget(shade, k, captures.load(k)[0], weights(k))
+        done += len(group)
+        progress(done / len(captures))
+
+
+def alike(cameras: Sequence[Camera]) -> list[list[int]]:
+    """Indices of cameras that differ in nothing but their name."""
+    groups: dict[tuple, list[int]] = {}
+    for k, camera in enumerate(cameras):
+        key = (camera.world_from_cam.tobytes(), camera.focal, camera.centre, camera.size)
+        groups.setdefault(key, []).append(k)
+    return list(groups.values())
 
 
 def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> np.ndarray:
