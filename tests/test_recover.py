@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_seam import sphere
 
-from mistyle.core.camera import look_at
+from mistyle.core.camera import by_camera, look_at
 from mistyle.core.capture import in_memory, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import erode, gaussian
@@ -23,7 +23,6 @@ from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
 from mistyle.stages.recover_observe import Gathered, gather
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.recover_texels import alike
 from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
@@ -340,7 +339,7 @@ def test_pictures_of_one_place_share_their_paths(monkeypatch):
 def test_cameras_of_one_place_are_found():
     one, other = look_at([0, 0, 4], fov=30, size=(32, 32)), look_at([0, 1, 4], fov=30, size=(32, 32))
     wider = replace(one, size=(32, 40))
-    assert alike([one, other, replace(one, name="again"), wider]) == [[0, 2], [1], [3]]
+    assert by_camera([one, other, replace(one, name="again"), wider]) == [[0, 2], [1], [3]]
 
 
 def test_averages_stay_on_their_surface(rng):

@@ -159,6 +159,15 @@ def angular_order(cameras: Sequence[Camera]) -> list[int]:
     return order[: len(cameras)]
 
 
+def by_camera(cameras: Sequence[Camera]) -> list[list[int]]:
+    """Indices of cameras that differ in nothing but their name: pictures from one place with one lens."""
+    groups: dict[tuple, list[int]] = {}
+    for k, camera in enumerate(cameras):
+        key = (camera.world_from_cam.tobytes(), camera.focal, camera.centre, camera.size)
+        groups.setdefault(key, []).append(k)
+    return list(groups.values())
+
+
 def px_from_world(
     camera: Camera, points: Float[np.ndarray, "*n 3"]
 ) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:

@@ -102,10 +102,10 @@ def plan_material(job: Any) -> dict[str, Any]:
     check_material(s, sizes, faces)
     averaged = looked_at(s, sizes)
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
-    bounces = 0 if s.recover.solver == "pictures" else s.recover.bounces
-    rounds = 0 if s.recover.solver == "pictures" else s.recover.rounds * (1 + bounces)
+    solves = s.recover.solver != "pictures"
+    rounds = solves * s.recover.rounds * (1 + s.recover.bounces)
     # render/indirect.py's pictures are half as wide, and never wider than 256 pixels.
-    paths = bounces * s.recover.bounce_samples * sum(min(n / 4, 2**16) for n in sizes)
+    paths = solves * s.recover.bounces * s.recover.bounce_samples * sum(min(n / 4, 2**16) for n in sizes)
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
     seconds = {
         "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.camera import Camera
+from mistyle.core.camera import Camera, by_camera
 from mistyle.core.capture import Captures
 from mistyle.core.image import erode
 from mistyle.core.light import DELTA, SOFT
@@ -88,7 +88,7 @@ def gather(
     points = Points(position, texel_frames(traced.mesh, face, position, normal, tangents), sky)
     parts: list[tuple] = []
     views = np.zeros(len(texel), np.int32)
-    for done, group in enumerate(_by_camera(captures.cameras)):
+    for done, group in enumerate(by_camera(captures.cameras)):
         camera = captures.cameras[group[0]]
         beams = [light for k in group for light in captures.lights[k] if isinstance(light, DELTA)]
         seen = look(traced, camera, beams)
@@ -127,15 +127,6 @@ def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
         here[1:] = np.minimum(here[1:], length)
     smallest = sides.min(axis=0).ravel()
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
-
-
-def _by_camera(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Pictures taken from one place with one lens belong together."""
-    groups: dict[tuple, list[int]] = {}
-    for k, camera in enumerate(cameras):
-        key = (camera.world_from_cam.tobytes(), camera.focal, camera.centre, camera.size)
-        groups.setdefault(key, []).append(k)
-    return list(groups.values())
 
 
 def _visible(camera: Camera, seen, position, normal, size, facing: float) -> tuple[np.ndarray, ...]:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.camera import Camera
+from mistyle.core.camera import by_camera
 from mistyle.core.capture import Captures
 from mistyle.core.image import resize
 from mistyle.core.light import SOFT
@@ -190,11 +190,10 @@ def take_off_indirect(
     from mistyle.render.indirect import Indirect, retarget
     from mistyle.render.shade import unpack
 
-    settings, weights = work.settings, trust(work.captures, indirect)
-    maps = unpack(table, work.where.sizes)
+    settings, captures, done = work.settings, work.captures, 0
+    weights, maps = trust(captures, indirect), unpack(table, work.where.sizes)
     scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
-    captures, done = work.captures, 0
-    for group in alike(captures.cameras):
+    for group in by_camera(captures.cameras):
         many = [captures.lights[k] for k in group]
         found = scene.pictures(captures.cameras[group[0]], many, settings.bounce_samples, seed + group[0])
         for k, light in zip(group, found, strict=True):
@@ -202,15 +201,6 @@ def take_off_indirect(
             retarget(shade, k, captures.load(k)[0], weights(k))
         done += len(group)
         progress(done / len(captures))
-
-
-def alike(cameras: Sequence[Camera]) -> list[list[int]]:
-    """Indices of cameras that differ in nothing but their name."""
-    groups: dict[tuple, list[int]] = {}
-    for k, camera in enumerate(cameras):
-        key = (camera.world_from_cam.tobytes(), camera.focal, camera.centre, camera.size)
-        groups.setdefault(key, []).append(k)
-    return list(groups.values())
 
 
 def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> np.ndarray:
