@@ -19,7 +19,7 @@ from helpers import ROOT, data
 
 from mistyle.core import weights
 from mistyle.core.errors import InputRefused, MistyleError
-from mistyle.files import lending, reader_process, wire
+from mistyle.files import bounds, lending, reader_process, wire
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.raw import RawMap, Textures, Tile
 from mistyle.files.read import read_exr, read_json, read_mesh, read_npy, read_picture, read_size, read_toml, read_yaml
@@ -418,6 +418,34 @@ def test_lent_or_through_the_pipe_a_picture_is_the_same(tmp_path, monkeypatch, r
         assert np.array_equal(np.rint(read_picture(tmp_path / "a.png").rgb * 255), pixels)
     assert reader_process._reader.lends == (allowed and sys.platform == "linux")
     reader_process.stop()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="/proc and glibc")
+def test_what_the_child_keeps_for_the_next_file_it_gives_back_when_none_comes(tmp_path):
+    np.save(tmp_path / "a.npy", np.ones(6_000_000))
+    reader_process.stop()
+
+    def held() -> int:
+        return int(Path(f"/proc/{child()}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    for _ in range(2):
+        assert read_npy(tmp_path / "a.npy").sum() == 6_000_000
+    most, deadline = held(), time.monotonic() + 20
+    while held() > most - 40_000_000 and time.monotonic() < deadline:
+        time.sleep(0.1)
+    assert held() < most - 40_000_000
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_parts_of_a_file_are_read_whole_on_any_number_of_threads(tmp_path, monkeypatch, rng, threads):
+    content = rng.bytes(20_000_003)
+    (tmp_path / "a").write_bytes(content)
+    monkeypatch.setattr(bounds, "READ_THREADS", threads)
+    assert bounds.read_part(tmp_path / "a", 5, 19_000_000) == content[5:19_000_005]
+    assert bounds.read_part(tmp_path / "a", 3, 1 << 40) == content[3:]
+    assert bounds.read_part(tmp_path / "a", 30_000_000, 7) == b""
+    with pytest.raises(InputRefused, match="found nothing"):
+        bounds.read_part(tmp_path / "b", 0, 1)
 
 
 def test_memory_that_cannot_be_copied_is_a_refusal_and_the_next_file_gets_a_new_child(tmp_path, monkeypatch, rng):

@@ -1,6 +1,10 @@
 """How many processor cores this process may use, and how many it does."""
 
 import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+
+PIECE = 1 << 23
 
 
 def cores() -> int:
@@ -22,3 +26,19 @@ def use_threads(count: int) -> None:
     torch.set_num_threads(count)
     cv2.setNumThreads(count)
     threadpool_limits(limits=count, user_api="blas")
+
+
+def in_pieces(place: memoryview, fill: Callable[[int, memoryview], None], threads: int) -> None:
+    """`fill(at, piece)` for all of `place`, PIECE bytes at a time, on so many threads. Raises what `fill` raises.
+
+    Most of the time that a large copy takes goes into pages that the system hands out anew, which it does for every
+    thread by itself.
+    """
+    starts = range(0, len(place), PIECE)
+    if threads < 2 or len(starts) < 2:
+        for at in starts:
+            fill(at, place[at : at + PIECE])
+        return
+    with ThreadPoolExecutor(min(len(starts), threads)) as pool:
+        for _ in pool.map(lambda at: fill(at, place[at : at + PIECE]), starts):
+            pass

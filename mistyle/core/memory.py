@@ -29,6 +29,18 @@ DEFAULT = 128 * 1024
 MOST = 2**30
 
 
+def trim() -> None:
+    """Give free blocks back to the system. Does nothing where there is no glibc."""
+    library = _glibc()
+    if library is not None:
+        library.malloc_trim(0)
+
+
+def _glibc() -> Any:
+    library = ctypes.CDLL(None) if sys.platform.startswith("linux") else None
+    return library if all(hasattr(library, name) for name in ("mallopt", "malloc_trim")) else None
+
+
 @contextmanager
 def kept() -> Iterator[None]:
     """Inside, freed blocks stay with the process; what is free at the end goes back to the system.
@@ -36,11 +48,8 @@ def kept() -> Iterator[None]:
     A loop that makes and drops pictures of tens of megabytes otherwise has the kernel hand out, and clear, all their
     pages anew at every turn. Does nothing where there is no glibc.
     """
-    if not sys.platform.startswith("linux"):
-        yield
-        return
-    library = ctypes.CDLL(None)
-    if not all(hasattr(library, name) for name in ("mallopt", "malloc_trim")):
+    library = _glibc()
+    if library is None:
         yield
         return
     library.mallopt(M_MMAP_THRESHOLD, MOST)

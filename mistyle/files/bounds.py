@@ -1,9 +1,13 @@
 """How much a stranger's file may ask for, and from where."""
 
+import errno
 import re
 from pathlib import Path
 from urllib.parse import unquote
 
+import numpy as np
+
+from mistyle.core.cores import in_pieces
 from mistyle.core.errors import InputRefused
 
 USD = (".usd", ".usda", ".usdc", ".usdz")
@@ -16,6 +20,7 @@ MAX_NODES = 200_000
 MAX_PIXELS = 1 << 26  # of one picture: 8192 x 8192
 MAX_TEXTURE_PIXELS = 1 << 27  # of all textures of one mesh
 WORK_TEXTURE = 4096  # a mesh's own textures are halved until no side is longer
+READ_THREADS = 1  # that read one large file; the reader process takes more
 
 
 def refuse(path: Path | str, found: str, expected: str, fix: str) -> InputRefused:
@@ -25,6 +30,37 @@ def refuse(path: Path | str, found: str, expected: str, fix: str) -> InputRefuse
 
 def read_bytes(path: Path, limit: int | None = None, count: int = -1) -> bytes:
     """The whole file (or its first `count` bytes), if it is one and not larger than `limit` (MAX_FILE_BYTES)."""
+    _check_size(path, limit)
+    try:
+        with open(path, "rb") as file:
+            return file.read(count)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+
+
+def read_part(path: Path, start: int, count: int) -> memoryview:
+    """`count` bytes of a file from `start` on, fewer where it ends before; READ_THREADS threads share the work."""
+    left = _check_size(path, None) - start
+    place = np.empty(max(min(count, left), 0), np.uint8).data
+
+    def read(at: int, piece: memoryview) -> None:
+        with open(path, "rb", buffering=0) as file:
+            file.seek(start + at)
+            while piece:
+                done = file.readinto(piece)
+                if not done:
+                    raise OSError(errno.EIO, "it became shorter while it was read")
+                piece = piece[done:]
+
+    try:
+        in_pieces(place, read, READ_THREADS)
+    except OSError as error:
+        raise _unreadable(path, error) from error
+    return place
+
+
+def _check_size(path: Path, limit: int | None) -> int:
+    """The size of a file in bytes, if it is one and not larger than `limit` (MAX_FILE_BYTES)."""
     limit = MAX_FILE_BYTES if limit is None else limit
     if not path.exists():
         raise refuse(path, "nothing", "a file", "Check the path")
@@ -34,13 +70,11 @@ def read_bytes(path: Path, limit: int | None = None, count: int = -1) -> bytes:
     if size > limit:
         found, most = f"{size / 2**20:.0f} MiB", f"at most {limit / 2**20:.0f} MiB"
         raise refuse(path, found, most, "Reduce the file (fewer faces, smaller textures)")
-    try:
-        with open(path, "rb") as file:
-            return file.read(count)
-    except OSError as error:
-        raise refuse(
-            path, f"a file that cannot be read ({error.strerror})", "a readable file", "Check its permissions"
-        ) from error
+    return size
+
+
+def _unreadable(path: Path, error: OSError) -> InputRefused:
+    return refuse(path, f"a file that cannot be read ({error.strerror})", "a readable file", "Check its permissions")
 
 
 def beside(path: Path, reference: str) -> Path:

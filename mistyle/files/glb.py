@@ -5,6 +5,7 @@ goes to new buffer views, what was there keeps its bytes.
 """
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from jaxtyping import Float
 from mistyle.core.errors import InputRefused, MistyleError
 
 Tree = dict[str, Any]
+Buffers = Sequence[bytes | memoryview]
 
 ARRAY_BUFFER, ELEMENT_ARRAY_BUFFER = 34962, 34963
 LINEAR, LINEAR_MIPMAP_LINEAR = 9729, 9987
@@ -25,7 +27,7 @@ _SHAPES |= {"MAT2": (2, 2), "MAT3": (3, 3), "MAT4": (4, 4)}
 _LARGEST = 2**32 - 1
 
 
-def element_bytes(tree: Tree, buffers: list[bytes], index: int) -> np.ndarray:
+def element_bytes(tree: Tree, buffers: Buffers, index: int) -> np.ndarray:
     """An accessor's elements as (count, bytes per element) uint8, without the stride's gaps, sparse values applied."""
     accessor = tree["accessors"][index]
     count, size = accessor["count"], _element_size(accessor)
@@ -47,7 +49,7 @@ def element_bytes(tree: Tree, buffers: list[bytes], index: int) -> np.ndarray:
     return result
 
 
-def values(tree: Tree, buffers: list[bytes], index: int) -> np.ndarray:
+def values(tree: Tree, buffers: Buffers, index: int) -> np.ndarray:
     """An accessor of scalars or vectors as numbers (count, components); normalised integers become floats."""
     accessor = tree["accessors"][index]
     kind = np.dtype(_TYPES[accessor["componentType"]])
@@ -65,7 +67,7 @@ def _element_size(accessor: Tree) -> int:
 
 
 def _elements(
-    tree: Tree, buffers: list[bytes], view: int, offset: int, count: int, size: int, tight: bool = False
+    tree: Tree, buffers: Buffers, view: int, offset: int, count: int, size: int, tight: bool = False
 ) -> np.ndarray:
     table = tree["bufferViews"][view]
     stride = size if tight else table.get("byteStride", size)
@@ -93,10 +95,10 @@ def unit_normals(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 class Builder:
     """A growing glTF: the tree and, for every buffer view, its bytes."""
 
-    def __init__(self, tree: Tree, buffers: list[bytes]) -> None:
+    def __init__(self, tree: Tree, buffers: Buffers) -> None:
         """Take over a tree (it is changed from now on) and the content of its buffers."""
         self.tree = tree
-        self.blobs: list[bytes] = []
+        self.blobs: list[bytes | memoryview] = []
         for view in tree.get("bufferViews", []):
             start = view.get("byteOffset", 0)
             self.blobs.append(buffers[view["buffer"]][start : start + view["byteLength"]])

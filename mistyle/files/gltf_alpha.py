@@ -8,7 +8,7 @@ from jaxtyping import Float
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import beside, read_bytes
-from mistyle.files.glb import Tree, values
+from mistyle.files.glb import Buffers, Tree, values
 from mistyle.files.gltf_check import data_uri
 from mistyle.files.gltf_materials import set_of, texture_transform
 from mistyle.files.read import load_gltf, read_gltf_alpha
@@ -72,13 +72,13 @@ def image_of(tree: Tree, texture: int) -> int | None:
     return source if isinstance(source, int) and 0 <= source < len(images) else None
 
 
-def image_bytes(image: Tree, tree: Tree, buffers: list[bytes], path) -> bytes | None:
+def image_bytes(image: Tree, tree: Tree, buffers: Buffers, path) -> bytes | None:
     """The file of an image, from a buffer view, a data URI or beside `path`; None where it is missing or out of
     bounds."""
     if "bufferView" in image:
         view = tree["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
-        return buffers[view["buffer"]][start : start + view["byteLength"]]
+        return bytes(buffers[view["buffer"]][start : start + view["byteLength"]])
     uri = image.get("uri") or ""
     try:
         return data_uri(uri, path) if uri.startswith("data:") else read_bytes(beside(path, uri))

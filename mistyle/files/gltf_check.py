@@ -12,7 +12,8 @@ import numpy as np
 from pydantic import ValidationError
 
 from mistyle.files import bounds
-from mistyle.files.bounds import MAX_DEPTH, MAX_JSON_BYTES, beside, read_bytes, refuse
+from mistyle.files.bounds import MAX_DEPTH, MAX_JSON_BYTES, beside, read_bytes, read_part, refuse
+from mistyle.files.glb import Buffers
 from mistyle.files.gltf_schema import Buffer, Document
 
 AGAIN = "Export the file again"
@@ -76,7 +77,7 @@ def _check_depth(tree: Any, path: Path) -> None:
     raise refuse(path, f"JSON nested deeper than {MAX_DEPTH} levels", f"at most {MAX_DEPTH}", AGAIN)
 
 
-def load_gltf(path: Path) -> tuple[dict[str, Any], list[bytes]]:
+def load_gltf(path: Path) -> tuple[dict[str, Any], Buffers]:
     """The JSON and the buffers of a .glb or .gltf file, checked: types and ranges of everything that is used later,
     indices, buffer lengths against what accessors and views reach, the node graph (a forest), required extensions.
 
@@ -84,11 +85,11 @@ def load_gltf(path: Path) -> tuple[dict[str, Any], list[bytes]]:
     Raises InputRefused with the reason.
     """
     path = Path(path)
-    data = read_bytes(path)
     binary = None
-    if data[:4] == b"glTF":
-        tree, binary = _unpack(data, path)
+    if read_bytes(path, count=4) == b"glTF":
+        tree, binary = _unpack(path)
     else:
+        data = read_bytes(path)
         if len(data) > MAX_JSON_BYTES:
             raise refuse(
                 path, f"{len(data) >> 20} MiB of JSON", f"at most {MAX_JSON_BYTES >> 20} MiB", "Export it as .glb"
@@ -125,23 +126,21 @@ def _validated(tree: dict[str, Any], path: Path) -> Document:
         raise refuse(path, f"at {where}: {first['msg'][:160]}", "glTF 2.0 as specified", AGAIN) from error
 
 
-def _unpack(data: bytes, path: Path) -> tuple[dict[str, Any], bytes | None]:
-    """JSON and binary chunk of a .glb (glTF 2.0, chapter 4)."""
-    if len(data) < 20:
+def _unpack(path: Path) -> tuple[dict[str, Any], memoryview | None]:
+    """JSON and binary chunk of a .glb (glTF 2.0, chapter 4), each read to where it stays."""
+    size, head = path.stat().st_size, read_part(path, 0, 12)
+    if size < 20:
         raise refuse(
-            path,
-            f"a .glb of {len(data)} bytes",
-            "at least a header and a JSON chunk",
-            "The file is cut off; copy it again",
+            path, f"a .glb of {size} bytes", "at least a header and a JSON chunk", "The file is cut off; copy it again"
         )
-    version, total = struct.unpack_from("<II", data, 4)
+    version, total = struct.unpack_from("<II", head, 4)
     if version != 2:
         raise refuse(path, f".glb version {version}", "version 2", "Convert it to glTF 2.0")
-    if total > len(data):
-        raise refuse(path, f"{len(data)} bytes", f"{total} as its header says", "The file is cut off; copy it again")
+    if total > size:
+        raise refuse(path, f"{size} bytes", f"{total} as its header says", "The file is cut off; copy it again")
     chunks, at = [], 12
     while at + 8 <= total and len(chunks) < 2:
-        length, kind = struct.unpack_from("<I4s", data, at)
+        length, kind = struct.unpack("<I4s", read_part(path, at, 8))
         if at + 8 + length > total:
             raise refuse(
                 path,
@@ -149,21 +148,21 @@ def _unpack(data: bytes, path: Path) -> tuple[dict[str, Any], bytes | None]:
                 f"at most {total - at - 8}",
                 "The file is damaged; copy it again",
             )
-        chunks.append((kind, data[at + 8 : at + 8 + length]))
+        chunks.append((kind, read_part(path, at + 8, length)))
         at += 8 + length
     if not chunks or chunks[0][0] != b"JSON":
         raise refuse(path, "a .glb that does not begin with JSON", "a JSON chunk", AGAIN)
     if len(chunks[0][1]) > MAX_JSON_BYTES:
         raise refuse(path, f"{len(chunks[0][1]) >> 20} MiB of JSON", f"at most {MAX_JSON_BYTES >> 20} MiB", AGAIN)
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == b"BIN\0" else None
-    return parse_json(chunks[0][1], path), binary
+    return parse_json(bytes(chunks[0][1]), path), binary
 
 
-def _buffer(buffer: Buffer, binary: bytes | None, path: Path) -> bytes:
+def _buffer(buffer: Buffer, binary: bytes | memoryview | None, path: Path) -> bytes | memoryview:
     if buffer.uri is None:
         if binary is None:
             raise refuse(path, "a buffer without bytes", "a binary chunk or a file", AGAIN)
-        data = binary
+        data: bytes | memoryview = binary
     elif buffer.uri.startswith("data:"):
         data = data_uri(buffer.uri, path)
     else:
@@ -289,7 +288,7 @@ def _check_reach(d: Document, path: Path) -> None:
                     )
 
 
-def _check_sparse(d: Document, buffers: list[bytes], path: Path) -> None:
+def _check_sparse(d: Document, buffers: Buffers, path: Path) -> None:
     """Sparse values replace elements that exist."""
     for i, accessor in enumerate(d.accessors):
         if accessor.sparse is None:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.files.bounds import beside, read_bytes
+from mistyle.files.glb import Buffers
 from mistyle.files.gltf_check import data_uri
 from mistyle.files.pictures import Budget, texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
@@ -59,7 +60,7 @@ def texture_transform(info: Tree) -> Float[np.ndarray, "3 3"] | None:
 
 
 def read_material(
-    tree: Tree, buffers: list[bytes], path: Path, index: int, other: dict[int, np.ndarray], budget: Budget
+    tree: Tree, buffers: Buffers, path: Path, index: int, other: dict[int, np.ndarray], budget: Budget
 ) -> RawMaterial:
     if index < 0:
         return RawMaterial("material", no_textures, roughness_factor=0.5)
@@ -91,7 +92,7 @@ def read_material(
 
 
 def _load(
-    tree: Tree, buffers: list[bytes], path: Path, index: int, other: dict[int, np.ndarray], budget: Budget, tile: int
+    tree: Tree, buffers: Buffers, path: Path, index: int, other: dict[int, np.ndarray], budget: Budget, tile: int
 ) -> tuple[Maps, tuple[str, ...]]:
     """The material's textures. glTF has no tiles."""
     maps: dict[str, RawMap] = {}
@@ -115,7 +116,7 @@ def _load(
     return maps, tuple(notes)
 
 
-def _image(tree: Tree, buffers: list[bytes], path: Path, texture: int, notes: list[str]) -> tuple[str, bytes] | None:
+def _image(tree: Tree, buffers: Buffers, path: Path, texture: int, notes: list[str]) -> tuple[str, bytes] | None:
     """Where a texture's image comes from, and its bytes; None with a note where it is not there or of a kind that
     cannot be read."""
     images = tree.get("images", [])
@@ -130,7 +131,7 @@ def _image(tree: Tree, buffers: list[bytes], path: Path, texture: int, notes: li
     if "bufferView" in image:
         view = tree["bufferViews"][image["bufferView"]]
         start = view.get("byteOffset", 0)
-        return where, buffers[view["buffer"]][start : start + view["byteLength"]]
+        return where, bytes(buffers[view["buffer"]][start : start + view["byteLength"]])
     uri = image.get("uri") or ""
     if uri.startswith("data:"):
         return where, data_uri(uri, path)

@@ -17,7 +17,7 @@ import numpy as np
 from mistyle import __version__
 from mistyle.core.asset import Asset, Primitive
 from mistyle.core.errors import MistyleError
-from mistyle.files.glb import TRIANGLES, Builder, Tree, values
+from mistyle.files.glb import TRIANGLES, Buffers, Builder, Tree, values
 from mistyle.files.gltf_alpha import image_bytes
 from mistyle.files.gltf_tidy import drop_unused
 from mistyle.files.gltf_vertices import Patch, rewrite, triangles
@@ -57,7 +57,7 @@ def patch_tree(asset: Asset, pictures: Sequence[Pictures], *, name: str, provena
     return builder
 
 
-def _patches(tree: Tree, buffers: list[bytes], asset: Asset) -> dict[int, list[Patch]]:
+def _patches(tree: Tree, buffers: Buffers, asset: Asset) -> dict[int, list[Patch]]:
     """What every node's primitives get, by node, in the winding of the file. texcoord is where the UVs were read."""
     groups: dict[tuple[int, int, int], list[Primitive]] = defaultdict(list)
     for primitive in asset.source.primitives:
@@ -113,7 +113,7 @@ def _wrapped(difference: np.ndarray) -> np.ndarray:
     return difference - np.rint(difference)
 
 
-def _with_texcoords(tree: Tree, buffers: list[bytes], patches: list[Patch]) -> list[Patch]:
+def _with_texcoords(tree: Tree, buffers: Buffers, patches: list[Patch]) -> list[Patch]:
     """Decide per material whether the file's own set serves (modulo 1), or the UVs go to a new one.
 
     All textures of a material name one set, so one primitive that needs a new set takes the others along.
@@ -136,13 +136,13 @@ def _sets(tree: Tree, patch: Patch) -> int:
     return next(n for n in range(len(attributes) + 1) if f"TEXCOORD_{n}" not in attributes)
 
 
-def _file_uvs(tree: Tree, buffers: list[bytes], patch: Patch) -> np.ndarray | None:
+def _file_uvs(tree: Tree, buffers: Buffers, patch: Patch) -> np.ndarray | None:
     attributes = tree["meshes"][patch.mesh]["primitives"][patch.primitive]["attributes"]
     index = attributes.get(f"TEXCOORD_{patch.texcoord}")
     return None if index is None else values(tree, buffers, index)[patch.faces]
 
 
-def _is_kept(tree: Tree, buffers: list[bytes], patch: Patch) -> bool:
+def _is_kept(tree: Tree, buffers: Buffers, patch: Patch) -> bool:
     own = _file_uvs(tree, buffers, patch)
     if own is None:
         return False
@@ -150,7 +150,7 @@ def _is_kept(tree: Tree, buffers: list[bytes], patch: Patch) -> bool:
     return bool(np.abs(_wrapped(difference)).max(initial=0) < SAME_UV)
 
 
-def _repeating(tree: Tree, buffers: list[bytes], patches: list[Patch]) -> set[int]:
+def _repeating(tree: Tree, buffers: Buffers, patches: list[Patch]) -> set[int]:
     """Parts whose texture coordinates in the file leave the unit square."""
     result = set()
     for patch in patches:
@@ -212,7 +212,7 @@ def _divide(builder: Builder, patch: Patch, faces: np.ndarray, materials: dict[t
         primitive |= {"indices": builder.indices(faces[patch.part == first]), "mode": TRIANGLES}
 
 
-def _embed_images(builder: Builder, buffers: list[bytes], asset: Asset) -> list[str]:
+def _embed_images(builder: Builder, buffers: Buffers, asset: Asset) -> list[str]:
     """Put the images that are still needed and lie beside the file into it; the names of those that are not there,
     for which a white pixel stands in (the same as no texture)."""
     missing = []

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from mistyle.core.asset import Primitive
 from mistyle.core.normals import area_vectors
 from mistyle.files.bounds import refuse
-from mistyle.files.glb import values
+from mistyle.files.glb import Buffers, values
 from mistyle.files.gltf_check import AGAIN, load_gltf
 from mistyle.files.gltf_materials import base_set, read_material, wanted_sets
 from mistyle.files.gltf_vertices import triangles
@@ -59,8 +59,9 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
     used = sorted({p.material for p in pieces})
     place = {m: i for i, m in enumerate(used)}
     counts = [len(p.faces) for p in pieces]
-    # 32 bits are enough for all that a file may hold, and all of it goes from one process to another.
-    material = np.repeat(np.array([place[p.material] for p in pieces], np.int32), counts)
+    # All of it goes from one process to another, in as few bytes as hold it.
+    kind = np.min_scalar_type(-len(used))
+    material = np.repeat(np.array([place[p.material] for p in pieces], kind), counts)
     budget = Budget(path)
     materials = tuple(read_material(tree, buffers, path, m, _other_sets(pieces, m), budget) for m in used)
     starts = np.cumsum([0, *counts])
@@ -98,7 +99,7 @@ def _joined(corners: list[Corners], faces: Int[np.ndarray, "f 3"]) -> Corners:
 
 
 def _pieces(
-    tree: Tree, buffers: list[bytes], path: Path, max_faces: int, notes: list[str]
+    tree: Tree, buffers: Buffers, path: Path, max_faces: int, notes: list[str]
 ) -> tuple[list[_Piece], list[np.ndarray]]:
     pieces: list[_Piece] = []
     positions: list[np.ndarray] = []
@@ -128,8 +129,8 @@ def _pieces(
             accessor = primitive["attributes"]["POSITION"]
             if (node, accessor) not in first:
                 first[node, accessor] = vertices
-                local = _vectors(tree, buffers, accessor, 3, path).astype(np.float64)
-                positions.append(local @ matrix[:3, :3].T + matrix[:3, 3])
+                local = _vectors(tree, buffers, accessor, 3, path)
+                positions.append(_placed(local, matrix))
                 check_positions(positions[-1], path)
                 vertices += len(local)
                 too_many(vertices, 3 * max_faces, path, "vertices")
@@ -137,6 +138,13 @@ def _pieces(
                 _piece(tree, buffers, path, (node, entry["mesh"], number), primitive, index, matrix, first, notes)
             )
     return pieces, positions
+
+
+def _placed(local: Float[np.ndarray, "v 3"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "v 3"]:
+    """Positions in world space; where that is the node's own, the file's float32 as they are: half of the bytes."""
+    if local.dtype == np.float32 and np.array_equal(matrix, np.eye(4)):
+        return local
+    return local.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
 
 
 def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -> _Piece:
@@ -149,13 +157,14 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
         index = index[:, [0, 2, 1]]
     if "COLOR_0" in attributes:
         notes.append("Vertex colours were not read.")
-    local = _vectors(tree, buffers, attributes["POSITION"], 3, path).astype(np.float64)
     if "NORMAL" in attributes:
         vectors = _vectors(tree, buffers, attributes["NORMAL"], 3, path).astype(np.float64)
-        vectors = vectors @ np.linalg.pinv(matrix[:3, :3])  # the inverse transpose, for row vectors
+        if not np.array_equal(matrix[:3, :3], np.eye(3)):
+            vectors = vectors @ np.linalg.pinv(matrix[:3, :3])  # the inverse transpose, for row vectors
         corner = index
     else:
         notes.append("A primitive has no normals: its faces are shaded flat, as glTF demands.")
+        local = _vectors(tree, buffers, attributes["POSITION"], 3, path).astype(np.float64)
         vectors = area_vectors(local @ matrix[:3, :3].T, index)
         corner = np.repeat(np.arange(len(index), dtype=np.int32)[:, None], 3, axis=1)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
@@ -189,7 +198,7 @@ def _check_counts(tree: Tree, primitive: Tree, max_faces: int, path: Path) -> No
         too_many(tree["accessors"][primitive["indices"]]["count"], 3 * max_faces + 2, path, "indices")
 
 
-def _indices(tree: Tree, buffers: list[bytes], primitive: Tree, path: Path) -> Int[np.ndarray, "f 3"] | None:
+def _indices(tree: Tree, buffers: Buffers, primitive: Tree, path: Path) -> Int[np.ndarray, "f 3"] | None:
     if "indices" in primitive:
         accessor = tree["accessors"][primitive["indices"]]
         if accessor["type"] != "SCALAR" or accessor["componentType"] not in (5121, 5123, 5125):
@@ -197,14 +206,14 @@ def _indices(tree: Tree, buffers: list[bytes], primitive: Tree, path: Path) -> I
     return triangles(tree, buffers, primitive)
 
 
-def _vectors(tree: Tree, buffers: list[bytes], accessor: int, width: int, path: Path) -> np.ndarray:
+def _vectors(tree: Tree, buffers: Buffers, accessor: int, width: int, path: Path) -> np.ndarray:
     """A float (or quantised) vector attribute as numbers."""
     if tree["accessors"][accessor]["type"] != f"VEC{width}":
         raise refuse(path, f"accessor {accessor} of {tree['accessors'][accessor]['type']}", f"VEC{width}", AGAIN)
     return values(tree, buffers, accessor)
 
 
-def _texcoords(tree: Tree, buffers: list[bytes], accessor: int, path: Path) -> Float[np.ndarray, "n 2"]:
+def _texcoords(tree: Tree, buffers: Buffers, accessor: int, path: Path) -> Float[np.ndarray, "n 2"]:
     uv = _vectors(tree, buffers, accessor, 2, path).astype(np.float32)
     return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
 
@@ -258,7 +267,7 @@ def world_matrices(tree: Tree) -> list[Float[np.ndarray, "4 4"]]:
 
 
 def _bind_pose(
-    tree: Tree, buffers: list[bytes], skin: int, world: list[np.ndarray], path: Path
+    tree: Tree, buffers: Buffers, skin: int, world: list[np.ndarray], path: Path
 ) -> Float[np.ndarray, "4 4"]:
     """Where the root joint puts the mesh: its world matrix times its inverse bind matrix. The same as skinning where
     the file's rest pose is the bind pose; else the bind pose, upright and at the right size all the same."""

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.rows import corner_rows, distinct
 from mistyle.core.tangents import mikktspace
-from mistyle.files.glb import FAN, STRIP, TRIANGLES, Builder, Tree, element_bytes, unit_normals, values
+from mistyle.files.glb import FAN, STRIP, TRIANGLES, Buffers, Builder, Tree, element_bytes, unit_normals, values
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Patch:
     fresh: tuple[int, ...] = ()
 
 
-def triangles(tree: Tree, buffers: list[bytes], primitive: Tree) -> Int[np.ndarray, "f 3"] | None:
+def triangles(tree: Tree, buffers: Buffers, primitive: Tree) -> Int[np.ndarray, "f 3"] | None:
     """The triangles of a primitive, strips and fans spelled out as the specification orders them; None for others."""
     mode = primitive.get("mode", TRIANGLES)
     if mode not in (TRIANGLES, STRIP, FAN):
@@ -48,7 +48,7 @@ def triangles(tree: Tree, buffers: list[bytes], primitive: Tree) -> Int[np.ndarr
     return np.stack([flat[i + 1], flat[i + 2], np.broadcast_to(flat[:1], i.shape)], axis=1)
 
 
-def rewrite(builder: Builder, buffers: list[bytes], patches: Sequence[Patch]) -> dict[tuple[int, int], np.ndarray]:
+def rewrite(builder: Builder, buffers: Buffers, patches: Sequence[Patch]) -> dict[tuple[int, int], np.ndarray]:
     """Give the painted primitives TANGENT, and where they need them NORMAL and fresh TEXCOORD sets.
 
     Returns the new vertex numbers of each patch's faces by (mesh, primitive). A file without normals is shaded flat
@@ -124,7 +124,7 @@ def _rewrite_family(family: "_Family") -> dict[tuple[int, int], np.ndarray]:
     return family.point_at(vertex, count, bool(len(origin)))
 
 
-def _corner_values(tree: Tree, buffers: list[bytes], pool: Sequence[Patch], attributes: Tree) -> dict[str, np.ndarray]:
+def _corner_values(tree: Tree, buffers: Buffers, pool: Sequence[Patch], attributes: Tree) -> dict[str, np.ndarray]:
     """What is new at every corner of the pool, in file terms: name to (corners, 2..4) float32."""
     positions = values(tree, buffers, attributes["POSITION"]).astype(np.float32)
     with_normals = "NORMAL" in attributes
@@ -185,7 +185,7 @@ def _filler(name: str, count: int) -> np.ndarray:
 class _Family:
     """All primitives of a mesh that use the same vertices, painted or not, and the accessors that only they use."""
 
-    def __init__(self, builder: Builder, buffers: list[bytes], number: int, members, pool: list[Patch], owners) -> None:
+    def __init__(self, builder: Builder, buffers: Buffers, number: int, members, pool: list[Patch], owners) -> None:
         self.builder, self.buffers, self.number, self.pool, self.owners = builder, buffers, number, pool, owners
         self.primitives = [builder.tree["meshes"][m]["primitives"][n] for m, n in members]
         self.made: dict[int, int] = {}

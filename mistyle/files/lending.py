@@ -7,14 +7,13 @@ shared between the two could be altered after it was checked.
 
 import ctypes
 import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from itertools import pairwise
 from typing import Any
+
+from mistyle.core.cores import in_pieces
 
 SIGN = b"mistyle reader  "
 LENT = 1 << 18  # arrays of so many bytes are lent, smaller ones are sent
-PIECE = 1 << 23
 MAX_THREADS = 4
 
 
@@ -49,17 +48,7 @@ def can_read(process: int, address: int) -> bool:
 def copy_from(process: int, address: int, into: memoryview) -> None:
     """Fill `into` with the bytes at `address` of that process, on several threads where they are many. Raises OSError
     where that is not allowed or there are none."""
-    if not into:
-        return
-    ends = [*range(0, len(into), PIECE), len(into)]
-    places = [(process, address + a, into[a:b]) for a, b in pairwise(ends)]
-    if len(places) < 2:
-        _copy(process, address, into)
-        return
-    # Most of the time goes into pages that the system hands out, which it does for every thread by itself.
-    with ThreadPoolExecutor(min(len(places), MAX_THREADS)) as pool:
-        for _ in pool.map(_copy, *zip(*places, strict=True)):
-            pass
+    in_pieces(into, lambda at, piece: _copy(process, address + at, piece), MAX_THREADS)
 
 
 def _copy(process: int, address: int, into: memoryview) -> None:

@@ -118,9 +118,9 @@ def check_indices(index: Int[np.ndarray, "..."], count: int, path: Path, what: s
 
 def check_positions(positions: Float[np.ndarray, "v 3"], path: Path) -> None:
     """Refuse positions that are not finite or beyond MAX_COORDINATE."""
-    finite = np.isfinite(positions).all(axis=1)
+    finite = np.isfinite(positions)
     if not finite.all():
-        found = f"a position that is not finite (vertex {int(np.flatnonzero(~finite)[0])})"
+        found = f"a position that is not finite (vertex {int(np.flatnonzero(~finite.all(axis=1))[0])})"
         raise refuse(path, found, "finite numbers", "Repair the mesh or export it again")
     if np.abs(positions).max(initial=0) > MAX_COORDINATE:
         found = f"coordinates up to {np.abs(positions).max():.1e}"

@@ -112,7 +112,8 @@ class Corners:
 
 @dataclass(frozen=True)
 class Indexed:
-    """A Raw on its way from one process to another: its normals and uvs, several times smaller, beside it."""
+    """A Raw on its way from one process to another: its normals and uvs, several times smaller, beside it, and its
+    positions perhaps as float32."""
 
     raw: Raw
     normals: Corners
@@ -120,7 +121,12 @@ class Indexed:
 
     def finished(self) -> Raw:
         """As everything after the border has it."""
-        return replace(self.raw, normals=self.normals.finished(), uvs=None if self.uvs is None else self.uvs.finished())
+        return replace(
+            self.raw,
+            positions=self.raw.positions.astype(np.float64, copy=False),
+            normals=self.normals.finished(),
+            uvs=None if self.uvs is None else self.uvs.finished(),
+        )
 
 
 def spelled(found: Raw | Indexed) -> Raw:

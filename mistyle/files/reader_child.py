@@ -7,6 +7,7 @@ only the audit hook holds. Interrupts and requests to end are the parent's busin
 """
 
 import os
+import select
 import signal
 import sys
 from importlib import import_module
@@ -16,7 +17,8 @@ import numpy as np
 
 from mistyle.core.cores import cores
 from mistyle.core.errors import MistyleError
-from mistyle.files import lending, wire
+from mistyle.core.memory import trim
+from mistyle.files import bounds, lending, wire
 
 try:
     import resource
@@ -29,6 +31,7 @@ FORBIDDEN = (
     *("socket.__new__", "socket.connect", "socket.bind", "os.putenv", "os.kill", "signal.pthread_kill"),
 )
 MAX_THREADS = 4
+IDLE = 1.0  # seconds after which no further file is expected soon
 WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC | os.O_APPEND
 
 
@@ -46,11 +49,14 @@ def main() -> None:
 
     # Several make up for the way of the pixels to the job's process.
     OpenEXR.set_global_thread_count(min(cores(), MAX_THREADS))
+    bounds.READ_THREADS = min(cores(), MAX_THREADS)
     base = _confine()
     shown = np.frombuffer(lending.SIGN, np.uint8)  # where the parent tries whether it can read this process's memory
     wire.send(lambda data: os.write(answers, data), None, sign=shown.ctypes.data)
     os.dup2(nothing, 2)
     while True:
+        if resource is not None and not select.select([requests], [], [], IDLE)[0]:
+            trim()
         try:
             arguments, request = wire.receive(requests.readinto)
         except wire.BrokenMessage:

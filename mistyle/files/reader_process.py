@@ -37,6 +37,7 @@ WHOLE = "a file that can be decoded"
 # Modules of mistyle/files whose bounds (MAX_..., WORK_...) hold in the child as they stand here.
 BOUNDED = ("bounds", "pictures", "hdr", "obj_read", "polygons", "gltf_schema", "gltf_check", "colmap", "cameras")
 PIPE_BYTES = 1 << 20
+KEPT = 256 << 20  # bytes that the child may hold for the next file
 F_SETPIPE_SZ = 1031  # fcntl.h of Linux; Python has the name only since 3.10 and only there
 
 _lock = threading.Lock()
@@ -54,6 +55,9 @@ class Reader:
         paths = os.pathsep.join(p for p in (str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")) if p)
         # One thread each and few heaps: all of them reserve address space, which is limited.
         alone = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+        # glibc: blocks that one file gave back serve the next, which else waits for the system to clear new pages. What
+        # is free goes back when no file follows (reader_child.py).
+        alone |= {"MALLOC_MMAP_THRESHOLD_": str(KEPT // 4), "MALLOC_TRIM_THRESHOLD_": str(KEPT)}
         try:
             self.process = subprocess.Popen(
                 [sys.executable, "-B", "-m", "mistyle.files.reader_child"],

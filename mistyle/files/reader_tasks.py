@@ -20,6 +20,7 @@ from jaxtyping import Float
 from mistyle.core.errors import InputRefused
 from mistyle.files import hdr, pictures
 from mistyle.files.bounds import MAX_DEPTH, MAX_SETTINGS_BYTES, MAX_VALUES, read_bytes, refuse
+from mistyle.files.glb import Buffers
 from mistyle.files.gltf_check import load_gltf, read_json
 from mistyle.files.raw import Indexed, Raw, RawMaterial, Textures, Tile
 from mistyle.files.wire import Json
@@ -132,7 +133,7 @@ def json(path: Path) -> Json:
     return Json(read_json(path))
 
 
-def gltf(path: Path) -> tuple[Json, list[bytes]]:
+def gltf(path: Path) -> tuple[Json, Buffers]:
     tree, buffers = load_gltf(path)
     return Json(tree), buffers
 
