@@ -22,6 +22,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust, usable, without
 from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.recover_smooth import smoothed
 from mistyle.stages.recover_texels import Found, Work, solve_level
 
 __all__ = ["RecoverSettings", "Recovered", "recover"]
@@ -95,7 +96,9 @@ def recover(
     )  # fmt: skip
     trace: dict[str, list[float]] = {}
     found = solve_level(work, shade, start, indirect, seed, trace, lambda done: progress(0.5 * done))
-    table, before = found.table, None
+    if found.solved and settings.smooth:
+        found = replace(found, table=smoothed(found.table, found.noise, where, settings.roughness_floor))
+    table = found.table
     if settings.solver != "texels" and settings.iterations:
         before = total_loss(shade, table, settings)
         with stopping.at_checkpoints():
@@ -105,6 +108,8 @@ def recover(
         if not after < before:
             notes.append(f"The steps on whole pictures were undone: the loss went from {before:.3g} to {after:.3g}.")
             table = found.table
+        elif found.solved and settings.smooth:
+            table = smoothed(table, found.noise, where, settings.roughness_floor)
     if settings.polish:
         # Its pictures keep the light between surfaces.
         table = polished(work, whole, table, seed, trace, lambda d: progress(0.95 + 0.05 * d))

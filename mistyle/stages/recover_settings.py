@@ -45,6 +45,11 @@ class RecoverSettings(BaseModel):
         gt=0,
         description="standard deviation between a texel and its neighbours' mean; of tilts at most, less where smooth",
     )
+    smooth: bool = Field(
+        default=True,
+        description="tilt and roughness as smooth as the surface around them is measured to be, as far as the pictures "
+        "leave them open; a sharp edge that few pictures show is rounded",
+    )
     noise: float = Field(default=0.002, gt=0, le=1, description="standard deviation of a pixel in the dark")
     relative: float = Field(default=0.01, ge=0, le=1, description="standard deviation of a pixel relative to its value")
     facing: float = Field(

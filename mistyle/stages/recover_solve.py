@@ -33,6 +33,8 @@ WIDE = 24  # steps over which it is measured how much the surface's tilt varies
 LEAST_SEEN = 3  # times that a texel was seen, for what was seen to decide anything
 AROUND = 8  # steps over which it is measured how badly observations fit
 KNOWN = 0.05  # what a texel may leave open of its tilt and still say how much tilts vary at all
+BEST_FIT = 0.1  # of what `noise` and `relative` say, as variance: observations are never thought better than that
+MARGIN = 1.5  # on the variance of what observations tell, since they err together
 LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean of its neighbours
 
 Table = Float[np.ndarray, "a 8"]
@@ -105,16 +107,24 @@ def neighbourhood(
     full[0, gathered.texel], full[1, gathered.texel] = values * weight, weight
     for k, size in enumerate(where.sizes):
         part = full[:, where.offsets[k] : where.offsets[k + 1]].reshape(2, *size, channels)
-        right, below = where.right[k][..., None], where.below[k][..., None]
-        for _ in range(steps):
-            total = 2 * part
-            total[:, :, :-1] += part[:, :, 1:] * right
-            total[:, :, 1:] += part[:, :, :-1] * right
-            total[:, :-1] += part[:, 1:] * below
-            total[:, 1:] += part[:, :-1] * below
-            part[...] = total * np.float32(0.2)
+        part[...] = diffused(part, where.right[k][..., None], where.below[k][..., None], steps)
     summed, weights = full[:, gathered.texel]
     return np.where(weights > 1e-12, summed / np.maximum(weights, 1e-12), values).astype(np.float32)
+
+
+def diffused(
+    part: Float[np.ndarray, "n h w c"], right: np.ndarray, below: np.ndarray, steps: int
+) -> Float[np.ndarray, "n h w c"]:
+    """Sums that every texel shares with the four around it, step by step; `right` and `below` (h w 1): which of them
+    are of its island. What would go to others is lost, so sums mean something only beside sums of weights."""
+    for _ in range(steps):
+        total = 2 * part
+        total[:, :, :-1] += part[:, :, 1:] * right
+        total[:, :, 1:] += part[:, :, :-1] * right
+        total[:, :-1] += part[:, 1:] * below
+        total[:, 1:] += part[:, :-1] * below
+        part = total * np.float32(0.2)
+    return part
 
 
 def first_solve(
@@ -290,6 +300,17 @@ def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.nda
     each = np.where(spare[:, None] > 0, np.stack([solution.cost, spare], axis=1), 0).astype(np.float32)
     cost, count = neighbourhood(each, np.ones_like(each), gathered, where, AROUND).T
     return np.where(count > 1e-6, cost / np.maximum(count, 1e-6), 0).astype(np.float32)
+
+
+def told(solution: Solution, gathered: Gathered, where: Atlas) -> Values:
+    """Standard deviations of what a texel's observations tell, by how well they and those of the texels around it fit:
+    where they fit far better than `noise` and `relative` say, they also tell more; infinite where there are none."""
+    around = misfit(solution, gathered, where)
+    own = np.where(gathered.seen >= OFTEN, solution.cost / np.maximum(gathered.seen - len(UNKNOWNS) / 3, 1), 0)
+    scale = MARGIN * np.maximum(np.maximum(around, own) / 3, BEST_FIT)
+    found = likelihood(solution)[0] * np.sqrt(scale)[:, None]
+    found[gathered.seen == 0] = np.inf
+    return found
 
 
 def decided(solution: Solution, gathered: Gathered) -> Float[np.ndarray, " t"]:

@@ -40,12 +40,14 @@ class Work:
 class Found:
     """What the texels found out by themselves, at the atlas's resolution; not `solved`: only where they start.
 
-    `decided` is the share of a texel's tilt, 0..1, that its own pictures decide and not its neighbours.
+    `decided` is the share of a texel's tilt, 0..1, that its own pictures decide and not its neighbours; `noise` the
+    standard deviations of what they tell, infinite where there are none.
     """
 
     table: Float[np.ndarray, "a 8"]
     spread: Float[np.ndarray, "a 7"]
     decided: Float[np.ndarray, " a"]
+    noise: Float[np.ndarray, "a 7"]
     seen: Int[np.ndarray, " a"]
     views: Int[np.ndarray, " a"]
     solved: bool
@@ -84,10 +86,10 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
                 for a, b, size in zip(where.offsets[:-1], where.offsets[1:], where.sizes, strict=True)
             ]
         )
-        for values in (found.table, found.spread, found.decided, found.seen, found.views)
+        for values in (found.table, found.spread, found.decided, found.noise, found.seen, found.views)
     ]
-    table, spread, decided, seen, views = large
-    return Found(table.astype(np.float32), spread, decided[:, 0], seen[:, 0], views[:, 0], found.solved)
+    table, spread, decided, noise, seen, views = large
+    return Found(table.astype(np.float32), spread, decided[:, 0], noise, seen[:, 0], views[:, 0], found.solved)
 
 
 def _enlarged(values: np.ndarray, by: int) -> np.ndarray:
@@ -126,7 +128,7 @@ def solve_texels(
     first = mean.copy() if start is None else pack(start)[gathered.texel, :7].copy()
     mean[:, 6] = first[:, 6]
     spread = np.tile(np.array(solving.PRIOR_SPREAD, np.float32), (len(mean), 1))
-    decided = np.ones(len(mean), np.float32)
+    decided, noise = np.ones(len(mean), np.float32), np.full(mean.shape, np.inf, np.float32)
     values, solved = first, settings.solver != "pictures" and len(gathered.observations.rgb) > 0
     if solved:
         problem = Problem(
@@ -159,7 +161,7 @@ def solve_texels(
             trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
             heard(1.0)
         values = solution.values
-        decided = solving.decided(solution, gathered)
+        decided, noise = solving.decided(solution, gathered), solving.told(solution, gathered, where)
         spread = solution.spread * solving.inflation(solution, gathered)
         bad = np.asarray(~np.isfinite(values).all(axis=1))
         if bad.any():
@@ -172,6 +174,7 @@ def solve_texels(
         solving.spread_out(values, gathered, where),
         solving.placed(spread, gathered, where, np.array(solving.PRIOR_SPREAD, np.float32)),
         solving.placed(decided, gathered, where, 1),
+        solving.placed(noise, gathered, where, np.inf),
         solving.placed(gathered.seen, gathered, where, 0),
         solving.placed(gathered.views, gathered, where, 0),
         solved,

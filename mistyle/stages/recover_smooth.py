@@ -1,0 +1,117 @@
+"""The neighbours' last word: tilt and roughness as smooth as the surface is, as far as the pictures leave them open.
+
+A texel's own pictures tell its tilt and roughness with an error that is known roughly (`Found.noise`). What texels in
+a row differ by from a straight line through their neighbours has a variance that is the surface's own plus that of
+these errors; so the surface's own is measured around every texel (empirical Bayes), and the most likely values under
+both minimise
+
+    sum (x - found)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance
+
+over rows and columns of each island (a Gaussian field of second differences: Rue and Held, Gaussian Markov Random
+Fields, 2005, section 3.4). Where the surface is rough the variance is large, and what was found stays.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.stages.recover_solve import Atlas, diffused, fill
+
+# Channels of the table that are smoothed, and the least standard deviation of their second differences.
+LEAST = {3: 0.006, 4: 0.006, 5: 0.008}
+MOST = 0.3  # of that standard deviation
+OPEN = 0.3  # what is taken for left open where nothing was seen
+SURE = 0.01  # standard deviation of a second difference below which one tells as much as another
+AROUND = 24  # steps over which the variance is measured
+STEPS, CLOSE = 300, 1e-4  # of conjugate gradients, at most; and what they may leave of the residual
+
+Grid = Float[np.ndarray, "h w"]
+Links = Bool[np.ndarray, "h v"]  # which texels have a neighbour on either side in their row
+Both = tuple[np.ndarray, np.ndarray]  # along rows, and along columns (transposed)
+
+
+def smoothed(
+    table: Float[np.ndarray, "a 8"],
+    noise: Float[np.ndarray, "a 7"],
+    where: Atlas,
+    floor: float,
+    progress: Callable[[float], None] = lambda done: None,
+) -> Float[np.ndarray, "a 8"]:
+    """`table` with tilt and roughness (not below `floor`) as above; uncovered texels move as the nearest covered one.
+
+    `noise`: standard deviations of what the pictures tell, infinite where they tell nothing. Cannot see edges: a crease
+    in a smooth surround is rounded by as much as its texels are uncertain.
+    """
+    moved = np.zeros_like(table)
+    for k, size in enumerate(where.sizes):
+        part = slice(where.offsets[k], where.offsets[k + 1])
+        rows = where.right[k][:, :-1] & where.right[k][:, 1:]
+        columns = where.below[k][:-1] & where.below[k][1:]
+        links = (rows, columns.T)
+        for c, least in LEAST.items():
+            found = table[part, c].reshape(size)
+            error = np.minimum(noise[part, c].reshape(size), OPEN)
+            variance = _variance(found, error, links, where.right[k], where.below[k], least)
+            moved[part, c] = (_likely(found, error, variance, links) - found).ravel()
+        progress((k + 1) / len(where.sizes))
+    result = table + fill(moved, where)
+    result[:, 5] = np.clip(result[:, 5], floor, 1)
+    return result
+
+
+def _second(x: Grid, links: Links) -> Float[np.ndarray, "h v"]:
+    """What each texel of a row differs by from the mean of its two neighbours, with its sign turned; 0 without them."""
+    return np.where(links, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
+
+
+def _back(second: Float[np.ndarray, "h v"], width: int) -> Grid:
+    """The transpose of `_second`; what has no neighbours is 0 already."""
+    result = np.zeros((len(second), width), np.float32)
+    result[:, :-2] += 0.5 * second
+    result[:, 2:] += 0.5 * second
+    result[:, 1:-1] -= second
+    return result
+
+
+def _variance(found: Grid, error: Grid, links: Both, right: np.ndarray, below: np.ndarray, least: float) -> Both:
+    """Of second differences along rows and columns (transposed), the surface's own around every texel."""
+    total = np.zeros((2, *found.shape, 1), np.float32)
+    for turned, link in enumerate(links):
+        x, e = (found.T, error.T) if turned else (found, error)
+        noise = 0.25 * (e[:, :-2] ** 2 + e[:, 2:] ** 2) + e[:, 1:-1] ** 2
+        weight = np.where(link, 1 / (noise + SURE**2) ** 2, 0)
+        own = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
+        own[0][:, 1:-1] += weight * (_second(x, link) ** 2 - noise)
+        own[1][:, 1:-1] += weight
+    summed, weights = diffused(total, right[..., None], below[..., None], AROUND)[..., 0]
+    around = np.clip(summed / np.maximum(weights, 1e-12), least**2, MOST**2)
+    return around[:, 1:-1], around.T[:, 1:-1]
+
+
+def _likely(found: Grid, error: Grid, variance: Both, links: Both) -> Float[np.ndarray, "h w"]:
+    from scipy.sparse.linalg import LinearOperator, cg
+
+    sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32)
+    firm = [np.where(link, 1 / v, 0).astype(np.float32) for v, link in zip(variance, links, strict=True)]
+    height, width = found.shape
+
+    def apply(flat: np.ndarray) -> np.ndarray:
+        x = flat.reshape(found.shape).astype(np.float32)
+        result = sure * x + _back(firm[0] * _second(x, links[0]), width)
+        return (result + _back(firm[1] * _second(x.T, links[1]), height).T).ravel()
+
+    def weights(link: np.ndarray, size: int) -> Grid:
+        middle = np.zeros((len(link), size), np.float32)
+        middle[:, 1:-1] += link
+        middle[:, :-2] += 0.25 * link
+        middle[:, 2:] += 0.25 * link
+        return middle
+
+    diagonal = (sure + weights(firm[0], width) + weights(firm[1], height).T).ravel()
+    count = found.size
+    matrix = LinearOperator((count, count), matvec=apply, dtype=np.float32)
+    inverse = LinearOperator((count, count), matvec=lambda x: x / diagonal, dtype=np.float32)
+    # From what was found: the change is solved for, so that little of it is lost to rounding.
+    change, _ = cg(matrix, (sure * found).ravel() - apply(found), rtol=CLOSE, maxiter=STEPS, M=inverse)
+    return found + change.reshape(found.shape)
