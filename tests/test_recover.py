@@ -217,6 +217,38 @@ def test_misfit_is_of_those_that_could_contradict_themselves():
     assert (solving.misfit(solution, gathered, where) == 0).all()
 
 
+def test_what_observations_tell_is_measured_by_how_well_they_fit():
+    """Unseen: nothing. Fitting as `noise` promises: that, with the margin. Far better: as BEST_FIT. Worse: less."""
+    from mistyle.stages import recover_solve as solving
+
+    seen = np.where(np.arange(SIDE * SIDE) < SIDE, 0, 9)
+    solution, gathered, where = found_texels(np.full((SIDE * SIDE, 7), 0.5, np.float32), 0.01, 0.6, seen)
+    for cost, wanted in ((0, solving.BEST_FIT), (1, 1), (4, 4)):
+        solution.cost[:] = np.where(seen > 0, 3 * cost * (9 - 7 / 3), 0)
+        told = solving.told(solution, gathered, where)
+        assert (told[seen == 0] == solving.NOTHING).all()
+        np.testing.assert_allclose(told[seen > 0] / 0.01, np.sqrt(solving.MARGIN * wanted), rtol=0.02)
+
+
+@pytest.mark.parametrize("solver", ["both", "texels"])
+def test_noisy_pictures_make_smoother_maps_where_that_is_asked(world, rng, solver):
+    """Ten pictures with noise of 5 %: tilts and roughness are nearer to the truth by a tenth at least."""
+    mesh, maps, texels, captures = world
+    some = subset(captures, range(0, 30, 3))
+    pictures = [some.load(k) for k in range(len(some))]
+    noisy = [(rgb * (1 + 0.05 * rng.standard_normal(rgb.shape))).astype(np.float32) for rgb, _ in pictures]
+    doubtful = replace(some, load=lambda k: (noisy[k], pictures[k][1]))
+    settings = QUICK.model_copy(update={"solver": solver, "iterations": 60, "relative": 0.05})
+    found = []
+    for smooth in (False, True):
+        result = recover(mesh, [texels], doubtful, settings.model_copy(update={"smooth": smooth}), 0)
+        angle, roughness, _ = errors(result.maps[0], maps, texels.covered & (result.views[0] >= 3))
+        found.append((float(np.mean(angle)), float(np.mean(roughness**2))))
+    (angle, roughness), (smooth_angle, smooth_roughness) = found
+    assert smooth_angle < 0.9 * angle
+    assert smooth_roughness < 0.9 * roughness
+
+
 def test_the_same_bytes_again_and_after_an_interruption(world):
     """Two runs agree; one that stops after a checkpoint and goes on agrees with both."""
     mesh, _, texels, captures = world
@@ -239,8 +271,8 @@ def test_an_atlas_too_fine_is_solved_at_a_coarser_level(world):
     found = recover(mesh, [texels], captures, settings, 0)
     assert any("2 times coarser" in note for note in found.notes)
     assert found.maps[0].albedo.shape == (SIZE, SIZE, 3) and found.seen[0].shape == (SIZE, SIZE)
-    _, _, albedo = errors(found.maps[0], maps, texels.covered & (found.seen[0] >= 3))
-    assert -10 * np.log10((albedo**2).mean()) > 20
+    angle, _, albedo = errors(found.maps[0], maps, texels.covered & (found.seen[0] >= 3))
+    assert -10 * np.log10((albedo**2).mean()) > 20 and np.isfinite(angle).all()
 
 
 def test_from_pictures_alone_and_from_a_start(world):

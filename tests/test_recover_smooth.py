@@ -79,7 +79,7 @@ def test_what_nothing_was_seen_of_follows_the_slope_around_it(rng: np.random.Gen
     table, error = tables(wrong, error)
     result = smoothing.smoothed(table, error, atlas(np.ones(true.shape, bool)), FLOOR)[:, 3].reshape(true.shape)
     hole = np.isinf(error[:, 3].reshape(true.shape))
-    assert np.abs(result - true)[hole].mean() < 0.1 * np.abs(true)[hole].mean()
+    assert np.abs(result - true)[hole].mean() < 0.15 * np.abs(true)[hole].mean()
     assert np.abs(result - true)[~hole].max() < 0.01
 
 

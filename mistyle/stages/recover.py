@@ -3,6 +3,7 @@
 First texel by texel (`recover_solve.py`): with geometry, cameras and lights known nothing has to be rendered to
 solve for one texel, and Levenberg-Marquardt gets in twenty steps where gradient descent on pictures does not get in
 hundreds. Then on whole pictures, by Adam through `render/shade.py`, which models pixels and interpolation exactly.
+Before and after that neighbours have a word about what pictures leave open (`recover_smooth.py`).
 Light that reaches the surface by way of other surfaces can be estimated with the maps found and taken off the
 pictures (`bounces`). Lights and cameras are taken as they are given; a common factor of light and albedo cannot be
 told apart, so albedo is as right as the lights' units are.

@@ -11,8 +11,6 @@ over rows and columns of each island (a Gaussian field of second differences: Ru
 Fields, 2005, section 3.4). Where the surface is rough the variance is large, and what was found stays.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -36,12 +34,11 @@ def smoothed(
     noise: Float[np.ndarray, "a 7"],
     where: Atlas,
     floor: float,
-    progress: Callable[[float], None] = lambda done: None,
 ) -> Float[np.ndarray, "a 8"]:
     """`table` with tilt and roughness (not below `floor`) as above; uncovered texels move as the nearest covered one.
 
-    `noise`: standard deviations of what the pictures tell, infinite where they tell nothing. Cannot see edges: a crease
-    in a smooth surround is rounded by as much as its texels are uncertain.
+    `noise`: standard deviations of what the pictures tell, OPEN and above where they tell nothing. Cannot see edges: a
+    crease in a smooth surround is rounded by as much as its texels are uncertain.
     """
     moved = np.zeros_like(table)
     for k, size in enumerate(where.sizes):
@@ -52,9 +49,8 @@ def smoothed(
         for c, least in LEAST.items():
             found = table[part, c].reshape(size)
             error = np.minimum(noise[part, c].reshape(size), OPEN)
-            variance = _variance(found, error, links, where.right[k], where.below[k], least)
+            error, variance = _measured(found, error, links, where.right[k], where.below[k], least)
             moved[part, c] = (_likely(found, error, variance, links) - found).ravel()
-        progress((k + 1) / len(where.sizes))
     result = table + fill(moved, where)
     result[:, 5] = np.clip(result[:, 5], floor, 1)
     return result
@@ -74,19 +70,27 @@ def _back(second: Float[np.ndarray, "h v"], width: int) -> Grid:
     return result
 
 
-def _variance(found: Grid, error: Grid, links: Both, right: np.ndarray, below: np.ndarray, least: float) -> Both:
-    """Of second differences along rows and columns (transposed), the surface's own around every texel."""
-    total = np.zeros((2, *found.shape, 1), np.float32)
+def _measured(
+    found: Grid, error: Grid, links: Both, right: np.ndarray, below: np.ndarray, least: float
+) -> tuple[Grid, Both]:
+    """Of what second differences vary by around every texel: how much is error, and the surface's own variance of those
+    along rows and columns (transposed).
+
+    Where values vary less than their errors say, the errors are shared with the neighbours (the solver's prior made
+    them so): then only as much error is taken as the variation shows, since no smoothing could remove the rest.
+    """
+    total = np.zeros((3, *found.shape, 1), np.float32)
     for turned, link in enumerate(links):
         x, e = (found.T, error.T) if turned else (found, error)
         noise = 0.25 * (e[:, :-2] ** 2 + e[:, 2:] ** 2) + e[:, 1:-1] ** 2
         weight = np.where(link, 1 / (noise + SURE**2) ** 2, 0)
-        own = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
-        own[0][:, 1:-1] += weight * (_second(x, link) ** 2 - noise)
-        own[1][:, 1:-1] += weight
-    summed, weights = diffused(total, right[..., None], below[..., None], AROUND)[..., 0]
-    around = np.clip(summed / np.maximum(weights, 1e-12), least**2, MOST**2)
-    return around[:, 1:-1], around.T[:, 1:-1]
+        sums = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
+        for own, value in zip(sums, (_second(x, link) ** 2, noise, 1), strict=True):
+            own[:, 1:-1] += weight * value
+    varies, noise, weights = diffused(total, right[..., None], below[..., None], AROUND)[..., 0]
+    own = np.clip((varies - noise) / np.maximum(weights, 1e-12), least**2, MOST**2)
+    share = np.clip(varies / np.maximum(noise, 1e-12), 0, 1)
+    return error * np.sqrt(share), (own[:, 1:-1], own.T[:, 1:-1])
 
 
 def _likely(found: Grid, error: Grid, variance: Both, links: Both) -> Float[np.ndarray, "h w"]:

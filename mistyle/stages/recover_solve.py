@@ -35,6 +35,7 @@ AROUND = 8  # steps over which it is measured how badly observations fit
 KNOWN = 0.05  # what a texel may leave open of its tilt and still say how much tilts vary at all
 BEST_FIT = 0.1  # of what `noise` and `relative` say, as variance: observations are never thought better than that
 MARGIN = 1.5  # on the variance of what observations tell, since they err together
+NOTHING = 1.0  # standard deviation of what nothing was told about
 LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean of its neighbours
 
 Table = Float[np.ndarray, "a 8"]
@@ -304,13 +305,13 @@ def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.nda
 
 def told(solution: Solution, gathered: Gathered, where: Atlas) -> Values:
     """Standard deviations of what a texel's observations tell, by how well they and those of the texels around it fit:
-    where they fit far better than `noise` and `relative` say, they also tell more; infinite where there are none."""
+    where they fit far better than `noise` and `relative` say, they also tell more; NOTHING where there are none."""
     around = misfit(solution, gathered, where)
     own = np.where(gathered.seen >= OFTEN, solution.cost / np.maximum(gathered.seen - len(UNKNOWNS) / 3, 1), 0)
     scale = MARGIN * np.maximum(np.maximum(around, own) / 3, BEST_FIT)
-    found = likelihood(solution)[0] * np.sqrt(scale)[:, None]
-    found[gathered.seen == 0] = np.inf
-    return found
+    found = np.minimum(likelihood(solution)[0] * np.sqrt(scale)[:, None], NOTHING)
+    found[gathered.seen == 0] = NOTHING
+    return found.astype(np.float32)
 
 
 def decided(solution: Solution, gathered: Gathered) -> Float[np.ndarray, " t"]:

@@ -41,7 +41,7 @@ class Found:
     """What the texels found out by themselves, at the atlas's resolution; not `solved`: only where they start.
 
     `decided` is the share of a texel's tilt, 0..1, that its own pictures decide and not its neighbours; `noise` the
-    standard deviations of what they tell, infinite where there are none.
+    standard deviations of what they tell, `recover_solve.NOTHING` where there are none.
     """
 
     table: Float[np.ndarray, "a 8"]
@@ -128,7 +128,7 @@ def solve_texels(
     first = mean.copy() if start is None else pack(start)[gathered.texel, :7].copy()
     mean[:, 6] = first[:, 6]
     spread = np.tile(np.array(solving.PRIOR_SPREAD, np.float32), (len(mean), 1))
-    decided, noise = np.ones(len(mean), np.float32), np.full(mean.shape, np.inf, np.float32)
+    decided, noise = np.ones(len(mean), np.float32), np.full(mean.shape, solving.NOTHING, np.float32)
     values, solved = first, settings.solver != "pictures" and len(gathered.observations.rgb) > 0
     if solved:
         problem = Problem(
@@ -174,7 +174,7 @@ def solve_texels(
         solving.spread_out(values, gathered, where),
         solving.placed(spread, gathered, where, np.array(solving.PRIOR_SPREAD, np.float32)),
         solving.placed(decided, gathered, where, 1),
-        solving.placed(noise, gathered, where, np.inf),
+        solving.placed(noise, gathered, where, solving.NOTHING),
         solving.placed(gathered.seen, gathered, where, 0),
         solving.placed(gathered.views, gathered, where, 0),
         solved,
