@@ -230,23 +230,23 @@ def test_what_observations_tell_is_measured_by_how_well_they_fit():
         np.testing.assert_allclose(told[seen > 0] / 0.01, np.sqrt(solving.MARGIN * wanted), rtol=0.02)
 
 
-@pytest.mark.parametrize("solver", ["both", "texels"])
-def test_noisy_pictures_make_smoother_maps_where_that_is_asked(world, rng, solver):
-    """Ten pictures with noise of 5 %: tilts and roughness are nearer to the truth by a tenth at least."""
+@pytest.mark.parametrize(("step", "noise", "most"), [(1, 0.03, 0.95), (3, 0.05, 1.02)])
+def test_neighbours_help_against_noise_and_where_little_is_known_do_no_harm(world, rng, step, noise, most):
+    """Thirty noisy pictures: normals and roughness gain. Ten, where most texels have little but their neighbours."""
     mesh, maps, texels, captures = world
-    some = subset(captures, range(0, 30, 3))
+    some = subset(captures, range(0, 30, step))
     pictures = [some.load(k) for k in range(len(some))]
-    noisy = [(rgb * (1 + 0.05 * rng.standard_normal(rgb.shape))).astype(np.float32) for rgb, _ in pictures]
+    noisy = [(rgb * (1 + noise * rng.standard_normal(rgb.shape))).astype(np.float32) for rgb, _ in pictures]
     doubtful = replace(some, load=lambda k: (noisy[k], pictures[k][1]))
-    settings = QUICK.model_copy(update={"solver": solver, "iterations": 60, "relative": 0.05})
+    settings = QUICK.model_copy(update={"iterations": 60, "relative": noise})
     found = []
     for smooth in (False, True):
         result = recover(mesh, [texels], doubtful, settings.model_copy(update={"smooth": smooth}), 0)
         angle, roughness, _ = errors(result.maps[0], maps, texels.covered & (result.views[0] >= 3))
         found.append((float(np.mean(angle)), float(np.mean(roughness**2))))
     (angle, roughness), (smooth_angle, smooth_roughness) = found
-    assert smooth_angle < 0.9 * angle
-    assert smooth_roughness < 0.9 * roughness
+    assert smooth_angle < most * angle
+    assert smooth_roughness < most * roughness
 
 
 def test_the_same_bytes_again_and_after_an_interruption(world):
