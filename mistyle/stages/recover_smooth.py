@@ -113,9 +113,16 @@ def _likely(found: Grid, error: Grid, variance: Both, links: Both) -> Float[np.n
         return middle
 
     diagonal = (sure + weights(firm[0], width) + weights(firm[1], height).T).ravel()
-    count = found.size
-    matrix = LinearOperator((count, count), matvec=apply, dtype=np.float32)
-    inverse = LinearOperator((count, count), matvec=lambda x: x / diagonal, dtype=np.float32)
+
+    class Matrix(LinearOperator):
+        def _matvec(self, x: np.ndarray) -> np.ndarray:
+            return apply(x)
+
+    class Inverse(LinearOperator):  # of the diagonal
+        def _matvec(self, x: np.ndarray) -> np.ndarray:
+            return x / diagonal
+
+    matrix, inverse = (kind(np.float32, (found.size, found.size)) for kind in (Matrix, Inverse))
     # From what was found: the change is solved for, so that little of it is lost to rounding.
     change, _ = cg(matrix, (sure * found).ravel() - apply(found), rtol=CLOSE, maxiter=STEPS, M=inverse)
     return found + change.reshape(found.shape)
