@@ -51,7 +51,7 @@ def ebsynth(program: Path) -> Callable[[Scene], Row]:
                 drawn = read_picture(folder / "out.png").rgb
                 pictures.append(np.where(view.mask[..., None], drawn, 0).astype(np.float32))
         outside = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * 1024 / 1e9
-        return Row(pictures, seconds, outside_gb=outside)
+        return Row(pictures, seconds, held_gb=outside)
 
     return work
 

@@ -58,7 +58,7 @@ def test_the_peer_gets_guides_of_the_paintings_size_and_its_pictures_are_masked(
         np.testing.assert_allclose(
             picture[view.mask], np.broadcast_to([0.2, 0.4, 0.6], (view.mask.sum(), 3)), atol=3e-3
         )
-    assert row.seconds > 0 and row.outside_gb > 0.001 and row.albedo is None
+    assert row.seconds > 0 and row.held_gb > 0.001 and row.albedo is None
 
 
 def test_source_guides_are_the_synthesis_own(rng):

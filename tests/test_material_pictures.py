@@ -106,13 +106,13 @@ def test_a_picture_that_is_not_kept_is_the_same_picture(rng, memory):
 def test_rays_beside_the_mesh_are_not_traced():
     """Samples of a mesh that fills little of the picture are those of a crop about it, wherever the mesh is."""
     traced, camera = draw.tracer(torus()), look_at((0.5, 3, 14), fov=40, size=(60, 90))
-    down, across = hits._window(traced.mesh, camera)
+    down, across = hits.window(traced.mesh, camera)
     seen = draw.gbuffer(traced, camera).mask
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     assert down.start <= rows[0] <= down.start + 3 and down.stop - 4 <= rows[-1] < down.stop
     assert across.start <= columns[0] <= across.start + 3 and across.stop - 4 <= columns[-1] < across.stop
     near = look_at((0.5, 0.3, 0.2), fov=120, size=(60, 90))
-    assert hits._window(traced.mesh, near) == (slice(0, 60), slice(0, 90))
+    assert hits.window(traced.mesh, near) == (slice(0, 60), slice(0, 90))
     away = look_at((0, 0, 9), target=(0, 0, 20), fov=20, size=(60, 90))
     mask = np.ones(away.size, bool)
     assert not list(hits.collect(traced, away, (KEY,), mask, SIZES))

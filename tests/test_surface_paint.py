@@ -309,7 +309,7 @@ def test_a_coat_of_two_pictures_with_a_protected_part(painted_sheet, tmp_path):
     half, strip = np.zeros((32, 32, 3), np.float32), np.zeros((32, 32, 3), np.float32)
     half[:, :16], strip[:6] = 1, 1
     red, blue = np.zeros((40, 50, 3), np.float32), np.zeros((40, 50, 3), np.float32)
-    red[..., 0], blue[..., 2] = np.tile(np.repeat([0.4, 0.9], 5), 5), np.tile(np.repeat([0.4, 0.9], 5), 5)
+    red[..., 0], blue[..., 2] = np.tile(np.repeat([0.5, 0.9], 5), 5), np.tile(np.repeat([0.5, 0.9], 5), 5)
     for name, picture in (("half", half), ("strip", strip), ("blue", blue)):
         write_png(tmp_path / f"{name}.png", picture)
     chosen = {"slots": [f"{tmp_path / 'half.png'}={tmp_path / 'blue.png'}"], "protect": tmp_path / "strip.png"}
@@ -334,7 +334,7 @@ def test_unlit_views_agree_with_plain_fetches(painted_sheet, rng):
     maps = replace(maps, albedo=cv2.GaussianBlur(rng.random((32, 32, 3)).astype(np.float32), (0, 0), 1.5))
     camera = rig(RigSettings(resolution=48))[2]
     traced = tracer(mesh)
-    (rgb, coverage) = unlit(traced, [maps], [camera])[0]
+    (rgb, coverage) = unlit(traced, [maps], [camera], fine=2)[0]
     hits = gbuffer(traced, resized(camera, (96, 96)))
     fine = np.zeros((96, 96, 3), np.float32)
     uv = hits.uv[hits.mask]

@@ -12,7 +12,7 @@ from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.raster import fragments
 from mistyle.stages import texels as atlas
-from mistyle.stages.texels import pad, pad_maps, rasterise, start_maps
+from mistyle.stages.texels import pad, pad_maps, rasterise, sharpen_in_place, start_maps
 
 # Float32 positions of size 1, interpolated from three corners.
 ROUNDING = 2e-6
@@ -198,6 +198,36 @@ def test_padding_takes_the_nearest_texel_and_leaves_covered_ones(rng):
     assert np.array_equal(padded[25:28, 5:55], np.broadcast_to(values[24, 5:55], (3, 50)))
     assert np.array_equal(padded[29:32, 5:55], np.broadcast_to(values[32, 5:55], (3, 50)))
     assert np.array_equal(pad(values, texels, 0), values)
+
+
+def test_sharpening_stays_within_islands_and_knows_no_bands(rng, monkeypatch):
+    texels = islands_at(60, (5, 25, 5, 55), (25, 55, 5, 55), (0, 3, 0, 60))
+    was = (0.4 + 0.2 * rng.random((60, 60, 3))).astype(np.float32)
+    once = was.copy()
+    sharpen_in_place(once, texels)
+    assert np.array_equal(once[~texels.covered], was[~texels.covered])
+    # Where all neighbours are of the island: less a twelfth of the second differences.
+    second = was[1:-1, :-2] + was[1:-1, 2:] + was[:-2, 1:-1] + was[2:, 1:-1] - 4 * was[1:-1, 1:-1]
+    inner = np.s_[6:24, 6:54]
+    np.testing.assert_allclose(once[inner], was[inner] - second[5:23, 5:53] / 12, atol=1e-6)
+    # A border of islands is no edge: what lies beyond does not count.
+    other = was.copy()
+    other[25:] = rng.random((35, 60, 3))
+    sharpen_in_place(other, texels)
+    assert np.array_equal(other[:25], once[:25]) and not np.array_equal(other[25:55], once[25:55])
+    # Rows of any number at a time, and one channel.
+    monkeypatch.setattr(
+        atlas, "bands", lambda height, width: (slice(k, min(k + 7, height)) for k in range(0, height, 7))
+    )
+    again = was.copy()
+    sharpen_in_place(again, texels)
+    assert np.array_equal(again, once)
+    grey = was[..., 0].copy()
+    sharpen_in_place(grey, texels)
+    assert np.array_equal(grey, once[..., 0])
+    step = np.where(np.arange(60) < 30, 0.0, 1.0).astype(np.float32) * np.ones((60, 1), np.float32)
+    sharpen_in_place(step, texels)
+    assert step.min() == 0 and step.max() == 1
 
 
 MATERIAL = Material("m", None, None, None, None, np.array([0.2, 0.4, 0.6], np.float32), 0.7, 0.3)

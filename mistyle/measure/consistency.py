@@ -43,7 +43,7 @@ def warp_rmse(views: Sequence[View], pictures: Sequence[Float[np.ndarray, "h w 3
     """Root mean square difference (all channels, sRGB) of a picture and another carried over into its view.
 
     Pooled over the pixels of all pairs; pairs that share less than LEAST_SHARED of the view are left out, NaN where
-    none is left. Bilinear lookups of fine strokes leave some error even in one painting of the surface.
+    none is left. What one view shows finer than the other leaves some error even in one painting of the surface.
     """
     squares, count = 0.0, 0
     for i, j in chosen:
@@ -60,7 +60,7 @@ def round_trip_rmse(
     """What carrying over alone costs, to be read beside `warp_rmse`: the same difference between a picture and itself
     carried into the other view and back.
 
-    No view contradicts itself, so this is the blur of bilinear lookups and of a place seen at another scale. The
+    No view contradicts itself, so this is the error of two lookups and the blur of a place seen at another scale. The
     other view's own pixels are antialiased when they are drawn, and these are not, so it is no strict bound.
     """
     squares, count = 0.0, 0
@@ -68,7 +68,7 @@ def round_trip_rmse(
         there, seen = carried_over(views[j], views[i], pictures[i])
         back, both = carried_over(views[i], views[j], np.concatenate([there, seen[..., None]], axis=-1))
         if both.sum() >= max(LEAST_SHARED * views[i].mask.sum(), 1):
-            both &= back[..., 3] > 0.999  # nothing of what the other view does not show was mixed in
+            both &= np.abs(back[..., 3] - 1) < 1e-3  # nothing of what the other view does not show was mixed in
             squares += float(((back[both][:, :3] - pictures[i][both]) ** 2).sum(dtype=np.float64))
             count += 3 * int(both.sum())
     return float(np.sqrt(squares / count)) if count else float("nan")

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.camera import pixel_centres, px_from_world, world_from_px
-from mistyle.core.image import bilinear, dilate, erode, gaussian, linear_from_srgb, resize
+from mistyle.core.image import dilate, erode, gaussian, linear_from_srgb, resize
 from mistyle.core.view import View
 
 XYZ_FROM_LINEAR = np.array(
@@ -232,8 +232,8 @@ def warp_error(
 ) -> float:
     """View-to-view error: mean |Delta L| + |Delta a| + |Delta b| (Lab / 100, times 100) of points both views see.
 
-    Every pixel of `view` is lifted by its depth, looked up (bilinear) in `other`, and counted where the depths agree
-    and both are three pixels inside their masks. Bilinear lookups of fine strokes leave a few units.
+    Every pixel of `view` is lifted by its depth, looked up (bicubic) in `other`, and counted where the depths agree
+    and both are three pixels inside their masks. What one view shows finer than the other leaves a few units.
     """
     carried, both = carried_over(view, other, other_picture)
     if not both.any():
@@ -244,17 +244,23 @@ def warp_error(
 def carried_over(
     view: View, other: View, other_picture: Float[np.ndarray, "h w c"]
 ) -> tuple[Float[np.ndarray, "h w c"], Bool[np.ndarray, "h w"]]:
-    """The other view's picture as `view` sees it, and which of the view's pixels both see, as in `warp_error`; zero
-    elsewhere."""
+    """The other view's picture, of up to four channels, as `view` sees it, and which of the view's pixels both see, as
+    in `warp_error`; zero elsewhere.
+
+    Bicubic: bilinear lookups blur, and would count every sharp picture as one that contradicts itself. They overshoot
+    at edges, and OpenCV rounds their places to 1/32 pixel.
+    """
     chosen = erode(view.mask, 3)
     px = pixel_centres(view.camera.size)[chosen]
     points = world_from_px(view.camera, px, view.depth[chosen].astype(np.float64))
     there, z = px_from_world(other.camera, points)
     seen = _sees(other, there, z)
-    both = np.zeros(chosen.shape, bool)
-    both[chosen] = seen
-    carried = np.zeros((*chosen.shape, other_picture.shape[2]), np.float32)
-    carried[both] = bilinear(other_picture.astype(np.float32), there[seen])
+    both, places = np.zeros(chosen.shape, bool), np.zeros((2, *chosen.shape), np.float32)
+    both[chosen], places[:, chosen] = seen, there.T - 0.5
+    picture = np.ascontiguousarray(other_picture, np.float32)
+    carried = cv2.remap(picture, places[0], places[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    carried = carried.reshape(*chosen.shape, picture.shape[2])
+    carried[~both] = 0
     return carried, both
 
 

@@ -181,7 +181,7 @@ def collect(
     if any(isinstance(light, SceneLights) for light in lights):
         raise ValueError(f"{camera.name}: light that only a scene file describes cannot be collected")
     soft = soft or sky(lights)
-    down, across = _window(traced.mesh, camera)
+    down, across = window(traced.mesh, camera)
     near = np.zeros_like(mask)
     near[down, across] = mask[down, across]
     rows = max(1, BLOCK_RAYS // (max(1, across.stop - across.start) * subsamples))
@@ -192,7 +192,7 @@ def collect(
             yield block
 
 
-def _window(mesh: Mesh, camera: Camera) -> tuple[slice, slice]:
+def window(mesh: Mesh, camera: Camera) -> tuple[slice, slice]:
     """Rows and columns of the picture that the mesh can be seen in: all, where some of it is behind the camera."""
     px, depth = px_from_world(camera, mesh.positions.astype(np.float64))
     if len(px) == 0 or not (depth > 0).all():

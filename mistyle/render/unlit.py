@@ -13,6 +13,7 @@ from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device
 from mistyle.render.draw import Tracer, tracer
+from mistyle.render.hits import window
 
 Picture = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
 
@@ -21,7 +22,7 @@ def unlit(
     mesh: Mesh | Tracer,
     maps: Sequence[Maps],
     cameras: Sequence[Camera],
-    fine: int = 2,
+    fine: int = 3,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Picture]:
     """Linear rgb, premultiplied, and coverage of every camera: the mean over `fine` x `fine` exact rays a pixel.
@@ -71,9 +72,14 @@ def unlit(
 
 
 def _picture(mi: Any, dr: Any, traced: Tracer, camera: Camera, fine: int, fetch: Callable[[Any], Any]) -> Picture:
-    height, width = camera.size
+    down, across = window(traced.mesh, camera)
+    height, width = down.stop - down.start, across.stop - across.start
+    rgb, share = np.zeros((*camera.size, 3), np.float32), np.zeros(camera.size, np.float32)
+    if height * width == 0:
+        return rgb, share
     # Opaque: as literals every camera would compile a kernel of its own.
-    numbers = [*camera.position, *camera.world_from_cam[:3, :3].reshape(-1), *np.ravel(camera.centre), camera.focal]
+    corner = np.ravel(camera.centre) - (across.start, down.start)
+    numbers = [*camera.position, *camera.world_from_cam[:3, :3].reshape(-1), *corner, camera.focal]
     value = [dr.opaque(mi.Float, float(v)) for v in numbers]
     origin, turn, centre, focal = mi.Point3f(*value[:3]), value[3:12], value[12:14], value[14]
     i = dr.arange(mi.UInt32, height * width)
@@ -91,5 +97,6 @@ def _picture(mi: Any, dr: Any, traced: Tracer, camera: Camera, fine: int, fetch:
     state = (mi.UInt32(0), dr.zeros(mi.Color3f, height * width), dr.zeros(mi.Float, height * width))
     _, colour, coverage = dr.while_loop(state, lambda k, *rest: k < fine * fine, body)
     count = np.float32(fine * fine)
-    rgb = np.array(dr.ravel(colour)).reshape(height, width, 3) / count
-    return rgb, np.array(coverage).reshape(height, width) / count
+    rgb[down, across] = np.array(dr.ravel(colour)).reshape(height, width, 3) / count
+    share[down, across] = np.array(coverage).reshape(height, width) / count
+    return rgb, share

@@ -123,7 +123,7 @@ def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Setti
     """
     from mistyle.backends.embedded import surface_colour
     from mistyle.stages.coat import painted_mask, protected
-    from mistyle.stages.texels import pad_in_place
+    from mistyle.stages.texels import pad_in_place, sharpen_in_place
 
     maps = []
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
@@ -133,6 +133,7 @@ def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Setti
                 here = at[rows]
                 place = texels.position[rows][here], texels.normal[rows][here]
                 albedo[rows][here] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
+        sharpen_in_place(albedo, texels)
         pad_in_place([albedo], texels, settings.atlas.padding)
         coated = replace(start, albedo=albedo, known=texels.covered)
         if settings.coat.protect is not None:
@@ -195,7 +196,7 @@ def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) 
     return read_views(run.stage("stylized", ["bake", "views"], [], write))
 
 
-def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report, fine: int = 2) -> list[View]:
+def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report, fine: int = 3) -> list[View]:
     """Each view with its rgb replaced by the albedo seen there, `fine` x `fine` samples a pixel, premultiplied."""
     from mistyle.render.unlit import unlit
 

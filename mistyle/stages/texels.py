@@ -254,6 +254,31 @@ def pad(values: Float[np.ndarray, "h w *c"], texels: Texels, padding: int) -> Fl
     return result
 
 
+def sharpen_in_place(values: Float[np.ndarray, "h w *c"], texels: Texels) -> None:
+    """Make bilinear lookups of covered texels, of values 0..1, come nearest to what the texels were sampled from.
+
+    As `surface.style.for_bilinear`, along both axes: less a twelfth of the second difference, within an island. For
+    values that were looked up texel by texel; what is averaged over texels needs none of it.
+    """
+    height, width = texels.covered.shape
+    above = None  # the last row of the band before, as it was
+    for rows in bands(height, width):
+        wide = slice(max(rows.start - 1, 0), min(rows.stop + 1, height))
+        was = values[wide].reshape(wide.stop - wide.start, width, -1).copy()
+        if above is not None:
+            was[0] = above
+        above = was[rows.stop - 1 - wide.start].copy()
+        island, sharp = texels.island[wide], was.copy()
+        for one, other in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+            joined = (island[one] == island[other])[..., None]
+            step = np.where(joined, was[other] - was[one], 0) / 12
+            sharp[one] -= step
+            sharp[other] += step
+        here = texels.covered[rows]
+        inner = sharp[rows.start - wide.start : rows.stop - wide.start]
+        values[rows][here] = np.clip(inner[here], 0, 1).reshape(-1, *values.shape[2:])
+
+
 def pad_maps(maps: Maps, texels: Texels, padding: int) -> Maps:
     """`pad` for albedo, normal, roughness and metallic, with one search for the nearest texels."""
     arrays = {name: memory.copied(getattr(maps, name)) for name in ("albedo", "normal", "roughness", "metallic")}

@@ -13,7 +13,7 @@ from mistyle.surface import relief as reliefs
 from mistyle.surface.samples import Level, as_points, lifted, workers
 
 CHUNK = 1 << 19
-BLEND = 0.5  # of the Gaussian between the nearest samples, in spacings
+BLEND = 0.25  # of the Gaussian between the nearest samples, in spacings
 NEAREST = 3
 
 
@@ -97,7 +97,7 @@ def colour(
     """Encoded sRGB (0..1) at surface points with unit normals.
 
     The three samples nearest in [p, 3 h n] each continue their piece of the painting to the point; their colours are
-    blended by exp(-(d^2 - d0^2) / (2 (0.5 h)^2)). `footprint` is the distance between neighbouring queries (a texel, a
+    blended by exp(-(d^2 - d0^2) / (2 (0.25 h)^2)). `footprint` is the distance between neighbouring queries (a texel, a
     pixel) in working units: the painting is blurred to it, 0 leaves it sharp. A point off the surface gets the colour
     of the nearest sample's tangent plane.
     """
@@ -146,6 +146,7 @@ def looked_up(
     pixel = solution.spacing / max(solution.scale)  # one pixel of the painting on the surface
     if footprint > pixel:
         picture = style.blurred(picture, 0.4 * footprint / pixel)
+    picture = style.for_bilinear(picture)
     across = np.cross(solution.tangent, solution.normals)
     per_unit = np.array(solution.scale) / solution.spacing
     canvas = on_canvas(

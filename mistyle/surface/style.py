@@ -120,6 +120,17 @@ def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
     return cv2.GaussianBlur(picture, (0, 0), max(sigma, 0.3), borderType=cv2.BORDER_REPLICATE)
 
 
+def for_bilinear(picture: np.ndarray) -> np.ndarray:
+    """The picture whose bilinear lookups come nearest to `picture` itself, which they would blur; edges repeated.
+
+    The quasi-interpolation [-1/12, 7/6, -1/12] of Condat, Blu and Unser (Beyond interpolation: optimal reconstruction
+    by quasi-interpolation, ICIP 2005): lookups at any place between pixels blur by a variance of 1/6 on average. Edges
+    overshoot, by a twelfth of their step along each axis.
+    """
+    kernel = np.array([-1, 14, -1]) / 12
+    return cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
+
+
 def grain(lightness: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
     """Direction of strokes from the structure tensor: (cos 2t, sin 2t) times its anisotropy."""
     base = blurred(lightness, 0.8)
