@@ -12,6 +12,7 @@ from mistyle.core.camera import (
     RigSettings,
     in_frame,
     look_at,
+    of_corners,
     orbit,
     pixel_centres,
     px_from_world,
@@ -92,6 +93,13 @@ def test_a_zoomed_camera_sees_the_window(angle, point, x, y, width) -> None:
     near, near_depth = px_from_world(zoom(camera, x, y, width, (100, 100)), world)
     assert near == pytest.approx((px - [x, y]) * (100 / width), abs=1e-6)
     assert near_depth == depth
+
+
+def test_corners_are_half_a_pixel_further_out() -> None:
+    camera, world = camera_at(30, 20), np.array([0.3, -0.2, 0.6])
+    corners = of_corners(camera)
+    assert corners.size == (camera.size[0] + 1, camera.size[1] + 1)
+    assert px_from_world(corners, world)[0] == pytest.approx(px_from_world(camera, world)[0] + 0.5)
 
 
 def test_resizing_keeps_the_picture_and_refuses_another_shape() -> None:

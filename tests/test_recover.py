@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from test_seam import sphere
 
-from mistyle.core.camera import by_camera, look_at
+from mistyle.core.camera import by_camera, look_at, of_corners, pixel_centres, world_from_px
 from mistyle.core.capture import in_memory, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import erode, gaussian
@@ -18,6 +18,8 @@ from mistyle.render import hits as collecting
 from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
 from mistyle.render.indirect import MOST, Indirect, averaged, enlarged
+from mistyle.render.texel_views import Look
+from mistyle.stages import recover_observe
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
@@ -442,6 +444,67 @@ def test_observations_are_the_pictures_at_the_texels(world):
     assert len(wrong) > 5 * len(gathered.texel)
     assert np.median(np.abs(wrong)) < 0.01 * np.abs(gathered.observations.rgb).max()
     assert (gathered.views <= gathered.seen).all() and (gathered.views * 3 >= gathered.seen).all()
+
+
+def test_a_look_up_moves_to_the_pixels_that_count():
+    """Between four pixels at (0.2, 0.3): by hand, for each set of those that count."""
+    ramp = np.add.outer(10.0 * np.arange(8), np.arange(8))[..., None].repeat(3, axis=-1).astype(np.float32)
+    right_dark = np.ones((8, 8), np.int8)
+    right_dark[:, 4] = 0
+    edge = np.where(np.arange(8) == 3, -1, 1).astype(np.int8) * np.ones((8, 1), np.int8)
+
+    def seen(own, lit=(), usable=None, soft=True, move=1.5):
+        one = np.array([3 * 8 + 3]), np.float32([0.2]), np.float32([0.3]), np.array(own, bool)[:, None]
+        usable = np.ones((8, 8), bool) if usable is None else usable
+        return recover_observe._observe(ramp, usable, lit, soft, np.array([7]), *one, move)
+
+    whole, left, top = (1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0)
+    for own, place in (
+        (whole, (0.2, 0.3)), (left, (0, 0.3)), (top, (0.2, 0)), ((1, 1, 1, 0), (0, 0.3)), ((1, 0, 0, 1), (0, 0)),
+        ((0, 1, 0, 1), (1, 0.3)), ((0, 0, 1, 1), (0.2, 1)), ((0, 0, 0, 1), (1, 1)),
+    ):  # fmt: skip
+        near, rgb, bits, chosen, u, v, share = seen(own)
+        assert (near.item(), bits.item(), chosen.item()) == (7, 0, 0)
+        np.testing.assert_allclose((u[0], v[0]), place, atol=1e-6)
+        np.testing.assert_allclose(rgb[0], 33 + place[0] + 10 * place[1], rtol=1e-6)
+        moved = (place[0] - 0.2) ** 2 + (place[1] - 0.3) ** 2
+        np.testing.assert_allclose(share[0], 1 / (1 + recover_observe.MOVED * moved), rtol=1e-6)
+        assert len(seen(own, move=0.0)[0]) == (own == whole)
+    assert len(seen((0, 0, 0, 0))[0]) == 0
+    # Pixels in another light than the nearest are as good as none; so are those with a shadow's edge in them.
+    assert seen(whole, [right_dark])[4].item() == 0 and seen(whole, [right_dark])[2].item() == 1
+    assert seen(whole, [edge, right_dark])[4].item() == 1 and seen(whole, [edge, right_dark])[2].item() == 1
+    assert len(seen(whole, [0 * right_dark], soft=False)[0]) == 0 and len(seen(whole, [0 * right_dark])[0]) == 1
+    # What the picture's own mask leaves out, and its neighbours, is not looked at.
+    hidden = np.ones((8, 8), bool)
+    hidden[3, 1] = False
+    assert seen(whole, usable=hidden)[4].item() == pytest.approx(0.2)
+    hidden[3, 2] = False
+    assert seen(whole, usable=hidden)[4].item() == 1
+
+
+def test_pixels_with_an_edge_in_them_do_not_count():
+    """A plane with a step in depth through column 4: pixels whose corners lie on both sides are mixtures."""
+    camera = look_at([0, 0, 4], [0, 0, 0], fov=30, size=(8, 8), name="front")
+
+    def plane(at, step):
+        depth = np.where(pixel_centres(at.size)[..., 0] > step, 4.5, 4.0).ravel()
+        position = world_from_px(at, pixel_centres(at.size).reshape(-1, 2), depth).reshape(*at.size, 3)
+        normal = np.broadcast_to(np.float32([0, 0, 1]), position.shape)
+        lit = pixel_centres(at.size)[..., 1] > step - 2
+        return Look(position.astype(np.float32), normal, np.ones(at.size, bool), (lit,))
+
+    # The picture of the corners begins half a pixel further out.
+    seen, corners = plane(camera, 4.3), plane(of_corners(camera), 4.8)
+    wanted = np.ones((8, 8), bool)
+    wanted[:, 4] = False
+    assert np.array_equal(recover_observe._pure(camera, seen, corners), wanted)
+    steady = recover_observe._steady(seen.lit[0], corners.lit[0])
+    assert np.array_equal(steady, np.repeat([0, 0, -1, 1, 1, 1, 1, 1], 8).reshape(8, 8))
+    hole = corners.mask.copy()
+    hole[2, 2] = False
+    wanted[1:3, 1:3] = False
+    assert np.array_equal(recover_observe._pure(camera, seen, replace(corners, mask=hole)), wanted)
 
 
 def test_pictures_that_say_nothing(world):

@@ -187,6 +187,12 @@ def world_from_px(
     return cam @ camera.world_from_cam[:3, :3].T + camera.world_from_cam[:3, 3]
 
 
+def of_corners(camera: Camera) -> Camera:
+    """The camera whose pixels' centres are the corners of this one's pixels; one more in each row and column."""
+    (x, y), (height, width) = camera.centre, camera.size
+    return replace(camera, centre=(x + 0.5, y + 0.5), size=(height + 1, width + 1))
+
+
 def pixel_centres(size: tuple[int, int]) -> Float[np.ndarray, "h w 2"]:
     """Pixel coordinates (x, y) of every pixel centre of an image of `size` (height, width)."""
     x, y = np.meshgrid(np.arange(size[1]) + 0.5, np.arange(size[0]) + 0.5)

@@ -31,6 +31,7 @@ from mistyle.run.budget import (
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import thread_count
 from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
+from mistyle.stages.recover_settings import all_rounds
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -103,7 +104,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     averaged = looked_at(s, sizes)
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
-    rounds = solves * s.recover.rounds * (1 + s.recover.bounces)
+    rounds = solves * all_rounds(s.recover)
     # render/indirect.py's pictures are half as wide, and never wider than 256 pixels.
     paths = solves * s.recover.bounces * s.recover.bounce_samples * sum(min(n / 4, 2**16) for n in sizes)
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations

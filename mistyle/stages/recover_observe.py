@@ -1,8 +1,9 @@
 """From pictures to what each texel was seen to reflect: the observations of the per-texel solver.
 
-A texel's reference value is the picture, interpolated bilinearly where the texel's centre is seen. It counts where all
-four pixels around that place count, show the texel's own surface, and lie, with their neighbours, wholly in the light
-or wholly out of it: pixels on the edge of a shadow or a silhouette are mixtures that no material explains.
+A texel's reference value is the picture, interpolated bilinearly where the texel's centre is seen, between those of
+the four pixels around that place which count. A pixel counts where its centre and its corners show the texel's own
+surface and are all lit or all in the shadow: pixels on the edge of a shadow or a silhouette are mixtures that no
+material explains.
 """
 
 from collections.abc import Callable, Sequence
@@ -11,18 +12,19 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.camera import Camera, by_camera
+from mistyle.core.camera import Camera, by_camera, of_corners
 from mistyle.core.capture import Captures
 from mistyle.core.image import erode
 from mistyle.core.light import DELTA, SOFT
 from mistyle.core.maps import Texels
 from mistyle.render.draw import Tracer
 from mistyle.render.texel_lm import Observations, Points, Rig
-from mistyle.render.texel_views import look, open_sky, rig
+from mistyle.render.texel_views import Look, look, open_sky, rig
 from mistyle.stages.frames import texel_frames
 
 REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
 LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane
+MOVED = 4.0  # of a look-up that moved d pixels: its standard deviation grows by 1 + MOVED d²
 PERCENTILE = 95.0  # of the observed radiance: the unit of the noise
 
 
@@ -68,11 +70,14 @@ def gather(
     noise: float = 0.002,
     relative: float = 0.01,
     skies: bool = True,
+    move: float = 1.5,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Gathered:
     """All observations of all pictures. ValueError for lights that only a scene file describes.
 
-    `skies` False leaves out what hides the sky from each texel, which only the solver asks for.
+    `skies` False leaves out what hides the sky from each texel, which only the solver asks for. `move`: how many
+    pixels a look-up may move at most, 0 where all four have to count; it then shows what is beside the texel, which
+    only rounds of what pictures and maps differ by there make good.
     `facing` is the least cosine between the texel's normal and the camera; the standard deviation of an observation of
     radiance y is noise · (the brightest radiance, robustly) + relative · y, larger where the surface turns away and
     where the texel is smaller than the pixel, which then says more about its neighbours.
@@ -91,19 +96,20 @@ def gather(
     for done, group in enumerate(by_camera(captures.cameras)):
         camera = captures.cameras[group[0]]
         beams = [light for k in group for light in captures.lights[k] if isinstance(light, DELTA)]
-        seen = look(traced, camera, beams)
-        near, pixel, x, y, worth = _visible(camera, seen, position, normal, size, facing)
+        seen, corners = look(traced, camera, beams), look(traced, of_corners(camera), beams)
+        pure = _pure(camera, seen, corners)
+        near, pixel, x, y, own, worth = _visible(camera, seen, pure, position, normal, size, facing)
         any_light, first = np.zeros(len(near), bool), 0
         for k in group:
             count = sum(isinstance(light, DELTA) for light in captures.lights[k])
-            lit = [_steady(mask, seen.mask) for mask in seen.lit[first : first + count]]
+            lit = [_steady(seen.lit[j], corners.lit[j]) for j in range(first, first + count)]
             first += count
             rgb, usable = captures.load(k)
-            ids, values, bits, chosen = _observe(rgb, usable, lit, soft[k], near, pixel, x, y)
+            ids, values, bits, chosen, *place, share = _observe(rgb, usable, lit, soft[k], near, pixel, x, y, own, move)
             any_light[chosen] = True
             # These are most of a fit's memory: nothing here is larger than it has to be.
             where = pixel[chosen].astype(np.int32)
-            parts.append((k, ids.astype(np.int32), values, bits, where, x[chosen], y[chosen], worth[chosen]))
+            parts.append((k, ids.astype(np.int32), values, bits, where, *place, worth[chosen] * share))
         views[near[any_light]] += 1
         progress((done + 1) / max(len(captures) / max(len(group), 1), 1))
     return _assemble(texel, points, captures, parts, views, noise, relative)
@@ -129,9 +135,37 @@ def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
 
 
-def _visible(camera: Camera, seen, position, normal, size, facing: float) -> tuple[np.ndarray, ...]:
-    """Texels whose four pixels show their own surface: index, top left pixel, place between the pixels, and what the
-    observation is worth, 0..1."""
+def _pure(camera: Camera, seen: Look, corners: Look) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose corners show the surface that their centre shows: no silhouette and no crease goes through them."""
+    p, n = seen.position, seen.normal
+    away = camera.position.astype(np.float32) - p
+    unit = away @ -camera.world_from_cam[:3, 2].astype(np.float32) / np.float32(camera.focal)
+    cosine = np.clip((away * n).sum(axis=-1) / np.maximum(np.sqrt((away**2).sum(axis=-1)), 1e-12), 0.05, 1)
+    reach, lift, pure = (REACH * unit / cosine) ** 2, LIFT * unit / cosine, seen.mask.copy()
+    for corner in _corners(seen.mask.shape):
+        d = corners.position[corner] - p
+        pure &= corners.mask[corner] & ((d * d).sum(axis=-1) <= reach) & (np.abs((d * n).sum(axis=-1)) <= lift)
+        pure &= (corners.normal[corner] * n).sum(axis=-1) > 0.5
+    return pure
+
+
+def _corners(size: tuple[int, int]) -> list[tuple[slice, slice]]:
+    """Of a picture of the pixels' corners, those at each pixel's top left, top right, bottom left and bottom right."""
+    height, width = size
+    return [np.s_[r : r + height, c : c + width] for r in (0, 1) for c in (0, 1)]
+
+
+def _steady(lit: Bool[np.ndarray, "h w"], corners: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, "h w"]:
+    """1 where a pixel's centre and corners are all lit, 0 where none is, -1 where the edge of a shadow goes through."""
+    count = lit.astype(np.int8)
+    for corner in _corners(lit.shape):
+        count += corners[corner]
+    return np.where(count == 5, 1, np.where(count == 0, 0, -1)).astype(np.int8)
+
+
+def _visible(camera: Camera, seen: Look, pure, position, normal, size, facing: float) -> tuple[np.ndarray, ...]:
+    """Texels whose own surface one of the four pixels around them shows: index, top left pixel, place between the
+    pixels, which of the four do, and what the observation is worth, 0..1."""
     height, width = camera.size
     eye = camera.position.astype(np.float32)
     away = eye - position
@@ -148,41 +182,51 @@ def _visible(camera: Camera, seen, position, normal, size, facing: float) -> tup
     p, n = position[near], normal[near]
     unit = depth[near] / np.float32(camera.focal)
     reach, lift = (REACH * unit / cosine[near]) ** 2, LIFT * unit / cosine[near]
-    good = np.ones(len(near), bool)
-    hit, front, mask = seen.position.reshape(-1, 3), seen.normal.reshape(-1, 3), seen.mask.ravel()
-    for step in (0, 1, width, width + 1):
+    own = np.zeros((4, len(near)), bool)
+    hit, front, mask = seen.position.reshape(-1, 3), seen.normal.reshape(-1, 3), pure.ravel()
+    for k, step in enumerate((0, 1, width, width + 1)):
         d = hit.take(pixel + step, axis=0) - p
-        good &= mask.take(pixel + step) & ((d * d).sum(axis=1) <= reach)
-        good &= np.abs((d * n).sum(axis=1)) <= lift
-        good &= (front.take(pixel + step, axis=0) * n).sum(axis=1) > 0.5
+        own[k] = mask.take(pixel + step) & ((d * d).sum(axis=1) <= reach)
+        own[k] &= np.abs((d * n).sum(axis=1)) <= lift
+        own[k] &= (front.take(pixel + step, axis=0) * n).sum(axis=1) > 0.5
+    good = own.any(axis=0)
     chosen = near[good]
     worth = np.sqrt(cosine[chosen]) * np.minimum(size[chosen] / unit[good], 1)
-    return chosen, pixel[good], (x[near] - left)[good], (y[near] - top)[good], worth
+    return chosen, pixel[good], (x[near] - left)[good], (y[near] - top)[good], own[:, good], worth
 
 
-def _steady(lit: Bool[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"]) -> Int[np.ndarray, "h w"]:
-    """1 where a pixel and its neighbours on the mesh are all lit, 0 where none is, -1 at the edge of a shadow."""
-    whole, none = erode(lit | ~mask, 1) & mask, erode(~lit | ~mask, 1)
-    return np.where(whole, 1, np.where(none, 0, -1)).astype(np.int8)
+def _observe(rgb, usable, lit, soft: bool, near, pixel, x, y, own, move: float) -> tuple[np.ndarray, ...]:
+    """Texels that one picture observes in the light: index, radiance, light bits, which of `near`, the place between
+    the pixels that was looked up, and what that makes of the observation's worth. Soft light, where the picture has it
+    too, is taken to reach them all.
 
-
-def _observe(rgb, usable, lit, soft: bool, near, pixel, x, y) -> tuple[np.ndarray, ...]:
-    """Texels that one picture observes in the light: index, radiance, light bits, which of `near`. Soft light, where
-    the picture has it too, is taken to reach them all."""
+    Where not all four pixels count, the place moves to the nearest ones that do, and the observation counts for less.
+    """
     usable = erode(usable & np.isfinite(rgb).all(axis=-1), 1)
-    width = rgb.shape[1]
-    good, bits = np.ones(len(near), bool), np.zeros(len(near), np.uint32)
+    rgb, width = np.where(usable[..., None], rgb, 0), rgb.shape[1]
     corners = [pixel + step for step in (0, 1, width, width + 1)]
-    for corner in corners:
-        good &= usable.ravel().take(corner)
-    for k, state in enumerate(lit):
-        four = np.stack([state.ravel().take(corner) for corner in corners])
-        on, off = (four == 1).all(axis=0), (four == 0).all(axis=0)
-        good &= on | off
-        bits |= np.where(on, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
-    chosen = np.flatnonzero(good & ((bits != 0) | soft))
-    values = _bilinear(rgb, pixel[chosen], x[chosen], y[chosen])
-    return near[chosen], values, bits[chosen], chosen
+    good, code = own.copy(), np.zeros(own.shape, np.uint32)
+    for j, corner in enumerate(corners):
+        good[j] &= usable.ravel().take(corner)
+        for k, state in enumerate(lit):
+            here = state.ravel().take(corner)
+            good[j] &= here >= 0
+            code[j] |= np.where(here == 1, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
+    across, down = np.stack([x, 1 - x, x, 1 - x]), np.stack([y, y, 1 - y, 1 - y])
+    nearest = np.where(good, across**2 + down**2, np.inf).argmin(axis=0)  # its lowest bit: right; the next: below
+    every = np.arange(len(near))
+    bits = code[nearest, every]
+    good &= code == bits
+    whole, beside, above = good.all(axis=0), good[nearest ^ 1, every], good[nearest ^ 2, every]
+    keep_y = whole | (above & (~beside | (across[nearest, every] <= down[nearest, every])))
+    keep_x = whole | (beside & ~keep_y)
+    u, v = np.where(keep_x, x, nearest & 1).astype(np.float32), np.where(keep_y, y, nearest >> 1).astype(np.float32)
+    moved = (u - x) ** 2 + (v - y) ** 2
+    share = 1 / (1 + np.float32(MOVED) * moved)
+    chosen = np.flatnonzero(good.any(axis=0) & (moved <= move**2) & ((bits != 0) | soft))
+    u, v = u[chosen], v[chosen]
+    values = _bilinear(rgb, pixel[chosen], u, v)
+    return near[chosen], values, bits[chosen], chosen, u, v, share[chosen]
 
 
 def _bilinear(image: Float[np.ndarray, "h w 3"], pixel, x, y) -> Float[np.ndarray, "n 3"]:

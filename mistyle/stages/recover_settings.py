@@ -4,6 +4,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+SETTLING = 3
+
 
 class RecoverSettings(BaseModel):
     """Choices of `stages/recover.py`; defaults are what measuring on synthetic maps of known truth suggested.
@@ -38,7 +40,8 @@ class RecoverSettings(BaseModel):
         default=3,
         ge=0,
         le=100,
-        description="how often what the pictures still differ by is given back to the texels, which are solved again",
+        description="how often what the pictures still differ by is given back to the texels, which are solved again; "
+        "as often after each estimate of light between surfaces, and three times as often after the last",
     )
     neighbours: float = Field(
         default=0.03,
@@ -90,3 +93,9 @@ class RecoverSettings(BaseModel):
     shadows: bool = Field(default=True, description="whether the object shadows itself")
     memory: float = Field(default=4.0, gt=0, description="GB for what is kept of the pictures' samples")
     checkpoint: float = Field(default=60.0, gt=0, description="seconds between checkpoints")
+
+
+def all_rounds(settings: RecoverSettings) -> int:
+    """How many rounds the texels are solved in: `rounds` at first and after each estimate of light between surfaces,
+    SETTLING times as many after the last, whose changes take them to settle."""
+    return settings.rounds * (settings.bounces + (SETTLING if settings.bounces else 1))

@@ -16,7 +16,7 @@ from mistyle.render.indirect import enlarged
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust
 from mistyle.stages.recover_observe import Gathered, fetch
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.recover_settings import RecoverSettings, all_rounds
 from mistyle.stages.texels import rasterise
 
 SOFT_COST = 64  # times as long as under one light a texel takes under a sky, nearly
@@ -138,14 +138,14 @@ def solve_texels(
         solution = solving.first_solve(
             problem, first, mean, gathered.seen, settings, lambda done: progress(0.3 + 0.2 * done)
         )
-        total = settings.rounds * (1 + settings.bounces)
+        last, total = settings.rounds * settings.bounces, all_rounds(settings)
         for number in range(total):
             table = solving.spread_out(solution.values, gathered, where)
 
             def heard(done: float, number=number) -> None:
                 progress(0.5 + 0.5 * (number + done) / total)
 
-            if number and number % settings.rounds == 0:
+            if 0 < number <= last and number % settings.rounds == 0:
                 take_off_indirect(work, shade, table, indirect, seed, lambda done: heard(0.7 * done))
                 problem.reweight(doubted(gathered, work.captures, indirect))
             shade.table = table

@@ -100,7 +100,7 @@ def _observations(traced: Tracer, captures: Captures, settings: RecoverSettings)
     def observed(side: int) -> tuple[list[Texels], Gathered]:
         texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
         return texels, gather(
-            traced, texels, lit, tangents, facing=settings.facing, noise=NOISE, relative=RELATIVE, skies=False
+            traced, texels, lit, tangents, facing=settings.facing, noise=NOISE, relative=RELATIVE, skies=False, move=0
         )
 
     side = max(LEAST, int(ATLAS / len(mesh.parts) ** 0.5))
