@@ -13,9 +13,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.common import peak_gb
-from benchmarks.consistency_scene import Scene, blank_maps, encoded, load
+from benchmarks.consistency_scene import Scene, encoded, load
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
-from mistyle.stages.texels import pad, sharpen_in_place
 
 
 @dataclass(frozen=True)
@@ -33,28 +32,27 @@ class Row:
 
 def surface(scene: Scene) -> Row:
     """The embedded surface stylizer: the surface is painted once and baked to the atlas, and the views are drawn."""
-    from mistyle.backends.embedded import solve_surface, surface_colour
-    from mistyle.run.painting import texel_side, unlit_views
+    from mistyle.backends.embedded import solve_surface
+    from mistyle.core.maps import flat_maps
+    from mistyle.run.made import Atlas
+    from mistyle.run.painting import painted, unlit_views
 
     start, asset = time.perf_counter(), scene.asset
     solution = solve_surface(asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
-    albedos = [np.zeros((*t.covered.shape, 3), np.float32) for t in scene.texels]
-    for part, (albedo, t) in enumerate(zip(albedos, scene.texels, strict=True)):
-        at, side = t.covered, texel_side(asset, part, t)
-        albedo[at] = linear_from_srgb(surface_colour(solution, t.position[at], t.normal[at], footprint=side))
-        sharpen_in_place(albedo, t)
-    padded = [pad(a, t, scene.settings.atlas.padding) for a, t in zip(albedos, scene.texels, strict=True)]
-    drawn = unlit_views(asset, blank_maps(scene, padded), scene.views, lambda done: None)
-    seconds = time.perf_counter() - start
-    held = peak_gb()
-    return Row([encoded(view) for view in drawn], seconds, albedos, without_atlas(scene, solution), held)
+    atlas = Atlas(scene.texels, tuple(flat_maps(len(t.covered)) for t in scene.texels))
+    maps = painted(asset, solution, atlas, scene.settings)
+    drawn = unlit_views(asset, maps, scene.views, lambda done: None)
+    seconds, held = time.perf_counter() - start, peak_gb()
+    blind = without_atlas(scene, solution)
+    return Row([encoded(view) for view in drawn], seconds, [m.albedo for m in maps], blind, held)
 
 
-def without_atlas(scene: Scene, solution: Any, fine: int = 3) -> list[np.ndarray]:
-    """Views of a painted surface that asks it for the colour of every hit, `fine` x `fine` a pixel."""
+def without_atlas(scene: Scene, solution: Any) -> list[np.ndarray]:
+    """Views of a painted surface that asks it for the colour of every hit, as many a pixel as `unlit` has rays."""
     from mistyle.backends.embedded import surface_colour
     from mistyle.core.camera import resized
     from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.unlit import FINE as fine
 
     traced, pictures = tracer(scene.asset.mesh), []
     for view in scene.views:

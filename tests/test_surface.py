@@ -615,6 +615,11 @@ def test_a_real_pair_shows_palette_strokes_and_form():
     one, other = (surface_colour(solution, p, solution.normals) for p in (places, places + pixel))
     one, other = (style.lab_from_srgb(c[None])[0, :, 0] for c in (one, other))
     assert 0.6 < np.abs(one - other).mean() / np.abs(np.diff(light, axis=1)).mean() < 1.1
+    # And neighbouring samples as pixels that far apart.
+    distance, near = KDTree(solution.positions).query(solution.positions, k=2)
+    apart = round(float(distance[:, 1].mean()) / (solution.spacing / max(solution.scale)))
+    step = np.abs(light[:, apart:] - light[:, :-apart]).mean()
+    assert 0.5 < np.abs(colour[near[:, 1], 0] - colour[:, 0]).mean() / step < 2.0
     # Form: lighter above than below.
     up = solution.normals[:, 1]
     assert colour[up > 0.5, 0].mean() > colour[up < -0.5, 0].mean() + 0.05

@@ -334,13 +334,13 @@ def test_unlit_views_agree_with_plain_fetches(painted_sheet, rng):
     maps = replace(maps, albedo=cv2.GaussianBlur(rng.random((32, 32, 3)).astype(np.float32), (0, 0), 1.5))
     camera = rig(RigSettings(resolution=48))[2]
     traced = tracer(mesh)
-    (rgb, coverage) = unlit(traced, [maps], [camera], fine=2)[0]
-    hits = gbuffer(traced, resized(camera, (96, 96)))
-    fine = np.zeros((96, 96, 3), np.float32)
+    (rgb, coverage) = unlit(traced, [maps], [camera])[0]
+    hits = gbuffer(traced, resized(camera, (144, 144)))
+    fine = np.zeros((144, 144, 3), np.float32)
     uv = hits.uv[hits.mask]
     fine[hits.mask] = bilinear(maps.albedo, np.stack([uv[:, 0] * 32, (1 - uv[:, 1]) * 32], axis=1), "repeat")
-    mean = fine.reshape(48, 2, 48, 2, 3).mean(axis=(1, 3))
-    share = hits.mask.reshape(48, 2, 48, 2).mean(axis=(1, 3))
+    mean = fine.reshape(48, 3, 48, 3, 3).mean(axis=(1, 3))
+    share = hits.mask.reshape(48, 3, 48, 3).mean(axis=(1, 3))
     # Rays on an edge may fall to either side by rounding.
     same = np.abs(coverage - share) < 1e-6
     assert same.mean() > 0.995 and coverage.sum() > 100

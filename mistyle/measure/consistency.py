@@ -69,7 +69,8 @@ def round_trip_rmse(
         back, both = carried_over(views[i], views[j], np.concatenate([there, seen[..., None]], axis=-1))
         if both.sum() >= max(LEAST_SHARED * views[i].mask.sum(), 1):
             both &= np.abs(back[..., 3] - 1) < 1e-3  # nothing of what the other view does not show was mixed in
-            squares += float(((back[both][:, :3] - pictures[i][both]) ** 2).sum(dtype=np.float64))
+            carried = back[both][:, :3] / back[both][:, 3:]
+            squares += float(((carried - pictures[i][both]) ** 2).sum(dtype=np.float64))
             count += 3 * int(both.sum())
     return float(np.sqrt(squares / count)) if count else float("nan")
 

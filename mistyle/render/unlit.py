@@ -15,6 +15,7 @@ from mistyle.render import device
 from mistyle.render.draw import Tracer, tracer
 from mistyle.render.hits import window
 
+FINE = 3  # rays along each side of a pixel
 Picture = tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]
 
 
@@ -22,7 +23,7 @@ def unlit(
     mesh: Mesh | Tracer,
     maps: Sequence[Maps],
     cameras: Sequence[Camera],
-    fine: int = 3,
+    fine: int = FINE,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Picture]:
     """Linear rgb, premultiplied, and coverage of every camera: the mean over `fine` x `fine` exact rays a pixel.

@@ -196,11 +196,11 @@ def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) 
     return read_views(run.stage("stylized", ["bake", "views"], [], write))
 
 
-def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report, fine: int = 3) -> list[View]:
-    """Each view with its rgb replaced by the albedo seen there, `fine` x `fine` samples a pixel, premultiplied."""
+def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report) -> list[View]:
+    """Each view with its rgb replaced by the albedo seen there, premultiplied."""
     from mistyle.render.unlit import unlit
 
-    drawn = unlit(asset.mesh, maps, [view.camera for view in views], fine, report)
+    drawn = unlit(asset.mesh, maps, [view.camera for view in views], progress=report)
     return [replace(view, rgb=rgb, coverage=share) for view, (rgb, share) in zip(views, drawn, strict=True)]
 
 

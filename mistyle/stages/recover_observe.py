@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt
 
 from mistyle.core.camera import Camera, by_camera, of_corners
 from mistyle.core.capture import Captures
@@ -141,12 +141,18 @@ def _pure(camera: Camera, seen: Look, corners: Look) -> Bool[np.ndarray, "h w"]:
     away = camera.position.astype(np.float32) - p
     unit = away @ -camera.world_from_cam[:3, 2].astype(np.float32) / np.float32(camera.focal)
     cosine = np.clip((away * n).sum(axis=-1) / np.maximum(np.sqrt((away**2).sum(axis=-1)), 1e-12), 0.05, 1)
-    reach, lift, pure = (REACH * unit / cosine) ** 2, LIFT * unit / cosine, seen.mask.copy()
+    pure, width = seen.mask.copy(), unit / cosine
     for corner in _corners(seen.mask.shape):
-        d = corners.position[corner] - p
-        pure &= corners.mask[corner] & ((d * d).sum(axis=-1) <= reach) & (np.abs((d * n).sum(axis=-1)) <= lift)
-        pure &= (corners.normal[corner] * n).sum(axis=-1) > 0.5
+        pure &= corners.mask[corner]
+        pure &= _one_surface(p, n, width, corners.position[corner], corners.normal[corner])
     return pure
+
+
+def _one_surface(p: np.ndarray, n: np.ndarray, width: np.ndarray, q: np.ndarray, m: np.ndarray) -> np.ndarray:
+    """Whether points q with normals m continue the surface at p with normals n; `width`: of a pixel on it."""
+    d = q - p
+    near = ((d * d).sum(axis=-1) <= (REACH * width) ** 2) & (np.abs((d * n).sum(axis=-1)) <= LIFT * width)
+    return near & ((m * n).sum(axis=-1) > 0.5)
 
 
 def _corners(size: tuple[int, int]) -> list[tuple[slice, slice]]:
@@ -181,14 +187,11 @@ def _visible(camera: Camera, seen: Look, pure, position, normal, size, facing: f
     pixel = (top * width + left).astype(np.int64)
     p, n = position[near], normal[near]
     unit = depth[near] / np.float32(camera.focal)
-    reach, lift = (REACH * unit / cosine[near]) ** 2, LIFT * unit / cosine[near]
     own = np.zeros((4, len(near)), bool)
-    hit, front, mask = seen.position.reshape(-1, 3), seen.normal.reshape(-1, 3), pure.ravel()
+    hit, front = seen.position.reshape(-1, 3), seen.normal.reshape(-1, 3)
     for k, step in enumerate((0, 1, width, width + 1)):
-        d = hit.take(pixel + step, axis=0) - p
-        own[k] = mask.take(pixel + step) & ((d * d).sum(axis=1) <= reach)
-        own[k] &= np.abs((d * n).sum(axis=1)) <= lift
-        own[k] &= (front.take(pixel + step, axis=0) * n).sum(axis=1) > 0.5
+        there = hit.take(pixel + step, axis=0), front.take(pixel + step, axis=0)
+        own[k] = pure.ravel().take(pixel + step) & _one_surface(p, n, unit / cosine[near], *there)
     good = own.any(axis=0)
     chosen = near[good]
     worth = np.sqrt(cosine[chosen]) * np.minimum(size[chosen] / unit[good], 1)
@@ -212,21 +215,28 @@ def _observe(rgb, usable, lit, soft: bool, near, pixel, x, y, own, move: float) 
             here = state.ravel().take(corner)
             good[j] &= here >= 0
             code[j] |= np.where(here == 1, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
-    across, down = np.stack([x, 1 - x, x, 1 - x]), np.stack([y, y, 1 - y, 1 - y])
-    nearest = np.where(good, across**2 + down**2, np.inf).argmin(axis=0)  # its lowest bit: right; the next: below
-    every = np.arange(len(near))
-    bits = code[nearest, every]
-    good &= code == bits
-    whole, beside, above = good.all(axis=0), good[nearest ^ 1, every], good[nearest ^ 2, every]
-    keep_y = whole | (above & (~beside | (across[nearest, every] <= down[nearest, every])))
-    keep_x = whole | (beside & ~keep_y)
-    u, v = np.where(keep_x, x, nearest & 1).astype(np.float32), np.where(keep_y, y, nearest >> 1).astype(np.float32)
+    bits, u, v = _moved(good, code, x, y)
     moved = (u - x) ** 2 + (v - y) ** 2
     share = 1 / (1 + np.float32(MOVED) * moved)
     chosen = np.flatnonzero(good.any(axis=0) & (moved <= move**2) & ((bits != 0) | soft))
     u, v = u[chosen], v[chosen]
     values = _bilinear(rgb, pixel[chosen], u, v)
     return near[chosen], values, bits[chosen], chosen, u, v, share[chosen]
+
+
+def _moved(good: Bool[np.ndarray, "4 n"], code: UInt[np.ndarray, "4 n"], x, y) -> tuple[np.ndarray, ...]:
+    """The light bits of the nearest of the four pixels that is `good`, and the place (u, v) nearest to (x, y) for which
+    only good ones in the same light are needed: all four, two beside or above each other, or the nearest alone."""
+    across, down = np.stack([x, 1 - x, x, 1 - x]), np.stack([y, y, 1 - y, 1 - y])
+    nearest = np.where(good, across**2 + down**2, np.inf).argmin(axis=0)  # its lowest bit: right; the next: below
+    every = np.arange(len(x))
+    bits = code[nearest, every]
+    same = good & (code == bits)
+    whole, beside, above = same.all(axis=0), same[nearest ^ 1, every], same[nearest ^ 2, every]
+    keep_y = whole | (above & (~beside | (across[nearest, every] <= down[nearest, every])))
+    keep_x = whole | (beside & ~keep_y)
+    u, v = np.where(keep_x, x, nearest & 1), np.where(keep_y, y, nearest >> 1)
+    return bits, u.astype(np.float32), v.astype(np.float32)
 
 
 def _bilinear(image: Float[np.ndarray, "h w 3"], pixel, x, y) -> Float[np.ndarray, "n 3"]:
