@@ -6,22 +6,31 @@ import numpy as np
 import pytest
 
 from mistyle.stages import recover_smooth as smoothing
+from mistyle.stages.neighbours import Links, Seam
 from mistyle.stages.recover_solve import Atlas
 
 FLOOR = 0.04
+NONE = Seam(np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
 
 
 def atlas(covered: np.ndarray, island: np.ndarray | None = None) -> Atlas:
     from mistyle.core.image import nearest
 
     island = np.where(covered, 0, -1) if island is None else island
-    return Atlas(
-        sizes=((covered.shape[0], covered.shape[1]),),
-        covered=(covered,),
-        right=((island[:, :-1] == island[:, 1:]) & (island[:, 1:] >= 0),),
-        below=((island[:-1] == island[1:]) & (island[1:] >= 0),),
-        closest=(nearest(covered)[0].ravel(),),
-    )
+    right = (island[:, :-1] == island[:, 1:]) & (island[:, 1:] >= 0)
+    links = Links(right, (island[:-1] == island[1:]) & (island[1:] >= 0), (NONE, NONE, NONE, NONE))
+    return Atlas(((covered.shape[0], covered.shape[1]),), (covered,), (nearest(covered)[0].ravel(),), (links,))
+
+
+def cut(covered: np.ndarray, column: int) -> Links:
+    """A grid whose halves left and right of `column` are two islands that a seam joins where both are covered."""
+    island = np.where(covered, (np.arange(covered.shape[1]) >= column).astype(int), -1)
+    number = np.arange(covered.size).reshape(covered.shape)
+    both = covered[:, column - 1] & covered[:, column]
+    left, right = number[both, column - 1], number[both, column]
+    all_ = np.ones(len(left), np.float32)
+    seams = Seam(left, right, all_), Seam(right, left, all_), NONE, NONE
+    return replace(atlas(covered, island).links[0], seams=seams)
 
 
 def tables(tilt: np.ndarray, error: float | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -37,22 +46,47 @@ def waves(side: int, length: float) -> np.ndarray:
 
 
 def test_the_result_is_the_minimum_that_is_promised(rng: np.random.Generator):
-    covered = rng.random((9, 12)) < 0.9
-    where, found = atlas(covered), rng.normal(0, 0.1, (9, 12)).astype(np.float32)
-    error = rng.uniform(0.01, 0.1, (9, 12)).astype(np.float32)
-    variance = (rng.uniform(0.01, 0.02, (9, 10)) ** 2, rng.uniform(0.01, 0.02, (12, 7)) ** 2)
-    right, below = where.right[0], where.below[0]
-    links = (right[:, :-1] & right[:, 1:], (below[:-1] & below[1:]).T)
-    number = np.arange(9 * 12).reshape(9, 12)
-    matrix = np.diag(1 / error.ravel().astype(np.float64) ** 2)
-    for grid, link, of in ((number, links[0], variance[0]), (number.T, links[1], variance[1])):
-        for line, middle in zip(*np.nonzero(link), strict=True):
+    """Against the full matrix, with holes and a seam, over which differences count by 1 / WIDER."""
+    size, column = (9, 12), 7
+    covered = rng.random(size) < 0.9
+    covered[:4, column - 2 : column + 2] = True
+    found = rng.normal(0, 0.1, size).astype(np.float32)
+    error = rng.uniform(0.01, 0.1, size).astype(np.float32)
+    variance = rng.uniform(0.01, 0.02, size).astype(np.float32) ** 2
+    number = np.arange(found.size).reshape(size)
+    matrix, over = np.diag(1 / error.ravel().astype(np.float64) ** 2), 0
+    for at, of, seams in ((number, variance, (column - 1, column)), (number.T, variance.T, ())):
+        inside = covered.ravel()[at]
+        for line, middle in np.argwhere(inside[:, :-2] & inside[:, 1:-1] & inside[:, 2:]) + (0, 1):
             row = np.zeros(number.size)
-            row[grid[line, middle : middle + 3]] = 0.5, -1, 0.5
-            matrix += np.outer(row, row) / of[line, middle]
+            row[at[line, middle - 1 : middle + 2]] = 0.5, -1, 0.5
+            matrix += np.outer(row, row) / of[line, middle] / (smoothing.WIDER if middle in seams else 1)
+            over += middle in seams
+    assert over >= 8
     wanted = np.linalg.solve(matrix, (found / error.astype(np.float64) ** 2).ravel())
-    got = smoothing._likely(found, error, variance, links).ravel()
+    got = smoothing._likely(found, error, variance, cut(covered, column)).ravel()
     assert np.abs(got - wanted).max() < 2e-3 * np.abs(wanted - found.ravel()).max()
+
+
+def test_a_seam_is_a_border_of_tilts_but_not_of_roughness():
+    """Beside a seam roughness loses as much noise as within a chart, and without the seam less; tilts stay apart."""
+    size, column, noise = (96, 64), 32, 0.03
+    covered, true = np.ones(size, bool), 0.5 + waves(96, 40)[:, :64]
+
+    def wrong(among: Links) -> tuple[float, np.ndarray]:
+        noisy = true + np.random.default_rng(3).normal(0, noise, size)
+        table, error = tables(noisy, noise)
+        table[:, 5] = noisy.ravel()
+        result = smoothing.smoothed(table, error, replace(atlas(covered), links=(among,)), FLOOR)
+        beside = (result[:, 5].reshape(size) - true)[:, column - 1 : column + 1]
+        return float(np.sqrt((beside**2).mean())), result[:, 3]
+
+    sewn = cut(covered, column)
+    (joined, tilt), (apart, same), (whole, _) = map(
+        wrong, (sewn, replace(sewn, seams=(NONE, NONE, NONE, NONE)), atlas(covered).links[0])
+    )
+    assert joined < 1.1 * whole < 0.8 * apart
+    assert np.array_equal(tilt, same)
 
 
 def test_noise_on_a_smooth_surface_goes(rng: np.random.Generator):
@@ -92,7 +126,9 @@ def test_islands_do_not_mix_and_uncovered_texels_move_as_their_nearest(rng: np.r
     where = atlas(island >= 0, island)
     result = smoothing.smoothed(table, error, where, FLOOR)[:, 3].reshape(side, side)
     assert np.abs(result - true)[island >= 0].mean() < 0.01
-    alone = replace(where, right=(where.right[0] & (island[:, 1:] == 0),), below=(where.below[0] & (island[1:] == 0),))
+    links = where.links[0]
+    one = replace(links, right=links.right & (island[:, 1:] == 0), below=links.below & (island[1:] == 0))
+    alone = replace(where, links=(one,))
     half = smoothing.smoothed(table, error, alone, FLOOR)[:, 3].reshape(side, side)
     assert np.allclose(half[:, :18], result[:, :18], atol=2e-4)
     moved = (result - table[:, 3].reshape(side, side)).ravel()

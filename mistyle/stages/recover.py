@@ -89,7 +89,7 @@ def recover(
     whole = usable(mesh, captures, notes)
     captures = without(whole, indirect)
     traced = tracer(mesh)
-    where = solving.atlas(texels)
+    where = solving.linked(mesh, texels)
     work = Work(traced, tangents_of(mesh, settings.frame), texels, where, captures, settings, notes)
     shade = Shade(
         traced, captures, where.sizes, model=settings.model, frame=settings.frame, subsamples=settings.subsamples,

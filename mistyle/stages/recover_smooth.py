@@ -7,14 +7,18 @@ both minimise
 
     sum (x - found)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance
 
-over rows and columns of each island (a Gaussian field of second differences: Rue and Held, Gaussian Markov Random
-Fields, 2005, section 3.4). Where the surface is rough the variance is large, and what was found stays.
+over rows and columns of each island, of the roughness also across seams (a Gaussian field of second differences: Rue
+and Held, Gaussian Markov Random Fields, 2005, section 3.4). Where the surface is rough the variance is large, and what
+was found stays.
 """
+
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.stages.recover_solve import Atlas, diffused, fill
+from mistyle.stages.neighbours import Links, within
+from mistyle.stages.recover_solve import OVER_SEAMS, Atlas, diffused, fill, joined
 
 # Channels of the table that are smoothed, and the least standard deviation of their second differences.
 LEAST = {3: 0.006, 4: 0.006, 5: 0.008}
@@ -22,10 +26,11 @@ MOST = 0.3  # of that standard deviation
 OPEN = 0.3  # what is taken for left open where nothing was seen
 SURE = 0.01  # standard deviation of a second difference below which one tells as much as another
 AROUND = 24  # steps over which the variance is measured
+WIDER = 2.0  # times the variance over a seam, since what stands in for a neighbour lies beside its place
 STEPS, CLOSE = 300, 1e-4  # of conjugate gradients, at most; and what they may leave of the residual
 
 Grid = Float[np.ndarray, "h w"]
-Links = Bool[np.ndarray, "h v"]  # which texels have a neighbour on either side in their row
+Line = Bool[np.ndarray, "h v"]  # which texels have a neighbour on either side in their row
 Both = tuple[np.ndarray, np.ndarray]  # along rows, and along columns (transposed)
 
 
@@ -40,23 +45,26 @@ def smoothed(
     `noise`: standard deviations of what the pictures tell, OPEN and above where they tell nothing. Cannot see edges: a
     crease in a smooth surround is rounded by as much as its texels are uncertain.
     """
-    moved = np.zeros_like(table)
+    moved, where = np.zeros_like(table), joined(where, table[:, :7], noise)
     for k, size in enumerate(where.sizes):
         part = slice(where.offsets[k], where.offsets[k + 1])
-        rows = where.right[k][:, :-1] & where.right[k][:, 1:]
-        columns = where.below[k][:-1] & where.below[k][1:]
-        links = (rows, columns.T)
         for c, least in LEAST.items():
             found = table[part, c].reshape(size)
             error = np.minimum(noise[part, c].reshape(size), OPEN)
-            error, variance = _measured(found, error, links, where.right[k], where.below[k], least)
-            moved[part, c] = (_likely(found, error, variance, links) - found).ravel()
+            among = where.links[k] if OVER_SEAMS[c] else within(where.links[k])
+            error, variance = _measured(found, error, among, least)
+            moved[part, c] = (_likely(found, error, variance, among) - found).ravel()
     result = table + fill(moved, where)
     result[:, 5] = np.clip(result[:, 5], floor, 1)
     return result
 
 
-def _second(x: Grid, links: Links) -> Float[np.ndarray, "h v"]:
+def _lines(among: Links) -> Both:
+    """Which texels have a neighbour in the grid on either side in their row, and in their column (transposed)."""
+    return among.right[:, :-1] & among.right[:, 1:], (among.below[:-1] & among.below[1:]).T
+
+
+def _second(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
     """What each texel of a row differs by from the mean of its two neighbours, with its sign turned; 0 without them."""
     return np.where(links, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
 
@@ -70,40 +78,63 @@ def _back(second: Float[np.ndarray, "h v"], width: int) -> Grid:
     return result
 
 
-def _measured(
-    found: Grid, error: Grid, links: Both, right: np.ndarray, below: np.ndarray, least: float
-) -> tuple[Grid, Both]:
-    """Of what second differences vary by around every texel: how much is error, and the surface's own variance of those
-    along rows and columns (transposed).
+def _measured(found: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
+    """Of what second differences vary by around every texel: how much is error, and the surface's own variance of them.
 
     Where values vary less than their errors say, the errors are shared with the neighbours (the solver's prior made
     them so): then only as much error is taken as the variation shows, since no smoothing could remove the rest.
     """
     total = np.zeros((3, *found.shape, 1), np.float32)
-    for turned, link in enumerate(links):
+    for turned, link in enumerate(_lines(among)):
         x, e = (found.T, error.T) if turned else (found, error)
         noise = 0.25 * (e[:, :-2] ** 2 + e[:, 2:] ** 2) + e[:, 1:-1] ** 2
         weight = np.where(link, 1 / (noise + SURE**2) ** 2, 0)
         sums = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
         for own, value in zip(sums, (_second(x, link) ** 2, noise, 1), strict=True):
             own[:, 1:-1] += weight * value
-    varies, noise, weights = diffused(total, right[..., None], below[..., None], AROUND)[..., 0]
+    varies, noise, weights = diffused(total, among, AROUND, np.ones(1, np.float32))[..., 0]
     own = np.clip((varies - noise) / np.maximum(weights, 1e-12), least**2, MOST**2)
     share = np.clip(varies / np.maximum(noise, 1e-12), 0, 1)
-    return error * np.sqrt(share), (own[:, 1:-1], own.T[:, 1:-1])
+    return error * np.sqrt(share), own
 
 
-def _likely(found: Grid, error: Grid, variance: Both, links: Both) -> Float[np.ndarray, "h w"]:
+def _over_seams(variance: Grid, among: Links) -> tuple[Any, Float[np.ndarray, " n"]]:
+    """Second differences of rows and columns with a seam on one side or both: a matrix, and one over their variance."""
+    from scipy.sparse import csr_array
+
+    width, rows, firm = variance.shape[1], [], []
+    grids = np.pad(among.right, ((0, 0), (0, 1))).ravel(), np.pad(among.below, ((0, 1), (0, 0))).ravel()
+    for grid, step, sides in zip(grids, (1, width), (among.seams[:2], among.seams[2:]), strict=True):
+        at = np.unique(np.concatenate([seam.here for seam in sides]))
+        before = np.maximum(at - step, 0)
+        beside = np.stack([np.where(grid[at], at + step, -1), np.where(grid[before] & (at >= step), before, -1)])
+        share = np.ones(beside.shape, np.float32)
+        for k, seam in enumerate(sides):
+            row = np.searchsorted(at, seam.here)
+            beside[k, row], share[k, row] = seam.there, seam.share
+        whole = (beside >= 0).all(axis=0)
+        rows.append(np.stack([*beside[:, whole], at[whole]], axis=1))
+        firm.append(share.prod(axis=0)[whole] / (WIDER * variance.ravel()[at[whole]]))
+    columns, weights = np.concatenate(rows), np.concatenate(firm)
+    values = np.tile(np.array([0.5, 0.5, -1], np.float32), len(columns))
+    starts = np.arange(0, 3 * len(columns) + 1, 3)
+    return csr_array((values, columns.ravel(), starts), shape=(len(columns), variance.size)), weights
+
+
+def _likely(found: Grid, error: Grid, variance: Grid, among: Links) -> Float[np.ndarray, "h w"]:
     from scipy.sparse.linalg import LinearOperator, cg
 
     sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32)
-    firm = [np.where(link, 1 / v, 0).astype(np.float32) for v, link in zip(variance, links, strict=True)]
+    lines, of = _lines(among), (variance[:, 1:-1], variance.T[:, 1:-1])
+    firm = [np.where(link, 1 / v, 0).astype(np.float32) for v, link in zip(of, lines, strict=True)]
+    across, weight = _over_seams(variance, among)
     height, width = found.shape
 
     def apply(flat: np.ndarray) -> np.ndarray:
         x = flat.reshape(found.shape).astype(np.float32)
-        result = sure * x + _back(firm[0] * _second(x, links[0]), width)
-        return (result + _back(firm[1] * _second(x.T, links[1]), height).T).ravel()
+        result = sure * x + _back(firm[0] * _second(x, lines[0]), width)
+        result += _back(firm[1] * _second(x.T, lines[1]), height).T
+        return result.ravel() + across.T @ (weight * (across @ x.ravel()))
 
     def weights(link: np.ndarray, size: int) -> Grid:
         middle = np.zeros((len(link), size), np.float32)
@@ -112,7 +143,7 @@ def _likely(found: Grid, error: Grid, variance: Both, links: Both) -> Float[np.n
         middle[:, 2:] += 0.25 * link
         return middle
 
-    diagonal = (sure + weights(firm[0], width) + weights(firm[1], height).T).ravel()
+    diagonal = (sure + weights(firm[0], width) + weights(firm[1], height).T).ravel() + (across**2).T @ weight
 
     class Matrix(LinearOperator):
         def _matvec(self, x: np.ndarray) -> np.ndarray:

@@ -6,14 +6,16 @@ what they still differ by is added to what the texels should reach (defect corre
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels
+from mistyle.core.mesh import Mesh
 from mistyle.render.texel_lm import UNKNOWNS, Problem, Solution
+from mistyle.stages.neighbours import Links, believed, links
 from mistyle.stages.recover_observe import Gathered, fetch
 from mistyle.stages.recover_settings import RecoverSettings
 
@@ -38,19 +40,23 @@ MARGIN = 1.5  # on the variance of what observations tell, since they err togeth
 NOTHING = 1.0  # standard deviation of what nothing was told about
 LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean of its neighbours
 
+# Which of the unknowns go on across seams. Tilts would have to be turned into the other chart's frame, and where charts
+# meet at an edge, normal maps often bevel it: neighbours from beyond would level that.
+OVER_SEAMS = np.array([1, 1, 1, 0, 0, 1, 1], np.float32)
+
 Table = Float[np.ndarray, "a 8"]
 Values = Float[np.ndarray, "t 7"]
 
 
 @dataclass(frozen=True)
 class Atlas:
-    """All texels of all sets in one row after the other: which are covered, and which neighbours share an island."""
+    """All texels of all sets in one row after the other: which are covered, which covered one is closest to each, and
+    per set which are neighbours, where that was asked for."""
 
     sizes: tuple[tuple[int, int], ...]
     covered: tuple[np.ndarray, ...]
-    right: tuple[np.ndarray, ...]
-    below: tuple[np.ndarray, ...]
     closest: tuple[np.ndarray, ...]
+    links: tuple[Links, ...] = ()
 
     @property
     def offsets(self) -> list[int]:
@@ -61,14 +67,16 @@ class Atlas:
 def atlas(texels: Sequence[Texels]) -> Atlas:
     """The atlas of some texture sets."""
     covered = tuple(t.covered for t in texels)
-    islands = [t.island for t in texels]
     return Atlas(
         sizes=tuple((t.covered.shape[0], t.covered.shape[1]) for t in texels),
         covered=covered,
-        right=tuple((i[:, :-1] == i[:, 1:]) & (i[:, 1:] >= 0) for i in islands),
-        below=tuple((i[:-1] == i[1:]) & (i[1:] >= 0) for i in islands),
         closest=tuple(nearest(c)[0].ravel() if c.any() else np.arange(c.size) for c in covered),
     )
+
+
+def linked(mesh: Mesh, texels: Sequence[Texels]) -> Atlas:
+    """The same with neighbours."""
+    return replace(atlas(texels), links=tuple(links(mesh, t) for t in texels))
 
 
 def spread_out(values: Values, gathered: Gathered, where: Atlas) -> Table:
@@ -100,30 +108,41 @@ def fill(table: Table, where: Atlas, only: np.ndarray | None = None) -> Table:
 
 
 def neighbourhood(
-    values: Float[np.ndarray, "t c"], weight: Float[np.ndarray, "t c"], gathered: Gathered, where: Atlas, steps: int
+    values: Float[np.ndarray, "t c"],
+    weight: Float[np.ndarray, "t c"],
+    gathered: Gathered,
+    where: Atlas,
+    steps: int,
+    over: Float[np.ndarray, " c"],
 ) -> Float[np.ndarray, "t c"]:
-    """Weighted mean over the texels around within the same island; where none has a weight, the texel's own value."""
+    """Weighted mean over the neighbours and theirs, of column c also over seams where over[c] is 1, not where it is 0;
+    where none has a weight, the texel's own value."""
     channels = values.shape[1]
     full = np.zeros((2, where.offsets[-1], channels), np.float32)
     full[0, gathered.texel], full[1, gathered.texel] = values * weight, weight
     for k, size in enumerate(where.sizes):
         part = full[:, where.offsets[k] : where.offsets[k + 1]].reshape(2, *size, channels)
-        part[...] = diffused(part, where.right[k][..., None], where.below[k][..., None], steps)
+        part[...] = diffused(part, where.links[k], steps, over)
     summed, weights = full[:, gathered.texel]
     return np.where(weights > 1e-12, summed / np.maximum(weights, 1e-12), values).astype(np.float32)
 
 
 def diffused(
-    part: Float[np.ndarray, "n h w c"], right: np.ndarray, below: np.ndarray, steps: int
+    part: Float[np.ndarray, "n h w c"], among: Links, steps: int, over: Float[np.ndarray, " c"]
 ) -> Float[np.ndarray, "n h w c"]:
-    """Sums that every texel shares with the four around it, step by step; `right` and `below` (h w 1): which of them
-    are of its island. What would go to others is lost, so sums mean something only beside sums of weights."""
+    """Sums that every texel shares with the four around it, step by step. What would go to others is lost, so sums mean
+    something only beside sums of weights."""
+    right, below = among.right[..., None], among.below[..., None]
+    seams = among.seams if over.any() else ()
     for _ in range(steps):
         total = 2 * part
         total[:, :, :-1] += part[:, :, 1:] * right
         total[:, :, 1:] += part[:, :, :-1] * right
         total[:, :-1] += part[:, 1:] * below
         total[:, 1:] += part[:, :-1] * below
+        flat, sums = (grid.reshape(len(part), -1, part.shape[-1]) for grid in (part, total))
+        for seam in seams:
+            sums[:, seam.here] += flat[:, seam.there] * (seam.share[:, None] * over)
         part = total * np.float32(0.2)
     return part
 
@@ -203,7 +222,8 @@ def another_round(
         if len(sighting.rows):
             target[sighting.rows] += fetch(differences(k), sighting)
     problem.retarget(target)
-    mean = neighbourhood(solution.values, sureness(solution, gathered), gathered, where, BLUR)
+    where = joined(where, *(placed(v, gathered, where, 0) for v in (solution.values, _open(solution, gathered))))
+    mean = neighbourhood(solution.values, sureness(solution, gathered), gathered, where, BLUR, OVER_SEAMS)
     prior = belief(solution, mean, gathered, where, settings.neighbours)
     mean, prior = levelled(solution, mean, prior, gathered, where)
 
@@ -223,6 +243,22 @@ def another_round(
                 other[:, 5] = roughness
             solved.append(tried(other, 8, _nearest(mean)))
     return best(solved)
+
+
+def joined(where: Atlas, values: Float[np.ndarray, "a 7"], spread: Float[np.ndarray, "a 7"]) -> Atlas:
+    """The same with seams believed by albedo and roughness; `spread`: standard deviations."""
+    columns, found = [0, 1, 2, 5], []
+    for k, size in enumerate(where.sizes):
+        part = slice(where.offsets[k], where.offsets[k + 1])
+        found.append(believed(where.links[k], *(a[part, columns].reshape(*size, -1) for a in (values, spread))))
+    return replace(where, links=tuple(found))
+
+
+def _open(solution: Solution, gathered: Gathered) -> Values:
+    """Standard deviations of what the texels' observations tell, NOTHING where there are none."""
+    found = np.minimum(likelihood(solution)[0], NOTHING)
+    found[gathered.seen == 0] = NOTHING
+    return found
 
 
 def sureness(solution: Solution, gathered: Gathered) -> Values:
@@ -246,7 +282,7 @@ def belief(solution: Solution, mean: Values, gathered: Gathered, where: Atlas, n
     apart = (solution.values - mean)[:, 3:5] / np.maximum(gain, 1e-3)
     weight = (1 / (open_**2 + neighbours**2) ** 2).astype(np.float32)
     weight[gathered.seen == 0] = 0
-    variance = neighbourhood((apart**2 - open_**2).astype(np.float32), weight, gathered, where, WIDE)
+    variance = neighbourhood((apart**2 - open_**2).astype(np.float32), weight, gathered, where, WIDE, OVER_SEAMS[3:5])
     prior = np.full(mean.shape, 1 / neighbours**2, np.float32)
     prior[:, 3:5] = 1 / np.clip(variance, min(LEAST, neighbours) ** 2, neighbours**2)
     return prior
@@ -263,7 +299,7 @@ def levelled(
     more costs strong relief, less lets light between surfaces through.
     """
     precision = np.where(gathered.seen[:, None] > 0, 1 / open_tilts(solution, gathered) ** 2, 0).astype(np.float32)
-    precision = AMONG * neighbourhood(precision, np.ones_like(precision), gathered, where, BLUR)
+    precision = AMONG * neighbourhood(precision, np.ones_like(precision), gathered, where, BLUR, OVER_SEAMS[3:5])
     left = 1 / (precision + 1 / varied(solution, gathered))
     mean, prior = mean.copy(), prior.copy()
     mean[:, 3:5] *= precision * left
@@ -299,7 +335,7 @@ def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.nda
     """
     spare = np.maximum(gathered.seen - len(UNKNOWNS) / 3, 0)
     each = np.where(spare[:, None] > 0, np.stack([solution.cost, spare], axis=1), 0).astype(np.float32)
-    cost, count = neighbourhood(each, np.ones_like(each), gathered, where, AROUND).T
+    cost, count = neighbourhood(each, np.ones_like(each), gathered, where, AROUND, np.ones(2, np.float32)).T
     return np.where(count > 1e-6, cost / np.maximum(count, 1e-6), 0).astype(np.float32)
 
 

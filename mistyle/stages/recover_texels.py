@@ -69,7 +69,7 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
         return solve_texels(work, shade, start, indirect, seed, trace, progress)
     mesh = shade.traced.mesh
     texels = [rasterise(mesh, p, size[0] // by) for p, size in enumerate(work.where.sizes)]
-    where = solving.atlas(texels)
+    where = solving.linked(mesh, texels)
     small = Shade(
         shade.traced, work.captures, where.sizes, model=settings.model, frame=settings.frame,
         subsamples=settings.subsamples, shadows=settings.shadows, memory=settings.memory * 1e9,

@@ -1,0 +1,113 @@
+"""Which texels are neighbours on the surface: in the grid of the atlas, and across the seams of its charts.
+
+A chart's border is no border of the surface. Where a texel has no neighbour of its island on one side, the surface is
+followed by one texel's width in that direction, and the texel whose middle lies nearest to there takes that place.
+Charts often end where the material does, too: `believed` finds out where, as far as values are known.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.maps import Texels
+from mistyle.core.mesh import Mesh
+
+STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns to the texel on the right, left, below and above
+NEAR = 1.0  # sides of a texel between where the surface goes on and the middle of the texel that is taken for it
+OTHER_SIDE = -0.5  # cosine between normals below which that is the other side of something thin
+BESIDE = 2  # rows and columns around a texel within which its own island is no seam away
+CANDIDATES = 8  # texels looked at for each
+
+
+@dataclass(frozen=True)
+class Seam:
+    """Texels of one set (flat indices, each once) and those that stand in for their neighbours in one direction;
+    `share` is how much they are believed to, 0..1."""
+
+    here: Int[np.ndarray, " n"]
+    there: Int[np.ndarray, " n"]
+    share: Float[np.ndarray, " n"]
+
+
+@dataclass(frozen=True)
+class Links:
+    """The neighbours in one set: whether a texel and the one right of it, or below it, share an island; and one seam
+    for each of STEPS."""
+
+    right: Bool[np.ndarray, "h v"]
+    below: Bool[np.ndarray, "u w"]
+    seams: tuple[Seam, Seam, Seam, Seam]
+
+
+def within(among: Links) -> Links:
+    """The same without seams."""
+    none = _seam(np.zeros(0, int), np.zeros(0, int))
+    return replace(among, seams=(none, none, none, none))
+
+
+def believed(among: Links, values: Float[np.ndarray, "h w c"], spread: Float[np.ndarray, "h w c"]) -> Links:
+    """The same with seams believed as far as the surface seems to go on there: half where any value jumps by twice what
+    neighbours of the grid differ by on average and the values' standard deviations `spread` let expect."""
+    pairs = (values[:, 1:], values[:, :-1], among.right), (values[1:], values[:-1], among.below)
+    steps = np.concatenate([((ahead - here)[link]) ** 2 for ahead, here, link in pairs])
+    usual = steps.mean(axis=0) if len(steps) else 0
+    flat, open_ = values.reshape(-1, values.shape[-1]), spread.reshape(-1, values.shape[-1]) ** 2
+    seams = []
+    for seam in among.seams:
+        expected = usual + open_[seam.here] + open_[seam.there]
+        jump = ((flat[seam.here] - flat[seam.there]) ** 2 / np.maximum(expected, 1e-12)).max(axis=1)
+        seams.append(replace(seam, share=(1 / (1 + (jump / 4) ** 2)).astype(np.float32)))
+    right, left, below, above = seams
+    return replace(among, seams=(right, left, below, above))
+
+
+def links(mesh: Mesh, texels: Texels) -> Links:
+    """The neighbours. Surfaces that only come near each other, within NEAR, count as one; charts of other sets do not
+    count."""
+    island = texels.island
+    right = (island[:, :-1] == island[:, 1:]) & (island[:, 1:] >= 0)
+    below = (island[:-1] == island[1:]) & (island[1:] >= 0)
+    return Links(right, below, _seams(mesh, texels))
+
+
+def _seam(here: np.ndarray, there: np.ndarray) -> Seam:
+    return Seam(here, there, np.ones(len(here), np.float32))
+
+
+def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
+    from scipy.spatial import KDTree
+
+    at = np.flatnonzero(texels.covered)
+    if not len(at):
+        return _seam(at, at), _seam(at, at), _seam(at, at), _seam(at, at)
+    position, normal = texels.position.reshape(-1, 3)[at], texels.normal.reshape(-1, 3)[at]
+    own, island = texels.island.ravel()[at], np.pad(texels.island, 1, constant_values=-1)
+    row, column = np.divmod(at, texels.covered.shape[1])
+    sides, tree = _sides(mesh, texels.covered.shape)[texels.face.ravel()[at]], KDTree(position)
+    most = min(CANDIDATES, len(at))
+
+    def across(down: int, right: int) -> Seam:
+        alone = np.flatnonzero(island[row + 1 + down, column + 1 + right] != own)
+        step = right * sides[alone, 0] + down * sides[alone, 1]
+        distance, near = (a.reshape(-1, most) for a in tree.query(position[alone] + step, k=most))
+        good = distance < NEAR * np.linalg.norm(step, axis=1)[:, None]
+        good &= np.einsum("nd,nkd->nk", normal[alone], normal[near]) > OTHER_SIDE
+        away = np.maximum(np.abs(row[near] - row[alone, None]), np.abs(column[near] - column[alone, None]))
+        good &= (away > BESIDE) | (own[near] != own[alone, None])
+        first, found = good.argmax(axis=1), good.any(axis=1)
+        return _seam(at[alone[found]], at[near[found, first[found]]])
+
+    right, left, below, above = (across(*step) for step in STEPS)
+    return right, left, below, above
+
+
+def _sides(mesh: Mesh, size: tuple[int, ...]) -> Float[np.ndarray, "f 2 3"]:
+    """Where a step of one texel to the right, and one down, leads on every face."""
+    p = mesh.positions[mesh.faces].astype(np.float64)
+    uv = mesh.corner_uvs.astype(np.float64) * np.array([size[1], -size[0]])
+    e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
+    area = d1[:, :1] * d2[:, 1:] - d1[:, 1:] * d2[:, :1]
+    area = np.where(area != 0, area, np.inf)
+    right, down = (d2[:, 1:] * e1 - d1[:, 1:] * e2) / area, (d1[:, :1] * e2 - d2[:, :1] * e1) / area
+    return np.stack([right, down], axis=1).astype(np.float32)
