@@ -104,7 +104,8 @@ def test_a_seam_is_believed_unless_values_that_are_known_jump_there(rng, jump, s
     texels, every = neighbours_of(patches((square(0), chart(0.05, 0.05)), (square(1), chart(0.55, 0.55, 1))))
     values = 0.5 + 0.02 * texels.position + jump * (texels.island == 1)[..., None]
     values += rng.normal(0, 0.01, values.shape)
-    found = believed(every, values.astype(np.float32), np.full(values.shape, spread, np.float32))
+    open_ = np.full(values.shape[:2], spread, np.float32)
+    found = believed(every, [(values[..., c].astype(np.float32), open_) for c in range(3)])
     shares = np.concatenate([seam.share for seam in found.seams])
     assert len(shares) == 32 and least <= np.median(shares) <= most
     assert all(np.array_equal(a.here, b.here) for a, b in zip(found.seams, every.seams, strict=True))

@@ -5,6 +5,7 @@ followed by one texel's width in that direction, and the texel whose middle lies
 Charts often end where the material does, too: `believed` finds out where, as far as values are known.
 """
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,8 @@ NEAR = 1.0  # sides of a texel between where the surface goes on and the middle 
 OTHER_SIDE = -0.5  # cosine between normals below which that is the other side of something thin
 BESIDE = 2  # rows and columns around a texel within which its own island is no seam away
 CANDIDATES = 8  # texels looked at for each
+
+Grid = Float[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True)
@@ -46,19 +49,21 @@ def within(among: Links) -> Links:
     return replace(among, seams=(none, none, none, none))
 
 
-def believed(among: Links, values: Float[np.ndarray, "h w c"], spread: Float[np.ndarray, "h w c"]) -> Links:
-    """The same with seams believed as far as the surface seems to go on there: half where any value jumps by twice what
-    neighbours of the grid differ by on average and the values' standard deviations `spread` let expect."""
-    pairs = (values[:, 1:], values[:, :-1], among.right), (values[1:], values[:-1], among.below)
-    steps = np.concatenate([((ahead - here)[link]) ** 2 for ahead, here, link in pairs])
-    usual = steps.mean(axis=0) if len(steps) else 0
-    flat, open_ = values.reshape(-1, values.shape[-1]), spread.reshape(-1, values.shape[-1]) ** 2
-    seams = []
-    for seam in among.seams:
-        expected = usual + open_[seam.here] + open_[seam.there]
-        jump = ((flat[seam.here] - flat[seam.there]) ** 2 / np.maximum(expected, 1e-12)).max(axis=1)
-        seams.append(replace(seam, share=(1 / (1 + (jump / 4) ** 2)).astype(np.float32)))
-    right, left, below, above = seams
+def believed(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
+    """The same with seams believed as far as the surface seems to go on there: half where any of `fields` (values and
+    their standard deviations) jumps by twice what these and the mean difference of neighbours in the grid let expect.
+    """
+    worst = [np.zeros(len(seam.here), np.float32) for seam in among.seams]
+    for values, spread in fields:
+        steps = (values[:, 1:] - values[:, :-1])[among.right], (values[1:] - values[:-1])[among.below]
+        usual = sum(float((step**2).sum()) for step in steps) / max(sum(map(len, steps)), 1)
+        flat, open_ = values.ravel(), spread.ravel()
+        for jump, seam in zip(worst, among.seams, strict=True):
+            expected = usual + open_[seam.here] ** 2 + open_[seam.there] ** 2
+            np.maximum(jump, (flat[seam.here] - flat[seam.there]) ** 2 / np.maximum(expected, 1e-12), out=jump)
+    right, left, below, above = (
+        replace(seam, share=1 / (1 + (jump / 4) ** 2)) for seam, jump in zip(among.seams, worst, strict=True)
+    )
     return replace(among, seams=(right, left, below, above))
 
 

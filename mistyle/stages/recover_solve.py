@@ -247,18 +247,19 @@ def another_round(
 
 def joined(where: Atlas, values: Float[np.ndarray, "a 7"], spread: Float[np.ndarray, "a 7"]) -> Atlas:
     """The same with seams believed by albedo and roughness; `spread`: standard deviations."""
-    columns, found = [0, 1, 2, 5], []
-    for k, size in enumerate(where.sizes):
+    found = []
+    for k, (among, size) in enumerate(zip(where.links, where.sizes, strict=True)):
         part = slice(where.offsets[k], where.offsets[k + 1])
-        found.append(believed(where.links[k], *(a[part, columns].reshape(*size, -1) for a in (values, spread))))
+        fields = ((values[part, c].reshape(size), spread[part, c].reshape(size)) for c in (0, 1, 2, 5))
+        found.append(believed(among, fields))
     return replace(where, links=tuple(found))
 
 
-def _open(solution: Solution, gathered: Gathered) -> Values:
-    """Standard deviations of what the texels' observations tell, NOTHING where there are none."""
-    found = np.minimum(likelihood(solution)[0], NOTHING)
+def _open(solution: Solution, gathered: Gathered, scale: float | Float[np.ndarray, " t"] = 1.0) -> Values:
+    """Standard deviations of what the texels' observations tell, `scale` on their variance; NOTHING without any."""
+    found = np.minimum(likelihood(solution)[0] * np.sqrt(np.reshape(scale, (-1, 1))), NOTHING)
     found[gathered.seen == 0] = NOTHING
-    return found
+    return found.astype(np.float32)
 
 
 def sureness(solution: Solution, gathered: Gathered) -> Values:
@@ -345,9 +346,7 @@ def told(solution: Solution, gathered: Gathered, where: Atlas) -> Values:
     around = misfit(solution, gathered, where)
     own = np.where(gathered.seen >= OFTEN, solution.cost / np.maximum(gathered.seen - len(UNKNOWNS) / 3, 1), 0)
     scale = MARGIN * np.maximum(np.maximum(around, own) / 3, BEST_FIT)
-    found = np.minimum(likelihood(solution)[0] * np.sqrt(scale)[:, None], NOTHING)
-    found[gathered.seen == 0] = NOTHING
-    return found.astype(np.float32)
+    return _open(solution, gathered, scale)
 
 
 def decided(solution: Solution, gathered: Gathered) -> Float[np.ndarray, " t"]:
