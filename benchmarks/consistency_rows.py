@@ -52,18 +52,18 @@ def without_atlas(scene: Scene, solution: Any) -> list[np.ndarray]:
     from mistyle.backends.embedded import surface_colour
     from mistyle.core.camera import resized
     from mistyle.render.draw import gbuffer, tracer
-    from mistyle.render.unlit import FINE as fine
+    from mistyle.render.unlit import FINE
 
     traced, pictures = tracer(scene.asset.mesh), []
     for view in scene.views:
         height, width = view.camera.size
-        hits = gbuffer(traced, resized(view.camera, (height * fine, width * fine)))
+        hits = gbuffer(traced, resized(view.camera, (height * FINE, width * FINE)))
         rgb = np.zeros((*hits.mask.shape, 3), np.float32)
-        side = scene.settings.rig.distance / view.camera.focal / fine
+        side = scene.settings.rig.distance / view.camera.focal / FINE
         at = hits.mask
         rgb[at] = linear_from_srgb(surface_colour(solution, hits.position[at], hits.normal[at], footprint=side))
-        rgb = rgb.reshape(height, fine, width, fine, 3).mean(axis=(1, 3))
-        share = at.reshape(height, fine, width, fine).mean(axis=(1, 3), dtype=np.float32)
+        rgb = rgb.reshape(height, FINE, width, FINE, 3).mean(axis=(1, 3))
+        share = at.reshape(height, FINE, width, FINE).mean(axis=(1, 3), dtype=np.float32)
         pictures.append(encoded(replace(view, rgb=rgb, coverage=share)))
     return pictures
 

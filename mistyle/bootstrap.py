@@ -19,6 +19,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mistyle.core.children import end_with_asker
+
 PACKAGE = Path(__file__).resolve().parent
 ROOT = PACKAGE.parent
 VENV = ROOT / ".venv"
@@ -80,6 +82,8 @@ def _help(arguments: list[str]) -> int:
 
 
 def _command_line(arguments: list[str]) -> int:
+    # Before the imports, which take seconds on a busy machine: a shard whose batch is gone must not linger in them.
+    end_with_asker()
     try:
         from mistyle.run.cli import main
     except KeyboardInterrupt:

@@ -48,14 +48,15 @@ LINUX = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the ker
 
 @LINUX
 def test_the_peak_of_a_block_is_its_own():
-    large = np.ones(40_000_000, np.uint8)
+    large = np.ones(2 * BLOCK, np.uint8)
     before = memory.highest()
     del large
     with memory.watched() as most:
         held = memory.resident()
-        np.ones(20_000_000, np.uint8)
-        assert 19_000_000 < most() - held < 30_000_000
-    assert memory.highest() >= before
+        np.ones(BLOCK, np.uint8)
+        assert BLOCK - 1_000_000 < most() - held < BLOCK + 10_000_000
+    # The kernel's own mark, which it takes as memory is given back, may lack some pages of each core.
+    assert memory.highest() > before - 1_000_000
 
 
 @LINUX

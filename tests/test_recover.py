@@ -21,7 +21,7 @@ from mistyle.render.indirect import MOST, Indirect, averaged, enlarged
 from mistyle.render.texel_views import Look
 from mistyle.stages import recover_observe
 from mistyle.stages.frames import texel_frames
-from mistyle.stages.neighbours import Links, Seam
+from mistyle.stages.neighbours import of_islands
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
 from mistyle.stages.recover_observe import Gathered, gather
@@ -142,8 +142,7 @@ def found_texels(values: np.ndarray, noise: float, prior: float, seen: np.ndarra
     priors, alone = np.full(values.shape, 1 / prior**2, np.float32), np.where(seen[:, None] > 0, 1 / noise**2, 1e-9)
     spread = np.broadcast_to(1 / np.sqrt(alone + priors), values.shape).astype(np.float32)
     solution = Solution(values.astype(np.float32), np.zeros(count, np.float32), spread, spread, priors)
-    no = Seam(np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
-    grid = Links(np.ones((SIDE, SIDE - 1), bool), np.ones((SIDE - 1, SIDE), bool), (no, no, no, no))
+    grid = of_islands(np.zeros((SIDE, SIDE), int))
     where = solving.Atlas(((SIDE, SIDE),), (np.ones((SIDE, SIDE), bool),), (np.arange(count),), (grid,))
     start = np.concatenate([[0], np.cumsum(seen)])
     zeros, none = np.zeros(start[-1], np.float32), np.zeros((0, 3), np.float32)

@@ -6,20 +6,18 @@ import numpy as np
 import pytest
 
 from mistyle.stages import recover_smooth as smoothing
-from mistyle.stages.neighbours import Links, Seam
+from mistyle.stages.neighbours import NONE, Links, Seam, of_islands, within
 from mistyle.stages.recover_solve import Atlas
 
 FLOOR = 0.04
-NONE = Seam(np.zeros(0, int), np.zeros(0, int), np.zeros(0, np.float32))
 
 
 def atlas(covered: np.ndarray, island: np.ndarray | None = None) -> Atlas:
     from mistyle.core.image import nearest
 
     island = np.where(covered, 0, -1) if island is None else island
-    right = (island[:, :-1] == island[:, 1:]) & (island[:, 1:] >= 0)
-    links = Links(right, (island[:-1] == island[1:]) & (island[1:] >= 0), (NONE, NONE, NONE, NONE))
-    return Atlas(((covered.shape[0], covered.shape[1]),), (covered,), (nearest(covered)[0].ravel(),), (links,))
+    size = covered.shape[0], covered.shape[1]
+    return Atlas((size,), (covered,), (nearest(covered)[0].ravel(),), (of_islands(island),))
 
 
 def cut(covered: np.ndarray, column: int) -> Links:
@@ -82,9 +80,7 @@ def test_a_seam_is_a_border_of_tilts_but_not_of_roughness():
         return float(np.sqrt((beside**2).mean())), result[:, 3]
 
     sewn = cut(covered, column)
-    (joined, tilt), (apart, same), (whole, _) = map(
-        wrong, (sewn, replace(sewn, seams=(NONE, NONE, NONE, NONE)), atlas(covered).links[0])
-    )
+    (joined, tilt), (apart, same), (whole, _) = map(wrong, (sewn, within(sewn), atlas(covered).links[0]))
     assert joined < 1.1 * whole < 0.8 * apart
     assert np.array_equal(tilt, same)
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.children import PARENT, end_with_asker
+from mistyle.core.children import PARENT
 from mistyle.run.options import DELIVERY_OPTIONS, NAME_HELP, add_delivery_options, examples, said_settings
 
 
@@ -182,7 +182,6 @@ def _shard(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.shard import FarmProgress, run_shard, stages_of
 
-    end_with_asker()
     plan = read_plan(options.plan, path_maps(options.path_map))
     chosen: Sequence[int] = indices(options.index, len(plan.jobs))
     if len(chosen) > 1:

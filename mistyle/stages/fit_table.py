@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core import memory
 from mistyle.core.image import gaussian, nearest, resized_rows
 from mistyle.core.maps import Maps, Texels
-from mistyle.stages.texels import bands
+from mistyle.stages.texels import bands, beside
 
 MAPS = ("albedo", "normal", "roughness", "metallic")
 CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}
@@ -78,8 +78,7 @@ def build(
         island = where.island.reshape(height // by, by, width // by, by).max(axis=(1, 3))
         rows.append({name: _shrink(material, name, where.covered, by).reshape(-1, n) for name, n in CHANNELS.items()})
         same = np.zeros((2, *island.shape), bool)
-        same[0, :, :-1] = (island[:, :-1] == island[:, 1:]) & (island[:, :-1] >= 0)
-        same[1, :-1] = (island[:-1] == island[1:]) & (island[:-1] >= 0)
+        same[0, :, :-1], same[1, :-1] = beside(island)
         right.append(same[0].ravel())
         below.append(same[1].ravel())
         sizes.append(island.shape)

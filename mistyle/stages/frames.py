@@ -57,13 +57,19 @@ def texel_frames(
     return np.stack([s, t, normal], axis=1).astype(np.float32)
 
 
-def _along_u(mesh: Mesh) -> Float[np.ndarray, "f 3"]:
-    """dp/du of every face."""
+def uv_derivatives(mesh: Mesh) -> Float[np.ndarray, "f 2 3"]:
+    """dp/du and dp/dv of every face, in the mesh's unit; those of a face without area in UV only have a direction."""
     p, uv = mesh.positions[mesh.faces].astype(np.float64), mesh.corner_uvs.astype(np.float64)
     e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    area = d1[:, 0] * d2[:, 1] - d1[:, 1] * d2[:, 0]
-    result = (d2[:, 1:] * e1 - d1[:, 1:] * e2) / np.where(area != 0, area, 1)[:, None]
-    return (result / np.maximum(np.linalg.norm(result, axis=1, keepdims=True), 1e-30)).astype(np.float32)
+    area = d1[:, :1] * d2[:, 1:] - d1[:, 1:] * d2[:, :1]
+    along = np.stack([d2[:, 1:] * e1 - d1[:, 1:] * e2, d1[:, :1] * e2 - d2[:, :1] * e1], axis=1)
+    return along / np.where(area != 0, area, 1)[..., None]
+
+
+def _along_u(mesh: Mesh) -> Float[np.ndarray, "f 3"]:
+    """The direction of dp/du of every face."""
+    along = uv_derivatives(mesh)[:, 0]
+    return (along / np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-30)).astype(np.float32)
 
 
 def _barycentric(corners: Float[np.ndarray, "t 3 3"], position: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:

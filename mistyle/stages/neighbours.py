@@ -13,6 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
+from mistyle.stages.frames import uv_derivatives
+from mistyle.stages.texels import beside
 
 STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns to the texel on the right, left, below and above
 NEAR = 1.0  # sides of a texel between where the surface goes on and the middle of the texel that is taken for it
@@ -43,10 +45,22 @@ class Links:
     seams: tuple[Seam, Seam, Seam, Seam]
 
 
+def _seam(here: np.ndarray, there: np.ndarray) -> Seam:
+    return Seam(here, there, np.ones(len(here), np.float32))
+
+
+NONE = _seam(np.zeros(0, int), np.zeros(0, int))
+
+
+def of_islands(island: Int[np.ndarray, "h w"]) -> Links:
+    """The neighbours within islands (-1: none), without seams."""
+    right, below = beside(island)
+    return Links(right, below, (NONE, NONE, NONE, NONE))
+
+
 def within(among: Links) -> Links:
     """The same without seams."""
-    none = _seam(np.zeros(0, int), np.zeros(0, int))
-    return replace(among, seams=(none, none, none, none))
+    return replace(among, seams=(NONE, NONE, NONE, NONE))
 
 
 def believed(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
@@ -70,14 +84,7 @@ def believed(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
 def links(mesh: Mesh, texels: Texels) -> Links:
     """The neighbours. Surfaces that only come near each other, within NEAR, count as one; charts of other sets do not
     count."""
-    island = texels.island
-    right = (island[:, :-1] == island[:, 1:]) & (island[:, 1:] >= 0)
-    below = (island[:-1] == island[1:]) & (island[1:] >= 0)
-    return Links(right, below, _seams(mesh, texels))
-
-
-def _seam(here: np.ndarray, there: np.ndarray) -> Seam:
-    return Seam(here, there, np.ones(len(here), np.float32))
+    return replace(of_islands(texels.island), seams=_seams(mesh, texels))
 
 
 def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
@@ -85,7 +92,7 @@ def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
 
     at = np.flatnonzero(texels.covered)
     if not len(at):
-        return _seam(at, at), _seam(at, at), _seam(at, at), _seam(at, at)
+        return NONE, NONE, NONE, NONE
     position, normal = texels.position.reshape(-1, 3)[at], texels.normal.reshape(-1, 3)[at]
     own, island = texels.island.ravel()[at], np.pad(texels.island, 1, constant_values=-1)
     row, column = np.divmod(at, texels.covered.shape[1])
@@ -109,10 +116,4 @@ def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
 
 def _sides(mesh: Mesh, size: tuple[int, ...]) -> Float[np.ndarray, "f 2 3"]:
     """Where a step of one texel to the right, and one down, leads on every face."""
-    p = mesh.positions[mesh.faces].astype(np.float64)
-    uv = mesh.corner_uvs.astype(np.float64) * np.array([size[1], -size[0]])
-    e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
-    area = d1[:, :1] * d2[:, 1:] - d1[:, 1:] * d2[:, :1]
-    area = np.where(area != 0, area, np.inf)
-    right, down = (d2[:, 1:] * e1 - d1[:, 1:] * e2) / area, (d1[:, :1] * e2 - d2[:, :1] * e1) / area
-    return np.stack([right, down], axis=1).astype(np.float32)
+    return (uv_derivatives(mesh) / np.array([[size[1]], [-size[0]]])).astype(np.float32)

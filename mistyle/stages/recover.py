@@ -89,7 +89,8 @@ def recover(
     whole = usable(mesh, captures, notes)
     captures = without(whole, indirect)
     traced = tracer(mesh)
-    where = solving.linked(mesh, texels)
+    # The steps on whole pictures know no neighbours.
+    where = solving.atlas(texels) if settings.solver == "pictures" else solving.linked(mesh, texels)
     work = Work(traced, tangents_of(mesh, settings.frame), texels, where, captures, settings, notes)
     shade = Shade(
         traced, captures, where.sizes, model=settings.model, frame=settings.frame, subsamples=settings.subsamples,

@@ -21,6 +21,7 @@ from mistyle.render.draw import Tracer
 from mistyle.render.texel_lm import Observations, Points, Rig
 from mistyle.render.texel_views import Look, look, open_sky, rig
 from mistyle.stages.frames import texel_frames
+from mistyle.stages.texels import beside
 
 REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
 LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane
@@ -122,16 +123,14 @@ def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, 
 
 def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
     """The shorter side of every texel on the surface, from where its neighbours in the island lie; 0 without any."""
-    p, island = texels.position, texels.island
-    sides = np.full((2, *island.shape), np.inf, np.float32)
-    for axis, side in enumerate(sides):
-        ahead, here = np.moveaxis(p, axis, 0), np.moveaxis(np.asarray(side), axis, 0)
-        label = np.moveaxis(island, axis, 0)
-        same = (label[1:] == label[:-1]) & (label[1:] >= 0)
-        length = np.where(same, np.sqrt(((ahead[1:] - ahead[:-1]) ** 2).sum(axis=-1)), np.inf)
-        here[:-1] = length
-        here[1:] = np.minimum(here[1:], length)
-    smallest = sides.min(axis=0).ravel()
+    right, below = beside(texels.island)
+    shortest = np.full(texels.island.shape, np.inf, np.float32)
+    columns = shortest.T, texels.position.transpose(1, 0, 2), right.T
+    for side, p, same in ((shortest, texels.position, below), columns):
+        length = np.where(same, np.sqrt(((p[1:] - p[:-1]) ** 2).sum(axis=-1)), np.inf)
+        side[:-1] = np.minimum(side[:-1], length)
+        side[1:] = np.minimum(side[1:], length)
+    smallest = shortest.ravel()
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
 
 

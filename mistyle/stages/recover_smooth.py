@@ -92,7 +92,7 @@ def _measured(found: Grid, error: Grid, among: Links, least: float) -> tuple[Gri
         sums = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
         for own, value in zip(sums, (_second(x, link) ** 2, noise, 1), strict=True):
             own[:, 1:-1] += weight * value
-    varies, noise, weights = diffused(total, among, AROUND, np.ones(1, np.float32))[..., 0]
+    varies, noise, weights = diffused(total, among, AROUND)[..., 0]
     own = np.clip((varies - noise) / np.maximum(weights, 1e-12), least**2, MOST**2)
     share = np.clip(varies / np.maximum(noise, 1e-12), 0, 1)
     return error * np.sqrt(share), own

@@ -113,10 +113,10 @@ def neighbourhood(
     gathered: Gathered,
     where: Atlas,
     steps: int,
-    over: Float[np.ndarray, " c"],
+    over: Float[np.ndarray, " c"] | float = 1.0,
 ) -> Float[np.ndarray, "t c"]:
-    """Weighted mean over the neighbours and theirs, of column c also over seams where over[c] is 1, not where it is 0;
-    where none has a weight, the texel's own value."""
+    """Weighted mean over the neighbours and theirs; `over`: how much those beyond seams count, 0..1 (of each column).
+    Where none has a weight, the texel's own value."""
     channels = values.shape[1]
     full = np.zeros((2, where.offsets[-1], channels), np.float32)
     full[0, gathered.texel], full[1, gathered.texel] = values * weight, weight
@@ -128,12 +128,12 @@ def neighbourhood(
 
 
 def diffused(
-    part: Float[np.ndarray, "n h w c"], among: Links, steps: int, over: Float[np.ndarray, " c"]
+    part: Float[np.ndarray, "n h w c"], among: Links, steps: int, over: Float[np.ndarray, " c"] | float = 1.0
 ) -> Float[np.ndarray, "n h w c"]:
     """Sums that every texel shares with the four around it, step by step. What would go to others is lost, so sums mean
     something only beside sums of weights."""
     right, below = among.right[..., None], among.below[..., None]
-    seams = among.seams if over.any() else ()
+    seams = among.seams if np.any(over) else ()
     for _ in range(steps):
         total = 2 * part
         total[:, :, :-1] += part[:, :, 1:] * right
@@ -336,7 +336,7 @@ def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.nda
     """
     spare = np.maximum(gathered.seen - len(UNKNOWNS) / 3, 0)
     each = np.where(spare[:, None] > 0, np.stack([solution.cost, spare], axis=1), 0).astype(np.float32)
-    cost, count = neighbourhood(each, np.ones_like(each), gathered, where, AROUND, np.ones(2, np.float32)).T
+    cost, count = neighbourhood(each, np.ones_like(each), gathered, where, AROUND).T
     return np.where(count > 1e-6, cost / np.maximum(count, 1e-6), 0).astype(np.float32)
 
 

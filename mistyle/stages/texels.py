@@ -51,6 +51,12 @@ def threaded(work: Callable[[int], None], count: int, progress: Callable[[float]
             progress((k + 1) / count)
 
 
+def beside(island: Int[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "h v"], Bool[np.ndarray, "u w"]]:
+    """Whether a texel and the one right of it, and the one below it, lie in one UV island (v = w - 1, u = h - 1)."""
+    inside = island >= 0
+    return (island[:, :-1] == island[:, 1:]) & inside[:, 1:], (island[:-1] == island[1:]) & inside[1:]
+
+
 def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
     """Position, normal, island and face of every texel of texture set `part` whose centre a UV triangle covers.
 
