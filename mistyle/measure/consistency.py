@@ -4,7 +4,7 @@ Pictures are (h w 3), sRGB-encoded 0..1, one per view. Lower is better for warp 
 readability.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import combinations
 
 import numpy as np
@@ -13,7 +13,8 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.image import dilate, erode, gaussian
 from mistyle.core.view import View
 from mistyle.measure.lpips import Lpips
-from mistyle.measure.metrics import carried_over, lab
+from mistyle.measure.metrics import lab
+from mistyle.measure.overlap import Overlap, overlap, seen_here, seen_there
 
 SHORT, LONG = (
     (0.0, 46.0),
@@ -40,17 +41,17 @@ def pairs(views: Sequence[View], degrees: tuple[float, float]) -> list[Pair]:
 
 
 def warp_rmse(views: Sequence[View], pictures: Sequence[Float[np.ndarray, "h w 3"]], chosen: Sequence[Pair]) -> float:
-    """Root mean square difference (all channels, sRGB) of a picture and another carried over into its view.
+    """Root mean square difference (all channels, sRGB) of what two pictures show of the same places, at the coarser of
+    their pixels (`measure/overlap.py`).
 
     Pooled over the pixels of all pairs; pairs that share less than LEAST_SHARED of the view are left out, NaN where
-    none is left. What one view shows finer than the other leaves some error even in one painting of the surface.
+    none is left.
     """
     squares, count = 0.0, 0
-    for i, j in chosen:
-        carried, both = carried_over(views[i], views[j], pictures[j])
-        if both.sum() >= max(LEAST_SHARED * views[i].mask.sum(), 1):
-            squares += float(((carried[both] - pictures[i][both]) ** 2).sum(dtype=np.float64))
-            count += 3 * int(both.sum())
+    for i, j, shared in _shared(views, chosen):
+        wrong = seen_there(shared, pictures[j]) - seen_here(shared, pictures[i])
+        squares += float((wrong**2).sum(dtype=np.float64))
+        count += wrong.size
     return float(np.sqrt(squares / count)) if count else float("nan")
 
 
@@ -60,31 +61,39 @@ def round_trip_rmse(
     """What carrying over alone costs, to be read beside `warp_rmse`: the same difference between a picture and itself
     carried into the other view and back.
 
-    No view contradicts itself, so this is the error of two lookups and the blur of a place seen at another scale. The
-    other view's own pixels are antialiased when they are drawn, and these are not, so it is no strict bound.
+    No view contradicts itself, so this is the error of two lookups. It is no strict bound: `warp_rmse` makes one.
     """
     squares, count = 0.0, 0
-    for i, j in chosen:
-        there, seen = carried_over(views[j], views[i], pictures[i])
-        back, both = carried_over(views[i], views[j], np.concatenate([there, seen[..., None]], axis=-1))
-        if both.sum() >= max(LEAST_SHARED * views[i].mask.sum(), 1):
-            both &= np.abs(back[..., 3] - 1) < 1e-3  # nothing of what the other view does not show was mixed in
-            carried = back[both][:, :3] / back[both][:, 3:]
-            squares += float(((carried - pictures[i][both]) ** 2).sum(dtype=np.float64))
-            count += 3 * int(both.sum())
+    for i, j, shared in _shared(views, chosen):
+        there = overlap(views[j], views[i])
+        carried = np.zeros((*there.both.shape, 4), np.float32)
+        carried[there.both, :3], carried[there.both, 3] = seen_there(there, pictures[i]), 1
+        back = seen_there(shared, carried)
+        whole = np.abs(back[:, 3] - 1) < 1e-3  # nothing of what the other view does not show was mixed in
+        wrong = back[whole, :3] / back[whole, 3:] - seen_here(shared, pictures[i])[whole]
+        squares += float((wrong**2).sum(dtype=np.float64))
+        count += wrong.size
     return float(np.sqrt(squares / count)) if count else float("nan")
 
 
 def warp_lpips(
     views: Sequence[View], pictures: Sequence[Float[np.ndarray, "h w 3"]], chosen: Sequence[Pair], lpips: Lpips
 ) -> float:
-    """LPIPS of a picture and another carried over into its view, over the pixels both see; mean over the pairs."""
+    """LPIPS of what two pictures show of the same places, at the coarser of their pixels; mean over the pairs."""
     found = []
-    for i, j in chosen:
-        carried, both = carried_over(views[i], views[j], pictures[j])
-        if both.sum() >= max(LEAST_SHARED * views[i].mask.sum(), 1):
-            found.append(lpips(pictures[i], carried, both))
+    for i, j, shared in _shared(views, chosen):
+        mine, theirs = (pictures[i].astype(np.float32) for _ in range(2))
+        mine[shared.both], theirs[shared.both] = seen_here(shared, pictures[i]), seen_there(shared, pictures[j])
+        found.append(lpips(mine, theirs, shared.both))
     return float(np.mean(found)) if found else float("nan")
+
+
+def _shared(views: Sequence[View], chosen: Sequence[Pair]) -> Iterator[tuple[int, int, Overlap]]:
+    """The pairs that share enough, and what they share."""
+    for i, j in chosen:
+        shared = overlap(views[i], views[j])
+        if shared.both.sum() >= max(LEAST_SHARED * views[i].mask.sum(), 1):
+            yield i, j, shared
 
 
 def guide_correlation(

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.camera import pixel_centres, px_from_world, world_from_px
 from mistyle.core.image import dilate, erode, gaussian, linear_from_srgb, resize
 from mistyle.core.view import View
+from mistyle.measure.overlap import DEPTH_TOLERANCE, overlap, seen_here, seen_there
 
 XYZ_FROM_LINEAR = np.array(
     [[0.4123908, 0.3575843, 0.1804808], [0.2126390, 0.7151687, 0.0721923], [0.0193308, 0.1191948, 0.9505322]]
@@ -24,7 +24,6 @@ D65 = XYZ_FROM_LINEAR.sum(axis=1)
 PATCH = 5
 SCALES = (1, 2, 4)
 QUANTILES = 256
-DEPTH_TOLERANCE = 0.01  # working units: two views see the same point
 SEAM_JUMP = 8.0  # times the usual uv step between neighbouring pixels
 
 
@@ -232,44 +231,13 @@ def warp_error(
 ) -> float:
     """View-to-view error: mean |Delta L| + |Delta a| + |Delta b| (Lab / 100, times 100) of points both views see.
 
-    Every pixel of `view` is lifted by its depth, looked up (bicubic) in `other`, and counted where the depths agree
-    and both are three pixels inside their masks. What one view shows finer than the other leaves a few units.
+    Every pixel of `view` is lifted by its depth, looked up in `other`, and counted where the depths agree and both are
+    three pixels inside their masks, at the coarser of the two pixels (`overlap`).
     """
-    carried, both = carried_over(view, other, other_picture)
-    if not both.any():
+    shared = overlap(view, other)
+    if not shared.both.any():
         return float("nan")
-    return float(np.abs(lab(picture[both]) - lab(carried[both])).sum(axis=1).mean())
-
-
-def carried_over(
-    view: View, other: View, other_picture: Float[np.ndarray, "h w c"]
-) -> tuple[Float[np.ndarray, "h w c"], Bool[np.ndarray, "h w"]]:
-    """The other view's picture, of up to four channels, as `view` sees it, and which of the view's pixels both see, as
-    in `warp_error`; zero elsewhere.
-
-    Bicubic: bilinear lookups blur, and would count every sharp picture as one that contradicts itself. They overshoot
-    at edges, and OpenCV rounds their places to 1/32 pixel.
-    """
-    chosen = erode(view.mask, 3)
-    px = pixel_centres(view.camera.size)[chosen]
-    points = world_from_px(view.camera, px, view.depth[chosen].astype(np.float64))
-    there, z = px_from_world(other.camera, points)
-    seen = _sees(other, there, z)
-    both, places = np.zeros(chosen.shape, bool), np.zeros((2, *chosen.shape), np.float32)
-    both[chosen], places[:, chosen] = seen, there.T - 0.5
-    picture = np.ascontiguousarray(other_picture, np.float32)
-    carried = cv2.remap(picture, places[0], places[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-    carried = carried.reshape(*chosen.shape, picture.shape[2])
-    carried[~both] = 0
-    return carried, both
-
-
-def _sees(view: View, px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    height, width = view.camera.size
-    inside = (z > 0) & (px >= 0).all(axis=1) & (px[:, 0] < width) & (px[:, 1] < height)
-    column, row = np.where(inside[:, None], px, 0).astype(np.int64).T
-    depth = np.where(np.isfinite(view.depth), view.depth, 1e9)[row, column]
-    return inside & erode(view.mask, 3)[row, column] & (np.abs(depth - z) < DEPTH_TOLERANCE)
+    return float(np.abs(lab(seen_here(shared, picture)) - lab(seen_there(shared, other_picture))).sum(axis=1).mean())
 
 
 def seam_ratio(view: View, picture: Float[np.ndarray, "h w 3"]) -> float:
