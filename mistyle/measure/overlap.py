@@ -57,16 +57,12 @@ def overlap(view: View, other: View) -> Overlap:
 
 
 def seen_here(shared: Overlap, picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "n c"]:
-    """The first view's picture at the shared places."""
+    """The first view's picture, of up to four channels, at the shared places."""
     return _means(picture, shared.here, shared.around_here)
 
 
 def seen_there(shared: Overlap, picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "n c"]:
-    """The other view's picture at the shared places.
-
-    Bicubic: bilinear lookups blur, and would count every sharp picture as one that contradicts itself. They overshoot
-    at edges, and OpenCV rounds their places to 1/32 pixel.
-    """
+    """The other view's picture, of up to four channels, at the shared places."""
     return _means(picture, shared.there, shared.around_there)
 
 
@@ -108,7 +104,11 @@ def _axes(steps: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "n 2 2"]:
 
 
 def _means(picture: np.ndarray, px: np.ndarray, axes: np.ndarray) -> Float[np.ndarray, "n c"]:
-    """Means of LOOKS x LOOKS bicubic lookups over the parallelogram of `axes` around `px`."""
+    """Means of LOOKS x LOOKS lookups over the parallelogram of `axes` around `px`.
+
+    Bicubic: bilinear lookups blur, and would count every sharp picture as one that contradicts itself. They overshoot
+    at edges, and OpenCV rounds their places to 1/32 pixel.
+    """
     # OpenCV's maps have at least one row, and at most 32,767 rows and columns.
     count, width = len(px), 4096
     places = np.zeros((count // width + 1, width, 2), np.float32)
