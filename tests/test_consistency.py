@@ -40,9 +40,9 @@ def test_a_round_trip_knows_nothing_of_the_other_picture(rng):
     views = [plane_view(0), plane_view(60)]
     chosen = consistency.pairs(views, consistency.LONG)
     assert consistency.round_trip_rmse(views, [GREY, LIGHT], chosen) < 1e-6
-    smooth, fine = [waves(view) for view in views], [noise(rng, sigma=0.7)] * 2
+    smooth, fine = [waves(view) for view in views], [noise(rng, sigma=0.4)] * 2
     assert consistency.round_trip_rmse(views, smooth, chosen) < 0.002
-    assert consistency.round_trip_rmse(views, fine, chosen) > 0.02
+    assert consistency.round_trip_rmse(views, fine, chosen) > 0.04
     assert np.isnan(consistency.round_trip_rmse(views, smooth, []))
 
 

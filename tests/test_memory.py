@@ -55,8 +55,7 @@ def test_the_peak_of_a_block_is_its_own():
         held = memory.resident()
         np.ones(BLOCK, np.uint8)
         assert BLOCK - 1_000_000 < most() - held < BLOCK + 10_000_000
-    # The kernel's own mark, which it takes as memory is given back, may lack some pages of each core.
-    assert memory.highest() > before - 1_000_000
+    assert memory.highest() >= before
 
 
 @LINUX

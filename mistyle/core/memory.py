@@ -62,7 +62,7 @@ def kept() -> Iterator[None]:
         library.malloc_trim(0)
 
 
-_before = [0]  # bytes: the highest that was seen before the kernel's own mark was reset
+_seen = [0]  # bytes: the highest that was told; the kernel's own mark is reset, and lacks some pages of each core
 
 
 def resident() -> int:
@@ -72,13 +72,8 @@ def resident() -> int:
 
 def highest() -> int:
     """The most bytes that this process, or the largest of its children that have ended, has held so far."""
-    try:
-        import resource
-    except ImportError:
-        return max(_before[0], _status("VmHWM"))
-    unit = 1 if sys.platform == "darwin" else 1024
-    own, children = (resource.getrusage(w).ru_maxrss for w in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return max(_before[0], _status("VmHWM"), own * unit, children * unit)
+    _seen[0] = max(_seen[0], _status("VmHWM"), *map(_of, ("RUSAGE_SELF", "RUSAGE_CHILDREN")))
+    return _seen[0]
 
 
 @contextmanager
@@ -89,13 +84,13 @@ def watched() -> Iterator[Callable[[], int]]:
     (another system, a closed /proc) the answer is the most that was held so far. A child that ends within the block and
     was larger than all before it counts as well. Blocks do not nest: the inner one sets the outer one's mark back.
     """
-    children, outer = _of_children(), highest()
-    _before[0] = max(_before[0], outer)
+    children = _of("RUSAGE_CHILDREN")
+    highest()  # kept, for what follows forgets it
     reset = _reset()
 
     def most() -> int:
         own = _status("VmHWM") if reset else highest()
-        grown = _of_children()
+        grown = _of("RUSAGE_CHILDREN")
         return max(own, grown if grown > children else 0)
 
     yield most
@@ -110,12 +105,13 @@ def _reset() -> bool:
     return True
 
 
-def _of_children() -> int:
+def _of(whom: str) -> int:
+    """The most bytes held by RUSAGE_SELF or by one of RUSAGE_CHILDREN; 0 where nothing tells (Windows)."""
     try:
         import resource
     except ImportError:
         return 0
-    return resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return resource.getrusage(getattr(resource, whom)).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def _status(name: str) -> int:

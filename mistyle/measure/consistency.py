@@ -82,7 +82,8 @@ def warp_lpips(
     """LPIPS of what two pictures show of the same places, at the coarser of their pixels; mean over the pairs."""
     found = []
     for i, j, shared in _shared(views, chosen):
-        mine, theirs = (pictures[i].astype(np.float32) for _ in range(2))
+        mine = pictures[i].astype(np.float32)
+        theirs = mine.copy()  # what is not shared does not count
         mine[shared.both], theirs[shared.both] = seen_here(shared, pictures[i]), seen_there(shared, pictures[j])
         found.append(lpips(mine, theirs, shared.both))
     return float(np.mean(found)) if found else float("nan")

@@ -2,8 +2,8 @@
 
 A pixel shows the mean over its footprint on the surface. Where one view sees a place from nearer by or less flatly than
 the other, its pixels are finer, and two pictures of one painting differ there though they do not contradict each other.
-So each picture is averaged over the other's pixel where that is the larger (Heckbert, Fundamentals of Texture Mapping,
-1989, section 3.4: the pixel's footprint under the Jacobian of the mapping).
+So each picture is averaged over the other's pixel where that is the larger: its footprint under the Jacobian of the
+mapping (Heckbert, Fundamentals of Texture Mapping and Image Warping, 1989).
 """
 
 from dataclasses import dataclass
