@@ -25,7 +25,7 @@ from mistyle.stages.neighbours import of_islands
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
 from mistyle.stages.recover_observe import Gathered, gather
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.recover_settings import RecoverSettings, estimates
 from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
@@ -370,6 +370,13 @@ def test_pictures_of_one_place_share_their_paths(monkeypatch):
     assert np.abs(found[0] - found[1]).max() > 0.01
 
 
+def test_the_last_estimate_has_most_of_the_samples():
+    assert estimates(RecoverSettings()) == [16, 16, 16, 128]
+    assert estimates(RecoverSettings(bounces=0)) == []
+    assert estimates(RecoverSettings(bounces=1, bounce_samples=5)) == [5]
+    assert estimates(RecoverSettings(bounces=2, bounce_samples=5)) == [1, 5]
+
+
 def test_cameras_of_one_place_are_found():
     one, other = look_at([0, 0, 4], fov=30, size=(32, 32)), look_at([0, 1, 4], fov=30, size=(32, 32))
     wider = replace(one, size=(32, 40))
@@ -391,7 +398,8 @@ def test_averages_stay_on_their_surface(rng):
     np.testing.assert_allclose(averaged(light, position, normal, unit, inside)[inside], light[inside], rtol=1e-4)
     noisy = light * (1 + 0.2 * rng.standard_normal(light.shape)).astype(np.float32)
     smooth = averaged(noisy, position, normal, unit, inside)
-    assert (smooth - light)[inside].std() < 0.6 * (noisy - light)[inside].std()
+    # One mean of nine alone leaves 0.375 of it.
+    assert (smooth - light)[inside].std() < 0.25 * (noisy - light)[inside].std()
     light[30, 30] = 1000
     assert averaged(light, position, normal, unit, inside)[30, 30].max() < 40
 

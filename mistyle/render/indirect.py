@@ -1,10 +1,9 @@
 """Light that reaches the camera by way of more than one surface point: what a fit under direct light must take off.
 
-Paths begin at the pixels of a coarse picture and follow the reflectance; wherever they come after the first point, the
-lights are looked for. What they carry does not depend on the lights until then, so pictures of one camera under several
-lights share their paths, which are most of the work. What arrives is smooth along the surface, so a coarse picture of
-few samples says enough, once it is divided by the albedo, averaged over pixels that show the same surface, and
-multiplied again (Dammertz et al. 2010).
+Paths begin at the pixels and follow the reflectance; wherever they come after the first point, the lights are looked
+for. What they carry does not depend on the lights until then, so pictures of one camera under several lights share
+their paths, which are most of the work. What arrives is smooth along the surface, so few samples say enough, once they
+are divided by the albedo, averaged over pixels that show the same surface, and multiplied again (Dammertz et al. 2010).
 """
 
 from collections.abc import Sequence
@@ -24,14 +23,13 @@ from mistyle.render import device
 from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
 
-COARSER = 2  # pixels along a side of the picture that one pixel of the estimate covers
-LEAST = 128  # pixels along a side of the estimate, at least, where the picture has so many
-MOST = 256  # and at most along the longer side, however large the picture is
+MOST = 512  # pixels along the longer side of the estimate at most; it is as large as the picture where that is smaller
 TOGETHER = 6  # pictures of one camera that share their paths; more make the kernel long
 ROUGH = 0.25  # least roughness: light that mirrors carry comes in few bright samples and adds little
 DEPTH = 5  # path segments: light comes over up to four surface points
 ALIKE = 0.15  # length of the difference of two unit normals at which pixels hardly belong together any more
-LEVEL = 0.7  # and how far, in widths of a pixel, one may lie above or below the other's tangent plane
+LEVEL = 0.7  # and how far, by pixels that lie between the two, one may lie above or below the other's tangent plane
+RINGS = (1, 2)  # how far away, in pixels, the eight neighbours of each averaging are
 PALE = 0.04  # joins the albedo that light is divided by: what a surface reflects without taking its colour
 FIREFLY = 4.0  # times its surroundings: the brightest that a pixel of the estimate may be
 
@@ -53,10 +51,10 @@ class Indirect:
     def pictures(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
     ) -> list[Float[np.ndarray, "h w 3"]]:
-        """Indirect radiance, linear Rec.709, of coarser pictures of the camera, for `enlarged`, under each of `many`;
-        beside the object that of the nearest pixel on it.
+        """Indirect radiance, linear Rec.709, in pictures of the camera of MOST pixels at most, for `enlarged`, under
+        each of `many`; beside the object that of the nearest pixel on it.
 
-        Lights of a scene file raise ValueError. `samples` are those of a pixel of the coarse picture.
+        Lights of a scene file raise ValueError. `samples` are those of a pixel of such a picture.
         """
         found = []
         for k in range(0, len(many), TOGETHER):
@@ -67,7 +65,7 @@ class Indirect:
         import mitsuba
 
         mi: Any = mitsuba
-        by = max(COARSER if min(camera.size) >= COARSER * LEAST else 1, -(-max(camera.size) // MOST))
+        by = -(-max(camera.size) // MOST)
         # Pixels that begin inside the picture and end beside it belong to the estimate.
         small = replace(binned(camera, by), size=(-(-camera.size[0] // by), -(-camera.size[1] // by)))
         lit = [[mi.load_dict(light) for light in emitters(lights, camera)] for lights in many]
@@ -189,28 +187,40 @@ def averaged(
     unit: Float[np.ndarray, "h w"],
     inside: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w 3"]:
-    """Mean of each pixel and the eight around it that show the same surface; `unit` is the width of a pixel there.
+    """Mean of each pixel and the 24 around it, as far as they show the same surface; `unit` is a pixel's width there.
 
-    Pixels that are more than FIREFLY times brighter than those around them are first brought down to that.
+    Two means of nine, the second over every other pixel (the a-trous wavelet transform). Pixels that are more than
+    FIREFLY times brighter than those around them are first brought down to that.
     """
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     position, normal = (np.where(inside[..., None], field, 0).astype(np.float32) for field in (position, normal))
+    for ring in RINGS:
+        total, weights = _around(light, position, normal, unit, inside, ring)
+        if ring == RINGS[0]:
+            brightest = FIREFLY * (total / np.maximum(weights, 1e-6)[..., None])
+            light = np.where(weights[..., None] > 1e-6, np.minimum(light, brightest), light)
+        light = (light + total) / (1 + weights)[..., None]
+    return light
+
+
+def _around(
+    light: np.ndarray, position: np.ndarray, normal: np.ndarray, unit: np.ndarray, inside: np.ndarray, ring: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted sum and weights of the eight pixels that lie `ring` away from each."""
     total, weights = np.zeros_like(light), np.zeros(inside.shape, np.float32)
-    for dy in (-1, 0, 1):
-        for dx in (-1, 0, 1):
+    for dy in (-ring, 0, ring):
+        for dx in (-ring, 0, ring):
             if not (dy or dx):
                 continue
             rows, columns = _overlap(inside.shape[0], dy), _overlap(inside.shape[1], dx)
             here, there = (rows[0], columns[0]), (rows[1], columns[1])
-            lift = ((position[there] - position[here]) * normal[here]).sum(axis=-1) / (LEVEL * unit[here])
+            lift = ((position[there] - position[here]) * normal[here]).sum(axis=-1) / (LEVEL * ring * unit[here])
             turn2 = ((normal[there] - normal[here]) ** 2).sum(axis=-1)
             likeness = np.exp(-(lift**2) - turn2 / ALIKE**2) * (0.25 if dy and dx else 0.5)
             weight = np.where(inside[here] & inside[there], likeness, 0)
             total[here] += weight[..., None] * light[there]
             weights[here] += weight
-    brightest = FIREFLY * (total / np.maximum(weights, 1e-6)[..., None])
-    light = np.where(weights[..., None] > 1e-6, np.minimum(light, brightest), light)
-    return (light + total) / (1 + weights)[..., None]
+    return total, weights
 
 
 def _overlap(size: int, step: int) -> tuple[slice, slice]:

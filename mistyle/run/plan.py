@@ -31,7 +31,7 @@ from mistyle.run.budget import (
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import thread_count
 from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
-from mistyle.stages.recover_settings import all_rounds
+from mistyle.stages.recover_settings import all_rounds, estimates
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -95,6 +95,7 @@ def plan_material(job: Any) -> dict[str, Any]:
 
     How much of the pictures shows the object is not known yet: run/budget.py's shares are taken.
     """
+    from mistyle.render.indirect import MOST
     from mistyle.run.material import pixels_of, references_of
 
     s, files = job.settings, input_files(job.mesh)
@@ -105,8 +106,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
     rounds = solves * all_rounds(s.recover)
-    # render/indirect.py's pictures are half as wide, and never wider than 256 pixels.
-    paths = solves * s.recover.bounces * s.recover.bounce_samples * sum(min(n / 4, 2**16) for n in sizes)
+    paths = solves * sum(estimates(s.recover)) * sum(min(n, MOST**2) for n in averaged)
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
     seconds = {
         "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),

@@ -90,7 +90,7 @@ def blocks(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
 
 
 def without(captures: Captures, indirect: dict[int, np.ndarray]) -> Captures:
-    """The pictures less their indirect light, as coarse pictures that may still come."""
+    """The pictures less their indirect light, which may still come, in pictures that may be coarser."""
 
     def load(k: int) -> Loaded:
         rgb, mask = captures.load(k)

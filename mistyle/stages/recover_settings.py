@@ -5,6 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 SETTLING = 3
+FEWER = 8  # times as few samples for all estimates of light between surfaces but the last
 
 
 class RecoverSettings(BaseModel):
@@ -79,7 +80,12 @@ class RecoverSettings(BaseModel):
     bounces: int = Field(
         default=4, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
     )
-    bounce_samples: int = Field(default=128, ge=1, le=4096, description="samples a pixel of that estimate")
+    bounce_samples: int = Field(
+        default=128,
+        ge=1,
+        le=4096,
+        description="samples a pixel of the last estimate; those before it, with maps still far off, have an eighth",
+    )
     polish: int = Field(
         default=0,
         ge=0,
@@ -99,3 +105,9 @@ def all_rounds(settings: RecoverSettings) -> int:
     """How many rounds the texels are solved in: `rounds` at first and after each estimate of light between surfaces,
     SETTLING times as many after the last, whose changes take them to settle."""
     return settings.rounds * (settings.bounces + (SETTLING if settings.bounces else 1))
+
+
+def estimates(settings: RecoverSettings) -> list[int]:
+    """Samples a pixel of each estimate of light between surfaces."""
+    few = -(-settings.bounce_samples // FEWER)
+    return [few] * (settings.bounces - 1) + [settings.bounce_samples] * (settings.bounces > 0)

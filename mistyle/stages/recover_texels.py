@@ -16,7 +16,7 @@ from mistyle.render.indirect import enlarged
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust
 from mistyle.stages.recover_observe import Gathered, fetch
-from mistyle.stages.recover_settings import RecoverSettings, all_rounds
+from mistyle.stages.recover_settings import RecoverSettings, all_rounds, estimates
 from mistyle.stages.texels import rasterise
 
 SOFT_COST = 64  # times as long as under one light a texel takes under a sky, nearly
@@ -146,7 +146,8 @@ def solve_texels(
                 progress(0.5 + 0.5 * (number + done) / total)
 
             if 0 < number <= last and number % settings.rounds == 0:
-                take_off_indirect(work, shade, table, indirect, seed, lambda done: heard(0.7 * done))
+                samples = estimates(settings)[number // settings.rounds - 1]
+                take_off_indirect(work, shade, table, indirect, samples, seed + number, lambda d: heard(0.7 * d))
                 problem.reweight(doubted(gathered, work.captures, indirect))
             shade.table = table
             lost: list[float] = []
@@ -186,6 +187,7 @@ def take_off_indirect(
     shade,
     table: np.ndarray,
     indirect: dict[int, np.ndarray],
+    samples: int,
     seed: int,
     progress: Callable[[float], None],
 ) -> None:
@@ -198,7 +200,7 @@ def take_off_indirect(
     scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for group in by_camera(captures.cameras):
         many = [captures.lights[k] for k in group]
-        found = scene.pictures(captures.cameras[group[0]], many, settings.bounce_samples, seed + group[0])
+        found = scene.pictures(captures.cameras[group[0]], many, samples, seed + len(captures) * group[0])
         for k, light in zip(group, found, strict=True):
             indirect[k] = light
             retarget(shade, k, captures.load(k)[0], weights(k))
