@@ -10,9 +10,10 @@ under one that stands still and is solved for too. Texel figures are over the su
 weighted by area; "confident_" ones over the 95 % of it that the fit trusts most. Relit: four lights of no reference,
 cameras between theirs, mean over the pictures.
 
-`figures` are ours. `baselines`: "constant" is the best map of one value; "together" is ours from the same pictures
-summed by view (all lights on); "naive" and "naive_pyramid" are `naive_fit.py` for as many seconds as ours took.
-`gain_over_naive_db` is relight_psnr_l minus that of the naive loop.
+`figures` are ours. `baselines`: "constant" is the best map of one value; "other_seed" is the truth, relit with other
+random numbers than all others share: what two noisy renders of equal maps differ by; "together" is ours from the same
+pictures summed by view (all lights on); "naive" and "naive_pyramid" are `naive_fit.py` for as many seconds as ours
+took. `gain_over_naive_db` is relight_psnr_l minus that of the naive loop.
 """
 
 import argparse
@@ -36,6 +37,7 @@ from mistyle.measure.material_metrics import best_constant, confident, map_error
 from mistyle.render.scene import Frame
 
 LEAST_VIEWS = 3
+RELIT_SPP = 128  # least samples of relit pictures: their own noise counts as an error of the maps
 KINDS = ("real", "strong", "paper", "soft", "unknown")
 RIVALS = ("together", "naive", "naive_pyramid")
 
@@ -122,7 +124,7 @@ def parse(argv: list[str] | None) -> argparse.Namespace:
     parser.add_argument("--frame", choices=["mikkt", "mitsuba"], default="mikkt", help="frame of the normal maps")
     parser.add_argument("--resolution", type=int, default=None)
     parser.add_argument("--views", type=int, default=None)
-    parser.add_argument("--spp", type=int, default=None, help="samples of the references; the relit have a quarter")
+    parser.add_argument("--spp", type=int, default=None, help="samples of the references")
     parser.add_argument(
         "--direct", action="store_true", help="references without light between surfaces, to see what that costs"
     )
@@ -179,6 +181,7 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
     fitted = ours(known, main_shots, main_pictures, frame, unknown=row.kind == "unknown", **chosen)
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
+    methods["other_seed"] = judge.relight(known.maps, frame, "other_seed", seed=2)
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
     if row.kind in ("real", "strong") and "together" in options.rivals:
         other = ours(known, *drawing.together(shots, pictures), frame, **chosen)
@@ -228,17 +231,20 @@ class Judge:
         if confidence is not None:
             trusted = confident_weights(self.weights, confidence)
             result |= {f"confident_{k}": v for k, v in asdict(map_errors(self.known.maps, maps, trusted)).items()}
-        pictures = self._relit(maps, frame)
+        return result | self.relight(maps, frame, method)
+
+    def relight(self, maps: Sequence[Maps], frame: Frame, method: str, seed: int = 1) -> dict[str, float]:
+        pictures = self._relit(maps, frame, seed)
         self.shown[method] = pictures[:: self.each]
         errors = [
             relight_errors(a[..., :3], b[..., :3], a[..., 3] > 0.5) for a, b in zip(self.truth, pictures, strict=True)
         ]
-        return result | {f"relight_{k}": v for k, v in asdict(mean_errors(errors)).items()}
+        return {f"relight_{k}": v for k, v in asdict(mean_errors(errors)).items()}
 
-    def _relit(self, maps: Sequence[Maps], frame: Frame) -> list[np.ndarray]:
-        spp = max(8, self.options.spp // 4)
+    def _relit(self, maps: Sequence[Maps], frame: Frame, seed: int = 1) -> list[np.ndarray]:
+        spp = max(8 if self.options.quick else RELIT_SPP, self.options.spp // 4)
         return drawing.render(
-            self.known.mesh, maps, self.shots, frame=frame, spp=spp, seed=1, cache=self.options.cache / "relit"
+            self.known.mesh, maps, self.shots, frame=frame, spp=spp, seed=seed, cache=self.options.cache / "relit"
         )
 
 
