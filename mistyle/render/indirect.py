@@ -187,7 +187,7 @@ def averaged(
     unit: Float[np.ndarray, "h w"],
     inside: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w 3"]:
-    """Mean of each pixel and the 24 around it, as far as they show the same surface; `unit` is a pixel's width there.
+    """Mean of each pixel and the 48 around it, as far as they show the same surface; `unit` is a pixel's width there.
 
     Two means of nine, the second over every other pixel (the a-trous wavelet transform). Pixels that are more than
     FIREFLY times brighter than those around them are first brought down to that.
