@@ -181,7 +181,7 @@ def measure(row: Row, options: argparse.Namespace) -> tuple[dict[str, dict[str, 
     fitted = ours(known, main_shots, main_pictures, frame, unknown=row.kind == "unknown", **chosen)
     methods = {"ours": judge(fitted.maps, frame, "ours", fitted.confidence) | {"seconds": fitted.seconds}}
     methods["constant"] = judge(best_constant(known.maps, weights), frame, "constant")
-    methods["other_seed"] = judge.relight(known.maps, frame, "other_seed", seed=2)
+    methods["other_seed"] = judge.differences(judge.relit(known.maps, frame, seed=2))
     all_maps: dict[str, Sequence[Maps]] = {"truth": known.maps, "ours": fitted.maps}
     if row.kind in ("real", "strong") and "together" in options.rivals:
         other = ours(known, *drawing.together(shots, pictures), frame, **chosen)
@@ -217,7 +217,7 @@ class Judge:
         rigs = drawing.unseen(hdri, options.resolution, 1 if options.quick else 2)
         self.shots: list[Shot] = [shot for shots in rigs.values() for shot in shots]
         self.each = len(self.shots) // len(rigs)
-        self.truth = self._relit(known.maps, options.frame)
+        self.truth = self.relit(known.maps, options.frame)
         self.shown: dict[str, list[np.ndarray]] = {}
 
     @property
@@ -231,17 +231,18 @@ class Judge:
         if confidence is not None:
             trusted = confident_weights(self.weights, confidence)
             result |= {f"confident_{k}": v for k, v in asdict(map_errors(self.known.maps, maps, trusted)).items()}
-        return result | self.relight(maps, frame, method)
-
-    def relight(self, maps: Sequence[Maps], frame: Frame, method: str, seed: int = 1) -> dict[str, float]:
-        pictures = self._relit(maps, frame, seed)
+        pictures = self.relit(maps, frame)
         self.shown[method] = pictures[:: self.each]
+        return result | self.differences(pictures)
+
+    def differences(self, pictures: Sequence[np.ndarray]) -> dict[str, float]:
+        """Figures of relit pictures beside the truth's."""
         errors = [
             relight_errors(a[..., :3], b[..., :3], a[..., 3] > 0.5) for a, b in zip(self.truth, pictures, strict=True)
         ]
         return {f"relight_{k}": v for k, v in asdict(mean_errors(errors)).items()}
 
-    def _relit(self, maps: Sequence[Maps], frame: Frame, seed: int = 1) -> list[np.ndarray]:
+    def relit(self, maps: Sequence[Maps], frame: Frame, seed: int = 1) -> list[np.ndarray]:
         spp = max(8 if self.options.quick else RELIT_SPP, self.options.spp // 4)
         return drawing.render(
             self.known.mesh, maps, self.shots, frame=frame, spp=spp, seed=seed, cache=self.options.cache / "relit"
