@@ -3,6 +3,7 @@ depends on it is made anew; the edit stays; a run without edits ends as before."
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,14 @@ import pytest
 import trimesh
 from PIL import Image
 
+from mistyle.core.camera import look_at
 from mistyle.core.errors import InputRefused
+from mistyle.core.view import View
 from mistyle.files.read import read_exr, read_picture
 from mistyle.files.records import load_record
 from mistyle.run import pipeline
 from mistyle.run.progress import Progress
+from mistyle.run.retouch import EXACT, LOSSY, differs
 from mistyle.run.settings import resolve
 from mistyle.run.stages import STAGES, Job
 
@@ -191,6 +195,19 @@ def test_an_edit_of_another_size_is_refused(inputs, out):
 def test_a_finished_run_lists_every_stage_once(inputs, finished):
     again = run(inputs, finished)
     assert again.reused == list(STAGES) and not any("edited" in s for s in again.said)
+
+
+def test_single_pixels_of_a_lossy_view_are_not_taken_for_painting():
+    size, none = (40, 40), np.zeros((40, 40), np.float32)
+    camera = look_at([0, 0, 4], fov=30, size=size)
+    rgb = np.full((*size, 3), 0.4, np.float32)
+    drawn = View(camera, rgb, none, rgb, np.zeros((*size, 2), np.float32), none.astype(int), none == 0, none + 1)
+    painted = rgb.copy()
+    painted[10, 10] = painted[20:22, 20:22] = painted[30:33, 30:32] = 0.8
+    view = replace(drawn, rgb=painted)
+    assert differs(view, drawn, *EXACT).sum() == 11
+    lossy = differs(view, drawn, *LOSSY)
+    assert lossy.sum() == 6 and lossy[30:33, 30:32].all()
 
 
 def test_views_of_another_size_and_lossy_ones_are_taken(inputs, out):

