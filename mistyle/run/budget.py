@@ -185,8 +185,18 @@ def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int 
     count = material_counts(settings, pixels, faces, sets)
     found = peaks(MATERIAL, count)
     held = min(settings.recover.memory, SAMPLE * count.view * settings.recover.subsamples / 1e9)
+    held += between_gb(settings, pixels)
     found |= {stage: found[stage] + held for stage in KEEPING}
     return round(max(found.values()), 2)
+
+
+def between_gb(settings: Any, pixels: Sequence[int]) -> float:
+    """GB of the light between surfaces that is kept of every picture: three floats a pixel of the estimate."""
+    from mistyle.render.indirect import MOST
+
+    if settings.recover.solver == "pictures" or not settings.recover.bounces:
+        return 0.0
+    return 12 * sum(min(n, MOST**2) for n in looked_at(settings, pixels)) / 1e9
 
 
 def tiles(settings: Settings, faces: int = 0, sets: int = 1) -> bool:
@@ -228,6 +238,7 @@ def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: i
         return material_gb(with_setting(chosen, "recover.memory", 1e-9), pixels, faces, sets)
 
     left = settings.memory - max(peaks(MATERIAL, material_counts(settings, pixels, faces, sets)).values())
+    left -= between_gb(settings, pixels)
     if least(settings) > settings.memory or left <= 0:
         needed = least(settings)
         raise UsageError(
