@@ -25,11 +25,11 @@ from mistyle.stages.neighbours import of_islands
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
 from mistyle.stages.recover_observe import Gathered, gather
-from mistyle.stages.recover_settings import RecoverSettings, estimates
+from mistyle.stages.recover_settings import RecoverSettings, estimates, passes
 from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
-QUICK = RecoverSettings(rounds=3, iterations=150, rate=0.002, bounces=0)
+QUICK = RecoverSettings(rounds=3, iterations=300, bounces=0)
 LIGHTS = [((0.5, -0.5, -0.7), 2.0), ((-0.6, -0.3, -0.7), 1.5), ((0.0, 0.7, -0.7), 1.0)]
 
 
@@ -252,18 +252,21 @@ def test_neighbours_help_against_noise_and_where_little_is_known_do_no_harm(worl
 
 
 def test_the_same_bytes_again_and_after_an_interruption(world):
-    """Two runs agree; one that stops after a checkpoint and goes on agrees with both."""
+    """One run, and those that go on after each of its checkpoints: one before light between surfaces is estimated for
+    the last time, one after."""
     mesh, _, texels, captures = world
     some = subset(captures, range(0, 30, 5))
-    settings = QUICK.model_copy(update={"iterations": 18, "rounds": 1, "checkpoint": 1e-9})
+    update = {"iterations": 36, "rounds": 1, "bounces": 2, "bounce_samples": 8, "checkpoint": 1e-9}
+    settings = QUICK.model_copy(update=update)
     states = []
     whole = recover(mesh, [texels], some, settings, 5, save=states.append)
-    assert [int(s["iteration"]) for s in states] == [6, 12]
+    assert [int(s["iteration"]) for s in states] == [6, 18, 24, 30]
     assert all(isinstance(v, np.ndarray) and v.dtype != object for s in states for v in s.values())
-    resumed = recover(mesh, [texels], some, settings, 5, resume=states[0])
-    for name in ("albedo", "normal", "roughness", "metallic"):
-        assert getattr(whole.maps[0], name).tobytes() == getattr(resumed.maps[0], name).tobytes(), name
-    assert whole.trace == resumed.trace
+    for state in states:
+        resumed = recover(mesh, [texels], some, settings, 5, resume=state)
+        for name in ("albedo", "normal", "roughness", "metallic"):
+            assert getattr(whole.maps[0], name).tobytes() == getattr(resumed.maps[0], name).tobytes(), name
+        assert whole.trace == resumed.trace
 
 
 def test_an_atlas_too_fine_is_solved_at_a_coarser_level(world):
@@ -371,10 +374,15 @@ def test_pictures_of_one_place_share_their_paths(monkeypatch):
 
 
 def test_the_last_estimate_has_most_of_the_samples():
-    assert estimates(RecoverSettings()) == [16, 16, 16, 128]
-    assert estimates(RecoverSettings(bounces=0)) == []
-    assert estimates(RecoverSettings(bounces=1, bounce_samples=5)) == [5]
-    assert estimates(RecoverSettings(bounces=2, bounce_samples=5)) == [1, 5]
+    assert estimates(RecoverSettings(), 48) == ([16, 16], [16, 16, 128])
+    assert passes(RecoverSettings(), 48) == [(240, 0), (240, 16), (240, 16), (480, 128)]
+    assert estimates(RecoverSettings(bounces=0), 48) == ([], [])
+    assert estimates(RecoverSettings(bounces=1, bounce_samples=5), 48) == ([5], [])
+    assert estimates(RecoverSettings(bounces=2, bounce_samples=5), 48) == ([1], [5])
+    assert passes(RecoverSettings(bounces=2, iterations=37), 6) == [(12, 0), (25, 128)]
+    assert passes(RecoverSettings(), 1000) == [(1200, 0)]
+    for alone in ({"solver": "texels"}, {"iterations": 0}, {"iterations": 100}):
+        assert estimates(RecoverSettings(bounces=3, **alone), 48) == ([16, 16, 128], [])
 
 
 def test_cameras_of_one_place_are_found():

@@ -105,8 +105,10 @@ def plan_material(job: Any) -> dict[str, Any]:
     averaged = looked_at(s, sizes)
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
-    rounds = solves * all_rounds(s.recover)
-    paths = solves * sum(estimates(s.recover)) * sum(min(n, MOST**2) for n in averaged)
+    rounds = solves * all_rounds(s.recover, len(sizes))
+    paths = (
+        solves * sum(sum(part) for part in estimates(s.recover, len(sizes))) * sum(min(n, MOST**2) for n in averaged)
+    )
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
     seconds = {
         "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),

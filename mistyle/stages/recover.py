@@ -2,36 +2,31 @@
 
 First texel by texel (`recover_solve.py`): with geometry, cameras and lights known nothing has to be rendered to
 solve for one texel, and Levenberg-Marquardt gets in twenty steps where gradient descent on pictures does not get in
-hundreds. Then on whole pictures, by Adam through `render/shade.py`, which models pixels and interpolation exactly.
-Before and after that neighbours have a word about what pictures leave open (`recover_smooth.py`).
-Light that reaches the surface by way of other surfaces can be estimated with the maps found and taken off the
-pictures (`bounces`). Lights and cameras are taken as they are given; a common factor of light and albedo cannot be
-told apart, so albedo is as right as the lights' units are.
+hundreds. Then on whole pictures (`recover_pictures.py`), by Adam through `render/shade.py`, which models pixels and
+interpolation exactly. Before, in between and after that neighbours have a word about what pictures leave open
+(`recover_smooth.py`). Light that reaches the surface by way of other surfaces is estimated with the maps found so far
+and taken off the pictures, in both parts (`bounces`). Lights and cameras are taken as they are given; a common factor
+of light and albedo cannot be told apart, so albedo is as right as the lights' units are.
 """
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core import stopping
 from mistyle.core.capture import Captures
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust, usable, without
+from mistyle.stages.recover_pictures import improved
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.recover_smooth import smoothed
 from mistyle.stages.recover_texels import Found, Work, solve_level
 
 __all__ = ["RecoverSettings", "Recovered", "recover"]
 
-JUDGES = 48  # pictures that say whether the steps on whole pictures helped
-DAMPING = 0.3  # of a descent that begins from nothing
-# And multiples of the rate by channel: soft light says little of normals, less of roughness, most of albedo.
-SHARES = (2, 2, 2, 0.2, 0.2, 0.6, 0.6, 0)
 # Standard deviations at which a texel's confidence has fallen to a half: normal (sine), roughness, albedo, metallic.
 HALF_SURE = {"normal": 0.05, "roughness": 0.1, "albedo": 0.05, "metallic": 0.2}
 CHANNELS = {"albedo": slice(0, 3), "normal": slice(3, 5), "roughness": slice(5, 6), "metallic": slice(6, 7)}
@@ -102,16 +97,7 @@ def recover(
         found = replace(found, table=smoothed(found.table, found.noise, where, settings.roughness_floor))
     table = found.table
     if settings.solver != "texels" and settings.iterations:
-        before = total_loss(shade, table, settings)
-        with stopping.at_checkpoints():
-            table = descend(work, shade, found, seed, trace, lambda d: progress(0.5 + 0.45 * d), save, resume)
-        after = total_loss(shade, table, settings)
-        trace["pictures.whole"] = [before, after]
-        if not after < before:
-            notes.append(f"The steps on whole pictures were undone: the loss went from {before:.3g} to {after:.3g}.")
-            table = found.table
-        elif found.solved and settings.smooth:
-            table = smoothed(table, found.noise, where, settings.roughness_floor)
+        table = improved(work, shade, found, indirect, seed, trace, lambda d: progress(0.5 + 0.45 * d), save, resume)
     if settings.polish:
         # Its pictures keep the light between surfaces.
         table = polished(work, whole, table, seed, trace, lambda d: progress(0.95 + 0.05 * d))
@@ -119,64 +105,6 @@ def recover(
     residuals = {camera.name: _residual(shade, k) for k, camera in enumerate(captures.cameras)}
     progress(1.0)
     return _recovered(work, found, table, trace, residuals)
-
-
-def descend(
-    work: Work,
-    shade,
-    found: Found,
-    seed: int,
-    trace: dict[str, list[float]],
-    progress: Callable[[float], None],
-    save: Callable[[dict[str, np.ndarray]], None] | None,
-    resume: dict[str, np.ndarray] | None,
-) -> Float[np.ndarray, "a 8"]:
-    """Adam on whole pictures, one a step, in an order that is shuffled anew each time all have been looked at."""
-    from mistyle.render.descent import Descent, table_on_device
-
-    settings, count = work.settings, len(work.captures)
-    levels = settings.levels or (1 if found.solved else 5)
-    rates = [1.0, 1, 1, 1, 1, 1, 1 if settings.metallic else 0, 0]
-    if not found.solved:
-        rates = [rate * share for rate, share in zip(rates, SHARES, strict=True)]
-    damping = 0.0 if found.solved else DAMPING
-    descent = Descent(
-        work.where.sizes, rates, levels=levels, floor=settings.roughness_floor, damping=damping,
-        shares=_shares(found) if found.solved else None,
-    )  # fmt: skip
-    table, first, lost, losses = table_on_device(found.table), 0, [], trace.setdefault("pictures.loss", [])
-    if resume is not None:
-        first, table = int(resume["iteration"]), table_on_device(resume["table"])
-        losses.extend(resume["losses"].tolist())
-        descent.restore(resume)
-    saved = time.monotonic()
-    for k in range(first, settings.iterations):
-        picture = int(np.random.default_rng([seed, k // count]).permutation(count)[k % count])
-        shade.table = table
-        loss, gradient = shade.step([picture], settings.loss)
-        rate = settings.rate * 0.5 * (1 + np.cos(np.pi * k / settings.iterations))
-        table = descent.step(table, gradient.array, rate, picture)
-        lost.append(loss)
-        if (k + 1) % count == 0 or k + 1 == settings.iterations:
-            losses.extend(float(np.array(value)[0]) for value in lost)
-            lost.clear()
-            progress((k + 1) / settings.iterations)
-            due = stopping.asked() or time.monotonic() - saved > settings.checkpoint
-            if save is not None and due and k + 1 < settings.iterations:
-                state = descent.state() | {"iteration": np.array(k + 1), "losses": np.array(losses)}
-                save(state | {"table": np.array(table).reshape(-1, 8)})
-                saved = time.monotonic()
-                stopping.check()
-    _note_stopped(work, descent.stopped())
-    return np.array(table).reshape(-1, 8)
-
-
-def _shares(found: Found) -> Float[np.ndarray, "a 8"]:
-    """Multiples of Adam's rate: a step has the same length however little speaks for it, and a tilt that its neighbours
-    decided would wander off. (Albedo and roughness gain more from steps on whole pictures than they lose.)"""
-    shares = np.ones((len(found.decided), 8), np.float32)
-    shares[:, 3:5] = np.sqrt(found.decided)[:, None]
-    return shares
 
 
 def polished(
@@ -201,29 +129,6 @@ def polished(
         work.notes.append(f"The polish was undone: the loss went from {done.loss[0]:.3g} to {done.loss[1]:.3g}.")
         return table
     return pack(done.maps)
-
-
-def _note_stopped(work: Work, stopped: list[tuple[int, str, int]]) -> None:
-    """Say which texels stood still because their gradient was not a number."""
-    offsets = work.where.offsets
-    for texel, name, picture in stopped[:3]:
-        part = int(np.searchsorted(offsets, texel, side="right")) - 1
-        row, column = divmod(texel - offsets[part], work.where.sizes[part][1])
-        label = work.traced.mesh.parts[part]
-        work.notes.append(
-            f"The gradient of map '{name}' at texel (row {row}, column {column}) of set '{label}' is not a number in"
-            f" picture '{work.captures.cameras[picture].name}': the texel keeps its last good value."
-        )
-    if len(stopped) > 3:
-        work.notes.append(f"The same held for {len(stopped) - 3} more texels.")
-
-
-def total_loss(shade, table: Float[np.ndarray, "a 8"], settings: RecoverSettings) -> float:
-    """Mean loss over the pictures, or over JUDGES of them, evenly chosen."""
-    shade.table = table
-    last = len(shade.captures) - 1
-    chosen = np.unique(np.linspace(0, last, min(JUDGES, last + 1)).round().astype(int)).tolist()
-    return float(np.mean([np.array(shade.step([k], settings.loss)[0])[0] for k in chosen]))
 
 
 def _residual(shade, k: int) -> float:

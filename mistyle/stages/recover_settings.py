@@ -6,6 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 SETTLING = 3
 FEWER = 8  # times as few samples for all estimates of light between surfaces but the last
+PASSES = 4  # over the pictures at most, the last twice as long
+SWEEPS = 2  # how often a pass looks at every picture at least, or there are fewer passes
 
 
 class RecoverSettings(BaseModel):
@@ -59,14 +61,16 @@ class RecoverSettings(BaseModel):
     facing: float = Field(
         default=0.2, gt=0, lt=1, description="least cosine between a texel's normal and the camera that observes it"
     )
-    iterations: int = Field(default=480, ge=0, le=1_000_000, description="steps of Adam, one picture each")
-    rate: float = Field(default=0.003, gt=0, le=1, description="Adam's first rate; it falls to zero along a cosine")
-    levels: int | None = Field(
-        default=None,
-        ge=1,
-        le=16,
-        description="levels of the pyramid that preconditions Adam; none: 1 after the texels were solved, else 5",
+    iterations: int = Field(
+        default=1200,
+        ge=0,
+        le=1_000_000,
+        description="steps of Adam, one picture each; after the texels were solved in up to four passes",
     )
+    rate: float = Field(
+        default=0.003, gt=0, le=1, description="Adam's first rate in each; it falls to zero along a cosine"
+    )
+    levels: int = Field(default=5, ge=1, le=16, description="levels of the pyramid that preconditions Adam")
     loss: Literal["log_srgb_l1", "l2"] = Field(default="log_srgb_l1", description="what Adam minimises")
     subsamples: int = Field(
         default=9,
@@ -78,7 +82,7 @@ class RecoverSettings(BaseModel):
         default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
     )
     bounces: int = Field(
-        default=4, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
+        default=5, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
     )
     bounce_samples: int = Field(
         default=128,
@@ -101,13 +105,28 @@ class RecoverSettings(BaseModel):
     checkpoint: float = Field(default=60.0, gt=0, description="seconds between checkpoints")
 
 
-def all_rounds(settings: RecoverSettings) -> int:
+def all_rounds(settings: RecoverSettings, pictures: int) -> int:
     """How many rounds the texels are solved in: `rounds` at first and after each estimate of light between surfaces,
     SETTLING times as many after the last, whose changes take them to settle."""
-    return settings.rounds * (settings.bounces + (SETTLING if settings.bounces else 1))
+    among = len(estimates(settings, pictures)[0])
+    return settings.rounds * (among + (SETTLING if among else 1))
 
 
-def estimates(settings: RecoverSettings) -> list[int]:
-    """Samples a pixel of each estimate of light between surfaces."""
+def estimates(settings: RecoverSettings, pictures: int) -> tuple[list[int], list[int]]:
+    """Samples a pixel of each estimate of light between surfaces: those among the rounds, those before last passes."""
     few = -(-settings.bounce_samples // FEWER)
-    return [few] * (settings.bounces - 1) + [settings.bounce_samples] * (settings.bounces > 0)
+    every = [few] * (settings.bounces - 1) + [settings.bounce_samples] * (settings.bounces > 0)
+    late = min(_passes(settings, pictures) - 1, settings.bounces * 3 // 5) if settings.solver == "both" else 0
+    return every[: len(every) - late], every[len(every) - late :]
+
+
+def passes(settings: RecoverSettings, pictures: int) -> list[tuple[int, int]]:
+    """Of each pass on whole pictures the steps, and the samples of the estimate before it, 0 for none."""
+    count, late = _passes(settings, pictures), estimates(settings, pictures)[1]
+    ends = [settings.iterations * k // (count + 1) for k in range(count)] + [settings.iterations]
+    steps = [end - begin for begin, end in zip(ends[:-1], ends[1:], strict=True)]
+    return list(zip(steps, [0] * (count - len(late)) + late, strict=True))
+
+
+def _passes(settings: RecoverSettings, pictures: int) -> int:
+    return max(1, min(PASSES, settings.iterations // (SWEEPS * max(pictures, 1)) - 1))

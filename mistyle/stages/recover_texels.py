@@ -138,15 +138,16 @@ def solve_texels(
         solution = solving.first_solve(
             problem, first, mean, gathered.seen, settings, lambda done: progress(0.3 + 0.2 * done)
         )
-        last, total = settings.rounds * settings.bounces, all_rounds(settings)
+        pictures = len(work.captures)
+        estimated, total = estimates(settings, pictures)[0], all_rounds(settings, pictures)
         for number in range(total):
             table = solving.spread_out(solution.values, gathered, where)
 
             def heard(done: float, number=number) -> None:
                 progress(0.5 + 0.5 * (number + done) / total)
 
-            if 0 < number <= last and number % settings.rounds == 0:
-                samples = estimates(settings)[number // settings.rounds - 1]
+            if 0 < number <= settings.rounds * len(estimated) and number % settings.rounds == 0:
+                samples = estimated[number // settings.rounds - 1]
                 take_off_indirect(work, shade, table, indirect, samples, seed + number, lambda d: heard(0.7 * d))
                 problem.reweight(doubted(gathered, work.captures, indirect))
             shade.table = table
