@@ -19,13 +19,16 @@ from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
 from mistyle.render.indirect import MOST, Indirect, averaged, enlarged
 from mistyle.render.texel_views import Look
-from mistyle.stages import recover_observe
+from mistyle.stages import recover_observe, recover_pictures
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.neighbours import of_islands
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
 from mistyle.stages.recover_observe import Gathered, gather
+from mistyle.stages.recover_pictures import SHORTEST
 from mistyle.stages.recover_settings import RecoverSettings, estimates, passes
+from mistyle.stages.recover_solve import NOTHING
+from mistyle.stages.recover_texels import Found
 from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
@@ -383,6 +386,19 @@ def test_the_last_estimate_has_most_of_the_samples():
     assert passes(RecoverSettings(), 1000) == [(1200, 0)]
     for alone in ({"solver": "texels"}, {"iterations": 0}, {"iterations": 100}):
         assert estimates(RecoverSettings(bounces=3, **alone), 48) == ([16, 16, 128], [])
+
+
+def test_steps_are_as_long_as_the_noise():
+    """Twice the usual noise, twice the step, but no longer ones of roughness; a texel never seen takes the longest, and
+    a tilt that its neighbours decided hardly moves."""
+    noise = np.full((5, 7), 0.02, np.float32)
+    noise[1], noise[2], noise[3] = 0.04, 0.0001, NOTHING
+    seen, decided = np.array([9, 9, 9, 0, 9]), np.array([1, 1, 1, 1, 0.25], np.float32)
+    found = Found(np.zeros((5, 8), np.float32), noise, decided, noise, seen, seen, True)
+    shares = recover_pictures._shares(found)
+    np.testing.assert_allclose(shares[:4, 0], [1, 2, SHORTEST, 3], rtol=1e-6)
+    np.testing.assert_allclose(shares[:, 3], [1, 2, SHORTEST, 3, 0.5], rtol=1e-6)
+    np.testing.assert_allclose(shares[:4, 5], [1, 1, SHORTEST, 1], rtol=1e-6)
 
 
 def test_cameras_of_one_place_are_found():

@@ -19,12 +19,13 @@ from mistyle.stages.recover_texels import Found, Work, take_off_indirect
 
 JUDGES = 48  # pictures that say whether the steps helped
 SEEDS = 7907  # between the seeds of two estimates: more than there are rounds
-# Multiples of the rate by channel where the texels were solved before: what is taken for albedo is mostly noise, ...
+# Multiples of the rate by channel where the texels were solved before: their albedo is nearly right already, and longer
+# steps would follow the pictures' noise, ...
 SOLVED = (0.15, 0.15, 0.15, 0.5, 0.5, 1, 0.5, 0)
-# ... and by texel, as the noise of what is known of it to the usual one: the least, and the most of every unknown.
-# Roughness takes no long steps: where little speaks for one, albedo can stand for it.
+# ... and by texel, the noise of what is known of it as a multiple of the usual one, within these bounds. Roughness
+# takes no long steps: where little speaks for one, albedo can stand for it.
 SHORTEST, LONGEST = 0.3, np.array([3, 3, 3, 3, 3, 1, 3], np.float32)
-# Where they were not: soft light says little of normals, less of roughness, most of albedo.
+# By channel where they were not: soft light says little of normals, less of roughness, most of albedo.
 UNSOLVED = (2, 2, 2, 0.2, 0.2, 0.6, 0.6, 0)
 DAMPING = 0.3
 
