@@ -1,8 +1,8 @@
 """What is to be recovered: real assets or strong synthetic maps, at the resolution that the pictures can show.
 
-Resolution: of the powers of two, the one whose texel side on the surface (square root of area per texel) is nearest,
-as a ratio, to the side of a pixel at the object's distance, 2 d tan(fov / 2) / pixels. The asset's maps are averaged
-down to it: over each new texel's area, weighted by what the surface covers of it, normals made unit length again;
+Resolution: the finest power of two whose texel side on the surface (square root of area per texel) is no smaller than
+the side of a pixel that faces it at the object's distance, 2 d tan(fov / 2) / pixels: what is finer, no picture shows.
+The asset's maps are averaged down to it: over each new texel's area, weighted by what the surface covers of it, normals made unit length again;
 texels without surface take their nearest neighbour's values. Emission is left out, metallic is kept.
 
 Strong maps are smooth at the scale of a texel, whatever the atlas: Gaussian random fields in space (WAVES plane waves
@@ -101,7 +101,7 @@ def fitted_size(mesh: Mesh, part: int, pixel: float) -> int:
     share = float(coarse.covered.mean())
     area = float(face_areas(mesh)[mesh.part == part].sum())
     wanted = np.sqrt(area / max(share, 1e-6)) / pixel
-    return int(2 ** np.clip(np.round(np.log2(wanted)), 6, 12))
+    return int(2 ** np.clip(np.floor(np.log2(wanted)), 6, 12))
 
 
 def _averaged(mesh: Mesh, material, part: int, texels: Texels) -> Maps:

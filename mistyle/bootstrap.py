@@ -242,6 +242,12 @@ def told(library: str, folders: Sequence[str], base: Mapping[str, str]) -> dict[
     return result
 
 
+def known_llvm() -> str:
+    """The LLVM that the set-up found, where it is still there; else nothing."""
+    record = read_record(home())
+    return record["llvm"]["library"] if _llvm_ready(record) else ""
+
+
 def use_llvm() -> bool:
     """Tell Dr.Jit in this process about the LLVM that the set-up found; for scripts and tests that start without it.
 

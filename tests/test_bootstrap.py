@@ -157,6 +157,28 @@ def test_it_stays_where_it_was_sent(place, monkeypatch):
     assert os.environ["DRJIT_LIBLLVM_PATH"] == str(place / "libLLVM.so.19.1")
 
 
+def bare() -> dict[str, str]:
+    """An environment that tells nothing of LLVM."""
+    return {k: v for k, v in os.environ.items() if k not in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")}
+
+
+@pytest.mark.skipif(not bootstrap.known_llvm(), reason="the set-up found a GPU or was not run")
+def test_benchmarks_know_the_llvm_before_they_import_dr_jit():
+    script = "import benchmarks, drjit, mitsuba; mitsuba.set_variant('llvm_ad_rgb'); print(drjit.detail.llvm_version())"
+    line = [sys.executable, "-c", script]
+    done = subprocess.run(line, env=bare(), cwd=ROOT, capture_output=True, text=True, check=True)
+    assert int(done.stdout.strip("()[] \n").split(",")[0]) >= 17
+
+
+def test_dr_jit_that_came_too_early_is_said(monkeypatch):
+    from mistyle.render import device
+
+    monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
+    monkeypatch.setattr(device, "known_llvm", lambda: "/l/libLLVM.so.19.1")
+    assert "/l/libLLVM.so.19.1" in device._missing("llvm_ad_rgb")
+    assert "mistyle.bootstrap.use_llvm()" in device._missing("llvm_ad_rgb")
+
+
 def test_private_folders_come_first_and_once():
     once = bootstrap.told("/l/libLLVM.so", ["/l"], {"LD_LIBRARY_PATH": "/a:/b", "HOME": "/h"})
     assert once == {"DRJIT_LIBLLVM_PATH": "/l/libLLVM.so", "LD_LIBRARY_PATH": "/l:/a:/b", "HOME": "/h"}

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from mistyle.bootstrap import use_llvm
+from mistyle.bootstrap import known_llvm, use_llvm
 from mistyle.core.errors import EnvironmentMissing
 
 # The first that answers is taken; a GPU needs no LLVM.
@@ -121,6 +121,11 @@ def _missing(variant: str) -> str:
 
     if VARIANTS[variant] != "LLVM":
         return f"Mitsuba's {variant} does not answer on this machine (no device or no driver). Use llvm_ad_rgb instead."
+    if (ours := known_llvm()) and not os.environ.get("DRJIT_LIBLLVM_PATH"):
+        return (
+            f"Dr.Jit was imported before it could be told of the LLVM that works ({ours}). Call"
+            " `mistyle.bootstrap.use_llvm()` before the first import of mitsuba or drjit."
+        )
     if not dr.has_backend(dr.JitBackend.LLVM):
         return f"No LLVM library that Dr.Jit can load was found, and no GPU answers. {LLVM_HELP}"
     found = ".".join(str(n) for n in dr.detail.llvm_version())
