@@ -31,7 +31,7 @@ ALIKE = 0.15  # length of the difference of two unit normals at which pixels har
 LEVEL = 0.7  # and how far, by pixels that lie between the two, one may lie above or below the other's tangent plane
 RINGS = (1, 2)  # how far away, in pixels, the eight neighbours of each averaging are
 PALE = 0.04  # joins the albedo that light is divided by: what a surface reflects without taking its colour
-FIREFLY = 4.0  # times its surroundings: the brightest that a pixel of the estimate may be
+FIREFLY = 20.0  # times its surroundings: the brightest that a pixel of the estimate may be
 
 
 class Indirect:

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mistyle.core import stopping
 from mistyle.stages.recover_settings import RecoverSettings, passes
@@ -25,6 +25,9 @@ SOLVED = (0.15, 0.15, 0.15, 0.5, 0.5, 1, 0.5, 0)
 # ... and by texel, the noise of what is known of it as a multiple of the usual one, within these bounds. Roughness
 # takes no long steps: where little speaks for one, albedo can stand for it.
 SHORTEST, LONGEST = 0.3, np.array([3, 3, 3, 3, 3, 1, 3], np.float32)
+# What is left open after a pass, as multiples of what is usual: whole pictures show parts of texels of which the solver
+# had no observation, so what it knew least of is known better then than it promised.
+LEFT = np.array([6, 6, 6, 7, 7, 5, np.inf], np.float32)
 # By channel where they were not: soft light says little of normals, less of roughness, most of albedo.
 UNSOLVED = (2, 2, 2, 0.2, 0.2, 0.6, 0.6, 0)
 DAMPING = 0.3
@@ -49,12 +52,12 @@ def improved(
     """
     settings = work.settings
     parts = passes(settings, len(work.captures)) if found.solved else [(settings.iterations, 0)]
-    reached = 0 if resume is None else int(resume["iteration"])
+    reached, noise = 0 if resume is None else int(resume["iteration"]), _left(found)
 
     def settled(table: Table) -> Table:
         if not (found.solved and settings.smooth):
             return table
-        return smoothed(table, found.noise, work.where, settings.roughness_floor)
+        return smoothed(table, noise, work.where, settings.roughness_floor)
 
     def between(low: float, high: float) -> Callable[[float], None]:
         return lambda done: progress((low + (high - low) * done) / settings.iterations)
@@ -132,16 +135,30 @@ def _descend(
     return np.array(table).reshape(-1, 8)
 
 
+def _left(found: Found) -> Float[np.ndarray, "a 7"]:
+    """Standard deviations of what a pass leaves open: `found.noise`, which approaches LEFT times the usual."""
+    return (found.noise / np.sqrt(1 + (found.noise / (LEFT * _usual(found))) ** 2)).astype(np.float32)
+
+
 def _shares(found: Found) -> Table:
     """Multiples of Adam's rate. A step has the same length however little speaks for it, so texels that are known well
     take shorter ones; and a tilt that its neighbours decided would wander off."""
     shares = np.ones((len(found.decided), 8), np.float32)
-    known = (found.seen > 0) & (found.noise < NOTHING).all(axis=1)
-    if known.any():
-        usual = np.median(found.noise[known], axis=0)
-        shares[:, :7] = np.clip(found.noise / np.maximum(usual, 1e-9), SHORTEST, LONGEST)
+    if _known(found).any():
+        shares[:, :7] = np.clip(found.noise / _usual(found), SHORTEST, LONGEST)
     shares[:, 3:5] *= np.sqrt(found.decided)[:, None]
     return shares
+
+
+def _known(found: Found) -> Bool[np.ndarray, " a"]:
+    return np.asarray((found.seen > 0) & (found.noise < NOTHING).all(axis=1))
+
+
+def _usual(found: Found) -> Float[np.ndarray, "7"]:
+    """The median noise of texels that something is known of."""
+    known = _known(found)
+    usual = np.median(found.noise[known], axis=0) if known.any() else np.full(7, NOTHING, np.float32)
+    return np.maximum(usual, 1e-9)
 
 
 def _note_stopped(work: Work, stopped: list[tuple[int, str, int]]) -> None:

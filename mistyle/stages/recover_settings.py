@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 SETTLING = 3
 FEWER = 8  # times as few samples for all estimates of light between surfaces but the last
-PASSES = 4  # over the pictures at most, the last twice as long
+PASSES = 8  # over the pictures at most, the last twice as long
 SWEEPS = 2  # how often a pass looks at every picture at least, or there are fewer passes
 
 
@@ -53,8 +53,8 @@ class RecoverSettings(BaseModel):
     )
     smooth: bool = Field(
         default=True,
-        description="tilt and roughness as smooth as the surface around them is measured to be, as far as the pictures "
-        "leave them open; a sharp edge that few pictures show is rounded",
+        description="albedo, tilt and roughness as smooth as the surface around them is measured to be, as far as the "
+        "pictures leave them open; a sharp edge that few pictures show is rounded",
     )
     noise: float = Field(default=0.002, gt=0, le=1, description="standard deviation of a pixel in the dark")
     relative: float = Field(default=0.01, ge=0, le=1, description="standard deviation of a pixel relative to its value")
@@ -62,10 +62,10 @@ class RecoverSettings(BaseModel):
         default=0.2, gt=0, lt=1, description="least cosine between a texel's normal and the camera that observes it"
     )
     iterations: int = Field(
-        default=1200,
+        default=2160,
         ge=0,
         le=1_000_000,
-        description="steps of Adam, one picture each; after the texels were solved in up to four passes",
+        description="steps of Adam, one picture each; after the texels were solved in up to eight passes",
     )
     rate: float = Field(
         default=0.003, gt=0, le=1, description="Adam's first rate in each; it falls to zero along a cosine"

@@ -1,28 +1,28 @@
-"""The neighbours' last word: tilt and roughness as smooth as the surface is, as far as the pictures leave them open.
+"""The neighbours' last word: maps as smooth as the surface is, as far as the pictures leave them open.
 
-A texel's own pictures tell its tilt and roughness with an error that is known roughly (`Found.noise`). What texels in
+A texel's own pictures tell its albedo, tilt and roughness with an error that is known roughly (`Found.noise`). What texels in
 a row differ by from a straight line through their neighbours has a variance that is the surface's own plus that of
 these errors; so the surface's own is measured around every texel (empirical Bayes), and the most likely values under
 both minimise
 
     sum (x - found)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance
 
-over rows and columns of each island, of the roughness also across seams (a Gaussian field of second differences: Rue
+over rows and columns of each island, of albedo and roughness also across seams (a Gaussian field of second differences: Rue
 and Held, Gaussian Markov Random Fields, 2005, section 3.4). Where the surface is rough the variance is large, and what
 was found stays.
 """
-
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.stages.neighbours import Links, within
-from mistyle.stages.recover_solve import OVER_SEAMS, Atlas, diffused, fill, joined
+from mistyle.stages.recover_solve import METAL_SPREAD, OVER_SEAMS, Atlas, diffused, fill, joined
 
-# Channels of the table that are smoothed, and the least standard deviation of their second differences.
-LEAST = {3: 0.006, 4: 0.006, 5: 0.008}
+# Channels of the table that are smoothed, and the least standard deviation of their second differences. Not metallic:
+# surfaces are metal or not.
+LEAST = {0: 0.008, 1: 0.008, 2: 0.008, 3: 0.006, 4: 0.006, 5: 0.008}
 MOST = 0.3  # of that standard deviation
+ODD = 20
 OPEN = 0.3  # what is taken for left open where nothing was seen
 SURE = 0.01  # standard deviation of a second difference below which one tells as much as another
 AROUND = 24  # steps over which the variance is measured
@@ -40,7 +40,8 @@ def smoothed(
     where: Atlas,
     floor: float,
 ) -> Float[np.ndarray, "a 8"]:
-    """`table` with tilt and roughness (not below `floor`) as above; uncovered texels move as the nearest covered one.
+    """`table` with albedo, tilt and roughness (not below `floor`) as above; uncovered texels move as the nearest covered
+    one.
 
     `noise`: standard deviations of what the pictures tell, OPEN and above where they tell nothing. Cannot see edges: a
     crease in a smooth surround is rounded by as much as its texels are uncertain.
@@ -54,8 +55,23 @@ def smoothed(
             among = where.links[k] if OVER_SEAMS[c] else within(where.links[k])
             error, variance = _measured(found, error, among, least)
             moved[part, c] = (_likely(found, error, variance, among) - found).ravel()
-    result = table + fill(moved, where)
+    result = _settled(table + fill(moved, where), noise)
+    result[:, :3] = np.clip(result[:, :3], 0, 1)
     result[:, 5] = np.clip(result[:, 5], floor, 1)
+    return result
+
+
+def _settled(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"]) -> Float[np.ndarray, "a 8"]:
+    """`table` with metallic drawn to 0 or 1, whichever is nearer, as far as it is left open: surfaces are metal or not.
+    One in ODD is neither, so what lies far from both is left alone. What is no metal keeps its diffuse reflectance,
+    albedo (1 - metallic)."""
+    metallic, nearer = table[:, 6], np.round(table[:, 6])
+    away = metallic - nearer
+    likely = np.exp(-0.5 * (away / METAL_SPREAD) ** 2)
+    open_ = noise[:, 6] ** 2 / (METAL_SPREAD**2 + noise[:, 6] ** 2) * likely / (likely + 1 / ODD)
+    result = table.copy()
+    result[:, 6] = metallic - open_ * away
+    result[:, :3] *= np.where(nearer == 0, (1 - metallic) / np.maximum(1 - result[:, 6], 0.5), 1)[:, None]
     return result
 
 
@@ -67,15 +83,6 @@ def _lines(among: Links) -> Both:
 def _second(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
     """What each texel of a row differs by from the mean of its two neighbours, with its sign turned; 0 without them."""
     return np.where(links, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
-
-
-def _back(second: Float[np.ndarray, "h v"], width: int) -> Grid:
-    """The transpose of `_second`; what has no neighbours is 0 already."""
-    result = np.zeros((len(second), width), np.float32)
-    result[:, :-2] += 0.5 * second
-    result[:, 2:] += 0.5 * second
-    result[:, 1:-1] -= second
-    return result
 
 
 def _measured(found: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
@@ -98,10 +105,19 @@ def _measured(found: Grid, error: Grid, among: Links, least: float) -> tuple[Gri
     return error * np.sqrt(share), own
 
 
-def _over_seams(variance: Grid, among: Links) -> tuple[Any, Float[np.ndarray, " n"]]:
-    """Second differences of rows and columns with a seam on one side or both: a matrix, and one over their variance."""
-    from scipy.sparse import csr_array
+def _within(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
+    """Of every texel with neighbours in the grid on both sides, in its row or column: these two and itself (flat
+    indices), and one over the variance of what it differs by from their mean."""
+    number, own = np.arange(variance.size).reshape(variance.shape), variance.ravel()
+    lines, texels = _lines(among), []
+    for grid, link in zip((number, number.T), lines, strict=True):
+        texels.append(np.stack([grid[:, :-2][link], grid[:, 2:][link], grid[:, 1:-1][link]], axis=1))
+    every = np.concatenate(texels)
+    return every, 1 / own[every[:, 2]]
 
+
+def _over_seams(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
+    """The same of texels with a seam on one side or both."""
     width, rows, firm = variance.shape[1], [], []
     grids = np.pad(among.right, ((0, 0), (0, 1))).ravel(), np.pad(among.below, ((0, 1), (0, 0))).ravel()
     for grid, step, sides in zip(grids, (1, width), (among.seams[:2], among.seams[2:]), strict=True):
@@ -115,45 +131,23 @@ def _over_seams(variance: Grid, among: Links) -> tuple[Any, Float[np.ndarray, " 
         whole = (beside >= 0).all(axis=0)
         rows.append(np.stack([*beside[:, whole], at[whole]], axis=1))
         firm.append(share.prod(axis=0)[whole] / (WIDER * variance.ravel()[at[whole]]))
-    columns, weights = np.concatenate(rows), np.concatenate(firm)
-    values = np.tile(np.array([0.5, 0.5, -1], np.float32), len(columns))
-    starts = np.arange(0, 3 * len(columns) + 1, 3)
-    return csr_array((values, columns.ravel(), starts), shape=(len(columns), variance.size)), weights
+    return np.concatenate(rows), np.concatenate(firm)
 
 
 def _likely(found: Grid, error: Grid, variance: Grid, among: Links) -> Float[np.ndarray, "h w"]:
-    from scipy.sparse.linalg import LinearOperator, cg
+    from scipy.sparse import csr_array, dia_array
+    from scipy.sparse.linalg import cg
 
-    sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32)
-    lines, of = _lines(among), (variance[:, 1:-1], variance.T[:, 1:-1])
-    firm = [np.where(link, 1 / v, 0).astype(np.float32) for v, link in zip(of, lines, strict=True)]
-    across, weight = _over_seams(variance, among)
-    height, width = found.shape
-
-    def apply(flat: np.ndarray) -> np.ndarray:
-        x = flat.reshape(found.shape).astype(np.float32)
-        result = sure * x + _back(firm[0] * _second(x, lines[0]), width)
-        result += _back(firm[1] * _second(x.T, lines[1]), height).T
-        return result.ravel() + across.T @ (weight * (across @ x.ravel()))
-
-    def weights(link: np.ndarray, size: int) -> Grid:
-        middle = np.zeros((len(link), size), np.float32)
-        middle[:, 1:-1] += link
-        middle[:, :-2] += 0.25 * link
-        middle[:, 2:] += 0.25 * link
-        return middle
-
-    diagonal = (sure + weights(firm[0], width) + weights(firm[1], height).T).ravel() + (across**2).T @ weight
-
-    class Matrix(LinearOperator):
-        def _matvec(self, x: np.ndarray) -> np.ndarray:
-            return apply(x)
-
-    class Inverse(LinearOperator):  # of the diagonal
-        def _matvec(self, x: np.ndarray) -> np.ndarray:
-            return x / diagonal
-
-    matrix, inverse = (kind(np.float32, (found.size, found.size)) for kind in (Matrix, Inverse))
+    texels, firm = map(np.concatenate, zip(_within(variance, among), _over_seams(variance, among), strict=True))
+    # Each row a second difference in units of its standard deviation.
+    root = np.sqrt(firm).astype(np.float32)[:, None]
+    values = (root * np.array([0.5, 0.5, -1], np.float32)).ravel()
+    starts = np.arange(0, values.size + 1, 3)
+    differences = csr_array((values, texels.ravel(), starts), shape=(len(texels), found.size))
+    smooth = (differences.T @ differences).tocsr()
+    sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32).ravel()
+    matrix = smooth + dia_array((sure[None], 0), shape=smooth.shape)
+    inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=smooth.shape)
     # From what was found: the change is solved for, so that little of it is lost to rounding.
-    change, _ = cg(matrix, (sure * found).ravel() - apply(found), rtol=CLOSE, maxiter=STEPS, M=inverse)
-    return found + change.reshape(found.shape)
+    change, _ = cg(matrix, -(smooth @ found.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
+    return found + change.reshape(found.shape).astype(np.float32)

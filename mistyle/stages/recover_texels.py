@@ -20,7 +20,7 @@ from mistyle.stages.recover_settings import RecoverSettings, all_rounds, estimat
 from mistyle.stages.texels import rasterise
 
 SOFT_COST = 64  # times as long as under one light a texel takes under a sky, nearly
-DOUBT = 0.2  # standard deviation of an estimate of indirect light, relative to it
+DOUBT = 0.5  # standard deviation of an estimate of indirect light, relative to it
 
 
 @dataclass(frozen=True)
