@@ -2,8 +2,9 @@
 
 Resolution: the finest power of two whose texel side on the surface (square root of area per texel) is no smaller than
 the side of a pixel that faces it at the object's distance, 2 d tan(fov / 2) / pixels: what is finer, no picture shows.
-The asset's maps are averaged down to it: over each new texel's area, weighted by what the surface covers of it, normals made unit length again;
-texels without surface take their nearest neighbour's values. Emission is left out, metallic is kept.
+The asset's maps are averaged down to it: over each new texel's area, weighted by what the surface covers of it, normals
+made unit length again; texels without surface take their nearest neighbour's values. Emission is left out, metallic is
+kept.
 
 Strong maps are smooth at the scale of a texel, whatever the atlas: Gaussian random fields in space (WAVES plane waves
 of 16 to 64 texel sides): tilt of standard deviation 0.15 per axis, roughness and albedo uniform over their ranges.

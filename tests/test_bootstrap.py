@@ -157,7 +157,7 @@ def test_it_stays_where_it_was_sent(place, monkeypatch):
     assert os.environ["DRJIT_LIBLLVM_PATH"] == str(place / "libLLVM.so.19.1")
 
 
-def bare() -> dict[str, str]:
+def without_llvm() -> dict[str, str]:
     """An environment that tells nothing of LLVM."""
     return {k: v for k, v in os.environ.items() if k not in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")}
 
@@ -166,7 +166,7 @@ def bare() -> dict[str, str]:
 def test_benchmarks_know_the_llvm_before_they_import_dr_jit():
     script = "import benchmarks, drjit, mitsuba; mitsuba.set_variant('llvm_ad_rgb'); print(drjit.detail.llvm_version())"
     line = [sys.executable, "-c", script]
-    done = subprocess.run(line, env=bare(), cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(line, env=without_llvm(), cwd=ROOT, capture_output=True, text=True, check=True)
     assert int(done.stdout.strip("()[] \n").split(",")[0]) >= 17
 
 

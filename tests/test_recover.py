@@ -378,14 +378,27 @@ def test_pictures_of_one_place_share_their_paths(monkeypatch):
 
 def test_the_last_estimate_has_most_of_the_samples():
     assert estimates(RecoverSettings(), 48) == ([16, 16], [16, 16, 128])
-    assert passes(RecoverSettings(), 48) == [(240, 0), (240, 16), (240, 16), (480, 128)]
+    assert passes(RecoverSettings(), 48) == [(240, 0)] * 5 + [(240, 16), (240, 16), (480, 128)]
     assert estimates(RecoverSettings(bounces=0), 48) == ([], [])
     assert estimates(RecoverSettings(bounces=1, bounce_samples=5), 48) == ([5], [])
     assert estimates(RecoverSettings(bounces=2, bounce_samples=5), 48) == ([1], [5])
     assert passes(RecoverSettings(bounces=2, iterations=37), 6) == [(12, 0), (25, 128)]
-    assert passes(RecoverSettings(), 1000) == [(1200, 0)]
+    assert passes(RecoverSettings(), 1080) == [(2160, 0)]
     for alone in ({"solver": "texels"}, {"iterations": 0}, {"iterations": 100}):
         assert estimates(RecoverSettings(bounces=3, **alone), 48) == ([16, 16, 128], [])
+
+
+def test_whole_pictures_leave_no_texel_as_open_as_the_solver_did():
+    """The usual noise stays what it is; a multiple beyond LEFT, and what nothing was told of, end at LEFT times it."""
+    noise = np.full((6, 7), 0.002, np.float32)
+    noise[4], noise[5] = 0.06, NOTHING
+    seen = np.array([9, 9, 9, 9, 3, 0])
+    found = Found(np.zeros((6, 8), np.float32), noise, np.ones(6, np.float32), noise, seen, seen, True)
+    left = recover_pictures._left(found)
+    np.testing.assert_allclose(left[:4, :6], 0.002, rtol=0.03)
+    bound = recover_pictures.LEFT[:6] * 0.002
+    assert (left[4:, :6] < bound).all() and (left[4:, :6] > 0.95 * bound).all()
+    np.testing.assert_array_equal(left[:, 6], noise[:, 6])
 
 
 def test_steps_are_as_long_as_the_noise():

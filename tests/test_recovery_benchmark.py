@@ -105,7 +105,8 @@ def test_the_atlas_matches_the_pixels_and_strong_maps_are_strong():
     size = len(known.texels[0].covered)
     covered = known.texels[0].covered
     ratio = np.sqrt(known.areas[0].sum() / covered.sum()) / footprint(camera)
-    assert 2**-0.5 < ratio < 2**0.5 and size == fitted_size(known.mesh, 0, footprint(camera))
+    # Coverage is read off a coarser atlas.
+    assert 0.97 < ratio < 2.06 and size == fitted_size(known.mesh, 0, footprint(camera))
     maps = known.maps[0]
     tilt = maps.normal[covered][:, :2]
     assert tilt.std(axis=0) == pytest.approx(0.15, rel=0.2)

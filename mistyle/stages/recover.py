@@ -94,7 +94,8 @@ def recover(
     trace: dict[str, list[float]] = {}
     found = solve_level(work, shade, start, indirect, seed, trace, lambda done: progress(0.5 * done))
     if found.solved and settings.smooth:
-        found = replace(found, table=smoothed(found.table, found.noise, where, settings.roughness_floor))
+        table = smoothed(found.table, found.noise, where, settings.roughness_floor, settings.metallic)
+        found = replace(found, table=table)
     table = found.table
     if settings.solver != "texels" and settings.iterations:
         table = improved(work, shade, found, indirect, seed, trace, lambda d: progress(0.5 + 0.45 * d), save, resume)

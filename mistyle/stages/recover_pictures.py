@@ -57,7 +57,7 @@ def improved(
     def settled(table: Table) -> Table:
         if not (found.solved and settings.smooth):
             return table
-        return smoothed(table, noise, work.where, settings.roughness_floor)
+        return smoothed(table, noise, work.where, settings.roughness_floor, settings.metallic)
 
     def between(low: float, high: float) -> Callable[[float], None]:
         return lambda done: progress((low + (high - low) * done) / settings.iterations)

@@ -1,15 +1,15 @@
 """The neighbours' last word: maps as smooth as the surface is, as far as the pictures leave them open.
 
-A texel's own pictures tell its albedo, tilt and roughness with an error that is known roughly (`Found.noise`). What texels in
-a row differ by from a straight line through their neighbours has a variance that is the surface's own plus that of
-these errors; so the surface's own is measured around every texel (empirical Bayes), and the most likely values under
-both minimise
+A texel's own pictures tell its albedo, tilt and roughness with an error that is known roughly (`Found.noise`). What
+texels in a row differ by from a straight line through their neighbours has a variance that is the surface's own plus
+that of these errors; so the surface's own is measured around every texel (empirical Bayes), and the most likely values
+under both minimise
 
     sum (x - found)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance
 
-over rows and columns of each island, of albedo and roughness also across seams (a Gaussian field of second differences: Rue
-and Held, Gaussian Markov Random Fields, 2005, section 3.4). Where the surface is rough the variance is large, and what
-was found stays.
+over rows and columns of each island, of albedo and roughness also across seams (a Gaussian field of second
+differences: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.4). Where the surface is rough the variance is
+large, and what was found stays.
 """
 
 import numpy as np
@@ -22,7 +22,7 @@ from mistyle.stages.recover_solve import METAL_SPREAD, OVER_SEAMS, Atlas, diffus
 # surfaces are metal or not.
 LEAST = {0: 0.008, 1: 0.008, 2: 0.008, 3: 0.006, 4: 0.006, 5: 0.008}
 MOST = 0.3  # of that standard deviation
-ODD = 20
+ODD = 20  # times rarer than metals and others together: what is neither
 OPEN = 0.3  # what is taken for left open where nothing was seen
 SURE = 0.01  # standard deviation of a second difference below which one tells as much as another
 AROUND = 24  # steps over which the variance is measured
@@ -39,9 +39,10 @@ def smoothed(
     noise: Float[np.ndarray, "a 7"],
     where: Atlas,
     floor: float,
+    metallic: bool,
 ) -> Float[np.ndarray, "a 8"]:
-    """`table` with albedo, tilt and roughness (not below `floor`) as above; uncovered texels move as the nearest covered
-    one.
+    """`table` with albedo, tilt and roughness (not below `floor`) as above, and, where `metallic` was fitted, that drawn to
+    0 or 1; uncovered texels move as the nearest covered one.
 
     `noise`: standard deviations of what the pictures tell, OPEN and above where they tell nothing. Cannot see edges: a
     crease in a smooth surround is rounded by as much as its texels are uncertain.
@@ -55,7 +56,9 @@ def smoothed(
             among = where.links[k] if OVER_SEAMS[c] else within(where.links[k])
             error, variance = _measured(found, error, among, least)
             moved[part, c] = (_likely(found, error, variance, among) - found).ravel()
-    result = _settled(table + fill(moved, where), noise)
+    result = table + fill(moved, where)
+    if metallic:
+        result = _settled(result, noise)
     result[:, :3] = np.clip(result[:, :3], 0, 1)
     result[:, 5] = np.clip(result[:, 5], floor, 1)
     return result
@@ -63,12 +66,13 @@ def smoothed(
 
 def _settled(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"]) -> Float[np.ndarray, "a 8"]:
     """`table` with metallic drawn to 0 or 1, whichever is nearer, as far as it is left open: surfaces are metal or not.
-    One in ODD is neither, so what lies far from both is left alone. What is no metal keeps its diffuse reflectance,
+    What lies far from both is left alone, as if it were neither. What is no metal keeps its diffuse reflectance,
     albedo (1 - metallic)."""
     metallic, nearer = table[:, 6], np.round(table[:, 6])
     away = metallic - nearer
     likely = np.exp(-0.5 * (away / METAL_SPREAD) ** 2)
-    open_ = noise[:, 6] ** 2 / (METAL_SPREAD**2 + noise[:, 6] ** 2) * likely / (likely + 1 / ODD)
+    error2 = np.minimum(noise[:, 6], OPEN) ** 2
+    open_ = error2 / (METAL_SPREAD**2 + error2) * likely / (likely + 1 / ODD)
     result = table.copy()
     result[:, 6] = metallic - open_ * away
     result[:, :3] *= np.where(nearer == 0, (1 - metallic) / np.maximum(1 - result[:, 6], 0.5), 1)[:, None]
