@@ -31,7 +31,7 @@ from mistyle.run.budget import (
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import thread_count
 from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
-from mistyle.stages.recover_settings import all_rounds, estimates
+from mistyle.stages.recover_settings import all_rounds, estimates, passes
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -41,11 +41,12 @@ PER_TEXEL = 1.0e-6
 PER_VIEW_PIXEL = 8.0e-7
 PER_CROP_PIXEL = 1.6e-6
 # Of fits to pictures: a pixel read and made straight; a sample of one predicted, or stepped on; a texel in a picture; a
-# path of light between surfaces.
+# path of light between surfaces; a covered texel in one word of its neighbours.
 PER_READ_PIXEL = 8e-7
 PER_LOOK = 2e-7
 PER_OBSERVATION = 4e-7
 PER_BOUNCED_PATH = 1e-7
+PER_SMOOTHED = 1.5e-5
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
 BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}
@@ -110,6 +111,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         solves * sum(sum(part) for part in estimates(s.recover, len(sizes))) * sum(min(n, MOST**2) for n in averaged)
     )
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
+    words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
         "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),
         "texels": texels * PER_TEXEL,
@@ -117,7 +119,8 @@ def plan_material(job: Any) -> dict[str, Any]:
         "pictures": sum(sizes) * PER_READ_PIXEL,
         "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
         + (1 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
-        + paths * PER_BOUNCED_PATH,
+        + paths * PER_BOUNCED_PATH
+        + words * COVERED * texels * PER_SMOOTHED,
         "measure": 2 * looked * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,
         "scene": 2 * texels * PER_TEXEL,

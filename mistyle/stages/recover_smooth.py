@@ -41,8 +41,8 @@ def smoothed(
     floor: float,
     metallic: bool,
 ) -> Float[np.ndarray, "a 8"]:
-    """`table` with albedo, tilt and roughness (not below `floor`) as above, and, where `metallic` was fitted, that drawn to
-    0 or 1; uncovered texels move as the nearest covered one.
+    """`table` with albedo, tilt and roughness (not below `floor`) as above, and with `metallic`, where that was fitted,
+    drawn to 0 or 1; uncovered texels move as the nearest covered one.
 
     `noise`: standard deviations of what the pictures tell, OPEN and above where they tell nothing. Cannot see edges: a
     crease in a smooth surround is rounded by as much as its texels are uncertain.
@@ -112,7 +112,7 @@ def _measured(found: Grid, error: Grid, among: Links, least: float) -> tuple[Gri
 def _within(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
     """Of every texel with neighbours in the grid on both sides, in its row or column: these two and itself (flat
     indices), and one over the variance of what it differs by from their mean."""
-    number, own = np.arange(variance.size).reshape(variance.shape), variance.ravel()
+    number, own = np.arange(variance.size, dtype=np.int32).reshape(variance.shape), variance.ravel()
     lines, texels = _lines(among), []
     for grid, link in zip((number, number.T), lines, strict=True):
         texels.append(np.stack([grid[:, :-2][link], grid[:, 2:][link], grid[:, 1:-1][link]], axis=1))
@@ -135,7 +135,7 @@ def _over_seams(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
         whole = (beside >= 0).all(axis=0)
         rows.append(np.stack([*beside[:, whole], at[whole]], axis=1))
         firm.append(share.prod(axis=0)[whole] / (WIDER * variance.ravel()[at[whole]]))
-    return np.concatenate(rows), np.concatenate(firm)
+    return np.concatenate(rows).astype(np.int32), np.concatenate(firm)
 
 
 def _likely(found: Grid, error: Grid, variance: Grid, among: Links) -> Float[np.ndarray, "h w"]:
@@ -146,7 +146,7 @@ def _likely(found: Grid, error: Grid, variance: Grid, among: Links) -> Float[np.
     # Each row a second difference in units of its standard deviation.
     root = np.sqrt(firm).astype(np.float32)[:, None]
     values = (root * np.array([0.5, 0.5, -1], np.float32)).ravel()
-    starts = np.arange(0, values.size + 1, 3)
+    starts = np.arange(0, values.size + 1, 3, dtype=np.int32)
     differences = csr_array((values, texels.ravel(), starts), shape=(len(texels), found.size))
     smooth = (differences.T @ differences).tocsr()
     sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32).ravel()
