@@ -401,6 +401,18 @@ def test_whole_pictures_leave_no_texel_as_open_as_the_solver_did():
     np.testing.assert_array_equal(left[:, 6], noise[:, 6])
 
 
+def test_what_is_believed_of_metals_is_one_prior(rng: np.random.Generator):
+    """The neighbours' prior, metal or not, and how much metals reflect: their sum is the one prior and its constant."""
+    from mistyle.stages import recover_solve as solving
+
+    x, mean, prior = (rng.uniform(0.1, 2, (20, 7)).astype(np.float32) for _ in range(3))
+    metal = np.repeat([0, 1], 10).astype(np.float32)
+    around, weight, constant = solving._both(mean, prior, metal)
+    wanted = ((x - mean) ** 2 * prior).sum(axis=1) + (x[:, 6] - metal) ** 2 / solving.METAL_SPREAD**2
+    wanted += metal * ((x[:, :3] - solving.METAL_ALBEDO) ** 2).sum(axis=1) / solving.METAL_ALBEDOS**2
+    np.testing.assert_allclose(((x - around) ** 2 * weight).sum(axis=1) + constant, wanted, rtol=1e-4)
+
+
 def test_steps_are_as_long_as_the_noise():
     """Twice the usual noise, twice the step, but no longer ones of roughness; a texel never seen takes the longest, and
     a tilt that its neighbours decided hardly moves."""

@@ -7,6 +7,7 @@ what they still differ by is added to what the texels should reach (defect corre
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -23,6 +24,9 @@ from mistyle.stages.recover_settings import RecoverSettings
 PRIOR_MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.5, 0.0)
 PRIOR_SPREAD = (1.0, 1.0, 1.0, 0.6, 0.6, 0.8, 0.2)
 METAL_SPREAD = 0.1  # of metallic about 0 or 1: surfaces are metal or not, and few are in between
+# How much metals reflect, and its standard deviation. Where no highlight is seen, much of it on a smooth metal looks
+# like little on a rough one, and this decides.
+METAL_ALBEDO, METAL_ALBEDOS = 0.6, 0.2
 # What having no colour at all costs what is no metal, from which albedo on it costs nothing, and after how many looks.
 BLACK_COST, PALEST_BLACK, OFTEN = 20.0, 0.02, 8
 METAL_COST = 10.0  # what being a metal costs: twice the logarithm of how much rarer metals are
@@ -157,21 +161,22 @@ def first_solve(
 ) -> Solution:
     """The best of several starts: `start` itself, and every roughness of a coarse grid, as paint and as metal."""
     prior = np.tile(1 / np.array(PRIOR_SPREAD, np.float32) ** 2, (len(mean), 1)).astype(np.float32)
-    tries = [(start, mean)]
+    tries = [(start, mean, prior)]
     for metal in (0.0, 1.0) if settings.metallic else (None,):
         for roughness in STARTS:
-            other, around = mean.copy(), mean.copy()
+            other, around, weight = mean.copy(), mean.copy(), prior
             other[:, 5] = roughness
             if metal is not None:
                 other[:, 6], around[:, 6] = abs(metal - 0.1), metal
-            tries.append((other, around))
+                around, weight, _ = _reflecting(around, prior, np.full(len(mean), metal, np.float32))
+            tries.append((other, around, weight))
     tries = tries if not np.array_equal(start, mean) else tries[1:]
     solved = []
-    for k, (each, around) in enumerate(tries):
+    for k, (each, around, weight) in enumerate(tries):
         done = lambda share, k=k: progress((k + share) / len(tries))  # noqa: E731
-        solution = problem.solve(each, around, prior, settings.solver_iterations, done)
+        solution = problem.solve(each, around, weight, settings.solver_iterations, done)
         extra = unlikely(solution.values, seen) if settings.metallic else 0
-        solved.append((solution, penalty(solution.values, around, prior) + extra))
+        solved.append((solution, penalty(solution.values, around, weight) + extra))
     return best(solved)
 
 
@@ -371,9 +376,24 @@ def _nearest(values: Values) -> Float[np.ndarray, " t"]:
 
 def _both(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) -> tuple[Values, Values, np.ndarray]:
     """A prior and the belief that a texel is a metal or not as one prior, and the constant that this leaves."""
+    mean, prior, left = _reflecting(mean, prior, metal)
+    mean[:, 6:], prior[:, 6:], constant = _product(mean[:, 6:], prior[:, 6:], metal[:, None], 1 / METAL_SPREAD**2)
+    return mean, prior, left + constant
+
+
+def _reflecting(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) -> tuple[Values, Values, np.ndarray]:
+    """The same of a prior and of how much metals reflect, where a texel is one."""
     mean, prior = mean.copy(), prior.copy()
-    own, belief = prior[:, 6].copy(), np.float32(1 / METAL_SPREAD**2)
-    constant = (mean[:, 6] - metal) ** 2 * own * belief / (own + belief)
-    mean[:, 6] = (mean[:, 6] * own + metal * belief) / (own + belief)
-    prior[:, 6] = own + belief
+    mean[:, :3], prior[:, :3], constant = _product(
+        mean[:, :3], prior[:, :3], METAL_ALBEDO, metal[:, None] / METAL_ALBEDOS**2
+    )
     return mean, prior, constant
+
+
+def _product(
+    mean: Float[np.ndarray, "t c"], prior: Float[np.ndarray, "t c"], other: Any, weight: Any
+) -> tuple[Float[np.ndarray, "t c"], Float[np.ndarray, "t c"], Float[np.ndarray, " t"]]:
+    """Mean, weight and constant of prior (x - mean)² + weight (x - other)²."""
+    both = prior + np.float32(weight)
+    constant = ((mean - other) ** 2 * prior * weight / both).sum(axis=1)
+    return ((mean * prior + np.float32(other) * weight) / both).astype(np.float32), both, constant.astype(np.float32)
