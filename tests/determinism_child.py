@@ -5,6 +5,7 @@ another order. With BUDGET (GB) all arrays but the smallest lie in files. Run by
 circumstances that must not matter.
 """
 
+import faulthandler
 import hashlib
 import json
 import sys
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+PATIENCE = 240  # seconds after which it says where each thread stands, and ends
 SETTINGS = {
     "threads": 2,
     "rig": {"resolution": 96},
@@ -268,4 +270,5 @@ def main(out: Path, threads: int, budget: float) -> None:
 
 
 if __name__ == "__main__":
+    faulthandler.dump_traceback_later(PATIENCE, exit=True)
     main(Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]) if len(sys.argv) > 3 else 0)

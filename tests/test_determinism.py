@@ -45,20 +45,21 @@ SAME_BYTES = (
 )
 # Mitsuba's own texture gradient adds up by atomic operations: after six steps of Adam values differ by at most this.
 TOLERANCE = {"scene fit": 1e-4}
+SAID = "said.txt"
 MALLOC_FILL = "MALLOC_PERTURB_"  # glibc: the byte whose complement fresh memory is filled with
 
 
-def start(folder: Path, out: Path, budget: str = "0", **environment: str) -> subprocess.Popen[str]:
+def start(folder: Path, out: Path, budget: str = "0", **environment: str) -> subprocess.Popen[bytes]:
     folder.mkdir()
     child = ROOT / "tests" / "determinism_child.py"
     paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
-    return subprocess.Popen(
-        [sys.executable, str(child), str(out), "2", budget],
-        cwd=folder,
-        env=os.environ | {"PYTHONPATH": paths} | environment,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    with open(folder / SAID, "wb") as said:
+        return subprocess.Popen(
+            [sys.executable, str(child), str(out), "2", budget],
+            cwd=folder,
+            env=os.environ | {"PYTHONPATH": paths} | environment,
+            stderr=said,
+        )
 
 
 @pytest.fixture(scope="module")
@@ -71,9 +72,9 @@ def twice(tmp_path_factory) -> tuple[Path, Path]:
         start(place / "here", outs[0], PYTHONHASHSEED="0"),
         start(place / "else where", outs[1], "1", **other),
     ]
-    for child in running:
-        said = child.communicate(timeout=300)[1]
-        assert child.returncode == 0, said[-2000:]
+    ended = [child.wait() for child in running]  # they end by themselves, see PATIENCE there
+    for code, folder in zip(ended, ("here", "else where"), strict=True):
+        assert code == 0, (place / folder / SAID).read_text()[-6000:]
     return outs
 
 
