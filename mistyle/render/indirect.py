@@ -29,7 +29,6 @@ ROUGH = 0.25  # least roughness: light that mirrors carry comes in few bright sa
 DEPTH = 5  # path segments: light comes over up to four surface points
 ALIKE = 0.15  # length of the difference of two unit normals at which pixels hardly belong together any more
 LEVEL = 0.7  # and how far, by pixels that lie between the two, one may lie above or below the other's tangent plane
-RINGS = (1, 2)  # how far away, in pixels, the eight neighbours of each averaging are
 PALE = 0.04  # joins the albedo that light is divided by: what a surface reflects without taking its colour
 FIREFLY = 20.0  # times its surroundings: the brightest that a pixel of the estimate may be
 
@@ -187,34 +186,31 @@ def averaged(
     unit: Float[np.ndarray, "h w"],
     inside: Bool[np.ndarray, "h w"],
 ) -> Float[np.ndarray, "h w 3"]:
-    """Mean of each pixel and the 48 around it, as far as they show the same surface; `unit` is a pixel's width there.
+    """Mean of each pixel and the eight around it, as far as they show the same surface; `unit` is a pixel's width
+    there. Wider means take more detail of the light than they take noise.
 
-    Two means of nine, the second over every other pixel (the a-trous wavelet transform). Pixels that are more than
-    FIREFLY times brighter than those around them are first brought down to that.
+    Pixels that are more than FIREFLY times brighter than those around them are first brought down to that.
     """
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     position, normal = (np.where(inside[..., None], field, 0).astype(np.float32) for field in (position, normal))
-    for ring in RINGS:
-        total, weights = _around(light, position, normal, unit, inside, ring)
-        if ring == RINGS[0]:
-            brightest = FIREFLY * (total / np.maximum(weights, 1e-6)[..., None])
-            light = np.where(weights[..., None] > 1e-6, np.minimum(light, brightest), light)
-        light = (light + total) / (1 + weights)[..., None]
-    return light
+    total, weights = _around(light, position, normal, unit, inside)
+    brightest = FIREFLY * (total / np.maximum(weights, 1e-6)[..., None])
+    light = np.where(weights[..., None] > 1e-6, np.minimum(light, brightest), light)
+    return (light + total) / (1 + weights)[..., None]
 
 
 def _around(
-    light: np.ndarray, position: np.ndarray, normal: np.ndarray, unit: np.ndarray, inside: np.ndarray, ring: int
+    light: np.ndarray, position: np.ndarray, normal: np.ndarray, unit: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted sum and weights of the eight pixels that lie `ring` away from each."""
+    """Weighted sum and weights of the eight pixels around each."""
     total, weights = np.zeros_like(light), np.zeros(inside.shape, np.float32)
-    for dy in (-ring, 0, ring):
-        for dx in (-ring, 0, ring):
+    for dy in (-1, 0, 1):
+        for dx in (-1, 0, 1):
             if not (dy or dx):
                 continue
             rows, columns = _overlap(inside.shape[0], dy), _overlap(inside.shape[1], dx)
             here, there = (rows[0], columns[0]), (rows[1], columns[1])
-            lift = ((position[there] - position[here]) * normal[here]).sum(axis=-1) / (LEVEL * ring * unit[here])
+            lift = ((position[there] - position[here]) * normal[here]).sum(axis=-1) / (LEVEL * unit[here])
             turn2 = ((normal[there] - normal[here]) ** 2).sum(axis=-1)
             likeness = np.exp(-(lift**2) - turn2 / ALIKE**2) * (0.25 if dy and dx else 0.5)
             weight = np.where(inside[here] & inside[there], likeness, 0)

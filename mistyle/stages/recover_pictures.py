@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from mistyle.core import stopping
 from mistyle.stages.recover_settings import RecoverSettings, passes
 from mistyle.stages.recover_smooth import smoothed
-from mistyle.stages.recover_solve import NOTHING
+from mistyle.stages.recover_solve import NOTHING, Atlas, fill
 from mistyle.stages.recover_texels import Found, Work, take_off_indirect
 
 JUDGES = 48  # pictures that say whether the steps helped
@@ -106,7 +106,7 @@ def _descend(
     rates = [rate * share for rate, share in zip(rates, SOLVED if found.solved else UNSOLVED, strict=True)]
     descent = Descent(
         work.where.sizes, rates, levels=settings.levels, floor=settings.roughness_floor,
-        damping=0.0 if found.solved else DAMPING, shares=_shares(found) if found.solved else None,
+        damping=0.0 if found.solved else DAMPING, shares=_shares(found, work.where) if found.solved else None,
     )  # fmt: skip
     table, first, lost, losses = table_on_device(base), begin, [], trace.setdefault("pictures.loss", [])
     if resume is not None:
@@ -140,14 +140,15 @@ def _left(found: Found) -> Float[np.ndarray, "a 7"]:
     return (found.noise / np.sqrt(1 + (found.noise / (LEFT * _usual(found))) ** 2)).astype(np.float32)
 
 
-def _shares(found: Found) -> Table:
+def _shares(found: Found, where: Atlas) -> Table:
     """Multiples of Adam's rate. A step has the same length however little speaks for it, so texels that are known well
-    take shorter ones; and a tilt that its neighbours decided would wander off."""
+    take shorter ones; and a tilt that its neighbours decided would wander off. Uncovered texels, which pixels at the
+    borders of islands see, go at the pace of the nearest covered one, or what pixels tell would be lost to them."""
     shares = np.ones((len(found.decided), 8), np.float32)
     if _known(found).any():
         shares[:, :7] = np.clip(found.noise / _usual(found), SHORTEST, LONGEST)
     shares[:, 3:5] *= np.sqrt(found.decided)[:, None]
-    return shares
+    return fill(shares, where)
 
 
 def _known(found: Found) -> Bool[np.ndarray, " a"]:
