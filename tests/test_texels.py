@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay
 
 from mistyle.core.asset import Material
 from mistyle.core.errors import InputRefused
-from mistyle.core.maps import Texels
+from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.raster import fragments
 from mistyle.stages import texels as atlas
@@ -188,6 +188,16 @@ def test_padding_continues_islands_as_far_as_asked():
     assert (padded[distance <= 16] == np.float32([0.2, 0.4, 0.6])).all()
     assert (padded[distance > 19] == 9).all()
     assert np.array_equal(values, np.where(texels.covered[..., None], np.float32([0.2, 0.4, 0.6]), np.float32(9)))
+
+
+def test_padding_continues_what_an_island_has_of_its_own(rng):
+    texels = islands_at(60, (20, 40, 20, 40))
+    maps = Maps(*(rng.random((60, 60, *c)).astype(np.float32) for c in ((3,), (3,), (), ())), texels.covered)
+    padded = pad_maps(maps, texels, 8, own=1)
+    for name in ("albedo", "normal", "roughness", "metallic"):
+        before, after = getattr(maps, name), getattr(padded, name)
+        np.testing.assert_array_equal(after[19:41, 19:41], before[19:41, 19:41])
+        np.testing.assert_array_equal(after[12:19, 30], np.broadcast_to(before[19, 30], after[12:19, 30].shape))
 
 
 def test_padding_takes_the_nearest_texel_and_leaves_covered_ones(rng):

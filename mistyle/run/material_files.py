@@ -12,6 +12,8 @@ from mistyle.run import asset_files
 from mistyle.run.edits import UNEDITED, Edited
 from mistyle.run.progress import Report
 
+BORDER = 1  # texels beside an island that interpolation brought into the pictures, so that they were fitted too
+
 
 def write(
     folder: Path,
@@ -24,17 +26,19 @@ def write(
 ) -> None:
     """The asset as `stylize` writes it; `edited` holds textures that a person painted over."""
     provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
-    asset_files.write(folder, job, asset, texels, recovered.maps, provenance, report, edited)
+    asset_files.write(folder, job, asset, texels, recovered.maps, provenance, report, edited, own=BORDER)
 
 
 def scene(folder: Path, job: Any, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures) -> None:
     """A Mitsuba scene of the result that renders where mistyle is not installed."""
     from mistyle.stages.frames import mitsuba_normals
     from mistyle.stages.scene_file import write_scene
-    from mistyle.stages.texels import pad_maps
+    from mistyle.stages.texels import pad, pad_maps
 
-    turned = list(recovered.maps)
+    padding, turned = job.settings.atlas.padding, list(recovered.maps)
     if job.settings.recover.frame == "mikkt":
-        turned = [replace(m, normal=mitsuba_normals(asset.mesh, m, t)) for m, t in zip(turned, texels, strict=True)]
-    padded = [pad_maps(m, t, job.settings.atlas.padding) for m, t in zip(turned, texels, strict=True)]
+        # Texels beside the surface have no frame to turn from.
+        normals = [pad(mitsuba_normals(asset.mesh, m, t), t, padding) for m, t in zip(turned, texels, strict=True)]
+        turned = [replace(m, normal=normal) for m, normal in zip(turned, normals, strict=True)]
+    padded = [pad_maps(m, t, padding, own=BORDER) for m, t in zip(turned, texels, strict=True)]
     write_scene(folder, job.name, asset.mesh, padded, captures.cameras, captures.lights[0])

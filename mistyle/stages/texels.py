@@ -18,7 +18,7 @@ from mistyle.core import memory
 from mistyle.core.asset import Material
 from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused
-from mistyle.core.image import nearest, resize
+from mistyle.core.image import dilate, nearest, resize
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.normals import same_points
@@ -285,18 +285,19 @@ def sharpen_in_place(values: Float[np.ndarray, "h w *c"], texels: Texels) -> Non
         values[rows][here] = np.clip(inner[here], 0, 1).reshape(-1, *values.shape[2:])
 
 
-def pad_maps(maps: Maps, texels: Texels, padding: int) -> Maps:
-    """`pad` for albedo, normal, roughness and metallic, with one search for the nearest texels."""
+def pad_maps(maps: Maps, texels: Texels, padding: int, own: int = 0) -> Maps:
+    """`pad` for albedo, normal, roughness and metallic, with one search for the nearest texels. So many as `own` around
+    each island count as its own: they keep their values, and what lies beyond takes those."""
     arrays = {name: memory.copied(getattr(maps, name)) for name in ("albedo", "normal", "roughness", "metallic")}
-    pad_in_place(list(arrays.values()), texels, padding)
+    pad_in_place(list(arrays.values()), texels, padding, own)
     return replace(maps, **arrays)
 
 
-def pad_in_place(maps: Sequence[np.ndarray], texels: Texels, padding: int) -> None:
-    """`pad` for several maps of one atlas, written into them."""
+def pad_in_place(maps: Sequence[np.ndarray], texels: Texels, padding: int, own: int = 0) -> None:
+    """`pad_maps` for several arrays of one atlas, written into them."""
     if padding <= 0 or texels.covered.all() or not texels.covered.any():
         return
-    index, distance = nearest(texels.covered)
+    index, distance = nearest(dilate(texels.covered, own))
     ring = np.flatnonzero((distance > 0) & (distance <= 1.05 * padding))
     del distance
     source = index.reshape(-1)[ring]
