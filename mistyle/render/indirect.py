@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera, binned
-from mistyle.core.image import nearest_fill, resize
+from mistyle.core.image import gaussian, nearest_fill, resize
 from mistyle.core.lanes import aligned
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
@@ -30,6 +30,8 @@ DEPTH = 5  # path segments: light comes over up to four surface points
 ALIKE = 0.15  # length of the difference of two unit normals at which pixels hardly belong together any more
 LEVEL = 0.7  # and how far, by pixels that lie between the two, one may lie above or below the other's tangent plane
 PALE = 0.04  # joins the albedo that light is divided by: what a surface reflects without taking its colour
+LIKE = 8  # pixels of the estimate around each over which it is compared with the picture,
+BRIGHTER = 2.0  # and what it may be multiplied by at most
 FIREFLY = 20.0  # times its surroundings: the brightest that a pixel of the estimate may be
 
 
@@ -177,6 +179,21 @@ def enlarged(light: Float[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float[
     """What `Indirect.pictures` made, as large as the picture that it is of."""
     by = max(-(-whole // part) for whole, part in zip(size, light.shape, strict=False))
     return resize(light, (light.shape[0] * by, light.shape[1] * by))[: size[0], : size[1]]
+
+
+def in_proportion(
+    light: Float[np.ndarray, "h w 3"], direct: Float[np.ndarray, "H W 3"], picture: Float[np.ndarray, "H W 3"]
+) -> Float[np.ndarray, "h w 3"]:
+    """An estimate scaled so that with `direct`, of the same maps, it is around every pixel as bright as the picture.
+
+    Maps that were found while this light counted as direct are too bright, and what they send each other is twice so:
+    unscaled it would be taken off nearly twice where surfaces face each other. Where both show nothing, as it was.
+    """
+    size = light.shape[0], light.shape[1]
+    shown = resize(direct, size)
+    made = gaussian(shown + np.where(shown > 0, light, 0), LIKE)
+    there = gaussian(np.where(shown > 0, resize(picture, size), 0), LIKE)
+    return light * np.where(made > 1e-9, np.clip(there / np.maximum(made, 1e-9), 0, BRIGHTER), 1)
 
 
 def averaged(

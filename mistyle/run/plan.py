@@ -106,10 +106,9 @@ def plan_material(job: Any) -> dict[str, Any]:
     averaged = looked_at(s, sizes)
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
-    rounds = solves * all_rounds(s.recover, len(sizes))
-    paths = (
-        solves * sum(sum(part) for part in estimates(s.recover, len(sizes))) * sum(min(n, MOST**2) for n in averaged)
-    )
+    rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
+    begun = solves * (1 + len(estimated[0]))
+    paths = solves * sum(sum(part) for part in estimated) * sum(min(n, MOST**2) for n in averaged)
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
     words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
@@ -118,7 +117,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "cameras": 1,
         "pictures": sum(sizes) * PER_READ_PIXEL,
         "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
-        + (1 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
+        + (begun + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
         + paths * PER_BOUNCED_PATH
         + words * COVERED * texels * PER_SMOOTHED,
         "measure": 2 * looked * PER_LOOK,

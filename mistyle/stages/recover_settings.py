@@ -5,7 +5,7 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 SETTLING = 3
-FEWER = 8  # times as few samples for all estimates of light between surfaces but the last
+FEWER = 8  # times as few samples for estimates of light between surfaces that others soon replace
 PASSES = 8  # over the pictures at most, the last twice as long
 SWEEPS = 2  # how often a pass looks at every picture at least, or there are fewer passes
 
@@ -44,7 +44,8 @@ class RecoverSettings(BaseModel):
         ge=0,
         le=100,
         description="how often what the pictures still differ by is given back to the texels, which are solved again; "
-        "as often after each estimate of light between surfaces, and three times as often after the last",
+        "as often after each estimate of light between surfaces, with which they are solved anew, and three times as "
+        "often after the last",
     )
     neighbours: float = Field(
         default=0.03,
@@ -82,13 +83,14 @@ class RecoverSettings(BaseModel):
         default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
     )
     bounces: int = Field(
-        default=5, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
+        default=6, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
     )
     bounce_samples: int = Field(
         default=128,
         ge=1,
         le=4096,
-        description="samples a pixel of the last estimate; those before it, with maps still far off, have an eighth",
+        description="samples a pixel of those estimates; the first and those between passes on whole pictures, but for "
+        "the last, have an eighth",
     )
     polish: int = Field(
         default=0,
@@ -113,11 +115,14 @@ def all_rounds(settings: RecoverSettings, pictures: int) -> int:
 
 
 def estimates(settings: RecoverSettings, pictures: int) -> tuple[list[int], list[int]]:
-    """Samples a pixel of each estimate of light between surfaces: those among the rounds, those before last passes."""
-    few = -(-settings.bounce_samples // FEWER)
-    every = [few] * (settings.bounces - 1) + [settings.bounce_samples] * (settings.bounces > 0)
-    late = min(_passes(settings, pictures) - 1, settings.bounces * 3 // 5) if settings.solver == "both" else 0
-    return every[: len(every) - late], every[len(every) - late :]
+    """Samples a pixel of each estimate of light between surfaces: those among the rounds, those before last passes.
+
+    Few have the first, whose maps are still far off, and those that the last will replace.
+    """
+    few, many = -(-settings.bounce_samples // FEWER), settings.bounce_samples
+    late = min(_passes(settings, pictures) - 1, settings.bounces // 2) if settings.solver == "both" else 0
+    among = settings.bounces - late
+    return [few] * (among > 1) + [many] * (among - (among > 1)), [few] * (late - 1) + [many] * (late > 0)
 
 
 def passes(settings: RecoverSettings, pictures: int) -> list[tuple[int, int]]:

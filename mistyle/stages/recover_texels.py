@@ -113,7 +113,11 @@ def solve_texels(
     trace: dict[str, list[float]],
     progress: Callable[[float], None],
 ) -> Found:
-    """The per-texel solver and its rounds, with indirect light taken off the pictures in between."""
+    """The per-texel solver and its rounds, with indirect light taken off the pictures in between.
+
+    With each estimate it begins anew: roughness and metallic that light between surfaces made look right would else
+    stay where they are, minima of another cost.
+    """
     from mistyle.render.shade import pack
     from mistyle.render.texel_lm import Options, Problem
     from mistyle.stages.recover_observe import gather
@@ -135,9 +139,11 @@ def solve_texels(
             gathered.points, gathered.rig, gathered.observations,
             Options(settings.model, settings.metallic, floor=settings.roughness_floor),
         )  # fmt: skip
-        solution = solving.first_solve(
-            problem, first, mean, gathered.seen, settings, lambda done: progress(0.3 + 0.2 * done)
-        )
+
+        def solved_first(heard: Callable[[float], None]) -> solving.Solution:
+            return solving.first_solve(problem, first, mean, gathered.seen, settings, heard)
+
+        solution = solved_first(lambda done: progress(0.3 + 0.2 * done))
         pictures = len(work.captures)
         estimated, total = estimates(settings, pictures)[0], all_rounds(settings, pictures)
         for number in range(total):
@@ -148,8 +154,11 @@ def solve_texels(
 
             if 0 < number <= settings.rounds * len(estimated) and number % settings.rounds == 0:
                 samples = estimated[number // settings.rounds - 1]
-                take_off_indirect(work, shade, table, indirect, samples, seed + number, lambda d: heard(0.7 * d))
+                take_off_indirect(work, shade, table, indirect, samples, seed + number, lambda d: heard(0.4 * d))
                 problem.reweight(doubted(gathered, work.captures, indirect))
+                problem.retarget(observed(gathered, work.captures))
+                solution = solved_first(lambda d: heard(0.4 + 0.4 * d))
+                table = solving.spread_out(solution.values, gathered, where)
             shade.table = table
             lost: list[float] = []
 
@@ -192,21 +201,35 @@ def take_off_indirect(
     seed: int,
     progress: Callable[[float], None],
 ) -> None:
-    """Estimate the indirect light of every picture with the maps found so far; `indirect` then holds it."""
-    from mistyle.render.indirect import Indirect, retarget
+    """Estimate the indirect light of every picture with the maps found so far; `indirect` then holds it. Leaves the
+    table in `shade`."""
+    from mistyle.render.indirect import Indirect, in_proportion, retarget
     from mistyle.render.shade import unpack
 
     settings, captures, done = work.settings, work.captures, 0
+    shade.table = table
     weights, maps = trust(captures, indirect), unpack(table, work.where.sizes)
     scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for group in by_camera(captures.cameras):
         many = [captures.lights[k] for k in group]
         found = scene.pictures(captures.cameras[group[0]], many, samples, seed + len(captures) * group[0])
         for k, light in zip(group, found, strict=True):
-            indirect[k] = light
+            indirect.pop(k, None)
+            rgb, mask = captures.load(k)
+            counts = (mask & np.isfinite(rgb).all(axis=-1))[..., None]
+            indirect[k] = in_proportion(light, shade.image(k) * counts, np.where(counts, rgb, 0))
             retarget(shade, k, captures.load(k)[0], weights(k))
         done += len(group)
         progress(done / len(captures))
+
+
+def observed(gathered: Gathered, captures: Captures) -> Float[np.ndarray, "n 3"]:
+    """What the pictures show where texels were observed, less the light between surfaces that was taken off them."""
+    rgb = gathered.observations.rgb.copy()
+    for k, sighting in enumerate(gathered.sightings):
+        if len(sighting.rows):
+            rgb[sighting.rows] = fetch(np.nan_to_num(captures.load(k)[0]), sighting)
+    return rgb
 
 
 def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> np.ndarray:
