@@ -243,7 +243,7 @@ class Shade:
             block = Block(hits, soft_light, rgb, weights)
             if kept is not None:
                 kept.append(block)
-                if self._held() + sum(b.bytes for b in kept) > self.memory:
+                if self.held() + sum(b.bytes for b in kept) > self.memory:
                     kept = None
                     self._too_large.add(picture)
             yield block
@@ -263,7 +263,7 @@ class Shade:
             self._skies[key] = (made, None if made is None else shading.upload(made))
         return self._skies[key]
 
-    def _held(self) -> int:
+    def held(self) -> int:
         return sum(block.bytes for blocks in self._kept.values() for block in blocks)
 
 

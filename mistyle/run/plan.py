@@ -47,6 +47,7 @@ PER_LOOK = 2e-7
 PER_OBSERVATION = 4e-7
 PER_BOUNCED_PATH = 1e-7
 PER_SMOOTHED = 1.5e-5
+PER_JOINT = 1e-5  # of a pixel that shows the object, for each joint step
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
 BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}
@@ -110,6 +111,8 @@ def plan_material(job: Any) -> dict[str, Any]:
     begun = solves * (1 + len(estimated[0]))
     paths = solves * sum(sum(part) for part in estimated) * sum(min(n, MOST**2) for n in averaged)
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
+    if steps and s.recover.joint and solves:
+        paths += (s.recover.bounces > 0) * s.recover.bounce_samples * sum(min(n, MOST**2) for n in averaged)
     words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
         "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),
@@ -119,6 +122,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
         + (begun + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
         + paths * PER_BOUNCED_PATH
+        + (steps > 0) * solves * s.recover.joint * SHOWN * sum(averaged) * PER_JOINT
         + words * COVERED * texels * PER_SMOOTHED,
         "measure": 2 * looked * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,

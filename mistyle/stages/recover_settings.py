@@ -83,14 +83,25 @@ class RecoverSettings(BaseModel):
         default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
     )
     bounces: int = Field(
-        default=6, ge=0, le=8, description="how often light between surfaces is estimated and taken off the pictures"
+        default=6,
+        ge=0,
+        le=8,
+        description="how often light between surfaces is estimated and taken off the pictures; before joint steps once "
+        "more",
     )
     bounce_samples: int = Field(
         default=128,
         ge=1,
         le=4096,
-        description="samples a pixel of those estimates; the first and those between passes on whole pictures, but for "
-        "the last, have an eighth",
+        description="samples a pixel of those estimates; the first and those between passes on whole pictures have an "
+        "eighth, but for the last of all",
+    )
+    joint: int = Field(
+        default=3,
+        ge=0,
+        le=100,
+        description="steps after those on whole pictures that solve for all texels at once, from all pictures and with "
+        "what neighbours say; under directional and point lights only",
     )
     polish: int = Field(
         default=0,
@@ -117,12 +128,13 @@ def all_rounds(settings: RecoverSettings, pictures: int) -> int:
 def estimates(settings: RecoverSettings, pictures: int) -> tuple[list[int], list[int]]:
     """Samples a pixel of each estimate of light between surfaces: those among the rounds, those before last passes.
 
-    Few have the first, whose maps are still far off, and those that the last will replace.
+    Few have the first, whose maps are still far off, and those that the last will replace; where there are joint steps,
+    that is theirs.
     """
     few, many = -(-settings.bounce_samples // FEWER), settings.bounce_samples
     late = min(_passes(settings, pictures) - 1, settings.bounces // 2) if settings.solver == "both" else 0
-    among = settings.bounces - late
-    return [few] * (among > 1) + [many] * (among - (among > 1)), [few] * (late - 1) + [many] * (late > 0)
+    among, last = settings.bounces - late, late > 0 and not settings.joint
+    return [few] * (among > 1) + [many] * (among - (among > 1)), [few] * (late - last) + [many] * last
 
 
 def passes(settings: RecoverSettings, pictures: int) -> list[tuple[int, int]]:

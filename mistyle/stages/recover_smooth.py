@@ -12,6 +12,9 @@ differences: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.4). Wh
 large, and what was found stays.
 """
 
+from collections.abc import Iterator
+from typing import Any
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -48,13 +51,8 @@ def smoothed(
     crease in a smooth surround is rounded by as much as its texels are uncertain.
     """
     moved, where = np.zeros_like(table), joined(where, table[:, :7], noise)
-    for k, size in enumerate(where.sizes):
-        part = slice(where.offsets[k], where.offsets[k + 1])
-        for c, least in LEAST.items():
-            found = table[part, c].reshape(size)
-            error = np.minimum(noise[part, c].reshape(size), OPEN)
-            among = where.links[k] if OVER_SEAMS[c] else within(where.links[k])
-            error, variance = _measured(found, error, among, least)
+    for c in LEAST:
+        for part, found, among, error, variance in _sets(table, noise, where, c):
             moved[part, c] = (_likely(found, error, variance, among) - found).ravel()
     result = table + fill(moved, where)
     if metallic:
@@ -62,6 +60,27 @@ def smoothed(
     result[:, :3] = np.clip(result[:, :3], 0, 1)
     result[:, 5] = np.clip(result[:, 5], floor, 1)
     return result
+
+
+def firmness(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"], where: Atlas, channel: int) -> Any:
+    """The second sum above for one of LEAST's channels, as a sparse symmetric matrix P of the whole atlas: x' P x, of
+    variances as `smoothed` measures them on `table`. `where`: with its seams believed (`joined`)."""
+    from scipy.sparse import block_diag
+
+    sets = [_differences(variance, among) for *_, among, _, variance in _sets(table, noise, where, channel)]
+    differences = block_diag(sets, format="csr")
+    return (differences.T @ differences).tocsr()
+
+
+def _sets(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Iterator[tuple[Any, ...]]:
+    """Of every texture set: its rows, the channel's values, neighbours, errors, and variance of second differences."""
+    for k, size in enumerate(where.sizes):
+        part = slice(where.offsets[k], where.offsets[k + 1])
+        found = table[part, channel].reshape(size)
+        error = np.minimum(noise[part, channel].reshape(size), OPEN)
+        among = where.links[k] if OVER_SEAMS[channel] else within(where.links[k])
+        error, variance = _measured(found, error, among, LEAST[channel])
+        yield part, found, among, error, variance
 
 
 def _settled(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"]) -> Float[np.ndarray, "a 8"]:
@@ -138,16 +157,22 @@ def _over_seams(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows).astype(np.int32), np.concatenate(firm)
 
 
-def _likely(found: Grid, error: Grid, variance: Grid, among: Links) -> Float[np.ndarray, "h w"]:
-    from scipy.sparse import csr_array, dia_array
-    from scipy.sparse.linalg import cg
+def _differences(variance: Grid, among: Links) -> Any:
+    """As a sparse matrix: each row a second difference in units of its standard deviation."""
+    from scipy.sparse import csr_array
 
     texels, firm = map(np.concatenate, zip(_within(variance, among), _over_seams(variance, among), strict=True))
-    # Each row a second difference in units of its standard deviation.
     root = np.sqrt(firm).astype(np.float32)[:, None]
     values = (root * np.array([0.5, 0.5, -1], np.float32)).ravel()
     starts = np.arange(0, values.size + 1, 3, dtype=np.int32)
-    differences = csr_array((values, texels.ravel(), starts), shape=(len(texels), found.size))
+    return csr_array((values, texels.ravel(), starts), shape=(len(texels), variance.size))
+
+
+def _likely(found: Grid, error: Grid, variance: Grid, among: Links) -> Float[np.ndarray, "h w"]:
+    from scipy.sparse import dia_array
+    from scipy.sparse.linalg import cg
+
+    differences = _differences(variance, among)
     smooth = (differences.T @ differences).tocsr()
     sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32).ravel()
     matrix = smooth + dia_array((sure[None], 0), shape=smooth.shape)

@@ -1,0 +1,384 @@
+"""The last part of a recovery: all texels, all pictures and the neighbours' word in one system of equations.
+
+Steps of gradient descent on pictures move every unknown by itself and neighbours are asked in between. Where few
+pictures show a texel, albedo, roughness and tilt can nearly stand for each other, and it takes such steps very long to
+get to the end of that valley. Gauss-Newton steps follow it: around the maps x that were found a pixel is
+
+    I_p(x + d) = I_p(x) + D_p sum_t b_pt d_t
+
+with b the bilinear weights, averaged over the pixel's lit samples, and D its derivative by a change that all its texels
+share, from central differences of whole pictures. (Samples of a pixel are so taken to answer alike; the pictures
+themselves are exact, so where the steps end the pictures agree, up to that.) With R the references and P the
+neighbours' prior on second differences, of the same measured variances as in `recover_smooth.py`, each step solves
+
+    (B' D' W D B + P) d = B' D' W (R - I(x)) - P x
+
+by conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, sections 10.3 and 5.1), preconditioned by the
+texels' own blocks. W are Cauchy's weights (Huber, Robust Statistics, 1981, section 7.8) of residuals r of standard
+deviation s, 1 / (s² (1 + (r / (WRONG s))²)): of edges of shadows and outlines some pixels are always wrong. Metallic
+stays; soft light, whose pictures take long to draw, has no such steps.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.capture import Captures
+from mistyle.core.light import SOFT
+from mistyle.render.hits import steps
+from mistyle.render.indirect import enlarged
+from mistyle.stages.recover_observe import PERCENTILE
+from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.recover_smooth import LEAST, firmness
+from mistyle.stages.recover_solve import MARGIN, NOTHING, Atlas, joined
+from mistyle.stages.recover_texels import Work
+
+# By which the pictures' derivatives are taken: columns of the table that move together, and how far to either side. A
+# channel of a picture knows its own channel of the albedo only.
+MOVES = (((0, 1, 2), 0.02), ((3,), 0.01), ((4,), 0.01), ((5,), 0.01))
+# Of what `noise` and `relative` say, the least standard deviation that residuals are taken to have: most are far
+# smaller, but there are about as many unknowns.
+FIT = 0.5
+WRONG = 2.0  # standard deviations from which on a residual counts for less
+EDGE = 0.1  # standard deviation where only some of a pixel's samples are lit, relative to those that are
+BETWEEN = 0.15  # that of light between surfaces, relative to it
+FREE = 0.5  # standard deviation that what no picture tells is left
+ALIKE = 0.03  # between an uncovered texel, which pixels at charts' borders see, and the nearest covered one
+LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # of a step
+STEEPEST = 0.98  # of a tilt
+STEPS, CLOSE = 60, 1e-4  # of conjugate gradients at most; and the share of r' M r that they may leave
+PIXEL, WEIGHT = 160, 8  # bytes of a pixel, and of a bilinear weight
+
+Table = Float[np.ndarray, "a 8"]
+Unknowns = Float[np.ndarray, "t 6"]
+Blocks = Float[np.ndarray, "t 6 6"]
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """The lit pixels of one picture: flat indices, which share of their samples is lit, and the mean bilinear weights
+    of those, as a sparse matrix, pixels x unknown texels."""
+
+    index: Int[np.ndarray, " p"]
+    lit: Float[np.ndarray, " p"]
+    fetch: Any
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """The texels that are solved for, rows of the table: those that are covered or that a picture shows (`seen`)."""
+
+    rows: Int[np.ndarray, " t"]
+    seen: Bool[np.ndarray, " t"]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Of one picture's lit pixels the standard deviations of residuals, and how far they count at all, 0..1."""
+
+    spread: Float[np.ndarray, " p"]
+    counts: Float[np.ndarray, " p"]
+
+
+@dataclass(frozen=True)
+class Linear:
+    """A picture around the maps: its channels' derivatives by their own albedo, tilt (2) and roughness, the weights of
+    its channels, and reference - picture."""
+
+    fetch: Any
+    derivative: Float[np.ndarray, "p 3 4"]
+    weight: Float[np.ndarray, "p 3"]
+    wrong: Float[np.ndarray, "p 3"]
+
+
+def together(
+    work: Work,
+    shade,
+    table: Table,
+    indirect: dict[int, np.ndarray],
+    trace: dict[str, list[float]],
+    progress: Callable[[float], None],
+) -> Table:
+    """`settings.joint` such steps from `table`; the light between surfaces in `indirect` was taken off the pictures.
+
+    Steps after which the pictures fit worse are undone, and steps that need more than `settings.memory` beside what is
+    kept of the samples are left out; a note says so.
+    """
+    settings, captures = work.settings, work.captures
+    found = _pixels(shade, work)
+    if found is None:
+        work.notes.append(
+            f"The joint steps at the end were left out: they need more than the {settings.memory:g} GB of "
+            "recover.memory. Give more, or fewer or smaller pictures."
+        )
+        return table
+    pictures, unknown = found
+    errors = _errors(captures, pictures, indirect, settings)
+    wrong = _wrong(shade, table, pictures)
+    scale = max(FIT, _robust_spread(wrong, errors))
+    errors = [Errors(e.spread * np.float32(scale), e.counts) for e in errors]
+    costs, x = [_cost(wrong, errors)], table
+    for k in range(settings.joint):
+        derivatives = _derivatives(shade, x, pictures, unknown.rows, settings.roughness_floor)
+        linear = [
+            Linear(p.fetch, d, _weights(w, d, e), np.nan_to_num(w))
+            for p, d, w, e in zip(pictures, derivatives, wrong, errors, strict=True)
+        ]
+        progress((k + 0.5) / settings.joint)
+        x = _moved(x, unknown, _step(x, linear, unknown, work.where), settings.roughness_floor)
+        wrong = _wrong(shade, x, pictures)
+        costs.append(_cost(wrong, errors))
+        progress((k + 1) / settings.joint)
+    trace["joint.cost"] = costs
+    if not costs[-1] < costs[0]:
+        work.notes.append(f"The joint steps were undone: the cost went from {costs[0]:.3g} to {costs[-1]:.3g}.")
+        return table
+    return x
+
+
+def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSettings:
+    """The settings without joint steps where there are none: texels are not solved one by one before, neighbours shall
+    have no word, or a light is soft."""
+    soft = any(isinstance(light, SOFT) for own in captures.lights for light in own)
+    some = settings.solver == "both" and settings.smooth and not soft
+    return settings if some else settings.model_copy(update={"joint": 0})
+
+
+def _pixels(shade, work: Work) -> tuple[list[Pixels], Unknown] | None:
+    """All pictures' pixels, and what is solved for; None where they would take more memory than there may be."""
+    result, held = [], 0
+    seen = np.zeros(shade.texels, bool)
+    for k in range(len(work.captures)):
+        result.append(_lit_pixels(shade, k))
+        fetch = result[-1].fetch
+        seen[fetch.indices] = True
+        held += PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
+        if held + shade.held() > work.settings.memory * 1e9:
+            return None
+    rows = np.flatnonzero(seen | np.concatenate([c.ravel() for c in work.where.covered]))
+    number = np.zeros(shade.texels, np.int32)
+    number[rows] = np.arange(len(rows), dtype=np.int32)
+    for pixels in result:
+        pixels.fetch.indices = number[pixels.fetch.indices]
+        pixels.fetch.resize(pixels.fetch.shape[0], len(rows))
+    return result, Unknown(rows, seen[rows])
+
+
+def _lit_pixels(shade, picture: int) -> Pixels:
+    from scipy.sparse import csr_array, vstack
+
+    index, lit = [np.zeros(0, int)], [np.zeros(0, np.float32)]
+    fetches, moves = [csr_array((0, shade.texels), dtype=np.float32)], steps(shade.sizes)
+    for block in shade.blocks(picture):
+        samples, (count, pixels, _) = block.hits.samples, block.hits.counts
+        slot, texel, step = (np.array(a)[:count].astype(np.int64) for a in (samples.slot, samples.texel, samples.step))
+        x, y = np.array(samples.x)[:count], np.array(samples.y)[:count]
+        right, down = moves[step].T
+        texels = np.stack([texel, texel + right, texel + down, texel + right + down], axis=1)
+        number = np.bincount(slot, minlength=pixels)
+        weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1) / number[slot][:, None]
+        entries = (np.repeat(slot, 4).astype(np.int32), texels.ravel().astype(np.int32))
+        fetches.append(csr_array((weights.ravel().astype(np.float32), entries), shape=(pixels, shade.texels)))
+        index.append(block.pixel.astype(int))
+        lit.append((number / shade.subsamples).astype(np.float32))
+    return Pixels(np.concatenate(index), np.concatenate(lit), vstack(fetches, format="csr"))
+
+
+def _errors(
+    captures: Captures, pictures: Sequence[Pixels], indirect: dict[int, np.ndarray], settings: RecoverSettings
+) -> list[Errors]:
+    levels, counts = [], []
+    for k, pixels in enumerate(pictures):
+        rgb, mask = captures.load(k)
+        rgb = rgb.reshape(-1, 3)[pixels.index]
+        counts.append((mask.ravel()[pixels.index] & np.isfinite(rgb).all(axis=1)).astype(np.float32))
+        levels.append(np.maximum(np.nan_to_num(rgb).max(axis=1, initial=0), 0))
+    every = np.concatenate(levels)
+    unit = max(float(np.percentile(every, PERCENTILE)), 1e-6) if len(every) else 1.0
+    result = []
+    for k, (pixels, level, count) in enumerate(zip(pictures, levels, counts, strict=True)):
+        variance = (settings.noise * unit + settings.relative * level) ** 2
+        variance += np.where(pixels.lit < 0.999, EDGE * level / pixels.lit, 0) ** 2
+        if k in indirect:
+            light = enlarged(indirect[k], captures.cameras[k].size).reshape(-1, 3)[pixels.index]
+            variance += (BETWEEN * light.max(axis=1)) ** 2
+        result.append(Errors(np.sqrt(variance).astype(np.float32), count))
+    return result
+
+
+def _images(shade, table: Table, pictures: Sequence[Pixels]) -> list[Float[np.ndarray, "p 3"]]:
+    shade.table = table
+    return [shade.image(k).reshape(-1, 3)[pixels.index] for k, pixels in enumerate(pictures)]
+
+
+def _wrong(shade, table: Table, pictures: Sequence[Pixels]) -> list[Float[np.ndarray, "p 3"]]:
+    """Reference - picture; leaves the table in `shade`."""
+    images, load = _images(shade, table, pictures), shade.captures.load
+    return [load(k)[0].reshape(-1, 3)[p.index] - images[k] for k, p in enumerate(pictures)]
+
+
+def _robust_spread(wrong: Sequence[np.ndarray], errors: Sequence[Errors]) -> float:
+    """What residuals are to their standard deviations: by the median, as if they were normally distributed."""
+    every = np.concatenate(
+        [(np.abs(w) / e.spread[:, None])[e.counts > 0].ravel() for w, e in zip(wrong, errors, strict=True)]
+    )
+    return float(np.median(every)) / 0.6745 if len(every) else 1.0
+
+
+def _cost(wrong: Sequence[np.ndarray], errors: Sequence[Errors]) -> float:
+    """Cauchy's, the mean over the channels of all pixels that count."""
+    total, count = 0.0, 0.0
+    for w, e in zip(wrong, errors, strict=True):
+        units = np.nan_to_num(w / (WRONG * e.spread[:, None]))
+        total += float((np.log1p(units**2).sum(axis=1) * e.counts).sum(dtype=np.float64))
+        count += 3 * float(e.counts.sum())
+    return WRONG**2 * total / max(count, 1)
+
+
+def _weights(wrong: np.ndarray, derivative: np.ndarray, errors: Errors) -> Float[np.ndarray, "p 3"]:
+    units = wrong / (WRONG * errors.spread[:, None])
+    weight = (errors.counts / errors.spread**2)[:, None] / (1 + units**2)
+    sound = np.isfinite(weight) & np.isfinite(derivative).all(axis=2)
+    derivative[~sound] = 0
+    return np.where(sound, weight, 0).astype(np.float32)
+
+
+def _derivatives(
+    shade, table: Table, pictures: Sequence[Pixels], rows: Int[np.ndarray, " t"], floor: float
+) -> list[Float[np.ndarray, "p 3 4"]]:
+    result = [np.zeros((len(p.index), 3, len(MOVES)), np.float32) for p in pictures]
+    for j, (columns, far) in enumerate(MOVES):
+        up, down = table.copy(), table.copy()
+        up[:, columns] += far
+        down[:, columns] -= far
+        if columns == (5,):  # at its bounds roughness moves to one side only
+            up[:, 5], down[:, 5] = np.minimum(up[:, 5], 1), np.maximum(down[:, 5], floor)
+        high, low = _images(shade, up, pictures), _images(shade, down, pictures)
+        moved = (up - down)[rows, columns[0]]
+        for each, p, a, b in zip(result, pictures, high, low, strict=True):
+            each[:, :, j] = (a - b) / np.maximum(p.fetch @ moved, far / 10)[:, None]
+    return result
+
+
+def _step(table: Table, linear: Sequence[Linear], unknown: Unknown, where: Atlas) -> Unknowns:
+    """The change that solves the equations of the module."""
+    rows = unknown.rows
+    blocks = _blocks(linear, len(rows))
+    own = np.einsum("tii->ti", np.linalg.inv(blocks + np.eye(6, dtype=np.float32) / FREE**2))
+    noise = np.full((len(table), 7), NOTHING, np.float32)
+    noise[rows, :6] = np.where(unknown.seen[:, None], np.sqrt(MARGIN * np.maximum(own, 1e-12)), NOTHING)
+    priors, x = _priors(table, noise, rows, where), table[rows, :6]
+    right = _right(linear, len(rows)) - _product(priors, x)
+    diagonal = np.stack([prior.diagonal() for prior in priors], axis=1)
+    inverse = np.linalg.inv(blocks + np.einsum("ti,ij->tij", np.maximum(diagonal, 1e-6), np.eye(6, dtype=np.float32)))
+
+    def applied(v: Unknowns) -> Unknowns:
+        return _curved(linear, v) + _product(priors, v)
+
+    return _conjugate(applied, right, inverse)
+
+
+def _conjugate(applied: Callable[[Unknowns], Unknowns], right: Unknowns, inverse: Blocks) -> Unknowns:
+    """Conjugate gradients from zero, preconditioned by `inverse`, texel by texel."""
+
+    def dot(a: np.ndarray, b: np.ndarray) -> float:
+        return float((a * b).sum(dtype=np.float64))
+
+    x, left = np.zeros_like(right), right
+    towards = np.einsum("tij,tj->ti", inverse, left)
+    first = size = dot(left, towards)
+    for _ in range(STEPS):
+        if not size > CLOSE * first:
+            break
+        product = applied(towards)
+        length = np.float32(size / max(dot(towards, product), 1e-30))
+        x, left = x + length * towards, left - length * product
+        better = np.einsum("tij,tj->ti", inverse, left)
+        size, last = dot(left, better), size
+        towards = better + np.float32(size / last) * towards
+    return x
+
+
+def _full(derivative: Float[np.ndarray, "p 3 4"]) -> Float[np.ndarray, "p 3 6"]:
+    """Derivatives by all six unknowns: each channel by its own albedo only."""
+    full = np.zeros((len(derivative), 3, 6), np.float32)
+    full[:, range(3), range(3)], full[:, :, 3:] = derivative[:, :, 0], derivative[:, :, 1:]
+    return full
+
+
+def _blocks(linear: Sequence[Linear], count: int) -> Blocks:
+    """What the pictures say about each texel if all others stand still: sum of b² D' W D."""
+    above = np.triu_indices(6)
+    total = np.zeros((count, len(above[0])), np.float32)
+    for each in linear:
+        full, square = _full(each.derivative), each.fetch.copy()
+        square.data = square.data**2
+        own = np.stack(
+            [(full[:, :, i] * full[:, :, j] * each.weight).sum(axis=1) for i, j in zip(*above, strict=True)], axis=1
+        )
+        total += square.T @ own
+    blocks = np.zeros((count, 6, 6), np.float32)
+    blocks[:, above[0], above[1]] = blocks[:, above[1], above[0]] = total
+    return blocks
+
+
+def _curved(linear: Sequence[Linear], v: Unknowns) -> Unknowns:
+    """B' D' W D B v."""
+    total = np.zeros_like(v)
+    for each in linear:
+        pixels, d = each.fetch @ v, each.derivative
+        change = d[:, :, 0] * pixels[:, :3] + np.einsum("pcj,pj->pc", d[:, :, 1:], pixels[:, 3:])
+        total += _back(each, change)
+    return total
+
+
+def _right(linear: Sequence[Linear], count: int) -> Unknowns:
+    """B' D' W (reference - picture)."""
+    return sum((_back(each, each.wrong) for each in linear), np.zeros((count, 6), np.float32))
+
+
+def _back(each: Linear, channels: Float[np.ndarray, "p 3"]) -> Unknowns:
+    """B' D' W of values of a picture's channels."""
+    weighted, d = each.weight * channels, each.derivative
+    pixels = np.concatenate([d[:, :, 0] * weighted, np.einsum("pcj,pc->pj", d[:, :, 1:], weighted)], axis=1)
+    return each.fetch.T @ pixels
+
+
+def _priors(table: Table, noise: Float[np.ndarray, "a 7"], rows: Int[np.ndarray, " t"], where: Atlas) -> list[Any]:
+    """P of each unknown: second differences of covered texels; uncovered ones are nearly as the nearest covered one."""
+    from scipy.sparse import csr_array
+
+    number = np.full(len(table), -1, np.int64)
+    number[rows] = np.arange(len(rows))
+    pairs = []
+    for k, closest in enumerate(where.closest):
+        first = where.offsets[k]
+        empty = np.flatnonzero(~where.covered[k].ravel())
+        pairs.append(np.stack([empty, closest[empty]], axis=1) + first)
+    both = number[np.concatenate(pairs)]
+    both = both[(both >= 0).all(axis=1)]
+    ends = np.arange(0, both.size + 1, 2)
+    apart = csr_array(
+        (np.tile([1, -1], len(both)).astype(np.float32) / ALIKE, both.ravel(), ends), (len(both), len(rows))
+    )
+    tied = apart.T @ apart
+    where = joined(where, table[:, :7], noise)
+    return [(firmness(table, noise, where, c)[rows][:, rows] + tied).tocsr() for c in LEAST]
+
+
+def _product(priors: Sequence[Any], v: Unknowns) -> Unknowns:
+    return np.stack([prior @ v[:, c] for c, prior in enumerate(priors)], axis=1)
+
+
+def _moved(table: Table, unknown: Unknown, change: Unknowns, floor: float) -> Table:
+    """The table after a step: none where it is no number, LONGEST at most, within the bounds of its channels."""
+    result, change = table.copy(), np.where(np.isfinite(change).all(axis=1, keepdims=True), change, 0)
+    values = result[unknown.rows, :6] + np.clip(change, -LONGEST, LONGEST)
+    values[:, :3], values[:, 5] = np.clip(values[:, :3], 0, 1), np.clip(values[:, 5], floor, 1)
+    length = np.linalg.norm(values[:, 3:5], axis=1, keepdims=True)
+    values[:, 3:5] *= np.minimum(1, STEEPEST / np.maximum(length, 1e-9))
+    result[unknown.rows, :6] = values
+    return result
