@@ -38,10 +38,11 @@ from mistyle.stages.recover_texels import Work
 
 # By which the pictures' derivatives are taken: columns of the table that move together, and how far to either side. A
 # channel of a picture knows its own channel of the albedo only.
-MOVES = (((0, 1, 2), 0.02), ((3,), 0.01), ((4,), 0.01), ((5,), 0.01))
+MOVES = (((0, 1, 2), 0.02), ((3,), 0.003), ((4,), 0.003), ((5,), 0.01))
 # Of what `noise` and `relative` say, the least standard deviation that residuals are taken to have: most are far
 # smaller, but there are about as many unknowns.
 FIT = 0.5
+JUMP = 3.0  # times a change to one side is larger than to the other where it is none of a smooth function
 WRONG = 2.0  # standard deviations from which on a residual counts for less
 EDGE = 0.1  # standard deviation where only some of a pixel's samples are lit, relative to those that are
 BETWEEN = 0.15  # that of light between surfaces, relative to it
@@ -50,7 +51,7 @@ ALIKE = 0.03  # between an uncovered texel, which pixels at charts' borders see,
 LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # of a step
 STEEPEST = 0.98  # of a tilt
 STEPS, CLOSE = 60, 1e-4  # of conjugate gradients at most; and the share of r' M r that they may leave
-PIXEL, WEIGHT = 160, 8  # bytes of a pixel, and of a bilinear weight
+PIXEL, WEIGHT = 200, 8  # bytes of a pixel, and of a bilinear weight
 
 Table = Float[np.ndarray, "a 8"]
 Unknowns = Float[np.ndarray, "t 6"]
@@ -117,19 +118,22 @@ def together(
         return table
     pictures, unknown = found
     errors = _errors(captures, pictures, indirect, settings)
-    wrong = _wrong(shade, table, pictures)
+    references = [captures.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(pictures)]
+    images = _images(shade, table, pictures)
+    wrong = [r - i for r, i in zip(references, images, strict=True)]
     scale = max(FIT, _robust_spread(wrong, errors))
     errors = [Errors(e.spread * np.float32(scale), e.counts) for e in errors]
     costs, x = [_cost(wrong, errors)], table
     for k in range(settings.joint):
-        derivatives = _derivatives(shade, x, pictures, unknown.rows, settings.roughness_floor)
+        derivatives = _derivatives(shade, x, images, pictures, unknown.rows, settings.roughness_floor)
         linear = [
             Linear(p.fetch, d, _weights(w, d, e), np.nan_to_num(w))
             for p, d, w, e in zip(pictures, derivatives, wrong, errors, strict=True)
         ]
         progress((k + 0.5) / settings.joint)
         x = _moved(x, unknown, _step(x, linear, unknown, work.where), settings.roughness_floor)
-        wrong = _wrong(shade, x, pictures)
+        images = _images(shade, x, pictures)
+        wrong = [r - i for r, i in zip(references, images, strict=True)]
         costs.append(_cost(wrong, errors))
         progress((k + 1) / settings.joint)
     trace["joint.cost"] = costs
@@ -209,15 +213,9 @@ def _errors(
     return result
 
 
-def _images(shade, table: Table, pictures: Sequence[Pixels]) -> list[Float[np.ndarray, "p 3"]]:
+def _images(shade, table: Table, pictures: Sequence[Pixels]) -> list[Float[np.ndarray, "_ 3"]]:
     shade.table = table
     return [shade.image(k).reshape(-1, 3)[pixels.index] for k, pixels in enumerate(pictures)]
-
-
-def _wrong(shade, table: Table, pictures: Sequence[Pixels]) -> list[Float[np.ndarray, "p 3"]]:
-    """Reference - picture; leaves the table in `shade`."""
-    images, load = _images(shade, table, pictures), shade.captures.load
-    return [load(k)[0].reshape(-1, 3)[p.index] - images[k] for k, p in enumerate(pictures)]
 
 
 def _robust_spread(wrong: Sequence[np.ndarray], errors: Sequence[Errors]) -> float:
@@ -247,8 +245,14 @@ def _weights(wrong: np.ndarray, derivative: np.ndarray, errors: Errors) -> Float
 
 
 def _derivatives(
-    shade, table: Table, pictures: Sequence[Pixels], rows: Int[np.ndarray, " t"], floor: float
-) -> list[Float[np.ndarray, "p 3 4"]]:
+    shade,
+    table: Table,
+    images: Sequence[Float[np.ndarray, "_ 3"]],
+    pictures: Sequence[Pixels],
+    rows: Int[np.ndarray, " t"],
+    floor: float,
+) -> list[Float[np.ndarray, "_ 3 4"]]:
+    """Of `images`, which the table gives, by MOVES."""
     result = [np.zeros((len(p.index), 3, len(MOVES)), np.float32) for p in pictures]
     for j, (columns, far) in enumerate(MOVES):
         up, down = table.copy(), table.copy()
@@ -258,9 +262,18 @@ def _derivatives(
             up[:, 5], down[:, 5] = np.minimum(up[:, 5], 1), np.maximum(down[:, 5], floor)
         high, low = _images(shade, up, pictures), _images(shade, down, pictures)
         moved = (up - down)[rows, columns[0]]
-        for each, p, a, b in zip(result, pictures, high, low, strict=True):
-            each[:, :, j] = (a - b) / np.maximum(p.fetch @ moved, far / 10)[:, None]
+        for each, p, here, a, b in zip(result, pictures, images, high, low, strict=True):
+            change = _without_jumps(a - here, here - b) if columns in ((3,), (4,)) else a - b
+            each[:, :, j] = change / np.maximum(p.fetch @ moved, far / 10)[:, None]
     return result
+
+
+def _without_jumps(ahead: np.ndarray, back: np.ndarray) -> np.ndarray:
+    """Their sum, or twice the smaller where they differ by more than JUMP: reflectance jumps where the mapped normal
+    turns away from the camera or the light, and that is no slope."""
+    first = np.abs(ahead) < np.abs(back)
+    smaller, larger = np.where(first, ahead, back), np.where(first, back, ahead)
+    return np.where(np.abs(larger) > JUMP * np.abs(smaller), 2 * smaller, ahead + back)
 
 
 def _step(table: Table, linear: Sequence[Linear], unknown: Unknown, where: Atlas) -> Unknowns:
