@@ -4,8 +4,9 @@ First texel by texel (`recover_solve.py`): with geometry, cameras and lights kno
 solve for one texel, and Levenberg-Marquardt gets in twenty steps where gradient descent on pictures does not get in
 hundreds. Then on whole pictures (`recover_pictures.py`), by Adam through `render/shade.py`, which models pixels and
 interpolation exactly. Before, in between and after that neighbours have a word about what pictures leave open
-(`recover_smooth.py`). Light that reaches the surface by way of other surfaces is estimated with the maps found so far
-and taken off the pictures, in both parts (`bounces`). Lights and cameras are taken as they are given; a common factor
+(`recover_smooth.py`). Under delta lights texels, pictures and neighbours are at last solved for together
+(`recover_joint.py`). Light that reaches the surface by way of other surfaces is estimated with the maps found so far
+and taken off the pictures, in all parts (`bounces`). Lights and cameras are taken as they are given; a common factor
 of light and albedo cannot be told apart, so albedo is as right as the lights' units are.
 """
 
