@@ -75,7 +75,7 @@ MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
     "pictures": Need(0.53, texel=71, photograph=97),
-    "recover": Need(0.71, texel=446, look=9.6, picture=620),
+    "recover": Need(0.71, texel=900, look=9.6, picture=620),
     "measure": Need(0.73, texel=300, look=6, picture=620),
     "asset": Need(0.76, texel=200, look=6, picture=570),
     "scene": Need(0.76, texel=200, look=6, picture=570),

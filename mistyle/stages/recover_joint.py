@@ -279,14 +279,18 @@ def _without_jumps(ahead: np.ndarray, back: np.ndarray) -> np.ndarray:
 def _step(table: Table, linear: Sequence[Linear], unknown: Unknown, where: Atlas) -> Unknowns:
     """The change that solves the equations of the module."""
     rows = unknown.rows
-    blocks = _blocks(linear, len(rows))
-    own = np.einsum("tii->ti", np.linalg.inv(blocks + np.eye(6, dtype=np.float32) / FREE**2))
+    # One after the other, in place: these are most of what the steps hold of each texel.
+    blocks, of = _blocks(linear, len(rows)), np.arange(6)
+    blocks[:, of, of] += 1 / FREE**2
+    own = np.einsum("tii->ti", np.linalg.inv(blocks)).copy()
     noise = np.full((len(table), 7), NOTHING, np.float32)
     noise[rows, :6] = np.where(unknown.seen[:, None], np.sqrt(MARGIN * np.maximum(own, 1e-12)), NOTHING)
     priors, x = _priors(table, noise, rows, where), table[rows, :6]
     right = _right(linear, len(rows)) - _product(priors, x)
     diagonal = np.stack([prior.diagonal() for prior in priors], axis=1)
-    inverse = np.linalg.inv(blocks + np.einsum("ti,ij->tij", np.maximum(diagonal, 1e-6), np.eye(6, dtype=np.float32)))
+    blocks[:, of, of] += np.maximum(diagonal, 1e-6) - 1 / FREE**2
+    inverse = np.linalg.inv(blocks)
+    del blocks
 
     def applied(v: Unknowns) -> Unknowns:
         return _curved(linear, v) + _product(priors, v)
