@@ -39,9 +39,9 @@ from mistyle.stages.recover_texels import Work
 # By which the pictures' derivatives are taken: columns of the table that move together, and how far to either side. A
 # channel of a picture knows its own channel of the albedo only.
 MOVES = (((0, 1, 2), 0.02), ((3,), 0.003), ((4,), 0.003), ((5,), 0.01))
-# Of what `noise` and `relative` say, the least standard deviation that residuals are taken to have: most are far
-# smaller, but there are about as many unknowns.
-FIT = 0.5
+# The standard deviation of residuals as a multiple of what `noise` and `relative` say: LOOSE times what the median
+# residual proves, since there are about as many unknowns as pixels and most fit better than they tell; FIT at least.
+LOOSE, FIT = 2.0, 0.1
 JUMP = 3.0  # times a change to one side is larger than to the other where it is none of a smooth function
 WRONG = 2.0  # standard deviations from which on a residual counts for less
 EDGE = 0.1  # standard deviation where only some of a pixel's samples are lit, relative to those that are
@@ -121,7 +121,7 @@ def together(
     references = [captures.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(pictures)]
     images = _images(shade, table, pictures)
     wrong = [r - i for r, i in zip(references, images, strict=True)]
-    scale = max(FIT, _robust_spread(wrong, errors))
+    scale = max(FIT, LOOSE * _robust_spread(wrong, errors))
     errors = [Errors(e.spread * np.float32(scale), e.counts) for e in errors]
     costs, x = [_cost(wrong, errors)], table
     for k in range(settings.joint):
