@@ -14,6 +14,7 @@ from mistyle.core.light import Ambient
 from mistyle.render import draw
 from mistyle.render import hits as collecting
 from mistyle.render.shade import Shade, pack
+from mistyle.stages import joint_algebra as algebra
 from mistyle.stages import recover_joint as joint
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_solve import NOTHING, linked
@@ -22,19 +23,19 @@ from mistyle.stages.recover_texels import Work
 FEW = QUICK.model_copy(update={"iterations": 60, "rounds": 1})
 
 
-def random_linear(rng: np.random.Generator, pixels: int, texels: int) -> joint.Linear:
+def random_linear(rng: np.random.Generator, pixels: int, texels: int) -> algebra.Linear:
     weights = rng.uniform(0, 1, (pixels, texels)) * (rng.random((pixels, texels)) < 0.4)
     derivative, weight, wrong = (
         rng.normal(size=(pixels, 3, 4)),
         rng.uniform(0.5, 2, (pixels, 3)),
         rng.normal(size=(pixels, 3)),
     )
-    return joint.Linear(
+    return algebra.Linear(
         csr_array(weights.astype(np.float32)), *(a.astype(np.float32) for a in (derivative, weight, wrong))
     )
 
 
-def dense(each: joint.Linear) -> np.ndarray:
+def dense(each: algebra.Linear) -> np.ndarray:
     """D B as a matrix, channels of pixels x unknowns of texels."""
     fetch, d = each.fetch.toarray().astype(np.float64), each.derivative.astype(np.float64)
     by = np.zeros((*d.shape[:2], 6))
@@ -48,14 +49,14 @@ def test_the_equations_are_those_of_dense_matrices(rng):
     matrix = sum(dense(each).T @ np.diag(each.weight.ravel()) @ dense(each) for each in linear)
     right = sum(dense(each).T @ (each.weight * each.wrong).ravel() for each in linear)
     v = rng.normal(size=(texels, 6)).astype(np.float32)
-    np.testing.assert_allclose(joint._curved(linear, v).ravel(), matrix @ v.ravel(), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(joint._right(linear, texels).ravel(), right, rtol=1e-4, atol=1e-4)
-    blocks = joint._blocks(linear, texels)
+    np.testing.assert_allclose(algebra.curved(linear, v).ravel(), matrix @ v.ravel(), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(algebra.right_side(linear, texels).ravel(), right, rtol=1e-4, atol=1e-4)
+    blocks = algebra.own_blocks(linear, texels)
     for t in range(texels):
         np.testing.assert_allclose(blocks[t], matrix[6 * t : 6 * t + 6, 6 * t : 6 * t + 6], rtol=1e-4, atol=1e-4)
     inverse = np.linalg.inv(blocks + np.eye(6, dtype=np.float32))
-    solved = joint._conjugate(
-        lambda x: joint._curved(linear, x) + x, right.reshape(texels, 6).astype(np.float32), inverse
+    solved = algebra.conjugate(
+        lambda x: algebra.curved(linear, x) + x, right.reshape(texels, 6).astype(np.float32), inverse
     )
     exact = np.linalg.solve(matrix + np.eye(6 * texels), right)
     assert np.linalg.norm(solved.ravel() - exact) < 0.02 * np.linalg.norm(exact)

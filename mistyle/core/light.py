@@ -27,7 +27,7 @@ scene file describes the light. The world is the cameras' world, and lengths are
 import json
 import math
 import reprlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, TypeGuard
@@ -119,6 +119,11 @@ NAMES = {
     SphericalGaussian: "spherical_gaussian",
     SceneLights: "scene",
 }
+
+
+def has_soft(many: Iterable[Lights]) -> bool:
+    """Whether any of the lights is SOFT."""
+    return any(isinstance(light, SOFT) for lights in many for light in lights)
 
 
 def lights(name: str) -> Lights:

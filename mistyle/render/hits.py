@@ -138,6 +138,19 @@ def steps(sizes: Sequence[tuple[int, int]]) -> Int[np.ndarray, "k 2"]:
     return np.array(table, np.int32)
 
 
+def corners(
+    texel: Int[np.ndarray, " n"],
+    step: Int[np.ndarray, " n"],
+    place: Float[np.ndarray, "n 2"],
+    sizes: Sequence[tuple[int, int]],
+) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
+    """The four texels, rows of the table, that each of the `cells` is fetched from, and their bilinear weights."""
+    right, down = steps(sizes)[step].astype(np.int64).T
+    index = texel[:, None] + np.stack([np.zeros_like(right), right, down, right + down], axis=1)
+    x, y = place.T
+    return index, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
+
+
 def cells(
     uv: Float[np.ndarray, "n 2"], part: Int[np.ndarray, " n"], sizes: Sequence[tuple[int, int]]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
@@ -375,8 +388,7 @@ def _transpose(texel, step, place, sizes, size: int) -> tuple[Transpose, int]:
     import mitsuba as mi
     import scipy.sparse as sparse
 
-    right, down = steps(sizes)[step].astype(np.int64).T
-    index = texel[:, None] + np.stack([np.zeros_like(right), right, down, right + down], axis=1)
+    index, weight = corners(texel, step, place, sizes)
     total = sum(rows * columns for rows, columns in sizes)
     shape = (len(texel), total)
     by_sample = sparse.csr_matrix(
@@ -386,8 +398,7 @@ def _transpose(texel, step, place, sizes, size: int) -> tuple[Transpose, int]:
     touched = np.flatnonzero(np.diff(by_texel.indptr))
     t = padded(len(touched))
     begin, end = (_pad(by_texel.indptr[touched + k].astype(np.uint32), t) for k in (0, 1))
-    x, y = place.T
-    weight = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1).ravel()[by_texel.data]
+    weight = weight.ravel()[by_texel.data]
     integers = (_pad(touched.astype(np.uint32), t), begin, end, _pad(by_texel.data // 4, 4 * size))
     first, begins, ends, sample = (own(mi.UInt32, a) for a in integers)
     return Transpose(first, begins, ends, sample, own(mi.Float, _pad(weight.astype(np.float32), 4 * size))), len(

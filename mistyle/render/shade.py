@@ -264,6 +264,7 @@ class Shade:
         return self._skies[key]
 
     def held(self) -> int:
+        """Bytes of what is kept of the pictures' samples."""
         return sum(block.bytes for blocks in self._kept.values() for block in blocks)
 
 

@@ -31,7 +31,7 @@ from mistyle.run.budget import (
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import thread_count
 from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
-from mistyle.stages.recover_settings import all_rounds, estimates, passes
+from mistyle.stages.recover_settings import all_rounds, estimates, joint_steps, passes
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -111,7 +111,8 @@ def plan_material(job: Any) -> dict[str, Any]:
     begun = solves * (1 + len(estimated[0]))
     paths = solves * sum(sum(part) for part in estimated) * sum(min(n, MOST**2) for n in averaged)
     steps = 0 if s.recover.solver == "texels" else s.recover.iterations
-    if steps and s.recover.joint and solves:
+    joint = joint_steps(s.recover)
+    if joint:
         paths += (s.recover.bounces > 0) * s.recover.bounce_samples * sum(min(n, MOST**2) for n in averaged)
     words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
@@ -122,7 +123,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
         + (begun + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
         + paths * PER_BOUNCED_PATH
-        + (steps > 0) * solves * s.recover.joint * SHOWN * sum(averaged) * PER_JOINT
+        + joint * SHOWN * sum(averaged) * PER_JOINT
         + words * COVERED * texels * PER_SMOOTHED,
         "measure": 2 * looked * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,

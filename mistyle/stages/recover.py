@@ -25,13 +25,12 @@ from mistyle.stages.recover_joint import together, where_possible
 from mistyle.stages.recover_pictures import improved
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.recover_smooth import smoothed
-from mistyle.stages.recover_texels import Found, Work, solve_level, take_off_indirect
+from mistyle.stages.recover_texels import Found, Work, solve_level
 
 __all__ = ["RecoverSettings", "Recovered", "recover"]
 
 # Standard deviations at which a texel's confidence has fallen to a half: normal (sine), roughness, albedo, metallic.
 HALF_SURE = {"normal": 0.05, "roughness": 0.1, "albedo": 0.05, "metallic": 0.2}
-LAST_SEED = 104_729  # added for the last estimate of light between surfaces
 CHANNELS = {"albedo": slice(0, 3), "normal": slice(3, 5), "roughness": slice(5, 6), "metallic": slice(6, 7)}
 
 
@@ -103,7 +102,7 @@ def recover(
     if settings.solver != "texels" and settings.iterations:
         table = improved(work, shade, found, indirect, seed, trace, lambda d: progress(0.5 + 0.35 * d), save, resume)
         if found.solved and settings.joint:
-            table = jointly(work, shade, table, indirect, seed, trace, lambda d: progress(0.85 + 0.1 * d))
+            table = together(work, shade, table, indirect, seed, trace, lambda d: progress(0.85 + 0.1 * d))
     if settings.polish:
         # Its pictures keep the light between surfaces.
         table = polished(work, whole, table, seed, trace, lambda d: progress(0.95 + 0.05 * d))
@@ -111,24 +110,6 @@ def recover(
     residuals = {camera.name: _residual(shade, k) for k, camera in enumerate(captures.cameras)}
     progress(1.0)
     return _recovered(work, found, table, trace, residuals)
-
-
-def jointly(
-    work: Work,
-    shade,
-    table: Float[np.ndarray, "a 8"],
-    indirect: dict[int, np.ndarray],
-    seed: int,
-    trace: dict[str, list[float]],
-    progress: Callable[[float], None],
-) -> Float[np.ndarray, "a 8"]:
-    """The joint steps, after one more estimate of the light between surfaces."""
-    begun = 0.0
-    if work.settings.bounces:
-        begun = 0.5
-        samples = work.settings.bounce_samples
-        take_off_indirect(work, shade, table, indirect, samples, seed + LAST_SEED, lambda d: progress(begun * d))
-    return together(work, shade, table, indirect, trace, lambda d: progress(begun + (1 - begun) * d))
 
 
 def polished(

@@ -27,14 +27,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.capture import Captures
-from mistyle.core.light import SOFT
-from mistyle.render.hits import steps
+from mistyle.core.light import has_soft
+from mistyle.render.hits import corners
 from mistyle.render.indirect import enlarged
-from mistyle.stages.recover_observe import PERCENTILE
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.joint_algebra import Linear, Unknowns, conjugate, curved, own_blocks, right_side
+from mistyle.stages.recover_observe import deviation
+from mistyle.stages.recover_settings import RecoverSettings, joint_steps
 from mistyle.stages.recover_smooth import LEAST, firmness
 from mistyle.stages.recover_solve import MARGIN, NOTHING, Atlas, joined
-from mistyle.stages.recover_texels import Work
+from mistyle.stages.recover_texels import Work, take_off_indirect
 
 # By which the pictures' derivatives are taken: columns of the table that move together, and how far to either side. A
 # channel of a picture knows its own channel of the albedo only.
@@ -50,12 +51,10 @@ FREE = 0.5  # standard deviation that what no picture tells is left
 ALIKE = 0.03  # between an uncovered texel, which pixels at charts' borders see, and the nearest covered one
 LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # of a step
 STEEPEST = 0.98  # of a tilt
-STEPS, CLOSE = 60, 1e-4  # of conjugate gradients at most; and the share of r' M r that they may leave
+SEED = 104_729  # added for their estimate of light between surfaces
 PIXEL, WEIGHT = 200, 8  # bytes of a pixel, and of a bilinear weight
 
 Table = Float[np.ndarray, "a 8"]
-Unknowns = Float[np.ndarray, "t 6"]
-Blocks = Float[np.ndarray, "t 6 6"]
 
 
 @dataclass(frozen=True)
@@ -84,26 +83,16 @@ class Errors:
     counts: Float[np.ndarray, " p"]
 
 
-@dataclass(frozen=True)
-class Linear:
-    """A picture around the maps: its channels' derivatives by their own albedo, tilt (2) and roughness, the weights of
-    its channels, and reference - picture."""
-
-    fetch: Any
-    derivative: Float[np.ndarray, "p 3 4"]
-    weight: Float[np.ndarray, "p 3"]
-    wrong: Float[np.ndarray, "p 3"]
-
-
 def together(
     work: Work,
     shade,
     table: Table,
     indirect: dict[int, np.ndarray],
+    seed: int,
     trace: dict[str, list[float]],
     progress: Callable[[float], None],
 ) -> Table:
-    """`settings.joint` such steps from `table`; the light between surfaces in `indirect` was taken off the pictures.
+    """`settings.joint` such steps from `table`, after one more estimate of light between surfaces (`indirect`).
 
     Steps after which the pictures fit worse are undone, and steps that need more than `settings.memory` beside what is
     kept of the samples are left out; a note says so.
@@ -117,10 +106,14 @@ def together(
         )
         return table
     pictures, unknown = found
+    begun = 0.5 if settings.bounces else 0.0
+    if settings.bounces:
+        samples = settings.bounce_samples
+        take_off_indirect(work, shade, table, indirect, samples, seed + SEED, lambda d: progress(begun * d))
     errors = _errors(captures, pictures, indirect, settings)
     references = [captures.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(pictures)]
     images = _images(shade, table, pictures)
-    wrong = [r - i for r, i in zip(references, images, strict=True)]
+    wrong = _apart(references, images)
     scale = max(FIT, LOOSE * _robust_spread(wrong, errors))
     errors = [Errors(e.spread * np.float32(scale), e.counts) for e in errors]
     costs, x = [_cost(wrong, errors)], table
@@ -130,12 +123,12 @@ def together(
             Linear(p.fetch, d, _weights(w, d, e), np.nan_to_num(w))
             for p, d, w, e in zip(pictures, derivatives, wrong, errors, strict=True)
         ]
-        progress((k + 0.5) / settings.joint)
+        progress(begun + (1 - begun) * (k + 0.5) / settings.joint)
         x = _moved(x, unknown, _step(x, linear, unknown, work.where), settings.roughness_floor)
         images = _images(shade, x, pictures)
-        wrong = [r - i for r, i in zip(references, images, strict=True)]
+        wrong = _apart(references, images)
         costs.append(_cost(wrong, errors))
-        progress((k + 1) / settings.joint)
+        progress(begun + (1 - begun) * (k + 1) / settings.joint)
     trace["joint.cost"] = costs
     if not costs[-1] < costs[0]:
         work.notes.append(f"The joint steps were undone: the cost went from {costs[0]:.3g} to {costs[-1]:.3g}.")
@@ -144,11 +137,9 @@ def together(
 
 
 def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSettings:
-    """The settings without joint steps where there are none: texels are not solved one by one before, neighbours shall
-    have no word, or a light is soft."""
-    soft = any(isinstance(light, SOFT) for own in captures.lights for light in own)
-    some = settings.solver == "both" and settings.smooth and not soft
-    return settings if some else settings.model_copy(update={"joint": 0})
+    """The settings without joint steps where there are none (`joint_steps`), or where a light is soft."""
+    some = 0 if has_soft(captures.lights) else joint_steps(settings)
+    return settings.model_copy(update={"joint": some})
 
 
 def _pixels(shade, work: Work) -> tuple[list[Pixels], Unknown] | None:
@@ -175,15 +166,14 @@ def _lit_pixels(shade, picture: int) -> Pixels:
     from scipy.sparse import csr_array, vstack
 
     index, lit = [np.zeros(0, int)], [np.zeros(0, np.float32)]
-    fetches, moves = [csr_array((0, shade.texels), dtype=np.float32)], steps(shade.sizes)
+    fetches = [csr_array((0, shade.texels), dtype=np.float32)]
     for block in shade.blocks(picture):
         samples, (count, pixels, _) = block.hits.samples, block.hits.counts
         slot, texel, step = (np.array(a)[:count].astype(np.int64) for a in (samples.slot, samples.texel, samples.step))
-        x, y = np.array(samples.x)[:count], np.array(samples.y)[:count]
-        right, down = moves[step].T
-        texels = np.stack([texel, texel + right, texel + down, texel + right + down], axis=1)
+        place = np.stack([np.array(samples.x)[:count], np.array(samples.y)[:count]], axis=1)
+        texels, weights = corners(texel, step, place, shade.sizes)
         number = np.bincount(slot, minlength=pixels)
-        weights = np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1) / number[slot][:, None]
+        weights = weights / number[slot][:, None]
         entries = (np.repeat(slot, 4).astype(np.int32), texels.ravel().astype(np.int32))
         fetches.append(csr_array((weights.ravel().astype(np.float32), entries), shape=(pixels, shade.texels)))
         index.append(block.pixel.astype(int))
@@ -200,11 +190,12 @@ def _errors(
         rgb = rgb.reshape(-1, 3)[pixels.index]
         counts.append((mask.ravel()[pixels.index] & np.isfinite(rgb).all(axis=1)).astype(np.float32))
         levels.append(np.maximum(np.nan_to_num(rgb).max(axis=1, initial=0), 0))
-    every = np.concatenate(levels)
-    unit = max(float(np.percentile(every, PERCENTILE)), 1e-6) if len(every) else 1.0
+    every = np.split(
+        deviation(np.concatenate(levels), settings.noise, settings.relative), np.cumsum([len(a) for a in levels])[:-1]
+    )
     result = []
-    for k, (pixels, level, count) in enumerate(zip(pictures, levels, counts, strict=True)):
-        variance = (settings.noise * unit + settings.relative * level) ** 2
+    for k, (pixels, level, own, count) in enumerate(zip(pictures, levels, every, counts, strict=True)):
+        variance = own**2
         variance += np.where(pixels.lit < 0.999, EDGE * level / pixels.lit, 0) ** 2
         if k in indirect:
             light = enlarged(indirect[k], captures.cameras[k].size).reshape(-1, 3)[pixels.index]
@@ -216,6 +207,10 @@ def _errors(
 def _images(shade, table: Table, pictures: Sequence[Pixels]) -> list[Float[np.ndarray, "_ 3"]]:
     shade.table = table
     return [shade.image(k).reshape(-1, 3)[pixels.index] for k, pixels in enumerate(pictures)]
+
+
+def _apart(references: Sequence[np.ndarray], images: Sequence[np.ndarray]) -> list[Float[np.ndarray, "_ 3"]]:
+    return [r - i for r, i in zip(references, images, strict=True)]
 
 
 def _robust_spread(wrong: Sequence[np.ndarray], errors: Sequence[Errors]) -> float:
@@ -280,88 +275,22 @@ def _step(table: Table, linear: Sequence[Linear], unknown: Unknown, where: Atlas
     """The change that solves the equations of the module."""
     rows = unknown.rows
     # One after the other, in place: these are most of what the steps hold of each texel.
-    blocks, of = _blocks(linear, len(rows)), np.arange(6)
+    blocks, of = own_blocks(linear, len(rows)), np.arange(6)
     blocks[:, of, of] += 1 / FREE**2
     own = np.einsum("tii->ti", np.linalg.inv(blocks)).copy()
     noise = np.full((len(table), 7), NOTHING, np.float32)
     noise[rows, :6] = np.where(unknown.seen[:, None], np.sqrt(MARGIN * np.maximum(own, 1e-12)), NOTHING)
     priors, x = _priors(table, noise, rows, where), table[rows, :6]
-    right = _right(linear, len(rows)) - _product(priors, x)
+    right = right_side(linear, len(rows)) - _product(priors, x)
     diagonal = np.stack([prior.diagonal() for prior in priors], axis=1)
     blocks[:, of, of] += np.maximum(diagonal, 1e-6) - 1 / FREE**2
     inverse = np.linalg.inv(blocks)
     del blocks
 
     def applied(v: Unknowns) -> Unknowns:
-        return _curved(linear, v) + _product(priors, v)
+        return curved(linear, v) + _product(priors, v)
 
-    return _conjugate(applied, right, inverse)
-
-
-def _conjugate(applied: Callable[[Unknowns], Unknowns], right: Unknowns, inverse: Blocks) -> Unknowns:
-    """Conjugate gradients from zero, preconditioned by `inverse`, texel by texel."""
-
-    def dot(a: np.ndarray, b: np.ndarray) -> float:
-        return float((a * b).sum(dtype=np.float64))
-
-    x, left = np.zeros_like(right), right
-    towards = np.einsum("tij,tj->ti", inverse, left)
-    first = size = dot(left, towards)
-    for _ in range(STEPS):
-        if not size > CLOSE * first:
-            break
-        product = applied(towards)
-        length = np.float32(size / max(dot(towards, product), 1e-30))
-        x, left = x + length * towards, left - length * product
-        better = np.einsum("tij,tj->ti", inverse, left)
-        size, last = dot(left, better), size
-        towards = better + np.float32(size / last) * towards
-    return x
-
-
-def _full(derivative: Float[np.ndarray, "p 3 4"]) -> Float[np.ndarray, "p 3 6"]:
-    """Derivatives by all six unknowns: each channel by its own albedo only."""
-    full = np.zeros((len(derivative), 3, 6), np.float32)
-    full[:, range(3), range(3)], full[:, :, 3:] = derivative[:, :, 0], derivative[:, :, 1:]
-    return full
-
-
-def _blocks(linear: Sequence[Linear], count: int) -> Blocks:
-    """What the pictures say about each texel if all others stand still: sum of b² D' W D."""
-    above = np.triu_indices(6)
-    total = np.zeros((count, len(above[0])), np.float32)
-    for each in linear:
-        full, square = _full(each.derivative), each.fetch.copy()
-        square.data = square.data**2
-        own = np.stack(
-            [(full[:, :, i] * full[:, :, j] * each.weight).sum(axis=1) for i, j in zip(*above, strict=True)], axis=1
-        )
-        total += square.T @ own
-    blocks = np.zeros((count, 6, 6), np.float32)
-    blocks[:, above[0], above[1]] = blocks[:, above[1], above[0]] = total
-    return blocks
-
-
-def _curved(linear: Sequence[Linear], v: Unknowns) -> Unknowns:
-    """B' D' W D B v."""
-    total = np.zeros_like(v)
-    for each in linear:
-        pixels, d = each.fetch @ v, each.derivative
-        change = d[:, :, 0] * pixels[:, :3] + np.einsum("pcj,pj->pc", d[:, :, 1:], pixels[:, 3:])
-        total += _back(each, change)
-    return total
-
-
-def _right(linear: Sequence[Linear], count: int) -> Unknowns:
-    """B' D' W (reference - picture)."""
-    return sum((_back(each, each.wrong) for each in linear), np.zeros((count, 6), np.float32))
-
-
-def _back(each: Linear, channels: Float[np.ndarray, "p 3"]) -> Unknowns:
-    """B' D' W of values of a picture's channels."""
-    weighted, d = each.weight * channels, each.derivative
-    pixels = np.concatenate([d[:, :, 0] * weighted, np.einsum("pcj,pc->pj", d[:, :, 1:], weighted)], axis=1)
-    return each.fetch.T @ pixels
+    return conjugate(applied, right, inverse)
 
 
 def _priors(table: Table, noise: Float[np.ndarray, "a 7"], rows: Int[np.ndarray, " t"], where: Atlas) -> list[Any]:

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int, UInt
 from mistyle.core.camera import Camera, by_camera, of_corners
 from mistyle.core.capture import Captures
 from mistyle.core.image import erode
-from mistyle.core.light import DELTA, SOFT
+from mistyle.core.light import DELTA, has_soft
 from mistyle.core.maps import Texels
 from mistyle.render.draw import Tracer
 from mistyle.render.texel_lm import Observations, Points, Rig
@@ -89,7 +89,7 @@ def gather(
     face = np.concatenate([t.face[c] for t, c in zip(texels, covered, strict=True)])
     normal = np.concatenate([t.normal[c] for t, c in zip(texels, covered, strict=True)])
     size = np.concatenate([texel_sizes(t) for t in texels])[texel]
-    soft = [any(isinstance(light, SOFT) for light in own) for own in captures.lights]
+    soft = [has_soft([own]) for own in captures.lights]
     sky = open_sky(traced, position, normal) if skies and any(soft) else None
     points = Points(position, texel_frames(traced.mesh, face, position, normal, tangents), sky)
     parts: list[tuple] = []
@@ -119,6 +119,13 @@ def gather(
 def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, "n 3"]:
     """Any picture of the camera, at the places of its observations."""
     return _bilinear(image, at.pixel, at.x, at.y)
+
+
+def deviation(level: Float[np.ndarray, " n"], noise: float, relative: float) -> Float[np.ndarray, " n"]:
+    """Standard deviations of what was observed with radiance `level`: noise · (the brightest, robustly) + relative ·
+    level."""
+    unit = float(np.percentile(level, PERCENTILE)) if len(level) else 1.0
+    return noise * max(unit, 1e-6) + relative * level
 
 
 def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
@@ -266,7 +273,6 @@ def _assemble(texel, points, captures: Captures, parts, views, noise: float, rel
         picture[rows], lit[rows], rgb[rows], worth[rows] = k, bits, values, share
         sightings[k] = Sighting(rows, pixel, x, y)
     level = np.maximum(rgb.max(axis=1, initial=0), 0)
-    unit = float(np.percentile(level, PERCENTILE)) if total else 1.0
-    weight = worth / (noise * max(unit, 1e-6) + relative * level)
+    weight = worth / deviation(level, noise, relative)
     observations = Observations(start, picture, rgb, weight.astype(np.float32), lit)
     return Gathered(texel, points, rig(captures.cameras, captures.lights), observations, tuple(sightings), views)

@@ -118,6 +118,12 @@ class RecoverSettings(BaseModel):
     checkpoint: float = Field(default=60.0, gt=0, description="seconds between checkpoints")
 
 
+def joint_steps(settings: RecoverSettings) -> int:
+    """How many joint steps there are: none where texels are not solved one by one before and then whole pictures, or
+    where neighbours shall have no word."""
+    return settings.joint if settings.solver == "both" and settings.smooth and settings.iterations else 0
+
+
 def all_rounds(settings: RecoverSettings, pictures: int) -> int:
     """How many rounds the texels are solved in: `rounds` at first and after each estimate of light between surfaces,
     SETTLING times as many after the last, whose changes take them to settle."""
@@ -133,7 +139,7 @@ def estimates(settings: RecoverSettings, pictures: int) -> tuple[list[int], list
     """
     few, many = -(-settings.bounce_samples // FEWER), settings.bounce_samples
     late = min(_passes(settings, pictures) - 1, settings.bounces // 2) if settings.solver == "both" else 0
-    among, last = settings.bounces - late, late > 0 and not settings.joint
+    among, last = settings.bounces - late, late > 0 and not joint_steps(settings)
     return [few] * (among > 1) + [many] * (among - (among > 1)), [few] * (late - last) + [many] * last
 
 

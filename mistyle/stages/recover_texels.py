@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 from mistyle.core.camera import by_camera
 from mistyle.core.capture import Captures
 from mistyle.core.image import resize
-from mistyle.core.light import SOFT
+from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.render.indirect import enlarged
 from mistyle.stages import recover_solve as solving
@@ -59,8 +59,7 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
 
     by, settings = 1, work.settings
     sides = [side for size in work.where.sizes for side in size]
-    soft = any(isinstance(light, SOFT) for own in work.captures.lights for light in own)
-    most = settings.solver_texels / (SOFT_COST if soft else 1)
+    most = settings.solver_texels / (SOFT_COST if has_soft(work.captures.lights) else 1)
     while sum(int(c.sum()) for c in work.where.covered) / by**2 > most:
         if any(side % (2 * by) or side // (2 * by) < 8 for side in sides):
             break
