@@ -42,9 +42,9 @@ from mistyle.stages.recover_texels import Work, take_off_indirect
 MOVES = (((0, 1, 2), 0.02), ((3,), 0.003), ((4,), 0.003), ((5,), 0.01))
 # The standard deviation of residuals as a multiple of what `noise` and `relative` say: LOOSE times what the median
 # residual proves, since there are about as many unknowns as pixels and most fit better than they tell; FIT at least.
-LOOSE, FIT = 2.0, 0.1
+LOOSE, FIT = 1.4, 0.1
 JUMP = 3.0  # times a change to one side is larger than to the other where it is none of a smooth function
-WRONG = 2.0  # standard deviations from which on a residual counts for less
+WRONG = 1.4  # standard deviations from which on a residual counts for less
 EDGE = 0.1  # standard deviation where only some of a pixel's samples are lit, relative to those that are
 BETWEEN = 0.15  # that of light between surfaces, relative to it
 FREE = 0.5  # standard deviation that what no picture tells is left
