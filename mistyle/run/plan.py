@@ -109,11 +109,11 @@ def plan_material(job: Any) -> dict[str, Any]:
     solves = s.recover.solver != "pictures"
     rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
     begun = solves * (1 + len(estimated[0]))
-    paths = solves * sum(sum(part) for part in estimated) * sum(min(n, MOST**2) for n in averaged)
-    steps = 0 if s.recover.solver == "texels" else s.recover.iterations
-    joint = joint_steps(s.recover)
-    if joint:
-        paths += (s.recover.bounces > 0) * s.recover.bounce_samples * sum(min(n, MOST**2) for n in averaged)
+    steps, joint = 0 if s.recover.solver == "texels" else s.recover.iterations, joint_steps(s.recover)
+    samples = solves * sum(sum(part) for part in estimated)
+    if joint and s.recover.bounces:
+        samples += s.recover.bounce_samples
+    paths = samples * sum(min(n, MOST**2) for n in averaged)
     words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
         "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),

@@ -16,8 +16,8 @@ Blocks = Float[np.ndarray, "t 6 6"]
 
 @dataclass(frozen=True)
 class Linear:
-    """A picture around the maps: its channels' derivatives by their own albedo, tilt (2) and roughness, the weights of
-    its channels, and reference - picture."""
+    """A picture around the maps: what its pixels fetch (sparse, pixels x texels: B), its channels' derivatives by their
+    own albedo, tilt (2) and roughness (D), the weights of its channels (W), and reference - picture."""
 
     fetch: Any
     derivative: Float[np.ndarray, "p 3 4"]

@@ -110,6 +110,10 @@ def together(
     if settings.bounces:
         samples = settings.bounce_samples
         take_off_indirect(work, shade, table, indirect, samples, seed + SEED, lambda d: progress(begun * d))
+
+    def stepped(steps: float) -> None:
+        progress(begun + (1 - begun) * steps / settings.joint)
+
     errors = _errors(captures, pictures, indirect, settings)
     references = [captures.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(pictures)]
     images = _images(shade, table, pictures)
@@ -123,12 +127,12 @@ def together(
             Linear(p.fetch, d, _weights(w, d, e), np.nan_to_num(w))
             for p, d, w, e in zip(pictures, derivatives, wrong, errors, strict=True)
         ]
-        progress(begun + (1 - begun) * (k + 0.5) / settings.joint)
+        stepped(k + 0.5)
         x = _moved(x, unknown, _step(x, linear, unknown, work.where), settings.roughness_floor)
         images = _images(shade, x, pictures)
         wrong = _apart(references, images)
         costs.append(_cost(wrong, errors))
-        progress(begun + (1 - begun) * (k + 1) / settings.joint)
+        stepped(k + 1)
     trace["joint.cost"] = costs
     if not costs[-1] < costs[0]:
         work.notes.append(f"The joint steps were undone: the cost went from {costs[0]:.3g} to {costs[-1]:.3g}.")
