@@ -107,7 +107,7 @@ def drawn(world):  # noqa: F811
 def test_a_pixel_is_the_mean_of_its_texels(drawn, rng):
     """Changes that differ from texel to texel move the pictures as the model says, nearly, and equal ones nearer:
     where the camera is faced, since reflectance jumps where the mapped normal turns away."""
-    _, shade, table, pictures, unknown = drawn
+    _, shade, table, pictures, unknown, _ = drawn
     for pixels in pictures:
         np.testing.assert_allclose(pixels.fetch.sum(axis=1), 1, atol=1e-5)
         assert (pixels.lit > 0).all() and (pixels.lit <= 1).all()

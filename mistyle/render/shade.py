@@ -83,13 +83,15 @@ class Shade:
         specular: float = 0.5,
         weights: Callable[[int], Float[np.ndarray, "h w"]] | None = None,
         memory: float = 4e9,
+        gradients: bool = True,
         freeze: bool = True,
     ) -> None:
         """`sizes` (rows, columns) of the texture sets; `weights` gives picture k's pixels a factor in the loss.
 
         `flip_invalid`, `shadowing` and `specular` as in `bsdf.evaluate`; `subsamples` a square number of samples a
-        pixel; `directions` how many cells soft light comes from; without `freeze` every call is traced anew, which is
-        slow and good for looking into it.
+        pixel; `directions` how many cells soft light comes from; without `gradients` there are pictures only, and what
+        is kept of them takes half as much; without `freeze` every call is traced anew, which is slow and good for
+        looking into it.
         """
         device.use()
         if len(sizes) != len(traced.mesh.parts):
@@ -98,7 +100,7 @@ class Shade:
             raise ValueError(f"model is {model!r}; expected one of {', '.join(bsdf.MODELS)}")
         self.traced, self.captures, self.sizes = traced, captures, tuple(sizes)
         self.subsamples, self.shadows, self.weights, self.memory = subsamples, shadows, weights, memory
-        self.directions = directions
+        self.directions, self.gradients = directions, gradients
         self.texels = sum(rows * columns for rows, columns in sizes)
         self._tangents = collecting.tangents_of(traced.mesh, frame)
         options = {"flip_invalid": flip_invalid, "shadowing": shadowing, "specular": specular}
@@ -238,7 +240,7 @@ class Shade:
         soft, soft_light = self._sky(lights)
         options = {"subsamples": self.subsamples, "shadows": self.shadows, "soft": soft}
         kept: list[Block] | None = [] if self.memory and picture not in self._too_large else None
-        options["gradients"] = gradients or kept is not None
+        options["gradients"] = self.gradients and (gradients or kept is not None)
         for hits in collecting.collect(self.traced, camera, lights, mask, self.sizes, self._tangents, **options):
             block = Block(hits, soft_light, rgb, weights)
             if kept is not None:

@@ -18,6 +18,7 @@ from mistyle.core import memory
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import coarser
 from mistyle.run.settings import Settings
+from mistyle.stages.recover_settings import joint_steps
 
 
 class Need(NamedTuple):
@@ -184,7 +185,8 @@ def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int 
     """Peak memory of a fit to pictures of so many pixels each, GB."""
     count = material_counts(settings, pixels, faces, sets)
     found = peaks(MATERIAL, count)
-    held = min(settings.recover.memory, SAMPLE * count.view * settings.recover.subsamples / 1e9)
+    samples = max(settings.recover.subsamples, joint_steps(settings.recover) and settings.recover.joint_subsamples)
+    held = min(settings.recover.memory, SAMPLE * count.view * samples / 1e9)
     held += between_gb(settings, pixels)
     found |= {stage: found[stage] + held for stage in KEEPING}
     return round(max(found.values()), 2)

@@ -47,7 +47,7 @@ PER_LOOK = 2e-7
 PER_OBSERVATION = 4e-7
 PER_BOUNCED_PATH = 1e-7
 PER_SMOOTHED = 1.5e-5
-PER_JOINT = 1e-5  # of a pixel that shows the object, for each joint step
+PER_JOINT = 1.5e-5  # of a pixel that shows the object, for each joint step
 
 # Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
 BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}

@@ -12,6 +12,7 @@ of light and albedo cannot be told apart, so albedo is as right as the lights' u
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -89,10 +90,10 @@ def recover(
     # The steps on whole pictures know no neighbours.
     where = solving.atlas(texels) if settings.solver == "pictures" else solving.linked(mesh, texels)
     work = Work(traced, tangents_of(mesh, settings.frame), texels, where, captures, settings, notes)
-    shade = Shade(
-        traced, captures, where.sizes, model=settings.model, frame=settings.frame, subsamples=settings.subsamples,
-        shadows=settings.shadows, memory=settings.memory * 1e9, weights=trust(captures, indirect),
-    )  # fmt: skip
+    pictured = partial(
+        Shade, traced, captures, where.sizes, model=settings.model, frame=settings.frame, shadows=settings.shadows
+    )
+    shade = pictured(subsamples=settings.subsamples, memory=settings.memory * 1e9, weights=trust(captures, indirect))
     trace: dict[str, list[float]] = {}
     found = solve_level(work, shade, start, indirect, seed, trace, lambda done: progress(0.5 * done))
     if found.solved and settings.smooth:
@@ -102,6 +103,8 @@ def recover(
     if settings.solver != "texels" and settings.iterations:
         table = improved(work, shade, found, indirect, seed, trace, lambda d: progress(0.5 + 0.35 * d), save, resume)
         if found.solved and settings.joint:
+            # Of finer pictures; what was kept for the others makes room.
+            shade = pictured(subsamples=settings.joint_subsamples, memory=0, gradients=False)
             table = together(work, shade, table, indirect, seed, trace, lambda d: progress(0.85 + 0.1 * d))
     if settings.polish:
         # Its pictures keep the light between surfaces.

@@ -94,8 +94,8 @@ def together(
 ) -> Table:
     """`settings.joint` such steps from `table`, after one more estimate of light between surfaces (`indirect`).
 
-    Steps after which the pictures fit worse are undone, and steps that need more than `settings.memory` beside what is
-    kept of the samples are left out; a note says so.
+    `shade` keeps nothing yet; what the steps' own arrays leave of `settings.memory` is for its samples. Steps after
+    which the pictures fit worse are undone, and steps that need more than there is are left out; a note says so.
     """
     settings, captures = work.settings, work.captures
     found = _pixels(shade, work)
@@ -105,7 +105,7 @@ def together(
             "recover.memory. Give more, or fewer or smaller pictures."
         )
         return table
-    pictures, unknown = found
+    pictures, unknown, shade.memory = found
     begun = 0.5 if settings.bounces else 0.0
     if settings.bounces:
         samples = settings.bounce_samples
@@ -146,16 +146,17 @@ def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSett
     return settings.model_copy(update={"joint": some})
 
 
-def _pixels(shade, work: Work) -> tuple[list[Pixels], Unknown] | None:
-    """All pictures' pixels, and what is solved for; None where they would take more memory than there may be."""
-    result, held = [], 0
+def _pixels(shade, work: Work) -> tuple[list[Pixels], Unknown, float] | None:
+    """All pictures' pixels, what is solved for, and the bytes that they leave of the memory; None where it does not
+    suffice."""
+    result, left = [], work.settings.memory * 1e9
     seen = np.zeros(shade.texels, bool)
     for k in range(len(work.captures)):
         result.append(_lit_pixels(shade, k))
         fetch = result[-1].fetch
         seen[fetch.indices] = True
-        held += PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
-        if held + shade.held() > work.settings.memory * 1e9:
+        left -= PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
+        if left < 0:
             return None
     rows = np.flatnonzero(seen | np.concatenate([c.ravel() for c in work.where.covered]))
     number = np.zeros(shade.texels, np.int32)
@@ -163,7 +164,7 @@ def _pixels(shade, work: Work) -> tuple[list[Pixels], Unknown] | None:
     for pixels in result:
         pixels.fetch.indices = number[pixels.fetch.indices]
         pixels.fetch.resize(pixels.fetch.shape[0], len(rows))
-    return result, Unknown(rows, seen[rows])
+    return result, Unknown(rows, seen[rows]), left
 
 
 def _lit_pixels(shade, picture: int) -> Pixels:

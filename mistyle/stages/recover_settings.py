@@ -1,8 +1,9 @@
 """What a user may choose about fitting materials to pictures under known light."""
 
+from math import isqrt
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 SETTLING = 3
 FEWER = 8  # times as few samples for estimates of light between surfaces that others soon replace
@@ -103,6 +104,13 @@ class RecoverSettings(BaseModel):
         description="steps after those on whole pictures that solve for all texels at once, from all pictures and with "
         "what neighbours say; under directional and point lights only",
     )
+    joint_subsamples: int = Field(
+        default=25,
+        ge=1,
+        le=256,
+        description="samples a pixel in those steps, a square number: what 9 of them miss of a pixel's edges and "
+        "texture is a third of the error that the steps leave",
+    )
     polish: int = Field(
         default=0,
         ge=0,
@@ -116,6 +124,13 @@ class RecoverSettings(BaseModel):
     shadows: bool = Field(default=True, description="whether the object shadows itself")
     memory: float = Field(default=4.0, gt=0, description="GB for what is kept of the pictures' samples")
     checkpoint: float = Field(default=60.0, gt=0, description="seconds between checkpoints")
+
+    @field_validator("subsamples", "joint_subsamples")
+    @classmethod
+    def _square(cls, value: int) -> int:
+        if isqrt(value) ** 2 != value:
+            raise ValueError("expected a square number: 1, 4, 9, 16, 25, …")
+        return value
 
 
 def joint_steps(settings: RecoverSettings) -> int:
