@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from mistyle.core.errors import UsageError
+from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
 from mistyle.run.settings import PRESETS, Settings, as_toml, assignments, known_keys, resolve
 
 
@@ -38,6 +39,12 @@ def test_printed_settings_read_back_equal(tmp_path, preset):
 def test_wrong_settings_are_refused_with_their_path(said, expected):
     with pytest.raises(UsageError, match=expected):
         resolve(None, None, said, {})
+
+
+@pytest.mark.parametrize("name", ["subsamples", "joint_subsamples"])
+def test_samples_a_pixel_are_square_numbers(name):
+    with pytest.raises(UsageError, match=rf"recover\.{name} = 24: expected a square number: 1, 4, 9"):
+        resolve(None, None, {"recover": {name: 24}}, {}, MaterialSettings, MATERIAL_PRESETS)
 
 
 def test_the_guilty_layer_is_named(tmp_path):

@@ -261,6 +261,18 @@ def test_same_bytes_frozen_kept_recomputed_and_again(traced, lights, subsamples,
     assert all(result == results[0] for result in results[1:])
 
 
+@pytest.mark.parametrize("memory", [1e9, 0])
+def test_without_gradients_pictures_are_the_same_and_take_less(traced, memory):
+    found = []
+    for options in ({}, {"gradients": False}):
+        ours = made(traced, np.random.default_rng(1), [crop(40)], (KEY, LAMP), 4, memory=memory, **options)
+        pictures = [ours.image(0) for _ in range(2)]
+        list(ours.blocks(0))
+        found.append((ours.held(), *(p.tobytes() for p in pictures)))
+    assert found[0][1:] == found[1][1:]
+    assert found[1][0] <= 0.7 * found[0][0] and (found[1][0] > 0) == (memory > 0)
+
+
 def test_same_bytes_at_any_thread_count(traced):
     import drjit as dr
 

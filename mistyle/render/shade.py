@@ -90,7 +90,7 @@ class Shade:
 
         `flip_invalid`, `shadowing` and `specular` as in `bsdf.evaluate`; `subsamples` a square number of samples a
         pixel; `directions` how many cells soft light comes from; without `gradients` there are pictures only, and what
-        is kept of them takes half as much; without `freeze` every call is traced anew, which is slow and good for
+        is kept of them takes a third less; without `freeze` every call is traced anew, which is slow and good for
         looking into it.
         """
         device.use()
