@@ -188,9 +188,8 @@ def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
             near = difflib.get_close_matches(path, known_keys(root), n=1, cutoff=0.5)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UsageError(f"{origin}: there is no setting '{path}'{hint} (--print-config lists all)") from None
-        raise UsageError(
-            f"{origin}: {path} = {first['input']!r}: {first['msg'].lower().removeprefix('value error, ')}"
-        ) from None
+        said = first["msg"].lower().removeprefix("value error, ")
+        raise UsageError(f"{origin}: {path} = {first['input']!r}: {said}") from None
 
 
 def read_config(path: Path) -> dict[str, Any]:
