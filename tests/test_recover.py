@@ -235,9 +235,9 @@ def test_what_observations_tell_is_measured_by_how_well_they_fit():
         np.testing.assert_allclose(told[seen > 0] / 0.01, np.sqrt(solving.MARGIN * wanted), rtol=0.02)
 
 
-@pytest.mark.parametrize(("step", "noise", "most"), [(1, 0.03, 0.95), (3, 0.05, 1.02)])
-def test_neighbours_help_against_noise_and_where_little_is_known_do_no_harm(world, rng, step, noise, most):
-    """Thirty noisy pictures: normals and roughness gain. Ten, where most texels have little but their neighbours."""
+@pytest.mark.parametrize(("step", "noise", "most"), [(1, 0.03, 0.7), (3, 0.05, 0.7)])
+def test_neighbours_help_against_noise_and_where_little_is_known(world, rng, step, noise, most):
+    """Thirty noisy pictures, and ten, where most texels have little but them: normals and roughness gain."""
     mesh, maps, texels, captures = world
     some = subset(captures, range(0, 30, step))
     pictures = [some.load(k) for k in range(len(some))]

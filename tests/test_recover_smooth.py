@@ -52,7 +52,8 @@ def test_the_result_is_the_minimum_that_is_promised(rng: np.random.Generator):
     error = rng.uniform(0.01, 0.1, size).astype(np.float32)
     variance = rng.uniform(0.01, 0.02, size).astype(np.float32) ** 2
     number = np.arange(found.size).reshape(size)
-    matrix, over = np.diag(1 / error.ravel().astype(np.float64) ** 2), 0
+    held = rng.uniform(0, 500, size).astype(np.float32)
+    matrix, over = np.diag(1 / error.ravel().astype(np.float64) ** 2 + held.ravel()), 0
     for at, of, seams in ((number, variance, (column - 1, column)), (number.T, variance.T, ())):
         inside = covered.ravel()[at]
         for line, middle in np.argwhere(inside[:, :-2] & inside[:, 1:-1] & inside[:, 2:]) + (0, 1):
@@ -62,7 +63,7 @@ def test_the_result_is_the_minimum_that_is_promised(rng: np.random.Generator):
             over += middle in seams
     assert over >= 8
     wanted = np.linalg.solve(matrix, (found / error.astype(np.float64) ** 2).ravel())
-    got = smoothing._likely(found, error, variance, cut(covered, column)).ravel()
+    got = smoothing._likely(found, error, variance, held, cut(covered, column)).ravel()
     assert np.abs(got - wanted).max() < 2e-3 * np.abs(wanted - found.ravel()).max()
 
 
@@ -136,6 +137,18 @@ def test_what_nothing_was_seen_of_follows_the_slope_around_it(rng: np.random.Gen
     hole = np.isinf(error[:, 3].reshape(true.shape))
     assert np.abs(result - true)[hole].mean() < 0.15 * np.abs(true)[hole].mean()
     assert np.abs(result - true)[~hole].max() < 0.01
+
+
+def test_where_nothing_was_seen_tilts_do_not_lean_more_than_those_that_are_known(rng: np.random.Generator):
+    """Steps on pictures moved them there; of roughness, whose mean is not known, what they found stays."""
+    known = np.broadcast_to(np.abs(np.arange(64) - 32) > 8, (64, 64))
+    found = np.where(known, rng.normal(0, 0.05, known.shape), 0.4)
+    table, error = tables(found, np.where(known, 0.003, np.inf))
+    table[:, 5] = 0.5 + table[:, 3]
+    result = smoothing.smoothed(table, error, atlas(np.ones(known.shape, bool)), FLOOR, True)
+    tilt, roughness = (result[:, c].reshape(known.shape) for c in (3, 5))
+    assert np.abs(tilt[~known]).mean() < 0.06 and roughness[~known].mean() > 0.6
+    assert np.abs(tilt - found)[known].max() < 0.005
 
 
 def test_islands_do_not_mix_and_uncovered_texels_move_as_their_nearest(rng: np.random.Generator):

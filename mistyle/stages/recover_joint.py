@@ -9,7 +9,7 @@ get to the end of that valley. Gauss-Newton steps follow it: around the maps x t
 with b the bilinear weights, averaged over the pixel's lit samples, and D its derivative by a change that all its texels
 share, from central differences of whole pictures. (Samples of a pixel are so taken to answer alike; the pictures
 themselves are exact, so where the steps end the pictures agree, up to that.) With R the references and P the
-neighbours' prior on second differences, of the same measured variances as in `recover_smooth.py`, each step solves
+priors of `recover_smooth.py`, of variances that are measured alike, each step solves
 
     (B' D' W D B + P) d = B' D' W (R - I(x)) - P x
 
@@ -299,7 +299,7 @@ def _step(table: Table, linear: Sequence[Linear], unknown: Unknown, where: Atlas
 
 
 def _priors(table: Table, noise: Float[np.ndarray, "a 7"], rows: Int[np.ndarray, " t"], where: Atlas) -> list[Any]:
-    """P of each unknown: second differences of covered texels; uncovered ones are nearly as the nearest covered one."""
+    """P of each unknown: the priors of covered texels; uncovered ones are nearly as the nearest covered one."""
     from scipy.sparse import csr_array
 
     number = np.full(len(table), -1, np.int64)

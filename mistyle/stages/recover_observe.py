@@ -68,7 +68,7 @@ def gather(
     tangents: Float[np.ndarray, "f 3 4"] | None,
     *,
     facing: float = 0.2,
-    noise: float = 0.002,
+    noise: float = 0.0005,
     relative: float = 0.01,
     skies: bool = True,
     move: float = 1.5,

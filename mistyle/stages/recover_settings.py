@@ -58,7 +58,13 @@ class RecoverSettings(BaseModel):
         description="albedo, tilt and roughness as smooth as the surface around them is measured to be, as far as the "
         "pictures leave them open; a sharp edge that few pictures show is rounded",
     )
-    noise: float = Field(default=0.002, gt=0, le=1, description="standard deviation of a pixel in the dark")
+    noise: float = Field(
+        default=0.0005,
+        gt=0,
+        le=1,
+        description="standard deviation of a pixel in the dark, more than 8-bit sRGB rounds by: with 0.002, which "
+        "pictures of a camera may need, black rubber shows too little for its roughness to be told",
+    )
     relative: float = Field(default=0.01, ge=0, le=1, description="standard deviation of a pixel relative to its value")
     facing: float = Field(
         default=0.2, gt=0, lt=1, description="least cosine between a texel's normal and the camera that observes it"

@@ -5,11 +5,12 @@ texels in a row differ by from a straight line through their neighbours has a va
 that of these errors; so the surface's own is measured around every texel (empirical Bayes), and the most likely values
 under both minimise
 
-    sum (x - found)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance
+    sum (x - found)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance  +  SHARE sum x² / spread²
 
 over rows and columns of each island, of albedo and roughness also across seams (a Gaussian field of second
 differences: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.4). Where the surface is rough the variance is
-large, and what was found stays.
+large, and what was found stays. The last sum is of tilts alone: where little was seen, one that a few texels began
+would else go on along its slope, farther than any that is known. `spread` is measured around every texel too.
 """
 
 from collections.abc import Iterator
@@ -24,11 +25,15 @@ from mistyle.stages.recover_solve import METAL_SPREAD, OVER_SEAMS, Atlas, diffus
 # Channels of the table that are smoothed, and the least standard deviation of their second differences. Not metallic:
 # surfaces are metal or not.
 LEAST = {0: 0.008, 1: 0.008, 2: 0.008, 3: 0.006, 4: 0.006, 5: 0.008}
+TILTS = 3, 4
 MOST = 0.3  # of that standard deviation
 ODD = 20  # times rarer than metals and others together: what is neither
 OPEN = 0.3  # what is taken for left open where nothing was seen
 SURE = 0.01  # standard deviation of a second difference below which one tells as much as another
 AROUND = 24  # steps over which the variance is measured
+KNOWN = 0.02  # what a texel may leave open of its tilt and still say how much tilts vary around it
+ELSEWHERE = 0.1  # what the whole atlas counts beside them, in texels that are known exactly
+SHARE = 0.3  # of what a tilt's spread would hold it by, were it independent of its neighbours'
 WIDER = 2.0  # times the variance over a seam, since what stands in for a neighbour lies beside its place
 STEPS, CLOSE = 300, 1e-4  # of conjugate gradients, at most; and what they may leave of the residual
 
@@ -52,8 +57,8 @@ def smoothed(
     """
     moved, where = np.zeros_like(table), joined(where, table[:, :7], noise)
     for c in LEAST:
-        for part, found, among, error, variance in _sets(table, noise, where, c):
-            moved[part, c] = (_likely(found, error, variance, among) - found).ravel()
+        for part, found, among, error, variance, held in _sets(table, noise, where, c):
+            moved[part, c] = (_likely(found, error, variance, held, among) - found).ravel()
     result = table + fill(moved, where)
     if metallic:
         result = _settled(result, noise)
@@ -63,24 +68,42 @@ def smoothed(
 
 
 def firmness(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"], where: Atlas, channel: int) -> Any:
-    """The second sum above for one of LEAST's channels, as a sparse symmetric matrix P of the whole atlas: x' P x, of
-    variances as `smoothed` measures them on `table`. `where`: with its seams believed (`joined`)."""
+    """The second and third sum above for one of LEAST's channels, as a sparse symmetric matrix P of the whole atlas:
+    x' P x, of variances as `smoothed` measures them on `table`. `where`: with its seams believed (`joined`)."""
     from scipy.sparse import block_diag
 
-    sets = [_differences(variance, among) for *_, among, _, variance in _sets(table, noise, where, channel)]
-    differences = block_diag(sets, format="csr")
-    return (differences.T @ differences).tocsr()
+    sets = [_prior(variance, held, among) for _, _, among, _, variance, held in _sets(table, noise, where, channel)]
+    return block_diag(sets, format="csr")
 
 
 def _sets(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Iterator[tuple[Any, ...]]:
-    """Of every texture set: its rows, the channel's values, neighbours, errors, and variance of second differences."""
+    """Of every texture set: its rows, the channel's values, neighbours, errors, variance of second differences, and how
+    firmly values are held to none."""
+    held = _held(table, noise, where, channel) if channel in TILTS else np.zeros(len(table), np.float32)
     for k, size in enumerate(where.sizes):
         part = slice(where.offsets[k], where.offsets[k + 1])
         found = table[part, channel].reshape(size)
         error = np.minimum(noise[part, channel].reshape(size), OPEN)
         among = where.links[k] if OVER_SEAMS[channel] else within(where.links[k])
         error, variance = _measured(found, error, among, LEAST[channel])
-        yield part, found, among, error, variance
+        yield part, found, among, error, variance, held[part].reshape(size)
+
+
+def _held(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Float[np.ndarray, " a"]:
+    """SHARE / spread² of every texel: of what the texels around it are known to be, and a little of those of the whole
+    atlas, which are the only ones where none around is known; 0 where none is known at all.
+
+    Errors are not taken off: they are thought larger than most are, and what was left would hold tilts too firmly.
+    """
+    x2, error = table[:, channel].astype(np.float64) ** 2, noise[:, channel].astype(np.float64)
+    weight = np.where(error < OPEN, 1 / (error**2 + KNOWN**2) ** 2, 0)
+    sums = np.stack([weight * x2, weight], axis=1)
+    every = sums.sum(axis=0) / max(sums[:, 1].sum(), 1e-12) * (ELSEWHERE / KNOWN**4)
+    for k, size in enumerate(where.sizes):
+        part = slice(where.offsets[k], where.offsets[k + 1])
+        sums[part] = diffused(sums[part].reshape(1, *size, 2), within(where.links[k]), AROUND).reshape(-1, 2)
+    spread2, weights = (sums + every).T
+    return (SHARE * weights / np.maximum(spread2, weights * LEAST[channel] ** 2 + 1e-12)).astype(np.float32)
 
 
 def _settled(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"]) -> Float[np.ndarray, "a 8"]:
@@ -168,15 +191,22 @@ def _differences(variance: Grid, among: Links) -> Any:
     return csr_array((values, texels.ravel(), starts), shape=(len(texels), variance.size))
 
 
-def _likely(found: Grid, error: Grid, variance: Grid, among: Links) -> Float[np.ndarray, "h w"]:
+def _prior(variance: Grid, held: Grid, among: Links) -> Any:
+    """The second and third sum of one set, as a sparse matrix."""
+    from scipy.sparse import dia_array
+
+    differences = _differences(variance, among)
+    return (differences.T @ differences + dia_array((held.ravel()[None], 0), shape=(held.size, held.size))).tocsr()
+
+
+def _likely(found: Grid, error: Grid, variance: Grid, held: Grid, among: Links) -> Float[np.ndarray, "h w"]:
     from scipy.sparse import dia_array
     from scipy.sparse.linalg import cg
 
-    differences = _differences(variance, among)
-    smooth = (differences.T @ differences).tocsr()
+    prior = _prior(variance, held, among)
     sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32).ravel()
-    matrix = smooth + dia_array((sure[None], 0), shape=smooth.shape)
-    inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=smooth.shape)
+    matrix = prior + dia_array((sure[None], 0), shape=prior.shape)
+    inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=prior.shape)
     # From what was found: the change is solved for, so that little of it is lost to rounding.
-    change, _ = cg(matrix, -(smooth @ found.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
+    change, _ = cg(matrix, -(prior @ found.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
     return found + change.reshape(found.shape).astype(np.float32)
