@@ -16,6 +16,7 @@ from mistyle.render import hits as collecting
 from mistyle.render.shade import Shade, pack
 from mistyle.stages import joint_algebra as algebra
 from mistyle.stages import recover_joint as joint
+from mistyle.stages.joint_pixels import Unknown, all_pixels
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_solve import NOTHING, linked
 from mistyle.stages.recover_texels import Work
@@ -85,7 +86,7 @@ def test_a_step_keeps_within_bounds():
     table[:, :6] = 0.5, 0.5, 0.5, 0.6, 0.6, 0.1
     change = np.full((3, 6), 9.0, np.float32)
     change[1], change[2, 5] = np.nan, -9
-    moved = joint._moved(table, joint.Unknown(np.array([0, 1, 3]), np.ones(3, bool)), change, 0.04)
+    moved = joint._moved(table, Unknown(np.array([0, 1, 3]), np.ones(3, bool)), change, 0.04)
     np.testing.assert_allclose(moved[0, :3], 0.7, atol=1e-6)
     np.testing.assert_allclose(np.hypot(*moved[0, 3:5]), joint.STEEPEST, atol=1e-6)
     np.testing.assert_array_equal(moved[1:3], table[1:3])
@@ -99,7 +100,7 @@ def drawn(world):  # noqa: F811
     some = subset(captures, range(0, 30, 5))
     shade = Shade(draw.tracer(mesh), some, ((64, 64),), subsamples=9)
     work = Work(shade.traced, collecting.tangents_of(mesh, "mikkt"), [texels], linked(mesh, [texels]), some, QUICK, [])
-    found = joint._pixels(shade, work)
+    found = all_pixels(shade, work)
     assert found is not None
     return work, shade, pack([maps]), *found
 

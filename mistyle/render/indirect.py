@@ -32,6 +32,7 @@ LEVEL = 0.7  # and how far, by pixels that lie between the two, one may lie abov
 PALE = 0.04  # joins the albedo that light is divided by: what a surface reflects without taking its colour
 LIKE = 8  # pixels of the estimate around each over which it is compared with the picture,
 BRIGHTER = 2.0  # and what it may be multiplied by at most
+GRAZING = 0.1  # cosine below which what arrives counts for less in the vector irradiance: such paths are few and heavy
 FIREFLY = 20.0  # times its surroundings: the brightest that a pixel of the estimate may be
 
 
@@ -57,12 +58,31 @@ class Indirect:
 
         Lights of a scene file raise ValueError. `samples` are those of a pixel of such a picture.
         """
+        return [light for light, _ in self._all(camera, many, samples, seed, False)]
+
+    def pictures_and_vectors(
+        self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
+    ) -> list[tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 9"]]]:
+        """The same, and the vector irradiance E of indirect light at the first surface point, in world axes: x, y and z
+        of red, then of green and blue.
+
+        What a matt surface of normal n and reflectance a shows is a / π E · n, as long as n stays near the mapped
+        normal: light from below its horizon is not in E, and little of what just grazes it (GRAZING).
+        """
+        return self._all(camera, many, samples, seed, True)
+
+    def _all(
+        self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, vectors: bool
+    ) -> list[tuple[Any, Any]]:
+        """Pairs of light and vector irradiance, which is None where no `vectors` are asked for."""
         found = []
         for k in range(0, len(many), TOGETHER):
-            found += self._pictures(camera, many[k : k + TOGETHER], samples, seed)
+            found += self._pictures(camera, many[k : k + TOGETHER], samples, seed, vectors)
         return found
 
-    def _pictures(self, camera: Camera, many: Sequence[Lights], samples: int, seed: int) -> list[np.ndarray]:
+    def _pictures(
+        self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, vectors: bool
+    ) -> list[tuple[Any, Any]]:
         import mitsuba
 
         mi: Any = mitsuba
@@ -74,12 +94,12 @@ class Indirect:
             emitter.set_scene(self.scene)
         times, each = scenery.passes(samples)
         sensor = mi.load_dict(scenery.sensor_dict(small, each))
-        passes = [_traced(self.scene, sensor, lit, each, seed + k * 7919) for k in range(times)]
+        passes = [_traced(self.scene, sensor, lit, each, seed + k * 7919, vectors) for k in range(times)]
         whole = np.mean(passes, axis=0)
         share = whole[..., 0]
         inside = np.isfinite(whole).all(axis=-1) & (share > 0)
         if not inside.any():
-            return [np.zeros((*small.size, 3), np.float32) for _ in many]
+            return [(np.zeros((*small.size, 3), np.float32), np.zeros((*small.size, 9), np.float32)) for _ in many]
         covered = np.where(inside, np.maximum(share, 0.05), 1)[..., None]
         position, normal, albedo, *light = (whole[..., k : k + 3] / covered for k in range(1, whole.shape[-1], 3))
         albedo = np.maximum(np.nan_to_num(albedo), 0) + PALE
@@ -90,12 +110,20 @@ class Indirect:
             radiance = averaged(irradiance.astype(np.float32), position, normal, unit, inside) * albedo
             return nearest_fill(np.ascontiguousarray(radiance, np.float32), inside)
 
-        return [smooth(one) for one in light]
+        def smooth_vector(axes: Sequence[np.ndarray]) -> np.ndarray:
+            shown = [np.where(inside[..., None], axis, 0).astype(np.float32) for axis in axes]
+            mean = [averaged(axis, position, normal, unit, inside, most=np.inf) for axis in shown]
+            return nearest_fill(np.stack(mean, axis=-1).reshape(*small.size, 9), inside)
+
+        count = len(many)
+        arriving = [smooth_vector(light[k : k + 3]) for k in range(count, len(light), 3)] or [None] * count
+        return list(zip(map(smooth, light[:count]), arriving, strict=True))
 
 
-def _traced(scene: Any, sensor: Any, lit: Sequence[Sequence[Any]], each: int, seed: int) -> np.ndarray:
+def _traced(scene: Any, sensor: Any, lit: Sequence[Sequence[Any]], each: int, seed: int, vectors: bool) -> np.ndarray:
     """(h, w, 10 + 3 n) float32, means of `each` samples a pixel: coverage, position, shading normal and diffuse albedo
-    of the first surface point, and indirect radiance under each of n = len(lit) sets of emitters."""
+    of the first surface point, and indirect radiance under each of n = len(lit) sets of emitters; with `vectors` 9 n
+    more, x, y and z of each set's vector irradiance there."""
     import drjit as dr
     import mitsuba
 
@@ -136,8 +164,16 @@ def _traced(scene: Any, sensor: Any, lit: Sequence[Sequence[Any]], each: int, se
     start = (mi.UInt32(0), *onward(first, mi.Color3f(1), seen, sampler), sampler, *(mi.Color3f(0) for _ in lit))
     ended = dr.while_loop(start, lambda k, *rest: rest[4] & (k < points + soft), body, label="indirect")
     albedo = first.bsdf().eval_diffuse_reflectance(first, seen)
-    values = [mi.Float(1)]
-    for vector in (first.p, first.sh_frame.n, albedo, *ended[7:]):
+    values, arriving = [mi.Float(1)], []
+    if vectors:
+        ray, reflected, density = start[1:4]
+        # `total` is radiance x reflectance x cosine / density, and `reflected` what it is multiplied by.
+        cosine: Any = dr.abs(dr.dot(ray.d, first.sh_frame.n))
+        share = dr.minimum(1, cosine / GRAZING) / dr.maximum(density, 1e-9)
+        for total in ended[7:]:
+            radiance = dr.select(seen & (reflected > 1e-6), total / reflected, 0) * share
+            arriving += [radiance * ray.d.x, radiance * ray.d.y, radiance * ray.d.z]
+    for vector in (first.p, first.sh_frame.n, albedo, *ended[7:], *arriving):
         values += [vector.x, vector.y, vector.z]
     sums = [dr.zeros(mi.Float, width * height) for _ in values]
     for total, value in zip(sums, values, strict=True):
@@ -175,7 +211,7 @@ def _heuristic(own: Any, other: Any) -> Any:
     return own**2 / (own**2 + other**2)
 
 
-def enlarged(light: Float[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float[np.ndarray, "H W 3"]:
+def enlarged(light: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[np.ndarray, "H W c"]:
     """What `Indirect.pictures` made, as large as the picture that it is of."""
     by = max(-(-whole // part) for whole, part in zip(size, light.shape, strict=False))
     return resize(light, (light.shape[0] * by, light.shape[1] * by))[: size[0], : size[1]]
@@ -202,17 +238,19 @@ def averaged(
     normal: Float[np.ndarray, "h w 3"],
     unit: Float[np.ndarray, "h w"],
     inside: Bool[np.ndarray, "h w"],
+    most: float = FIREFLY,
 ) -> Float[np.ndarray, "h w 3"]:
     """Mean of each pixel and the eight around it, as far as they show the same surface; `unit` is a pixel's width
     there. Wider means take more detail of the light than they take noise.
 
-    Pixels that are more than FIREFLY times brighter than those around them are first brought down to that.
+    Pixels that are more than `most` times brighter than those around them are first brought down to that.
     """
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     position, normal = (np.where(inside[..., None], field, 0).astype(np.float32) for field in (position, normal))
     total, weights = _around(light, position, normal, unit, inside)
-    brightest = FIREFLY * (total / np.maximum(weights, 1e-6)[..., None])
-    light = np.where(weights[..., None] > 1e-6, np.minimum(light, brightest), light)
+    if np.isfinite(most):
+        brightest = most * (total / np.maximum(weights, 1e-6)[..., None])
+        light = np.where(weights[..., None] > 1e-6, np.minimum(light, brightest), light)
     return (light + total) / (1 + weights)[..., None]
 
 

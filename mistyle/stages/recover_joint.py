@@ -15,22 +15,25 @@ priors of `recover_smooth.py`, of variances that are measured alike, each step s
 
 by conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, sections 10.3 and 5.1), preconditioned by the
 texels' own blocks. W are Cauchy's weights (Huber, Robust Statistics, 1981, section 7.8) of residuals r of standard
-deviation s, 1 / (s² (1 + (r / (WRONG s))²)): of edges of shadows and outlines some pixels are always wrong. Metallic
-stays; soft light, whose pictures take long to draw, has no such steps.
+deviation s, 1 / (s² (1 + (r / (WRONG s))²)): of edges of shadows and outlines some pixels are always wrong. Light
+between surfaces is taken off R as it was estimated; what it changes by with the texels that reflect it to the camera is
+in D and in I (`joint_pixels.py`), so places that no light reaches have a say too. Metallic stays; soft light, whose
+pictures take long to draw, has no such steps.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from mistyle.core.capture import Captures
 from mistyle.core.light import has_soft
-from mistyle.render.hits import corners
 from mistyle.render.indirect import enlarged
 from mistyle.stages.joint_algebra import Linear, Unknowns, conjugate, curved, own_blocks, right_side
+from mistyle.stages.joint_pixels import Pixels, Unknown, all_pixels, between, change, frames
 from mistyle.stages.recover_observe import deviation
 from mistyle.stages.recover_settings import RecoverSettings, joint_steps
 from mistyle.stages.recover_smooth import LEAST, firmness
@@ -51,33 +54,15 @@ FREE = 0.5  # standard deviation that what no picture tells is left
 ALIKE = 0.03  # between an uncovered texel, which pixels at charts' borders see, and the nearest covered one
 LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # of a step
 STEEPEST = 0.98  # of a tilt
-SEED = 104_729  # added for their estimate of light between surfaces
-PIXEL, WEIGHT = 200, 8  # bytes of a pixel, and of a bilinear weight
+ESTIMATES = 1, 2  # of light between surfaces, each before such steps: samples as multiples of `bounce_samples`
+SEED = 104_729  # between the seeds of these and others
 
 Table = Float[np.ndarray, "a 8"]
 
 
 @dataclass(frozen=True)
-class Pixels:
-    """The lit pixels of one picture: flat indices, which share of their samples is lit, and the mean bilinear weights
-    of those, as a sparse matrix, pixels x unknown texels."""
-
-    index: Int[np.ndarray, " p"]
-    lit: Float[np.ndarray, " p"]
-    fetch: Any
-
-
-@dataclass(frozen=True)
-class Unknown:
-    """The texels that are solved for, rows of the table: those that are covered or that a picture shows (`seen`)."""
-
-    rows: Int[np.ndarray, " t"]
-    seen: Bool[np.ndarray, " t"]
-
-
-@dataclass(frozen=True)
 class Errors:
-    """Of one picture's lit pixels the standard deviations of residuals, and how far they count at all, 0..1."""
+    """Of one picture's pixels the standard deviations of residuals, and how far they count at all, 0..1."""
 
     spread: Float[np.ndarray, " p"]
     counts: Float[np.ndarray, " p"]
@@ -92,13 +77,14 @@ def together(
     trace: dict[str, list[float]],
     progress: Callable[[float], None],
 ) -> Table:
-    """`settings.joint` such steps from `table`, after one more estimate of light between surfaces (`indirect`).
+    """`settings.joint` such steps from `table`, after one more estimate of light between surfaces (`indirect`), and as
+    many after another one, of the better maps.
 
     `shade` keeps nothing yet; what the steps' own arrays leave of `settings.memory` is for its samples. Steps after
     which the pictures fit worse are undone, and steps that need more than there is are left out; a note says so.
     """
-    settings, captures = work.settings, work.captures
-    found = _pixels(shade, work)
+    settings = work.settings
+    found = all_pixels(shade, work)
     if found is None:
         work.notes.append(
             f"The joint steps at the end were left out: they need more than the {settings.memory:g} GB of "
@@ -106,14 +92,45 @@ def together(
         )
         return table
     pictures, unknown, shade.memory = found
-    begun = 0.5 if settings.bounces else 0.0
-    if settings.bounces:
-        samples = settings.bounce_samples
-        take_off_indirect(work, shade, table, indirect, samples, seed + SEED, lambda d: progress(begun * d))
+    axes, estimates = frames(work, unknown), ESTIMATES if settings.bounces else (0,)
+    for number, share in enumerate(estimates):
 
-    def stepped(steps: float) -> None:
-        progress(begun + (1 - begun) * steps / settings.joint)
+        def heard(done: float, number=number) -> None:
+            progress((number + done) / len(estimates))
 
+        reflected = [np.zeros((len(p.index), 3, 3), np.float32) for p in pictures]
+        if settings.bounces:
+
+            def arrived(k: int, vectors: np.ndarray, table=table, reflected=reflected) -> None:
+                size = work.captures.cameras[k].size
+                reflected[k] = between(pictures[k], vectors, size, table[unknown.rows], axes)
+
+            samples, new = share * settings.bounce_samples, seed + (number + 1) * SEED
+            take_off_indirect(work, shade, table, indirect, samples, new, lambda d, f=heard: f(0.5 * d), arrived)
+        moved = _steps(work, shade, table, pictures, unknown, reflected, indirect, trace, partial(_later, heard))
+        if moved is None:
+            break
+        table = moved
+    return table
+
+
+def _later(heard: Callable[[float], None], done: float) -> None:
+    heard(0.5 + 0.5 * done)
+
+
+def _steps(
+    work: Work,
+    shade,
+    table: Table,
+    pictures: Sequence[Pixels],
+    unknown: Unknown,
+    reflected: Sequence[Float[np.ndarray, "_ 3 3"]],
+    indirect: dict[int, np.ndarray],
+    trace: dict[str, list[float]],
+    progress: Callable[[float], None],
+) -> Table | None:
+    """All steps after one estimate; None, with a note, where the pictures then fit worse."""
+    settings, captures = work.settings, work.captures
     errors = _errors(captures, pictures, indirect, settings)
     references = [captures.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(pictures)]
     images = _images(shade, table, pictures)
@@ -123,20 +140,25 @@ def together(
     costs, x = [_cost(wrong, errors)], table
     for k in range(settings.joint):
         derivatives = _derivatives(shade, x, images, pictures, unknown.rows, settings.roughness_floor)
+        for derivative, more in zip(derivatives, reflected, strict=True):
+            derivative[:, :, :3] += more
         linear = [
             Linear(p.fetch, d, _weights(w, d, e), np.nan_to_num(w))
             for p, d, w, e in zip(pictures, derivatives, wrong, errors, strict=True)
         ]
-        stepped(k + 0.5)
+        progress((k + 0.5) / settings.joint)
         x = _moved(x, unknown, _step(x, linear, unknown, work.where), settings.roughness_floor)
         images = _images(shade, x, pictures)
-        wrong = _apart(references, images)
+        # Light between surfaces was taken off as the maps were when it was estimated.
+        moved = (x - table)[unknown.rows]
+        changed = [change(p, more, moved) for p, more in zip(pictures, reflected, strict=True)]
+        wrong = [w - c for w, c in zip(_apart(references, images), changed, strict=True)]
         costs.append(_cost(wrong, errors))
-        stepped(k + 1)
-    trace["joint.cost"] = costs
+        progress((k + 1) / settings.joint)
+    trace.setdefault("joint.cost", []).extend(costs)
     if not costs[-1] < costs[0]:
         work.notes.append(f"The joint steps were undone: the cost went from {costs[0]:.3g} to {costs[-1]:.3g}.")
-        return table
+        return None
     return x
 
 
@@ -144,46 +166,6 @@ def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSett
     """The settings without joint steps where there are none (`joint_steps`), or where a light is soft."""
     some = 0 if has_soft(captures.lights) else joint_steps(settings)
     return settings.model_copy(update={"joint": some})
-
-
-def _pixels(shade, work: Work) -> tuple[list[Pixels], Unknown, float] | None:
-    """All pictures' pixels, what is solved for, and the bytes that they leave of the memory; None where it does not
-    suffice."""
-    result, left = [], work.settings.memory * 1e9
-    seen = np.zeros(shade.texels, bool)
-    for k in range(len(work.captures)):
-        result.append(_lit_pixels(shade, k))
-        fetch = result[-1].fetch
-        seen[fetch.indices] = True
-        left -= PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
-        if left < 0:
-            return None
-    rows = np.flatnonzero(seen | np.concatenate([c.ravel() for c in work.where.covered]))
-    number = np.zeros(shade.texels, np.int32)
-    number[rows] = np.arange(len(rows), dtype=np.int32)
-    for pixels in result:
-        pixels.fetch.indices = number[pixels.fetch.indices]
-        pixels.fetch.resize(pixels.fetch.shape[0], len(rows))
-    return result, Unknown(rows, seen[rows]), left
-
-
-def _lit_pixels(shade, picture: int) -> Pixels:
-    from scipy.sparse import csr_array, vstack
-
-    index, lit = [np.zeros(0, int)], [np.zeros(0, np.float32)]
-    fetches = [csr_array((0, shade.texels), dtype=np.float32)]
-    for block in shade.blocks(picture):
-        samples, (count, pixels, _) = block.hits.samples, block.hits.counts
-        slot, texel, step = (np.array(a)[:count].astype(np.int64) for a in (samples.slot, samples.texel, samples.step))
-        place = np.stack([np.array(samples.x)[:count], np.array(samples.y)[:count]], axis=1)
-        texels, weights = corners(texel, step, place, shade.sizes)
-        number = np.bincount(slot, minlength=pixels)
-        weights = weights / number[slot][:, None]
-        entries = (np.repeat(slot, 4).astype(np.int32), texels.ravel().astype(np.int32))
-        fetches.append(csr_array((weights.ravel().astype(np.float32), entries), shape=(pixels, shade.texels)))
-        index.append(block.pixel.astype(int))
-        lit.append((number / shade.subsamples).astype(np.float32))
-    return Pixels(np.concatenate(index), np.concatenate(lit), vstack(fetches, format="csr"))
 
 
 def _errors(
@@ -201,7 +183,8 @@ def _errors(
     result = []
     for k, (pixels, level, own, count) in enumerate(zip(pictures, levels, every, counts, strict=True)):
         variance = own**2
-        variance += np.where(pixels.lit < 0.999, EDGE * level / pixels.lit, 0) ** 2
+        edge = (pixels.lit > 0) & (pixels.lit < 0.999)
+        variance += np.where(edge, EDGE * level / np.maximum(pixels.lit, 1e-6), 0) ** 2
         if k in indirect:
             light = enlarged(indirect[k], captures.cameras[k].size).reshape(-1, 3)[pixels.index]
             variance += (BETWEEN * light.max(axis=1)) ** 2

@@ -99,7 +99,7 @@ def placed(values: np.ndarray, gathered: Gathered, where: Atlas, otherwise) -> n
     return result
 
 
-def fill(table: Table, where: Atlas, only: np.ndarray | None = None) -> Table:
+def fill(table: Float[np.ndarray, "a c"], where: Atlas, only: np.ndarray | None = None) -> Float[np.ndarray, "a c"]:
     """Uncovered texels (of `only`, where given) take the values of the nearest covered one of their set."""
     result = table.copy()
     for k, closest in enumerate(where.closest):

@@ -199,9 +199,10 @@ def take_off_indirect(
     samples: int,
     seed: int,
     progress: Callable[[float], None],
+    vectors: Callable[[int, np.ndarray], None] | None = None,
 ) -> None:
     """Estimate the indirect light of every picture with the maps found so far; `indirect` then holds it. Leaves the
-    table in `shade`."""
+    table in `shade`. `vectors` gets each picture's vector irradiance (`Indirect.pictures_and_vectors`)."""
     from mistyle.render.indirect import Indirect, in_proportion, retarget
     from mistyle.render.shade import unpack
 
@@ -211,7 +212,14 @@ def take_off_indirect(
     scene = Indirect(shade.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for group in by_camera(captures.cameras):
         many = [captures.lights[k] for k in group]
-        found = scene.pictures(captures.cameras[group[0]], many, samples, seed + len(captures) * group[0])
+        asked = captures.cameras[group[0]], many, samples, seed + len(captures) * group[0]
+        if vectors is None:
+            found = scene.pictures(*asked)
+        else:
+            both = scene.pictures_and_vectors(*asked)
+            found = [light for light, _ in both]
+            for k, (_, vector) in zip(group, both, strict=True):
+                vectors(k, vector)
         for k, light in zip(group, found, strict=True):
             indirect.pop(k, None)
             rgb, mask = captures.load(k)

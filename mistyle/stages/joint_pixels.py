@@ -1,0 +1,163 @@
+"""What the joint steps (`recover_joint.py`) know of pictures' pixels: which texels each fetches, and how the light that
+reaches it by way of other surfaces depends on them.
+
+Of that light E the first surface point reflects E · n by Lambert's law, with n the mapped normal and E the vector
+irradiance (Gershun, The Light Field, 1939): the sum of what arrives, each part along where it comes from. E is smooth
+along the surface and does not depend on n, so n and albedo change the pixel by known amounts. Places that no light
+reaches directly are seen by this light alone. What highlights and metals reflect of it is taken to stay.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.camera import Camera, by_camera
+from mistyle.core.light import Point
+from mistyle.render.hits import Hits, collect, corners
+from mistyle.render.indirect import enlarged
+from mistyle.stages.frames import texel_frames
+from mistyle.stages.recover_solve import fill
+from mistyle.stages.recover_texels import Work
+
+PIXEL, WEIGHT = 240, 8  # bytes of a pixel, and of a bilinear weight
+LEAST_Z = 0.2  # of a mapped normal
+FLASH = (Point((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), "camera"),)
+
+Frames = Float[np.ndarray, "t 9"]
+
+
+@dataclass(frozen=True)
+class Pixels:
+    """Pixels of one picture: flat indices, which share of their samples is lit, and the mean bilinear weights of those,
+    as a sparse matrix, pixels x unknown texels; of all samples where none is lit."""
+
+    index: Int[np.ndarray, " p"]
+    lit: Float[np.ndarray, " p"]
+    fetch: Any
+
+
+@dataclass(frozen=True)
+class Unknown:
+    """The texels that are solved for, rows of the table: those that are covered or that a picture shows (`seen`)."""
+
+    rows: Int[np.ndarray, " t"]
+    seen: Bool[np.ndarray, " t"]
+
+
+def all_pixels(shade, work: Work) -> tuple[list[Pixels], Unknown, float] | None:
+    """All pictures' lit pixels, and where light between surfaces is looked for the others that show the mesh; what is
+    solved for; and the bytes that they leave of the memory. None where it does not suffice."""
+    settings, cameras = work.settings, work.captures.cameras
+    left, found, seen = settings.memory * 1e9, dict[int, Pixels](), np.zeros(shade.texels, bool)
+    for group in by_camera(cameras):
+        every = _seen_pixels(shade, work, cameras[group[0]]) if settings.bounces else None
+        for k in group:
+            lit = lit_pixels(shade, k)
+            found[k] = lit if every is None else _and_dark(lit, every)
+            fetch = found[k].fetch
+            seen[fetch.indices] = True
+            left -= PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
+            if left < 0:
+                return None
+    result = [found[k] for k in range(len(cameras))]
+    rows = np.flatnonzero(seen | np.concatenate([c.ravel() for c in work.where.covered]))
+    number = np.zeros(shade.texels, np.int32)
+    number[rows] = np.arange(len(rows), dtype=np.int32)
+    for pixels in result:
+        pixels.fetch.indices = number[pixels.fetch.indices]
+        pixels.fetch.resize(pixels.fetch.shape[0], len(rows))
+    return result, Unknown(rows, seen[rows]), left
+
+
+def lit_pixels(shade, picture: int) -> Pixels:
+    """Those that a light reaches."""
+    return _pixels((block.hits for block in shade.blocks(picture)), shade.sizes, shade.subsamples)
+
+
+def _seen_pixels(shade, work: Work, camera: Camera) -> Pixels:
+    """Those that show the mesh: by a flash at the camera, which throws no shadow."""
+    every, options = np.ones(camera.size, bool), {"subsamples": shade.subsamples, "shadows": False, "gradients": False}
+    hits = collect(work.traced, camera, FLASH, every, shade.sizes, work.tangents, **options)
+    return _pixels(hits, shade.sizes, shade.subsamples)
+
+
+def _pixels(blocks: Iterable[Hits], sizes: Sequence[tuple[int, int]], subsamples: int) -> Pixels:
+    from scipy.sparse import csr_array, vstack
+
+    texels_of_all = sum(rows * columns for rows, columns in sizes)
+    index, lit = [np.zeros(0, int)], [np.zeros(0, np.float32)]
+    fetches = [csr_array((0, texels_of_all), dtype=np.float32)]
+    for hits in blocks:
+        samples, (count, pixels, _) = hits.samples, hits.counts
+        slot, texel, step = (np.array(a)[:count].astype(np.int64) for a in (samples.slot, samples.texel, samples.step))
+        place = np.stack([np.array(samples.x)[:count], np.array(samples.y)[:count]], axis=1)
+        texels, weights = corners(texel, step, place, sizes)
+        number = np.bincount(slot, minlength=pixels)
+        weights = weights / number[slot][:, None]
+        entries = (np.repeat(slot, 4).astype(np.int32), texels.ravel().astype(np.int32))
+        fetches.append(csr_array((weights.ravel().astype(np.float32), entries), shape=(pixels, texels_of_all)))
+        index.append(np.array(hits.pixels.index)[:pixels].astype(int))
+        lit.append((number / subsamples).astype(np.float32))
+    return Pixels(np.concatenate(index), np.concatenate(lit), vstack(fetches, format="csr"))
+
+
+def _and_dark(pixels: Pixels, every: Pixels) -> Pixels:
+    """`pixels`, and those of `every` that are not among them."""
+    from scipy.sparse import vstack
+
+    dark = np.flatnonzero(~np.isin(every.index, pixels.index))
+    return Pixels(
+        np.concatenate([pixels.index, every.index[dark]]),
+        np.concatenate([pixels.lit, np.zeros(len(dark), np.float32)]),
+        vstack([pixels.fetch, every.fetch[dark]], format="csr"),
+    )
+
+
+def frames(work: Work, unknown: Unknown) -> Frames:
+    """Tangent, bitangent and normal of the unknown texels; of uncovered ones those of the nearest covered one."""
+    covered = [t.covered for t in work.texels]
+    position, normal, face = (
+        np.concatenate([getattr(t, name)[c] for t, c in zip(work.texels, covered, strict=True)])
+        for name in ("position", "normal", "face")
+    )
+    own = texel_frames(work.traced.mesh, face, position, normal, work.tangents)
+    every = np.zeros((work.where.offsets[-1], 9), np.float32)
+    every[np.concatenate([c.ravel() for c in covered])] = own.reshape(-1, 9)
+    return fill(every, work.where)[unknown.rows]
+
+
+def between(
+    pixels: Pixels,
+    vectors: Float[np.ndarray, "h w 9"],
+    size: tuple[int, int],
+    values: Float[np.ndarray, "t 8"],
+    axes: Frames,
+) -> Float[np.ndarray, "p 3 3"]:
+    """Derivatives of the light between surfaces in a picture of `size`: of each channel by its own albedo, and by the
+    tilt (2). `vectors` as of `Indirect.pictures_and_vectors`; `values` and `axes` of the unknown texels."""
+    arriving = enlarged(vectors, size).reshape(-1, 3, 3)[pixels.index]
+    frame = (pixels.fetch @ axes).reshape(-1, 3, 3)
+    frame /= np.maximum(np.linalg.norm(frame, axis=2, keepdims=True), 1e-6)
+    x, y, z = np.einsum("pca,pja->jpc", arriving, frame)
+    fetched = pixels.fetch @ values
+    tilt, diffuse = fetched[:, 3:5], (1 - fetched[:, 6:7]) / np.float32(np.pi)
+    up = np.sqrt(np.maximum(1 - (tilt**2).sum(axis=1), LEAST_Z**2))[:, None]
+    along, across = tilt[:, :1], tilt[:, 1:]
+    albedo = diffuse * fetched[:, :3]
+    by = (
+        diffuse * np.maximum(along * x + across * y + up * z, 0),
+        albedo * (x - along / up * z),
+        albedo * (y - across / up * z),
+    )
+    return np.stack(by, axis=2).astype(np.float32)
+
+
+def change(
+    pixels: Pixels, derivative: Float[np.ndarray, "p 3 3"], moved: Float[np.ndarray, "t 8"]
+) -> Float[np.ndarray, "p 3"]:
+    """What light between surfaces changes by when the unknown texels move."""
+    fetched = pixels.fetch @ moved[:, :5]
+    return derivative[:, :, 0] * fetched[:, :3] + np.einsum("pcj,pj->pc", derivative[:, :, 1:], fetched[:, 3:])

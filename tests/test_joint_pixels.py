@@ -1,0 +1,93 @@
+"""Pixels that no light reaches, and how light between surfaces depends on the surface that the camera sees: against
+estimates of that light with moved maps."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from test_recover import LIGHTS, QUICK, SIZE, directional, hollow, strong_maps
+
+from mistyle.core.camera import look_at
+from mistyle.core.capture import in_memory
+from mistyle.core.image import gaussian
+from mistyle.render import device, draw
+from mistyle.render import hits as collecting
+from mistyle.render.indirect import Indirect
+from mistyle.render.shade import Shade, pack, unpack
+from mistyle.stages import joint_pixels
+from mistyle.stages.recover_solve import linked
+from mistyle.stages.recover_texels import Work
+from mistyle.stages.texels import rasterise
+
+SAMPLES = 1024
+
+
+@pytest.fixture(scope="module")
+def bowl():
+    """The inside of a bowl that is lit from aslant: part of it is in its own shadow."""
+    device.use()
+    mesh = hollow()
+    maps = strong_maps(3)
+    maps = replace(maps, roughness=np.full((SIZE, SIZE), 0.8, np.float32), albedo=0.3 + 0.6 * maps.albedo)
+    cameras = [look_at([0.6, 0.4, 4], fov=30, size=(48, 48), name=name) for name in "ab"]
+    cameras.append(look_at([-0.9, 0.2, 4], fov=30, size=(48, 48), name="c"))
+    lights = [(directional(*LIGHTS[k]),) for k in range(3)]
+    masks = [np.ones((48, 48), bool)] * 3
+    captures, texels = (
+        in_memory(cameras, lights, [np.zeros((48, 48, 3), np.float32)] * 3, masks),
+        [rasterise(mesh, 0, SIZE)],
+    )
+    shade = Shade(draw.tracer(mesh), captures, ((SIZE, SIZE),), subsamples=9)
+    settings = QUICK.model_copy(update={"bounces": 1})
+    tangents = collecting.tangents_of(mesh, "mikkt")
+    work = Work(shade.traced, tangents, texels, linked(mesh, texels), captures, settings, [])
+    return work, shade, pack([maps])
+
+
+def test_every_pixel_that_shows_the_mesh_is_there_once(bowl):
+    """Where light between surfaces is looked for; the lit ones are the same as without."""
+    work, shade, _ = bowl
+    pictures, unknown, left = joint_pixels.all_pixels(shade, work)
+    alone = replace(work, settings=work.settings.model_copy(update={"bounces": 0}))
+    lit, fewer, more_left = joint_pixels.all_pixels(shade, alone)
+    assert left < more_left and len(fewer.rows) <= len(unknown.rows)
+    for k, (pixels, only) in enumerate(zip(pictures, lit, strict=True)):
+        shown = shade.image_and_coverage(k)[1].ravel() > 0
+        dark = pixels.lit == 0
+        assert 0.02 * shown.sum() < dark.sum() < 0.98 * shown.sum()
+        # A flash shows less than a camera where the surface is seen from its very edge.
+        assert set(pixels.index) <= set(np.flatnonzero(shown)) and len(set(pixels.index)) == len(pixels.index)
+        assert len(pixels.index) > 0.995 * shown.sum()
+        np.testing.assert_array_equal(pixels.index[~dark], only.index)
+        np.testing.assert_array_equal(pixels.lit[~dark], only.lit)
+        np.testing.assert_allclose(pixels.fetch.sum(axis=1), 1, atol=1e-5)
+
+
+@pytest.mark.parametrize(("columns", "far"), [((3,), 0.1), ((4,), 0.1), ((0, 1, 2), 0.05)])
+def test_light_between_surfaces_follows_what_reflects_it(bowl, columns, far):
+    """By tilt and albedo: against estimates of maps that are moved in a patch, which hardly lights itself."""
+    work, shade, table = bowl
+    pictures, unknown, _ = joint_pixels.all_pixels(shade, work)
+    axes, camera, many = joint_pixels.frames(work, unknown), work.captures.cameras[0], [work.captures.lights[0]]
+    mesh, sizes = shade.traced.mesh, work.where.sizes
+    (_, vectors), *_ = Indirect(mesh, unpack(table, sizes)).pictures_and_vectors(camera, many, SAMPLES, 3)
+    derivative = joint_pixels.between(pictures[0], vectors, camera.size, table[unknown.rows], axes)
+    first, second = 2 * [table]
+    place = work.texels[0].position.reshape(-1, 3)
+    lowest = work.texels[0].covered.ravel() & (place[:, 2] < -0.7)
+    assert 0.03 < lowest.sum() / work.texels[0].covered.sum() < 0.3
+    moves = np.zeros_like(table)
+    moves[np.ix_(lowest, columns)] = far
+    real = []
+    for moved in (table + moves, table - moves):
+        real.append(Indirect(mesh, unpack(moved, sizes)).pictures(camera, many, SAMPLES, 3)[0])
+    real = ((real[0] - real[1]) / 2).reshape(-1, 3)
+    told = np.zeros_like(real)
+    told[pictures[0].index] = joint_pixels.change(pictures[0], derivative, moves[unknown.rows])
+    inside = np.zeros(len(real), bool)
+    inside[pictures[0].index] = pictures[0].fetch @ lowest[unknown.rows].astype(np.float32) > 0.999
+    assert inside.sum() > 50
+    real, told = (
+        gaussian(a.reshape(48, 48, 3) * inside.reshape(48, 48, 1), 1.0).reshape(-1, 3)[inside] for a in (real, told)
+    )
+    assert np.linalg.norm(real - told) < 0.3 * np.linalg.norm(real)
