@@ -31,7 +31,7 @@ from mistyle.run.budget import (
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import thread_count
 from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
-from mistyle.stages.recover_settings import all_rounds, estimates, joint_steps, passes
+from mistyle.stages.recover_settings import all_rounds, estimates, joint_estimates, joint_steps, passes
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -111,8 +111,8 @@ def plan_material(job: Any) -> dict[str, Any]:
     begun = solves * (1 + len(estimated[0]))
     steps, joint = 0 if s.recover.solver == "texels" else s.recover.iterations, joint_steps(s.recover)
     samples = solves * sum(sum(part) for part in estimated)
-    if joint and s.recover.bounces:
-        samples += s.recover.bounce_samples
+    again = joint_estimates(s.recover)
+    samples += sum(again)
     paths = samples * sum(min(n, MOST**2) for n in averaged)
     words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
@@ -123,7 +123,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
         + (begun + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
         + paths * PER_BOUNCED_PATH
-        + joint * SHOWN * sum(averaged) * PER_JOINT
+        + joint * max(1, len(again)) * SHOWN * sum(averaged) * PER_JOINT
         + words * COVERED * texels * PER_SMOOTHED,
         "measure": 2 * looked * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,

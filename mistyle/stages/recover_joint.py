@@ -35,7 +35,7 @@ from mistyle.render.indirect import enlarged
 from mistyle.stages.joint_algebra import Linear, Unknowns, conjugate, curved, own_blocks, right_side
 from mistyle.stages.joint_pixels import Pixels, Unknown, all_pixels, between, change, frames
 from mistyle.stages.recover_observe import deviation
-from mistyle.stages.recover_settings import RecoverSettings, joint_steps
+from mistyle.stages.recover_settings import RecoverSettings, joint_estimates, joint_steps
 from mistyle.stages.recover_smooth import LEAST, firmness
 from mistyle.stages.recover_solve import MARGIN, NOTHING, Atlas, joined
 from mistyle.stages.recover_texels import Work, take_off_indirect
@@ -54,7 +54,6 @@ FREE = 0.5  # standard deviation that what no picture tells is left
 ALIKE = 0.03  # between an uncovered texel, which pixels at charts' borders see, and the nearest covered one
 LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # of a step
 STEEPEST = 0.98  # of a tilt
-ESTIMATES = 1, 2  # of light between surfaces, each before such steps: samples as multiples of `bounce_samples`
 SEED = 104_729  # between the seeds of these and others
 
 Table = Float[np.ndarray, "a 8"]
@@ -92,20 +91,20 @@ def together(
         )
         return table
     pictures, unknown, shade.memory = found
-    axes, estimates = frames(work, unknown), ESTIMATES if settings.bounces else (0,)
-    for number, share in enumerate(estimates):
+    axes, estimates = frames(work, unknown), joint_estimates(settings) or (0,)
+    for number, samples in enumerate(estimates):
 
         def heard(done: float, number=number) -> None:
             progress((number + done) / len(estimates))
 
         reflected = [np.zeros((len(p.index), 3, 3), np.float32) for p in pictures]
-        if settings.bounces:
+        if samples:
 
             def arrived(k: int, vectors: np.ndarray, table=table, reflected=reflected) -> None:
                 size = work.captures.cameras[k].size
                 reflected[k] = between(pictures[k], vectors, size, table[unknown.rows], axes)
 
-            samples, new = share * settings.bounce_samples, seed + (number + 1) * SEED
+            new = seed + (number + 1) * SEED
             take_off_indirect(work, shade, table, indirect, samples, new, lambda d, f=heard: f(0.5 * d), arrived)
         moved = _steps(work, shade, table, pictures, unknown, reflected, indirect, trace, partial(_later, heard))
         if moved is None:

@@ -93,7 +93,7 @@ class RecoverSettings(BaseModel):
         default=6,
         ge=0,
         le=8,
-        description="how often light between surfaces is estimated and taken off the pictures; before joint steps once "
+        description="how often light between surfaces is estimated and taken off the pictures; for joint steps twice "
         "more",
     )
     bounce_samples: int = Field(
@@ -101,14 +101,15 @@ class RecoverSettings(BaseModel):
         ge=1,
         le=4096,
         description="samples a pixel of those estimates; the first and those between passes on whole pictures have an "
-        "eighth, but for the last of all",
+        "eighth, but for the last of all, and that of the last joint steps twice as many",
     )
     joint: int = Field(
         default=3,
         ge=0,
         le=100,
         description="steps after those on whole pictures that solve for all texels at once, from all pictures and with "
-        "what neighbours say; under directional and point lights only",
+        "what neighbours say, after each of two estimates of light between surfaces; under directional and point "
+        "lights only",
     )
     joint_subsamples: int = Field(
         default=25,
@@ -143,6 +144,13 @@ def joint_steps(settings: RecoverSettings) -> int:
     """How many joint steps there are: none where texels are not solved one by one before and then whole pictures, or
     where neighbours shall have no word."""
     return settings.joint if settings.solver == "both" and settings.smooth and settings.iterations else 0
+
+
+def joint_estimates(settings: RecoverSettings) -> tuple[int, ...]:
+    """Samples a pixel of each estimate of light between surfaces that such steps follow: the last one, of maps that
+    hardly change any more, is worth more."""
+    several = joint_steps(settings) and settings.bounces
+    return (settings.bounce_samples, 2 * settings.bounce_samples) if several else ()
 
 
 def all_rounds(settings: RecoverSettings, pictures: int) -> int:
