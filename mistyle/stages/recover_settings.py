@@ -62,8 +62,8 @@ class RecoverSettings(BaseModel):
         default=0.0005,
         gt=0,
         le=1,
-        description="standard deviation of a pixel in the dark, more than 8-bit sRGB rounds by: with 0.002, which "
-        "pictures of a camera may need, black rubber shows too little for its roughness to be told",
+        description="standard deviation of a pixel in the dark, more than 8-bit sRGB rounds by: with 0.002 black "
+        "rubber shows too little for its roughness to be told",
     )
     relative: float = Field(default=0.01, ge=0, le=1, description="standard deviation of a pixel relative to its value")
     facing: float = Field(
