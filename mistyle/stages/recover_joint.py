@@ -106,15 +106,12 @@ def together(
 
             new = seed + (number + 1) * SEED
             take_off_indirect(work, shade, table, indirect, samples, new, lambda d, f=heard: f(0.5 * d), arrived)
-        moved = _steps(work, shade, table, pictures, unknown, reflected, indirect, trace, partial(_later, heard))
+        stepped = partial(_steps, work, shade, table, pictures, unknown, reflected, indirect, trace)
+        moved = stepped(lambda d, f=heard: f(0.5 + 0.5 * d))
         if moved is None:
             break
         table = moved
     return table
-
-
-def _later(heard: Callable[[float], None], done: float) -> None:
-    heard(0.5 + 0.5 * done)
 
 
 def _steps(
