@@ -32,11 +32,8 @@ def bowl():
     cameras = [look_at([0.6, 0.4, 4], fov=30, size=(48, 48), name=name) for name in "ab"]
     cameras.append(look_at([-0.9, 0.2, 4], fov=30, size=(48, 48), name="c"))
     lights = [(directional(*LIGHTS[k]),) for k in range(3)]
-    masks = [np.ones((48, 48), bool)] * 3
-    captures, texels = (
-        in_memory(cameras, lights, [np.zeros((48, 48, 3), np.float32)] * 3, masks),
-        [rasterise(mesh, 0, SIZE)],
-    )
+    captures = in_memory(cameras, lights, [np.zeros((48, 48, 3), np.float32)] * 3)
+    texels = [rasterise(mesh, 0, SIZE)]
     shade = Shade(draw.tracer(mesh), captures, ((SIZE, SIZE),), subsamples=9)
     settings = QUICK.model_copy(update={"bounces": 1})
     tangents = collecting.tangents_of(mesh, "mikkt")
@@ -72,7 +69,6 @@ def test_light_between_surfaces_follows_what_reflects_it(bowl, columns, far):
     mesh, sizes = shade.traced.mesh, work.where.sizes
     (_, vectors), *_ = Indirect(mesh, unpack(table, sizes)).pictures_and_vectors(camera, many, SAMPLES, 3)
     derivative = joint_pixels.between(pictures[0], vectors, camera.size, table[unknown.rows], axes)
-    first, second = 2 * [table]
     place = work.texels[0].position.reshape(-1, 3)
     lowest = work.texels[0].covered.ravel() & (place[:, 2] < -0.7)
     assert 0.03 < lowest.sum() / work.texels[0].covered.sum() < 0.3

@@ -1,10 +1,10 @@
 """What the joint steps (`recover_joint.py`) know of pictures' pixels: which texels each fetches, and how the light that
 reaches it by way of other surfaces depends on them.
 
-Of that light E the first surface point reflects E · n by Lambert's law, with n the mapped normal and E the vector
-irradiance (Gershun, The Light Field, 1939): the sum of what arrives, each part along where it comes from. E is smooth
-along the surface and does not depend on n, so n and albedo change the pixel by known amounts. Places that no light
-reaches directly are seen by this light alone. What highlights and metals reflect of it is taken to stay.
+Of that light the first surface point reflects albedo / π E · n by Lambert's law, with n the mapped normal and E the
+vector irradiance (Gershun, The Light Field, 1939): the sum of what arrives, each part along where it comes from. E is
+smooth along the surface and does not depend on n, so n and albedo change the pixel by known amounts. Places that no
+light reaches directly are seen by this light alone. What highlights and metals reflect of it is taken to stay.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,6 +19,7 @@ from mistyle.core.light import Point
 from mistyle.render.hits import Hits, collect, corners
 from mistyle.render.indirect import enlarged
 from mistyle.stages.frames import texel_frames
+from mistyle.stages.recover_observe import covered_rows, points_of
 from mistyle.stages.recover_solve import fill
 from mistyle.stages.recover_texels import Work
 
@@ -55,7 +56,7 @@ def all_pixels(shade, work: Work) -> tuple[list[Pixels], Unknown, float] | None:
     for group in by_camera(cameras):
         every = _seen_pixels(shade, work, cameras[group[0]]) if settings.bounces else None
         for k in group:
-            lit = lit_pixels(shade, k)
+            lit = _lit_pixels(shade, k)
             found[k] = lit if every is None else _and_dark(lit, every)
             fetch = found[k].fetch
             seen[fetch.indices] = True
@@ -72,7 +73,7 @@ def all_pixels(shade, work: Work) -> tuple[list[Pixels], Unknown, float] | None:
     return result, Unknown(rows, seen[rows]), left
 
 
-def lit_pixels(shade, picture: int) -> Pixels:
+def _lit_pixels(shade, picture: int) -> Pixels:
     """Those that a light reaches."""
     return _pixels((block.hits for block in shade.blocks(picture)), shade.sizes, shade.subsamples)
 
@@ -118,14 +119,10 @@ def _and_dark(pixels: Pixels, every: Pixels) -> Pixels:
 
 def frames(work: Work, unknown: Unknown) -> Frames:
     """Tangent, bitangent and normal of the unknown texels; of uncovered ones those of the nearest covered one."""
-    covered = [t.covered for t in work.texels]
-    position, normal, face = (
-        np.concatenate([getattr(t, name)[c] for t, c in zip(work.texels, covered, strict=True)])
-        for name in ("position", "normal", "face")
-    )
-    own = texel_frames(work.traced.mesh, face, position, normal, work.tangents)
+    position, normal, face = points_of(work.texels)
     every = np.zeros((work.where.offsets[-1], 9), np.float32)
-    every[np.concatenate([c.ravel() for c in covered])] = own.reshape(-1, 9)
+    own = texel_frames(work.traced.mesh, face, position, normal, work.tangents)
+    every[covered_rows(work.texels)] = own.reshape(-1, 9)
     return fill(every, work.where)[unknown.rows]
 
 

@@ -83,11 +83,8 @@ def gather(
     radiance y is noise · (the brightest radiance, robustly) + relative · y, larger where the surface turns away and
     where the texel is smaller than the pixel, which then says more about its neighbours.
     """
-    covered = [t.covered for t in texels]
-    texel = np.flatnonzero(np.concatenate([c.ravel() for c in covered]))
-    position = np.concatenate([t.position[c] for t, c in zip(texels, covered, strict=True)])
-    face = np.concatenate([t.face[c] for t, c in zip(texels, covered, strict=True)])
-    normal = np.concatenate([t.normal[c] for t, c in zip(texels, covered, strict=True)])
+    texel = covered_rows(texels)
+    position, normal, face = points_of(texels)
     size = np.concatenate([texel_sizes(t) for t in texels])[texel]
     soft = [has_soft([own]) for own in captures.lights]
     sky = open_sky(traced, position, normal) if skies and any(soft) else None
@@ -114,6 +111,19 @@ def gather(
         views[near[any_light]] += 1
         progress((done + 1) / max(len(captures) / max(len(group), 1), 1))
     return _assemble(texel, points, captures, parts, views, noise, relative)
+
+
+def covered_rows(texels: Sequence[Texels]) -> Int[np.ndarray, " n"]:
+    """The covered texels of all sets, rows of the table."""
+    return np.flatnonzero(np.concatenate([t.covered.ravel() for t in texels]))
+
+
+def points_of(texels: Sequence[Texels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Their positions, normals and faces."""
+    position, normal, face = (
+        np.concatenate([getattr(t, name)[t.covered] for t in texels]) for name in ("position", "normal", "face")
+    )
+    return position, normal, face
 
 
 def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, "n 3"]:

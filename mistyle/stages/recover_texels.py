@@ -213,14 +213,11 @@ def take_off_indirect(
     for group in by_camera(captures.cameras):
         many = [captures.lights[k] for k in group]
         asked = captures.cameras[group[0]], many, samples, seed + len(captures) * group[0]
-        if vectors is None:
-            found = scene.pictures(*asked)
-        else:
-            both = scene.pictures_and_vectors(*asked)
-            found = [light for light, _ in both]
-            for k, (_, vector) in zip(group, both, strict=True):
+        found: list[tuple[np.ndarray, Any]]
+        found = scene.pictures_and_vectors(*asked) if vectors else [(light, None) for light in scene.pictures(*asked)]
+        for k, (light, vector) in zip(group, found, strict=True):
+            if vectors:
                 vectors(k, vector)
-        for k, light in zip(group, found, strict=True):
             indirect.pop(k, None)
             rgb, mask = captures.load(k)
             counts = (mask & np.isfinite(rgb).all(axis=-1))[..., None]
