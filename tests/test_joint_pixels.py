@@ -60,15 +60,20 @@ def test_every_pixel_that_shows_the_mesh_is_there_once(bowl):
         np.testing.assert_allclose(pixels.fetch.sum(axis=1), 1, atol=1e-5)
 
 
-@pytest.mark.parametrize(("columns", "far"), [((3,), 0.1), ((4,), 0.1), ((0, 1, 2), 0.05)])
-def test_light_between_surfaces_follows_what_reflects_it(bowl, columns, far):
+@pytest.mark.parametrize(
+    ("columns", "far", "metallic"),
+    [((3,), 0.1, 0.0), ((4,), 0.1, 0.0), ((0, 1, 2), 0.05, 0.0), ((0, 1, 2), 0.05, 1.0)],
+)
+def test_light_between_surfaces_follows_what_reflects_it(bowl, columns, far, metallic):
     """By tilt and albedo: against estimates of maps that are moved in a patch, which hardly lights itself."""
     work, shade, table = bowl
+    table = table.copy()
+    table[:, 6] = metallic
     pictures, unknown, _ = joint_pixels.all_pixels(shade, work)
     axes, camera, many = joint_pixels.frames(work, unknown), work.captures.cameras[0], [work.captures.lights[0]]
     mesh, sizes = shade.traced.mesh, work.where.sizes
-    (_, vectors), *_ = Indirect(mesh, unpack(table, sizes)).pictures_and_vectors(camera, many, SAMPLES, 3)
-    derivative = joint_pixels.between(pictures[0], vectors, camera.size, table[unknown.rows], axes)
+    (light, vectors), *_ = Indirect(mesh, unpack(table, sizes)).pictures_and_vectors(camera, many, SAMPLES, 3)
+    derivative = joint_pixels.between(pictures[0], light, vectors, camera.size, table[unknown.rows], axes)
     place = work.texels[0].position.reshape(-1, 3)
     lowest = work.texels[0].covered.ravel() & (place[:, 2] < -0.7)
     assert 0.03 < lowest.sum() / work.texels[0].covered.sum() < 0.3

@@ -18,7 +18,7 @@ from mistyle.render import hits as collecting
 from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
 from mistyle.render.indirect import FIREFLY, MOST, Indirect, averaged, enlarged, in_proportion
-from mistyle.render.texel_views import Look
+from mistyle.render.texel_views import Look, look
 from mistyle.stages import recover_observe, recover_pictures
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.neighbours import of_islands
@@ -361,6 +361,26 @@ def test_indirect_light_is_what_path_sees_beyond_direct(rng, monkeypatch, most):
         np.testing.assert_allclose(estimate[inside].mean(axis=0), difference[inside].mean(axis=0), rtol=0.02)
 
 
+def test_what_mirrors_show_of_other_surfaces_is_in_the_estimate():
+    """A patch of smooth metal in a bowl of paint, against paths: what it mirrors is no blur."""
+    device.use()
+    mesh, maps = hollow(), strong_maps(3)
+    texels = rasterise(mesh, 0, SIZE)
+    patch = (texels.position[..., 2] < -0.8) & texels.covered
+    roughness, metallic = np.where(patch, 0.1, 0.8).astype(np.float32), patch.astype(np.float32)
+    maps = replace(maps, roughness=roughness, metallic=metallic)
+    camera, many = look_at([0.6, 0.4, 4], fov=30, size=(64, 64)), [(directional(*LIGHTS[0]),)]
+    path = {"type": "path", "rr_depth": 100}
+    direct, whole = (
+        photographs(mesh, [maps], [camera], many, "mikkt", path | {"max_depth": depth}, 1024)[0] for depth in (2, 5)
+    )
+    estimate = Indirect(mesh, [maps]).pictures(camera, many, 256, 3)[0]
+    shown = look(draw.tracer(mesh), camera, []).position[..., 2] < -0.85
+    difference = gaussian((whole - direct - estimate) * shown[..., None], 1.0)[shown]
+    assert shown.sum() > 50
+    assert np.sqrt((difference**2).mean()) < 0.1 * np.sqrt(((whole - direct)[shown] ** 2).mean())
+
+
 def test_an_estimate_is_brought_into_proportion():
     """Twice as bright with the direct light as the picture: halved, however noisy the picture; right: as it was. Beside
     the object, and where nothing is shown, it stays; a picture coarser by two says the same."""
@@ -463,6 +483,37 @@ def test_what_is_believed_of_metals_is_one_prior(rng: np.random.Generator):
     wanted = ((x - mean) ** 2 * prior).sum(axis=1) + (x[:, 6] - metal) ** 2 / solving.METAL_SPREAD**2
     wanted += metal * ((x[:, :3] - solving.METAL_ALBEDO) ** 2).sum(axis=1) / solving.METAL_ALBEDOS**2
     np.testing.assert_allclose(((x - around) ** 2 * weight).sum(axis=1) + constant, wanted, rtol=1e-4)
+
+
+def test_black_that_no_gloss_shows_on_is_rather_a_mirror():
+    """Black paint costs more than a metal where it is smooth and seen often, and nothing where its gloss shows."""
+    from mistyle.stages.recover_solve import OFTEN, unlikely
+
+    values = np.zeros((4, 7), np.float32)
+    values[:, 5] = 0.1, 0.8, 0.1, 0.1
+    values[2, 6], seen = 1, np.array([OFTEN, OFTEN, OFTEN, 1])
+    smooth, matt, metal, once = unlikely(values, seen)
+    assert matt == 0 < once < metal < smooth
+
+
+@pytest.mark.parametrize("unlike", [0.0, 0.5])
+def test_where_texels_and_pictures_differ_observations_count_for_less(world, monkeypatch, unlike):
+    """By what the picture drawn of the texels differs from their own radiance; no less where they agree."""
+    from mistyle.render.texel_lm import Problem
+    from mistyle.stages import recover_solve
+
+    mesh, _, texels, captures = world
+    few, tangents = subset(captures, range(0, 30, 5)), collecting.tangents_of(mesh, "mikkt")
+    heard = {"targets": [], "weights": []}
+    for name, kept in (("retarget", "targets"), ("reweight", "weights")):
+        real = getattr(Problem, name)
+        monkeypatch.setattr(Problem, name, lambda own, x, f=real, kept=kept: (heard[kept].append(x), f(own, x))[1])
+    monkeypatch.setattr(recover_solve, "UNLIKE", unlike)
+    recover(mesh, [texels], few, QUICK.model_copy(update={"iterations": 0, "rounds": 1}), 0)
+    seen = gather(draw.tracer(mesh), [texels], few, tangents, facing=QUICK.facing).observations
+    apart = np.abs(heard["targets"][0] - seen.rgb).max(axis=1)
+    assert np.quantile(apart * seen.weight, 0.9) > 1
+    np.testing.assert_allclose(1 / heard["weights"][0], 1 / seen.weight + unlike * apart, rtol=1e-4)
 
 
 def test_steps_are_as_long_as_the_noise():

@@ -25,7 +25,7 @@ from mistyle.render.emitters import emitters
 
 MOST = 512  # pixels along the longer side of the estimate at most; it is as large as the picture where that is smaller
 TOGETHER = 6  # pictures of one camera that share their paths; more make the kernel long
-ROUGH = 0.25  # least roughness: light that mirrors carry comes in few bright samples and adds little
+ROUGH = 0.25  # least roughness past the first point: light that mirrors carry comes in few bright samples
 DEPTH = 5  # path segments: light comes over up to four surface points
 ALIKE = 0.15  # length of the difference of two unit normals at which pixels hardly belong together any more
 LEVEL = 0.7  # and how far, by pixels that lie between the two, one may lie above or below the other's tangent plane
@@ -46,9 +46,13 @@ class Indirect:
         import mitsuba
 
         mi: Any = mitsuba
-        matt = [replace(m, roughness=np.maximum(m.roughness, np.float32(ROUGH))) for m in maps]
-        shapes = scenery.object_shapes(mesh, matt, model=model, frame=frame)
-        self.scene = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+
+        def made(least: float) -> Any:
+            held = [replace(m, roughness=np.maximum(m.roughness, np.float32(least))) for m in maps]
+            shapes = scenery.object_shapes(mesh, held, model=model, frame=frame)
+            return mi.load_dict({"type": "scene", **shapes}, optimize=False)
+
+        self.first, self.scene = made(0), made(ROUGH)
 
     def pictures(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
@@ -94,7 +98,8 @@ class Indirect:
             emitter.set_scene(self.scene)
         times, each = scenery.passes(samples)
         sensor = mi.load_dict(scenery.sensor_dict(small, each))
-        passes = [_traced(self.scene, sensor, lit, each, seed + k * 7919, vectors) for k in range(times)]
+        options = (self.first, self.scene, sensor, lit, each)
+        passes = [_traced(*options, seed + k * 7919, vectors) for k in range(times)]
         whole = np.mean(passes, axis=0)
         share = whole[..., 0]
         inside = np.isfinite(whole).all(axis=-1) & (share > 0)
@@ -120,10 +125,13 @@ class Indirect:
         return list(zip(map(smooth, light[:count]), arriving, strict=True))
 
 
-def _traced(scene: Any, sensor: Any, lit: Sequence[Sequence[Any]], each: int, seed: int, vectors: bool) -> np.ndarray:
+def _traced(
+    seen_first: Any, scene: Any, sensor: Any, lit: Sequence[Sequence[Any]], each: int, seed: int, vectors: bool
+) -> np.ndarray:
     """(h, w, 10 + 3 n) float32, means of `each` samples a pixel: coverage, position, shading normal and diffuse albedo
     of the first surface point, and indirect radiance under each of n = len(lit) sets of emitters; with `vectors` 9 n
-    more, x, y and z of each set's vector irradiance there."""
+    more, x, y and z of each set's vector irradiance there. Both scenes have the same surfaces: the camera sees that of
+    `seen_first`."""
     import drjit as dr
     import mitsuba
 
@@ -138,7 +146,7 @@ def _traced(scene: Any, sensor: Any, lit: Sequence[Sequence[Any]], each: int, se
     place = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row)) + sampler.next_2d()
     ray, _ = sensor.sample_ray(0.0, 0.0, place / mi.Point2f(width, height), mi.Point2f(0.5))
     context = mi.BSDFContext()
-    first = scene.ray_intersect(ray)
+    first = seen_first.ray_intersect(ray)
     seen = first.is_valid()
 
     def onward(si: Any, through: Any, active: Any, sampler: Any) -> tuple[Any, ...]:

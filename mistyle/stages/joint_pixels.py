@@ -3,8 +3,9 @@ reaches it by way of other surfaces depends on them.
 
 Of that light the first surface point reflects albedo / π E · n by Lambert's law, with n the mapped normal and E the
 vector irradiance (Gershun, The Light Field, 1939): the sum of what arrives, each part along where it comes from. E is
-smooth along the surface and does not depend on n, so n and albedo change the pixel by known amounts. Places that no
-light reaches directly are seen by this light alone. What highlights and metals reflect of it is taken to stay.
+smooth along the surface and does not depend on n, so n and albedo change the pixel by known amounts. What metals
+reflect is in proportion to their albedo. Places that no light reaches directly are seen by this light alone. Otherwise
+highlights, and how a metal's tilt turns what it mirrors, are taken to stay.
 """
 
 from collections.abc import Iterable, Sequence
@@ -17,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.camera import Camera, by_camera
 from mistyle.core.light import Point
 from mistyle.render.hits import Hits, collect, corners
-from mistyle.render.indirect import enlarged
+from mistyle.render.indirect import PALE, enlarged
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover_observe import covered_rows, points_of
 from mistyle.stages.recover_solve import fill
@@ -128,24 +129,27 @@ def frames(work: Work, unknown: Unknown) -> Frames:
 
 def between(
     pixels: Pixels,
+    light: Float[np.ndarray, "h w 3"],
     vectors: Float[np.ndarray, "h w 9"],
     size: tuple[int, int],
     values: Float[np.ndarray, "t 8"],
     axes: Frames,
 ) -> Float[np.ndarray, "p 3 3"]:
     """Derivatives of the light between surfaces in a picture of `size`: of each channel by its own albedo, and by the
-    tilt (2). `vectors` as of `Indirect.pictures_and_vectors`; `values` and `axes` of the unknown texels."""
+    tilt (2). `light` and `vectors` as of `Indirect.pictures_and_vectors`; `values` and `axes` of the unknown texels."""
     arriving = enlarged(vectors, size).reshape(-1, 3, 3)[pixels.index]
     frame = (pixels.fetch @ axes).reshape(-1, 3, 3)
     frame /= np.maximum(np.linalg.norm(frame, axis=2, keepdims=True), 1e-6)
     x, y, z = np.einsum("pca,pja->jpc", arriving, frame)
     fetched = pixels.fetch @ values
-    tilt, diffuse = fetched[:, 3:5], (1 - fetched[:, 6:7]) / np.float32(np.pi)
+    metallic = fetched[:, 6:7]
+    tilt, diffuse = fetched[:, 3:5], (1 - metallic) / np.float32(np.pi)
+    mirrored = metallic * enlarged(light, size).reshape(-1, 3)[pixels.index] / (fetched[:, :3] + PALE)
     up = np.sqrt(np.maximum(1 - (tilt**2).sum(axis=1), LEAST_Z**2))[:, None]
     along, across = tilt[:, :1], tilt[:, 1:]
     albedo = diffuse * fetched[:, :3]
     by = (
-        diffuse * np.maximum(along * x + across * y + up * z, 0),
+        diffuse * np.maximum(along * x + across * y + up * z, 0) + mirrored,
         albedo * (x - along / up * z),
         albedo * (y - across / up * z),
     )

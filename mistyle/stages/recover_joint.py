@@ -102,7 +102,7 @@ def together(
 
             def arrived(k: int, vectors: np.ndarray, table=table, reflected=reflected) -> None:
                 size = work.captures.cameras[k].size
-                reflected[k] = between(pictures[k], vectors, size, table[unknown.rows], axes)
+                reflected[k] = between(pictures[k], indirect[k], vectors, size, table[unknown.rows], axes)
 
             new = seed + (number + 1) * SEED
             take_off_indirect(work, shade, table, indirect, samples, new, lambda d, f=heard: f(0.5 * d), arrived)

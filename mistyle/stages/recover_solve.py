@@ -3,6 +3,8 @@
 The solver takes a texel's radiance for that of the picture at one place, but a pixel is a mean over its area of
 interpolated texels. So after each solve the pictures are rendered as they are really made (`render/shade.py`), and
 what they still differ by is added to what the texels should reach (defect correction): at the end the pictures agree.
+Where a texel's radiance is far from that of the picture drawn there, as where highlights are narrower than pixels and
+normals still vary, what is added is far off too, and the observation counts for less.
 """
 
 from collections.abc import Callable, Sequence
@@ -29,8 +31,11 @@ METAL_SPREAD = 0.1  # of metallic about 0 or 1: surfaces are metal or not, and f
 METAL_ALBEDO, METAL_ALBEDOS = 0.6, 0.2
 # What having no colour at all costs what is no metal, from which albedo on it costs nothing, and after how many looks.
 BLACK_COST, PALEST_BLACK, OFTEN = 20.0, 0.02, 8
+# From which roughness on its gloss shows, so that it could not as well be a mirror, in part and fully.
+GLOSSY, MATT = 0.3, 0.6
 METAL_COST = 10.0  # what being a metal costs: twice the logarithm of how much rarer metals are
-STARTS = (0.25, 0.7)  # roughness has local minima
+STARTS = (0.08, 0.25, 0.7)  # roughness has local minima
+UNLIKE = 0.3  # of what a texel and the picture drawn there differ by: what it adds to an observation's deviation
 RESTARTS = 3  # rounds in which texels also try what their neighbours found
 MISFIT = 0.1  # cost per observation above which a texel has less to say to its neighbours
 BLUR = 4  # steps of spreading, each to the four nearest texels
@@ -186,8 +191,10 @@ def penalty(values: Values, mean: Values, prior: Values) -> Float[np.ndarray, " 
 
 
 def unlikely(values: Values, seen: Int[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
-    """What being a metal costs, and what looking black often and yet being none costs: paint is never that black."""
+    """What being a metal costs, and what looking black often and yet being none costs, where no gloss shows either:
+    paint is never that black."""
     black = np.maximum(1 - values[:, :3].max(axis=1) / PALEST_BLACK, 0) * np.minimum(seen / OFTEN, 1)
+    black *= np.clip((MATT - values[:, 5]) / (MATT - GLOSSY), 0, 1)
     return np.where(values[:, 6] > 0.5, METAL_COST, BLACK_COST * black).astype(np.float32)
 
 
@@ -216,7 +223,8 @@ def another_round(
     settings: RecoverSettings,
     number: int,
 ) -> Solution:
-    """Solve again for targets corrected by `differences(k)`, reference minus render of picture k for `solution`.
+    """Solve again for targets corrected by `differences(k)`, reference minus render of picture k for `solution`; the
+    references, and how much they count, are `gathered`'s observations.
 
     Each texel's prior is the mean of its neighbours, weighted by how sure they are, as firm as the surface is smooth.
     """
@@ -227,6 +235,9 @@ def another_round(
         if len(sighting.rows):
             target[sighting.rows] += fetch(differences(k), sighting)
     problem.retarget(target)
+    weight = gathered.observations.weight
+    unlike = UNLIKE * np.abs(target - gathered.observations.rgb).max(axis=1)
+    problem.reweight(weight / (1 + weight * unlike))
     where = joined(where, *(placed(v, gathered, where, 0) for v in (solution.values, _open(solution, gathered))))
     mean = neighbourhood(solution.values, sureness(solution, gathered), gathered, where, BLUR, OVER_SEAMS)
     prior = belief(solution, mean, gathered, where, settings.neighbours)

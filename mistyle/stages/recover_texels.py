@@ -143,7 +143,7 @@ def solve_texels(
             return solving.first_solve(problem, first, mean, gathered.seen, settings, heard)
 
         solution = solved_first(lambda done: progress(0.3 + 0.2 * done))
-        pictures = len(work.captures)
+        pictures, less = len(work.captures), gathered
         estimated, total = estimates(settings, pictures)[0], all_rounds(settings, pictures)
         for number in range(total):
             table = solving.spread_out(solution.values, gathered, where)
@@ -154,8 +154,9 @@ def solve_texels(
             if 0 < number <= settings.rounds * len(estimated) and number % settings.rounds == 0:
                 samples = estimated[number // settings.rounds - 1]
                 take_off_indirect(work, shade, table, indirect, samples, seed + number, lambda d: heard(0.4 * d))
-                problem.reweight(doubted(gathered, work.captures, indirect))
-                problem.retarget(observed(gathered, work.captures))
+                less = direct(gathered, work.captures, indirect)
+                problem.reweight(less.observations.weight)
+                problem.retarget(less.observations.rgb)
                 solution = solved_first(lambda d: heard(0.4 + 0.4 * d))
                 table = solving.spread_out(solution.values, gathered, where)
             shade.table = table
@@ -167,7 +168,7 @@ def solve_texels(
                 lost.append(float((wrong**2).mean()))
                 return wrong
 
-            solution = solving.another_round(problem, gathered, where, solution, differences, settings, number)
+            solution = solving.another_round(problem, less, where, solution, differences, settings, number)
             trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
             heard(1.0)
         values = solution.values
@@ -202,7 +203,8 @@ def take_off_indirect(
     vectors: Callable[[int, np.ndarray], None] | None = None,
 ) -> None:
     """Estimate the indirect light of every picture with the maps found so far; `indirect` then holds it. Leaves the
-    table in `shade`. `vectors` gets each picture's vector irradiance (`Indirect.pictures_and_vectors`)."""
+    table in `shade`. `vectors` gets each picture's vector irradiance (`Indirect.pictures_and_vectors`), when `indirect`
+    has its light."""
     from mistyle.render.indirect import Indirect, in_proportion, retarget
     from mistyle.render.shade import unpack
 
@@ -216,31 +218,26 @@ def take_off_indirect(
         found: list[tuple[np.ndarray, Any]]
         found = scene.pictures_and_vectors(*asked) if vectors else [(light, None) for light in scene.pictures(*asked)]
         for k, (light, vector) in zip(group, found, strict=True):
-            if vectors:
-                vectors(k, vector)
             indirect.pop(k, None)
             rgb, mask = captures.load(k)
             counts = (mask & np.isfinite(rgb).all(axis=-1))[..., None]
             indirect[k] = in_proportion(light, shade.image(k) * counts, np.where(counts, rgb, 0))
             retarget(shade, k, captures.load(k)[0], weights(k))
+            if vectors:
+                vectors(k, vector)
         done += len(group)
         progress(done / len(captures))
 
 
-def observed(gathered: Gathered, captures: Captures) -> Float[np.ndarray, "n 3"]:
-    """What the pictures show where texels were observed, less the light between surfaces that was taken off them."""
-    rgb = gathered.observations.rgb.copy()
+def direct(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> Gathered:
+    """The same observations without the light between surfaces that was taken off the pictures, and with their weights
+    less by the doubt about it."""
+    rgb, weight = gathered.observations.rgb.copy(), gathered.observations.weight.copy()
     for k, sighting in enumerate(gathered.sightings):
-        if len(sighting.rows):
-            rgb[sighting.rows] = fetch(np.nan_to_num(captures.load(k)[0]), sighting)
-    return rgb
-
-
-def doubted(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> np.ndarray:
-    """Weights of the observations with the doubt about the indirect light that was taken off them."""
-    weight = gathered.observations.weight.copy()
-    for k, light in indirect.items():
-        sighting = gathered.sightings[k]
-        taken = fetch(enlarged(light, captures.cameras[k].size), sighting).max(axis=1)
-        weight[sighting.rows] /= 1 + weight[sighting.rows] * DOUBT * taken
-    return weight
+        if not len(sighting.rows):
+            continue
+        rgb[sighting.rows] = fetch(np.nan_to_num(captures.load(k)[0]), sighting)
+        if k in indirect:
+            taken = fetch(enlarged(indirect[k], captures.cameras[k].size), sighting).max(axis=1)
+            weight[sighting.rows] /= 1 + weight[sighting.rows] * DOUBT * taken
+    return replace(gathered, observations=replace(gathered.observations, rgb=rgb, weight=weight))
