@@ -46,13 +46,11 @@ class Indirect:
         import mitsuba
 
         mi: Any = mitsuba
-
-        def made(least: float) -> Any:
-            held = [replace(m, roughness=np.maximum(m.roughness, np.float32(least))) for m in maps]
-            shapes = scenery.object_shapes(mesh, held, model=model, frame=frame)
-            return mi.load_dict({"type": "scene", **shapes}, optimize=False)
-
-        self.first, self.scene = made(0), made(ROUGH)
+        matt = [replace(m, roughness=np.maximum(m.roughness, np.float32(ROUGH))) for m in maps]
+        shapes = scenery.object_shapes(mesh, matt, model=model, frame=frame)
+        self.scene = mi.load_dict({"type": "scene", **shapes}, optimize=False)
+        sharp = {f"part{p}": scenery.bsdf_dict(m, model=model, frame=frame) for p, m in enumerate(maps)}
+        self.sharp = [(shape, mi.load_dict(sharp[name])) for name, shape in shapes.items()]
 
     def pictures(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
@@ -98,7 +96,7 @@ class Indirect:
             emitter.set_scene(self.scene)
         times, each = scenery.passes(samples)
         sensor = mi.load_dict(scenery.sensor_dict(small, each))
-        options = (self.first, self.scene, sensor, lit, each)
+        options = (self.scene, self.sharp, sensor, lit, each)
         passes = [_traced(*options, seed + k * 7919, vectors) for k in range(times)]
         whole = np.mean(passes, axis=0)
         share = whole[..., 0]
@@ -126,12 +124,17 @@ class Indirect:
 
 
 def _traced(
-    seen_first: Any, scene: Any, sensor: Any, lit: Sequence[Sequence[Any]], each: int, seed: int, vectors: bool
+    scene: Any,
+    sharp: Sequence[tuple[Any, Any]],
+    sensor: Any,
+    lit: Sequence[Sequence[Any]],
+    each: int,
+    seed: int,
+    vectors: bool,
 ) -> np.ndarray:
     """(h, w, 10 + 3 n) float32, means of `each` samples a pixel: coverage, position, shading normal and diffuse albedo
     of the first surface point, and indirect radiance under each of n = len(lit) sets of emitters; with `vectors` 9 n
-    more, x, y and z of each set's vector irradiance there. Both scenes have the same surfaces: the camera sees that of
-    `seen_first`."""
+    more, x, y and z of each set's vector irradiance there. `sharp`: of each shape the reflectance at that point."""
     import drjit as dr
     import mitsuba
 
@@ -146,12 +149,14 @@ def _traced(
     place = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row)) + sampler.next_2d()
     ray, _ = sensor.sample_ray(0.0, 0.0, place / mi.Point2f(width, height), mi.Point2f(0.5))
     context = mi.BSDFContext()
-    first = seen_first.ray_intersect(ray)
-    seen = first.is_valid()
+    first = scene.ray_intersect(ray)
+    seen, surface = first.is_valid(), first.bsdf()
+    for shape, reflectance in sharp:
+        surface = dr.select(first.shape == mi.ShapePtr(shape), mi.BSDFPtr(reflectance), surface)
 
-    def onward(si: Any, through: Any, active: Any, sampler: Any) -> tuple[Any, ...]:
+    def onward(si: Any, surface: Any, through: Any, active: Any, sampler: Any) -> tuple[Any, ...]:
         """The next ray, what it carries, its density, where it begins, and whether it goes on."""
-        sample, weight = si.bsdf().sample(context, si, sampler.next_1d(active), sampler.next_2d(active), active)
+        sample, weight = surface.sample(context, si, sampler.next_1d(active), sampler.next_2d(active), active)
         through = dr.select(active, through * weight, 0)
         ray = si.spawn_ray(si.to_world(sample.wo))
         return ray, through, mi.Float(sample.pdf), mi.Interaction3f(si), active & (dr.max(through) > 0)
@@ -166,10 +171,15 @@ def _traced(
             for own in lit
         )
         more = (total + through * light for total, light in zip(sums, arriving, strict=True))
-        return k + 1, *onward(si, through, hit, sampler), sampler, *more
+        return k + 1, *onward(si, si.bsdf(), through, hit, sampler), sampler, *more
 
     points, soft = DEPTH - 2, any(emitter.is_environment() for own in lit for emitter in own)
-    start = (mi.UInt32(0), *onward(first, mi.Color3f(1), seen, sampler), sampler, *(mi.Color3f(0) for _ in lit))
+    start = (
+        mi.UInt32(0),
+        *onward(first, surface, mi.Color3f(1), seen, sampler),
+        sampler,
+        *(mi.Color3f(0) for _ in lit),
+    )
     ended = dr.while_loop(start, lambda k, *rest: rest[4] & (k < points + soft), body, label="indirect")
     albedo = first.bsdf().eval_diffuse_reflectance(first, seen)
     values, arriving = [mi.Float(1)], []
