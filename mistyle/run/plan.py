@@ -44,7 +44,7 @@ PER_CROP_PIXEL = 1.6e-6
 # path of light between surfaces; a covered texel in one word of its neighbours.
 PER_READ_PIXEL = 8e-7
 PER_LOOK = 2e-7
-PER_OBSERVATION = 4e-7
+PER_OBSERVATION = 4e-7  # a step, where a solve that begins anew has two starts
 PER_BOUNCED_PATH = 1e-7
 PER_SMOOTHED = 1.5e-5
 PER_JOINT = 1.5e-5  # of a pixel that shows the object, for each joint step
@@ -99,6 +99,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     """
     from mistyle.render.indirect import MOST
     from mistyle.run.material import pixels_of, references_of
+    from mistyle.stages.recover_solve import STARTS
 
     s, files = job.settings, input_files(job.mesh)
     sizes = pixels_of(references_of(job))
@@ -108,7 +109,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
     rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
-    begun = solves * (1 + len(estimated[0]))
+    begun = solves * (1 + len(estimated[0])) * len(STARTS) / 2
     steps, joint = 0 if s.recover.solver == "texels" else s.recover.iterations, joint_steps(s.recover)
     samples = solves * sum(sum(part) for part in estimated)
     again = joint_estimates(s.recover)
