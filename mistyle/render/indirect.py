@@ -193,11 +193,18 @@ def _traced(
             arriving += [radiance * ray.d.x, radiance * ray.d.y, radiance * ray.d.z]
     for vector in (first.p, first.sh_frame.n, albedo, *ended[7:], *arriving):
         values += [vector.x, vector.y, vector.z]
-    sums = [dr.zeros(mi.Float, width * height) for _ in values]
+    return _pixels(values, pixel, seen, width * height, each).reshape(height, width, -1)
+
+
+def _pixels(values: Sequence[Any], pixel: Any, seen: Any, count: int, each: int) -> np.ndarray:
+    """(count, n) float32: means over the `each` samples of every pixel, of n values a sample; 0 where not `seen`."""
+    import drjit as dr
+
+    sums = [dr.zeros(type(values[0]), count) for _ in values]
     for total, value in zip(sums, values, strict=True):
         dr.scatter_add(total, value / each, pixel, seen)
     dr.eval(sums)
-    return np.stack([np.array(total) for total in sums], axis=-1).reshape(height, width, -1)
+    return np.stack([np.array(total) for total in sums], axis=-1)
 
 
 def _arriving(

@@ -44,7 +44,7 @@ PER_CROP_PIXEL = 1.6e-6
 # path of light between surfaces; a covered texel in one word of its neighbours.
 PER_READ_PIXEL = 8e-7
 PER_LOOK = 2e-7
-PER_OBSERVATION = 4e-7  # a step, where a solve that begins anew has two starts
+PER_OBSERVATION = 4e-7  # in one step of a solve; of one that begins anew, with two starts
 PER_BOUNCED_PATH = 1e-7
 PER_SMOOTHED = 1.5e-5
 PER_JOINT = 1.5e-5  # of a pixel that shows the object, for each joint step
@@ -109,7 +109,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
     rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
-    begun = solves * (1 + len(estimated[0])) * len(STARTS) / 2
+    begun = solves * (1 + len(estimated[0]))
     steps, joint = 0 if s.recover.solver == "texels" else s.recover.iterations, joint_steps(s.recover)
     samples = solves * sum(sum(part) for part in estimated)
     again = joint_estimates(s.recover)
@@ -122,7 +122,7 @@ def plan_material(job: Any) -> dict[str, Any]:
         "cameras": 1,
         "pictures": sum(sizes) * PER_READ_PIXEL,
         "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
-        + (begun + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
+        + (begun * len(STARTS) / 2 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
         + paths * PER_BOUNCED_PATH
         + joint * max(1, len(again)) * SHOWN * sum(averaged) * PER_JOINT
         + words * COVERED * texels * PER_SMOOTHED,

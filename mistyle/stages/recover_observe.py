@@ -131,6 +131,11 @@ def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, 
     return _bilinear(image, at.pixel, at.x, at.y)
 
 
+def less_sure(weight: Float[np.ndarray, " n"], more: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Weights, one over a standard deviation, once `more` is added to it."""
+    return weight / (1 + weight * more)
+
+
 def deviation(level: Float[np.ndarray, " n"], noise: float, relative: float) -> Float[np.ndarray, " n"]:
     """Standard deviations of what was observed with radiance `level`: noise · (the brightest, robustly) + relative ·
     level."""

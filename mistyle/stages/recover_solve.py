@@ -19,7 +19,7 @@ from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.render.texel_lm import UNKNOWNS, Problem, Solution
 from mistyle.stages.neighbours import Links, believed, links
-from mistyle.stages.recover_observe import Gathered, fetch
+from mistyle.stages.recover_observe import Gathered, fetch, less_sure
 from mistyle.stages.recover_settings import RecoverSettings
 
 # Where a texel is thought to be before anything was seen, and how far from there (standard deviations).
@@ -235,9 +235,8 @@ def another_round(
         if len(sighting.rows):
             target[sighting.rows] += fetch(differences(k), sighting)
     problem.retarget(target)
-    weight = gathered.observations.weight
-    unlike = UNLIKE * np.abs(target - gathered.observations.rgb).max(axis=1)
-    problem.reweight(weight / (1 + weight * unlike))
+    apart = np.abs(target - gathered.observations.rgb).max(axis=1)
+    problem.reweight(less_sure(gathered.observations.weight, UNLIKE * apart))
     where = joined(where, *(placed(v, gathered, where, 0) for v in (solution.values, _open(solution, gathered))))
     mean = neighbourhood(solution.values, sureness(solution, gathered), gathered, where, BLUR, OVER_SEAMS)
     prior = belief(solution, mean, gathered, where, settings.neighbours)

@@ -15,7 +15,7 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.render.indirect import enlarged
 from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust
-from mistyle.stages.recover_observe import Gathered, fetch
+from mistyle.stages.recover_observe import Gathered, fetch, less_sure
 from mistyle.stages.recover_settings import RecoverSettings, all_rounds, estimates
 from mistyle.stages.texels import rasterise
 
@@ -143,7 +143,7 @@ def solve_texels(
             return solving.first_solve(problem, first, mean, gathered.seen, settings, heard)
 
         solution = solved_first(lambda done: progress(0.3 + 0.2 * done))
-        pictures, less = len(work.captures), gathered
+        pictures, sure = len(work.captures), gathered.observations.weight
         estimated, total = estimates(settings, pictures)[0], all_rounds(settings, pictures)
         for number in range(total):
             table = solving.spread_out(solution.values, gathered, where)
@@ -154,9 +154,9 @@ def solve_texels(
             if 0 < number <= settings.rounds * len(estimated) and number % settings.rounds == 0:
                 samples = estimated[number // settings.rounds - 1]
                 take_off_indirect(work, shade, table, indirect, samples, seed + number, lambda d: heard(0.4 * d))
-                less = direct(gathered, work.captures, indirect)
-                problem.reweight(less.observations.weight)
-                problem.retarget(less.observations.rgb)
+                gathered = direct(gathered, sure, work.captures, indirect)
+                problem.reweight(gathered.observations.weight)
+                problem.retarget(gathered.observations.rgb)
                 solution = solved_first(lambda d: heard(0.4 + 0.4 * d))
                 table = solving.spread_out(solution.values, gathered, where)
             shade.table = table
@@ -168,7 +168,7 @@ def solve_texels(
                 lost.append(float((wrong**2).mean()))
                 return wrong
 
-            solution = solving.another_round(problem, less, where, solution, differences, settings, number)
+            solution = solving.another_round(problem, gathered, where, solution, differences, settings, number)
             trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
             heard(1.0)
         values = solution.values
@@ -229,15 +229,17 @@ def take_off_indirect(
         progress(done / len(captures))
 
 
-def direct(gathered: Gathered, captures: Captures, indirect: dict[int, np.ndarray]) -> Gathered:
-    """The same observations without the light between surfaces that was taken off the pictures, and with their weights
-    less by the doubt about it."""
-    rgb, weight = gathered.observations.rgb.copy(), gathered.observations.weight.copy()
+def direct(
+    gathered: Gathered, sure: Float[np.ndarray, " o"], captures: Captures, indirect: dict[int, np.ndarray]
+) -> Gathered:
+    """The same observations without the light between surfaces that was taken off the pictures. Their weights are
+    `sure`, those of pictures as they came, less by the doubt about that light."""
+    rgb, weight = gathered.observations.rgb.copy(), sure.copy()
     for k, sighting in enumerate(gathered.sightings):
         if not len(sighting.rows):
             continue
         rgb[sighting.rows] = fetch(np.nan_to_num(captures.load(k)[0]), sighting)
         if k in indirect:
             taken = fetch(enlarged(indirect[k], captures.cameras[k].size), sighting).max(axis=1)
-            weight[sighting.rows] /= 1 + weight[sighting.rows] * DOUBT * taken
+            weight[sighting.rows] = less_sure(weight[sighting.rows], DOUBT * taken)
     return replace(gathered, observations=replace(gathered.observations, rgb=rgb, weight=weight))
