@@ -15,7 +15,7 @@ from mistyle.render import hits as collecting
 from mistyle.render.indirect import Indirect
 from mistyle.render.shade import Shade, pack, unpack
 from mistyle.stages import joint_pixels
-from mistyle.stages.recover_solve import linked
+from mistyle.stages.recover_table import linked
 from mistyle.stages.recover_texels import Work
 from mistyle.stages.texels import rasterise
 

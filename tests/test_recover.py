@@ -26,8 +26,9 @@ from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import usable
 from mistyle.stages.recover_observe import Gathered, gather
 from mistyle.stages.recover_pictures import SHORTEST
+from mistyle.stages.recover_prior import NOTHING
 from mistyle.stages.recover_settings import RecoverSettings, estimates, passes
-from mistyle.stages.recover_solve import NOTHING, Atlas
+from mistyle.stages.recover_table import Atlas
 from mistyle.stages.recover_texels import Found
 from mistyle.stages.texels import rasterise
 
@@ -139,14 +140,13 @@ SIDE = 64
 def found_texels(values: np.ndarray, noise: float, prior: float, seen: np.ndarray):
     """What a solver would say of an atlas of SIDE² texels without seams: solution, observations, neighbours."""
     from mistyle.render.texel_lm import Observations, Points, Rig, Solution
-    from mistyle.stages import recover_solve as solving
 
     count = SIDE * SIDE
     priors, alone = np.full(values.shape, 1 / prior**2, np.float32), np.where(seen[:, None] > 0, 1 / noise**2, 1e-9)
     spread = np.broadcast_to(1 / np.sqrt(alone + priors), values.shape).astype(np.float32)
     solution = Solution(values.astype(np.float32), np.zeros(count, np.float32), spread, spread, priors)
     grid = of_islands(np.zeros((SIDE, SIDE), int))
-    where = solving.Atlas(((SIDE, SIDE),), (np.ones((SIDE, SIDE), bool),), (np.arange(count),), (grid,))
+    where = Atlas(((SIDE, SIDE),), (np.ones((SIDE, SIDE), bool),), (np.arange(count),), (grid,))
     start = np.concatenate([[0], np.cumsum(seen)])
     zeros, none = np.zeros(start[-1], np.float32), np.zeros((0, 3), np.float32)
     rgb = np.zeros((start[-1], 3), np.float32)
@@ -159,7 +159,7 @@ def found_texels(values: np.ndarray, noise: float, prior: float, seen: np.ndarra
 @pytest.mark.parametrize(("variation", "noise"), [(0.0, 0.01), (0.01, 0.01), (0.02, 0.005), (0.2, 0.01)])
 def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
     """Texels that differ by `variation`, found with `noise` under a prior that has drawn them to their mean."""
-    from mistyle.stages import recover_solve as solving
+    from mistyle.stages import recover_prior
 
     mean = np.full((SIDE * SIDE, 7), 0.5, np.float32)
     truth = mean + variation * rng.standard_normal(mean.shape)
@@ -167,11 +167,11 @@ def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
     prior, alone = 0.03**-2, noise**-2
     values = (found * alone + mean * prior) / (alone + prior)
     solution, gathered, where = found_texels(values, noise, 0.03, np.full(SIDE * SIDE, 9))
-    np.testing.assert_allclose(solving.likelihood(solution)[0], noise, rtol=1e-2)
+    np.testing.assert_allclose(recover_prior.likelihood(solution)[0], noise, rtol=1e-2)
     own = noise**-2 / (noise**-2 + 0.03**-2)
-    np.testing.assert_allclose(solving.decided(solution, gathered), own, rtol=1e-2)
-    firm = 1 / np.sqrt(solving.belief(solution, mean, gathered, where, 0.03))
-    wanted = np.clip(variation, solving.LEAST, 0.03)
+    np.testing.assert_allclose(recover_prior.decided(solution, gathered), own, rtol=1e-2)
+    firm = 1 / np.sqrt(recover_prior.belief(solution, mean, gathered, where, 0.03))
+    wanted = np.clip(variation, recover_prior.LEAST, 0.03)
     if variation > 0:
         np.testing.assert_allclose(np.median(firm[:, 3:5]), wanted, rtol=0.1)
     else:
@@ -183,56 +183,56 @@ def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
 def test_where_nothing_is_known_a_surface_is_level(rng, tilt):
     """The half that nobody saw has wild tilts, as neighbours of badly seen texels get: they are drawn to none, and what
     is left open is how much tilts vary where they are known. The half that was seen keeps its neighbours' mean."""
-    from mistyle.stages import recover_solve as solving
+    from mistyle.stages import recover_prior
 
     values = np.full((SIDE * SIDE, 7), 0.5, np.float32)
     values[:, 3:5] = np.hypot(tilt, 0.01) * rng.standard_normal((SIDE * SIDE, 2))
     half = np.arange(SIDE * SIDE) < SIDE * SIDE // 2
     values[~half, 3:5] = 0.4
     solution, gathered, where = found_texels(values, 0.01, 0.6, np.where(half, 9, 0))
-    np.testing.assert_allclose(solving.varied(solution, gathered), tilt**2, rtol=0.15)
+    np.testing.assert_allclose(recover_prior.varied(solution, gathered), tilt**2, rtol=0.15)
     mean, firm = values.copy(), np.full(values.shape, 1 / 0.01**2, np.float32)
     mean[:, 3:5] = np.where(half[:, None], 0.1, 0.4)
-    level, prior = solving.levelled(solution, mean, firm, gathered, where)
-    far = solving.BLUR * SIDE  # rows next to the border have neighbours from both halves
+    level, prior = recover_prior.levelled(solution, mean, firm, gathered, where)
+    far = recover_prior.BLUR * SIDE  # rows next to the border have neighbours from both halves
     np.testing.assert_allclose(level[: SIDE * SIDE // 2 - far, 3:5], 0.1, rtol=0.05)
     assert (np.abs(level[SIDE * SIDE // 2 + far :, 3:5]) < 1e-3).all()
     np.testing.assert_allclose(prior[-1, 3:5] ** -0.5, np.hypot(0.01, tilt), rtol=0.1)
     np.testing.assert_array_equal(level[:, [0, 1, 2, 5, 6]], mean[:, [0, 1, 2, 5, 6]])
     solution.cost[:] = 3 * (9 - 7 / 3)  # what does not fit, here 3 times what it should, holds them more firmly
-    again = solving.levelled(solution, mean, firm, gathered, where)[1]
+    again = recover_prior.levelled(solution, mean, firm, gathered, where)[1]
     np.testing.assert_allclose((again / prior)[: SIDE * SIDE // 2 - far, 3:5], 2, rtol=0.15)
     solution.cost[:] = 0
     # Seen in parts only, it is for the pictures to say what tilts there are, where there are any.
-    share = solving.decided(solution, gathered)
+    share = recover_prior.decided(solution, gathered)
     assert (share[half] > 0.9).all()
-    np.testing.assert_allclose(share[~half], tilt**2 / (tilt**2 + solving.KNOWN**2), rtol=0.1)
+    np.testing.assert_allclose(share[~half], tilt**2 / (tilt**2 + recover_prior.KNOWN**2), rtol=0.1)
 
 
 def test_misfit_is_of_those_that_could_contradict_themselves():
     """A texel seen once has a cost of zero whatever it saw: its misfit is its neighbours'."""
-    from mistyle.stages import recover_solve as solving
+    from mistyle.stages import recover_prior
 
     seen = np.where(np.arange(SIDE * SIDE) % 2 == 0, 1, 9)
     values = np.full((SIDE * SIDE, 7), 0.5, np.float32)
     solution, gathered, where = found_texels(values, 0.01, 0.6, seen)
     solution.cost[seen == 9] = 20.0
-    np.testing.assert_allclose(solving.misfit(solution, gathered, where), 20 / (9 - 7 / 3), rtol=1e-4)
+    np.testing.assert_allclose(recover_prior.misfit(solution, gathered, where), 20 / (9 - 7 / 3), rtol=1e-4)
     solution, gathered, where = found_texels(values, 0.01, 0.6, np.ones_like(seen))
-    assert (solving.misfit(solution, gathered, where) == 0).all()
+    assert (recover_prior.misfit(solution, gathered, where) == 0).all()
 
 
 def test_what_observations_tell_is_measured_by_how_well_they_fit():
     """Unseen: nothing. Fitting as `noise` promises: that, with the margin. Far better: as BEST_FIT. Worse: less."""
-    from mistyle.stages import recover_solve as solving
+    from mistyle.stages import recover_prior
 
     seen = np.where(np.arange(SIDE * SIDE) < SIDE, 0, 9)
     solution, gathered, where = found_texels(np.full((SIDE * SIDE, 7), 0.5, np.float32), 0.01, 0.6, seen)
-    for cost, wanted in ((0, solving.BEST_FIT), (1, 1), (4, 4)):
+    for cost, wanted in ((0, recover_prior.BEST_FIT), (1, 1), (4, 4)):
         solution.cost[:] = np.where(seen > 0, 3 * cost * (9 - 7 / 3), 0)
-        told = solving.told(solution, gathered, where)
-        assert (told[seen == 0] == solving.NOTHING).all()
-        np.testing.assert_allclose(told[seen > 0] / 0.01, np.sqrt(solving.MARGIN * wanted), rtol=0.02)
+        told = recover_prior.told(solution, gathered, where)
+        assert (told[seen == 0] == recover_prior.NOTHING).all()
+        np.testing.assert_allclose(told[seen > 0] / 0.01, np.sqrt(recover_prior.MARGIN * wanted), rtol=0.02)
 
 
 @pytest.mark.parametrize(("step", "noise", "most"), [(1, 0.03, 0.7), (3, 0.05, 0.7)])
@@ -475,19 +475,19 @@ def test_whole_pictures_leave_no_texel_as_open_as_the_solver_did():
 
 def test_what_is_believed_of_metals_is_one_prior(rng: np.random.Generator):
     """The neighbours' prior, metal or not, and how much metals reflect: their sum is the one prior and its constant."""
-    from mistyle.stages import recover_solve as solving
+    from mistyle.stages import recover_prior
 
     x, mean, prior = (rng.uniform(0.1, 2, (20, 7)).astype(np.float32) for _ in range(3))
     metal = np.repeat([0, 1], 10).astype(np.float32)
-    around, weight, constant = solving._both(mean, prior, metal)
-    wanted = ((x - mean) ** 2 * prior).sum(axis=1) + (x[:, 6] - metal) ** 2 / solving.METAL_SPREAD**2
-    wanted += metal * ((x[:, :3] - solving.METAL_ALBEDO) ** 2).sum(axis=1) / solving.METAL_ALBEDOS**2
+    around, weight, constant = recover_prior.both(mean, prior, metal)
+    wanted = ((x - mean) ** 2 * prior).sum(axis=1) + (x[:, 6] - metal) ** 2 / recover_prior.METAL_SPREAD**2
+    wanted += metal * ((x[:, :3] - recover_prior.METAL_ALBEDO) ** 2).sum(axis=1) / recover_prior.METAL_ALBEDOS**2
     np.testing.assert_allclose(((x - around) ** 2 * weight).sum(axis=1) + constant, wanted, rtol=1e-4)
 
 
 def test_black_that_no_gloss_shows_on_is_rather_a_mirror():
     """Black paint costs more than a metal where it is smooth and seen often, and nothing where its gloss shows."""
-    from mistyle.stages.recover_solve import OFTEN, unlikely
+    from mistyle.stages.recover_prior import OFTEN, unlikely
 
     values = np.zeros((4, 7), np.float32)
     values[:, 5] = 0.1, 0.8, 0.1, 0.1

@@ -18,7 +18,8 @@ from mistyle.stages import joint_algebra as algebra
 from mistyle.stages import recover_joint as joint
 from mistyle.stages.joint_pixels import Unknown, all_pixels
 from mistyle.stages.recover import recover
-from mistyle.stages.recover_solve import NOTHING, linked
+from mistyle.stages.recover_prior import NOTHING
+from mistyle.stages.recover_table import linked
 from mistyle.stages.recover_texels import Work
 
 FEW = QUICK.model_copy(update={"iterations": 60, "rounds": 1})

@@ -7,7 +7,7 @@ import pytest
 
 from mistyle.stages import recover_smooth as smoothing
 from mistyle.stages.neighbours import NONE, Links, Seam, of_islands, within
-from mistyle.stages.recover_solve import Atlas
+from mistyle.stages.recover_table import Atlas
 
 FLOOR = 0.04
 
@@ -63,7 +63,8 @@ def test_the_result_is_the_minimum_that_is_promised(rng: np.random.Generator):
             over += middle in seams
     assert over >= 8
     wanted = np.linalg.solve(matrix, (found / error.astype(np.float64) ** 2).ravel())
-    got = smoothing._likely(found, error, variance, held, cut(covered, column)).ravel()
+    field = smoothing.Field(slice(0, found.size), found, error, variance, held, cut(covered, column))
+    got = smoothing._likely(field).ravel()
     assert np.abs(got - wanted).max() < 2e-3 * np.abs(wanted - found.ravel()).max()
 
 

@@ -16,7 +16,7 @@ from mistyle.files.read import read_mesh
 from mistyle.render.draw import tracer
 from mistyle.render.sky import even_directions, gathered_in
 from mistyle.render.texel_lm import Options
-from mistyle.stages import light_cells, light_solve, recover_solve, unknown_light
+from mistyle.stages import light_cells, light_solve, recover_prior, unknown_light
 from mistyle.stages.recover_observe import gather
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
@@ -143,7 +143,7 @@ def test_texels_are_eliminated_as_from_the_whole_matrix(mesh, captures):
     wrong = rng.normal(0, 1, (rows, 3)) * own.used[:, None]
     values = light_solve.first_values(own) + rng.normal(0, 0.1, (count, 7)).astype(np.float32)
     lost, slope = light_solve._followed(own, values, by_texel, by_light, wrong)
-    told = np.flatnonzero(own.gathered.seen >= recover_solve.LEAST_SEEN)
+    told = np.flatnonzero(own.gathered.seen >= recover_prior.LEAST_SEEN)
     expected, pulled = np.zeros((3 * cells, 3 * cells)), np.zeros(3 * cells)
     prior = np.diag(np.array(light_solve.SPREAD) ** -2.0)
     for texel in told:

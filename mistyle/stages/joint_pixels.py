@@ -21,7 +21,7 @@ from mistyle.render.hits import Hits, collect, corners
 from mistyle.render.indirect import PALE, enlarged
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover_observe import covered_rows, points_of
-from mistyle.stages.recover_solve import fill
+from mistyle.stages.recover_table import fill
 from mistyle.stages.recover_texels import Work
 
 PIXEL, WEIGHT = 240, 8  # bytes of a pixel, and of a bilinear weight

@@ -22,7 +22,7 @@ from mistyle.render.texel_shares import shares
 from mistyle.render.texel_views import open_sky
 from mistyle.stages.light_cells import Cells, Radiance
 from mistyle.stages.recover_observe import Gathered
-from mistyle.stages.recover_solve import LEAST_SEEN
+from mistyle.stages.recover_prior import LEAST_SEEN
 
 # Of a texel's unknowns: where they are thought to be, and standard deviations. Tilts are small on the whole, or the
 # whole surface would lean towards where the light is wrong.

@@ -20,12 +20,12 @@ from jaxtyping import Float, Int
 from mistyle.core.capture import Captures
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
-from mistyle.stages import recover_solve as solving
 from mistyle.stages.recover_check import trust, usable, without
 from mistyle.stages.recover_joint import together, where_possible
 from mistyle.stages.recover_pictures import improved
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.recover_smooth import smoothed
+from mistyle.stages.recover_table import atlas, linked
 from mistyle.stages.recover_texels import Found, Work, solve_level
 
 __all__ = ["RecoverSettings", "Recovered", "recover"]
@@ -88,7 +88,7 @@ def recover(
     captures = without(whole, indirect)
     traced = tracer(mesh)
     # The steps on whole pictures know no neighbours.
-    where = solving.atlas(texels) if settings.solver == "pictures" else solving.linked(mesh, texels)
+    where = atlas(texels) if settings.solver == "pictures" else linked(mesh, texels)
     work = Work(traced, tangents_of(mesh, settings.frame), texels, where, captures, settings, notes)
     pictured = partial(
         Shade, traced, captures, where.sizes, model=settings.model, frame=settings.frame, shadows=settings.shadows

@@ -35,9 +35,10 @@ from mistyle.render.indirect import enlarged
 from mistyle.stages.joint_algebra import Linear, Unknowns, conjugate, curved, own_blocks, right_side
 from mistyle.stages.joint_pixels import Pixels, Unknown, all_pixels, between, change, frames
 from mistyle.stages.recover_observe import deviation
+from mistyle.stages.recover_prior import MARGIN, NOTHING
 from mistyle.stages.recover_settings import RecoverSettings, joint_estimates, joint_steps
 from mistyle.stages.recover_smooth import LEAST, firmness
-from mistyle.stages.recover_solve import MARGIN, NOTHING, Atlas, joined
+from mistyle.stages.recover_table import Atlas, joined
 from mistyle.stages.recover_texels import Work, take_off_indirect
 
 # By which the pictures' derivatives are taken: columns of the table that move together, and how far to either side. A

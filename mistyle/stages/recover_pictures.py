@@ -12,9 +12,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core import stopping
+from mistyle.stages.recover_prior import NOTHING
 from mistyle.stages.recover_settings import RecoverSettings, passes
 from mistyle.stages.recover_smooth import smoothed
-from mistyle.stages.recover_solve import NOTHING, Atlas, fill
+from mistyle.stages.recover_table import Atlas, fill
 from mistyle.stages.recover_texels import Found, Work, take_off_indirect
 
 JUDGES = 48  # pictures that say whether the steps helped

@@ -14,13 +14,15 @@ would else go on along its slope, farther than any that is known. `spread` is me
 """
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.stages.neighbours import Links, within
-from mistyle.stages.recover_solve import METAL_SPREAD, OVER_SEAMS, Atlas, diffused, fill, joined
+from mistyle.stages.recover_prior import METAL_SPREAD
+from mistyle.stages.recover_table import OVER_SEAMS, Atlas, diffused, fill, joined
 
 # Channels of the table that are smoothed, and the least standard deviation of their second differences. Not metallic:
 # surfaces are metal or not.
@@ -42,6 +44,19 @@ Line = Bool[np.ndarray, "h v"]  # which texels have a neighbour on either side i
 Both = tuple[np.ndarray, np.ndarray]  # along rows, and along columns (transposed)
 
 
+@dataclass(frozen=True)
+class Field:
+    """One channel in one texture set: its rows of the table, what was found and its errors, the variance of its second
+    differences, how firmly values are held to none, and which texels are neighbours."""
+
+    part: slice
+    found: Grid
+    error: Grid
+    variance: Grid
+    held: Grid
+    among: Links
+
+
 def smoothed(
     table: Float[np.ndarray, "a 8"],
     noise: Float[np.ndarray, "a 7"],
@@ -57,8 +72,8 @@ def smoothed(
     """
     moved, where = np.zeros_like(table), joined(where, table[:, :7], noise)
     for c in LEAST:
-        for part, found, among, error, variance, held in _sets(table, noise, where, c):
-            moved[part, c] = (_likely(found, error, variance, held, among) - found).ravel()
+        for one in _fields(table, noise, where, c):
+            moved[one.part, c] = (_likely(one) - one.found).ravel()
     result = table + fill(moved, where)
     if metallic:
         result = _settled(result, noise)
@@ -72,13 +87,11 @@ def firmness(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"], w
     x' P x, of variances as `smoothed` measures them on `table`. `where`: with its seams believed (`joined`)."""
     from scipy.sparse import block_diag
 
-    sets = [_prior(variance, held, among) for _, _, among, _, variance, held in _sets(table, noise, where, channel)]
-    return block_diag(sets, format="csr")
+    return block_diag([_prior(one) for one in _fields(table, noise, where, channel)], format="csr")
 
 
-def _sets(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Iterator[tuple[Any, ...]]:
-    """Of every texture set: its rows, the channel's values, neighbours, errors, variance of second differences, and how
-    firmly values are held to none."""
+def _fields(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Iterator[Field]:
+    """The channel in every texture set."""
     held = _held(table, noise, where, channel) if channel in TILTS else np.zeros(len(table), np.float32)
     for k, size in enumerate(where.sizes):
         part = slice(where.offsets[k], where.offsets[k + 1])
@@ -86,7 +99,7 @@ def _sets(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> I
         error = np.minimum(noise[part, channel].reshape(size), OPEN)
         among = where.links[k] if OVER_SEAMS[channel] else within(where.links[k])
         error, variance = _measured(found, error, among, LEAST[channel])
-        yield part, found, among, error, variance, held[part].reshape(size)
+        yield Field(part, found, error, variance, held[part].reshape(size), among)
 
 
 def _held(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Float[np.ndarray, " a"]:
@@ -191,22 +204,22 @@ def _differences(variance: Grid, among: Links) -> Any:
     return csr_array((values, texels.ravel(), starts), shape=(len(texels), variance.size))
 
 
-def _prior(variance: Grid, held: Grid, among: Links) -> Any:
+def _prior(one: Field) -> Any:
     """The second and third sum of one set, as a sparse matrix."""
     from scipy.sparse import dia_array
 
-    differences = _differences(variance, among)
-    return (differences.T @ differences + dia_array((held.ravel()[None], 0), shape=(held.size, held.size))).tocsr()
+    differences, size = _differences(one.variance, one.among), one.held.size
+    return (differences.T @ differences + dia_array((one.held.ravel()[None], 0), shape=(size, size))).tocsr()
 
 
-def _likely(found: Grid, error: Grid, variance: Grid, held: Grid, among: Links) -> Float[np.ndarray, "h w"]:
+def _likely(one: Field) -> Float[np.ndarray, "h w"]:
     from scipy.sparse import dia_array
     from scipy.sparse.linalg import cg
 
-    prior = _prior(variance, held, among)
-    sure = (1 / np.maximum(error, 1e-4) ** 2).astype(np.float32).ravel()
+    prior = _prior(one)
+    sure = (1 / np.maximum(one.error, 1e-4) ** 2).astype(np.float32).ravel()
     matrix = prior + dia_array((sure[None], 0), shape=prior.shape)
     inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=prior.shape)
     # From what was found: the change is solved for, so that little of it is lost to rounding.
-    change, _ = cg(matrix, -(prior @ found.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
-    return found + change.reshape(found.shape).astype(np.float32)
+    change, _ = cg(matrix, -(prior @ one.found.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
+    return one.found + change.reshape(one.found.shape).astype(np.float32)

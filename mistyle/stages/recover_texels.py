@@ -13,10 +13,12 @@ from mistyle.core.image import resize
 from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.render.indirect import enlarged
-from mistyle.stages import recover_solve as solving
+from mistyle.render.texel_lm import Options, Problem, Solution
+from mistyle.stages import recover_prior, recover_solve
 from mistyle.stages.recover_check import trust
 from mistyle.stages.recover_observe import Gathered, fetch, less_sure
 from mistyle.stages.recover_settings import RecoverSettings, all_rounds, estimates
+from mistyle.stages.recover_table import PRIOR_MEAN, Atlas, linked, placed, spread_out
 from mistyle.stages.texels import rasterise
 
 SOFT_COST = 64  # times as long as under one light a texel takes under a sky, nearly
@@ -30,7 +32,7 @@ class Work:
     traced: Any
     tangents: np.ndarray | None
     texels: Sequence[Texels]
-    where: solving.Atlas
+    where: Atlas
     captures: Captures
     settings: RecoverSettings
     notes: list[str]
@@ -41,7 +43,7 @@ class Found:
     """What the texels found out by themselves, at the atlas's resolution; not `solved`: only where they start.
 
     `decided` is the share of a texel's tilt, 0..1, that its own pictures decide and not its neighbours; `noise` the
-    standard deviations of what they tell, `recover_solve.NOTHING` where there are none.
+    standard deviations of what they tell, `recover_prior.NOTHING` where there are none.
     """
 
     table: Float[np.ndarray, "a 8"]
@@ -68,7 +70,7 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
         return solve_texels(work, shade, start, indirect, seed, trace, progress)
     mesh = shade.traced.mesh
     texels = [rasterise(mesh, p, size[0] // by) for p, size in enumerate(work.where.sizes)]
-    where = solving.linked(mesh, texels)
+    where = linked(mesh, texels)
     small = Shade(
         shade.traced, work.captures, where.sizes, model=settings.model, frame=settings.frame,
         subsamples=settings.subsamples, shadows=settings.shadows, memory=settings.memory * 1e9,
@@ -118,7 +120,6 @@ def solve_texels(
     stay where they are, minima of another cost.
     """
     from mistyle.render.shade import pack
-    from mistyle.render.texel_lm import Options, Problem
     from mistyle.stages.recover_observe import gather
 
     settings, where = work.settings, work.where
@@ -127,11 +128,11 @@ def solve_texels(
         facing=settings.facing, noise=settings.noise, relative=settings.relative,
         skies=settings.solver != "pictures", progress=lambda done: progress(0.3 * done),
     )  # fmt: skip
-    mean = np.tile(np.array(solving.PRIOR_MEAN, np.float32), (len(gathered.texel), 1))
+    mean = np.tile(np.array(PRIOR_MEAN, np.float32), (len(gathered.texel), 1))
     first = mean.copy() if start is None else pack(start)[gathered.texel, :7].copy()
     mean[:, 6] = first[:, 6]
-    spread = np.tile(np.array(solving.PRIOR_SPREAD, np.float32), (len(mean), 1))
-    decided, noise = np.ones(len(mean), np.float32), np.full(mean.shape, solving.NOTHING, np.float32)
+    spread = np.tile(np.array(recover_prior.PRIOR_SPREAD, np.float32), (len(mean), 1))
+    decided, noise = np.ones(len(mean), np.float32), np.full(mean.shape, recover_prior.NOTHING, np.float32)
     values, solved = first, settings.solver != "pictures" and len(gathered.observations.rgb) > 0
     if solved:
         problem = Problem(
@@ -139,14 +140,14 @@ def solve_texels(
             Options(settings.model, settings.metallic, floor=settings.roughness_floor),
         )  # fmt: skip
 
-        def solved_first(heard: Callable[[float], None]) -> solving.Solution:
-            return solving.first_solve(problem, first, mean, gathered.seen, settings, heard)
+        def solved_first(heard: Callable[[float], None]) -> Solution:
+            return recover_solve.first_solve(problem, first, mean, gathered.seen, settings, heard)
 
         solution = solved_first(lambda done: progress(0.3 + 0.2 * done))
         pictures, sure = len(work.captures), gathered.observations.weight
         estimated, total = estimates(settings, pictures)[0], all_rounds(settings, pictures)
         for number in range(total):
-            table = solving.spread_out(solution.values, gathered, where)
+            table = spread_out(solution.values, gathered, where)
 
             def heard(done: float, number=number) -> None:
                 progress(0.5 + 0.5 * (number + done) / total)
@@ -158,7 +159,7 @@ def solve_texels(
                 problem.reweight(gathered.observations.weight)
                 problem.retarget(gathered.observations.rgb)
                 solution = solved_first(lambda d: heard(0.4 + 0.4 * d))
-                table = solving.spread_out(solution.values, gathered, where)
+                table = spread_out(solution.values, gathered, where)
             shade.table = table
             lost: list[float] = []
 
@@ -168,26 +169,26 @@ def solve_texels(
                 lost.append(float((wrong**2).mean()))
                 return wrong
 
-            solution = solving.another_round(problem, gathered, where, solution, differences, settings, number)
+            solution = recover_solve.another_round(problem, gathered, where, solution, differences, settings, number)
             trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
             heard(1.0)
         values = solution.values
-        decided, noise = solving.decided(solution, gathered), solving.told(solution, gathered, where)
-        spread = solution.spread * solving.inflation(solution, gathered)
+        decided, noise = recover_prior.decided(solution, gathered), recover_prior.told(solution, gathered, where)
+        spread = solution.spread * recover_prior.inflation(solution, gathered)
         bad = np.asarray(~np.isfinite(values).all(axis=1))
         if bad.any():
             work.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
             values = np.where(bad.reshape(-1, 1), mean, values)
-            spread = np.where(bad.reshape(-1, 1), np.array(solving.PRIOR_SPREAD, np.float32), spread)
+            spread = np.where(bad.reshape(-1, 1), np.array(recover_prior.PRIOR_SPREAD, np.float32), spread)
     elif settings.solver != "pictures":
         work.notes.append("No texel was observed in the light: texels were not solved one by one.")
     return Found(
-        solving.spread_out(values, gathered, where),
-        solving.placed(spread, gathered, where, np.array(solving.PRIOR_SPREAD, np.float32)),
-        solving.placed(decided, gathered, where, 1),
-        solving.placed(noise, gathered, where, solving.NOTHING),
-        solving.placed(gathered.seen, gathered, where, 0),
-        solving.placed(gathered.views, gathered, where, 0),
+        spread_out(values, gathered, where),
+        placed(spread, gathered, where, np.array(recover_prior.PRIOR_SPREAD, np.float32)),
+        placed(decided, gathered, where, 1),
+        placed(noise, gathered, where, recover_prior.NOTHING),
+        placed(gathered.seen, gathered, where, 0),
+        placed(gathered.views, gathered, where, 0),
         solved,
     )
 

@@ -21,11 +21,11 @@ from mistyle.core.light import Ambient, Environment
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.render.draw import Tracer
-from mistyle.stages import light_cells, light_solve
-from mistyle.stages import recover_solve as solving
+from mistyle.stages import light_cells, light_solve, recover_prior
 from mistyle.stages.light_solve import Bundle, State
 from mistyle.stages.recover_observe import Gathered, gather
 from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.recover_table import atlas, placed, spread_out
 from mistyle.stages.texels import rasterise
 
 SIDE = 192  # pixels along the longer side of the small pictures
@@ -108,9 +108,9 @@ def _observations(traced: Tracer, captures: Captures, settings: RecoverSettings)
     count = len(gathered.observations.rgb)
     if count > OBSERVATIONS:
         texels, gathered = observed(max(LEAST, int(side * (OBSERVATIONS / count) ** 0.5)))
-    if not (gathered.seen >= solving.LEAST_SEEN).any():
+    if not (gathered.seen >= recover_prior.LEAST_SEEN).any():
         raise InputRefused(
-            f"found no place of the mesh that {solving.LEAST_SEEN} of the pictures show, expected pictures from "
+            f"found no place of the mesh that {recover_prior.LEAST_SEEN} of the pictures show, expected pictures from "
             "around it. Check the cameras (--align where they are in other units than the mesh) and the masks."
         )
     return texels, gathered
@@ -147,9 +147,9 @@ def _conventional(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
 def _maps(state: State, gathered: Gathered, texels: Sequence[Texels]) -> tuple[Maps, ...]:
     from mistyle.render.shade import unpack
 
-    where = solving.atlas(texels)
-    known = np.split(solving.placed(gathered.seen > 0, gathered, where, False), where.offsets[1:-1])
-    found = unpack(solving.spread_out(state.values, gathered, where), where.sizes)
+    where = atlas(texels)
+    known = np.split(placed(gathered.seen > 0, gathered, where, False), where.offsets[1:-1])
+    found = unpack(spread_out(state.values, gathered, where), where.sizes)
     return tuple(replace(m, known=k.reshape(m.known.shape)) for m, k in zip(found, known, strict=True))
 
 

@@ -1,0 +1,179 @@
+"""What is believed of a texel besides what its own pictures tell, and how much those tell."""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.render.texel_lm import UNKNOWNS, Solution
+from mistyle.stages.recover_observe import Gathered
+from mistyle.stages.recover_table import OVER_SEAMS, Atlas, Values, neighbourhood
+
+PRIOR_SPREAD = (1.0, 1.0, 1.0, 0.6, 0.6, 0.8, 0.2)  # standard deviations from PRIOR_MEAN before anything was seen
+METAL_SPREAD = 0.1  # of metallic about 0 or 1: surfaces are metal or not, and few are in between
+# How much metals reflect, and its standard deviation. Where no highlight is seen, much of it on a smooth metal looks
+# like little on a rough one, and this decides.
+METAL_ALBEDO, METAL_ALBEDOS = 0.6, 0.2
+METAL_COST = 10.0  # what being a metal costs: twice the logarithm of how much rarer metals are
+# What having no colour at all costs what is no metal, from which albedo on it costs nothing, and after how many looks.
+BLACK_COST, PALEST_BLACK, OFTEN = 20.0, 0.02, 8
+# From which roughness on its gloss shows, so that it could not as well be a mirror, in part and fully.
+GLOSSY, MATT = 0.3, 0.6
+BLUR = 4  # steps of spreading, each to the four nearest texels, that make a mean of neighbours
+AMONG = 4 * np.pi * BLUR / 3  # how many texels such a mean is one of
+MISFIT = 0.1  # cost per observation above which a texel has less to say to its neighbours
+AROUND = 8  # steps over which it is measured how badly observations fit
+WIDE = 24  # steps over which it is measured how much the surface's tilt varies
+KNOWN = 0.05  # what a texel may leave open of its tilt and still say how much tilts vary at all
+LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean of its neighbours
+LEAST_SEEN = 3  # times that a texel was seen, for what was seen to decide anything
+BEST_FIT = 0.02  # of what `noise` and `relative` say, as variance: observations are never thought better than that
+MARGIN = 1.5  # on the variance of what observations tell, since they err together
+NOTHING = 1.0  # standard deviation of what nothing was told about
+
+
+def penalty(values: Values, mean: Values, prior: Values) -> Float[np.ndarray, " t"]:
+    """What a prior adds to the cost."""
+    return ((values - mean) ** 2 * prior).sum(axis=1)
+
+
+def unlikely(values: Values, seen: Int[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+    """What being a metal costs, and what looking black often and yet being none costs, where no gloss shows either:
+    paint is never that black."""
+    black = np.maximum(1 - values[:, :3].max(axis=1) / PALEST_BLACK, 0) * np.minimum(seen / OFTEN, 1)
+    black *= np.clip((MATT - values[:, 5]) / (MATT - GLOSSY), 0, 1)
+    return np.where(values[:, 6] > 0.5, METAL_COST, BLACK_COST * black).astype(np.float32)
+
+
+def belief(solution: Solution, mean: Values, gathered: Gathered, where: Atlas, neighbours: float) -> Values:
+    """How firmly each texel is held to `mean`, as weights of (x - mean)²: one over the variance of the surface itself.
+
+    Of the tilt by empirical Bayes: that variance is what the texels around differ by from their means, less what their
+    own observations leave open, at most `neighbours`² and at least LEAST². Everything else has `neighbours`: albedo,
+    roughness and metallic can stand for each other, and held to its neighbours' albedo a texel becomes a metal.
+    """
+    open_, gain = open_tilts(solution, gathered), likelihood(solution)[1][:, 3:5]
+    apart = (solution.values - mean)[:, 3:5] / np.maximum(gain, 1e-3)
+    weight = (1 / (open_**2 + neighbours**2) ** 2).astype(np.float32)
+    weight[gathered.seen == 0] = 0
+    variance = neighbourhood((apart**2 - open_**2).astype(np.float32), weight, gathered, where, WIDE, OVER_SEAMS[3:5])
+    prior = np.full(mean.shape, 1 / neighbours**2, np.float32)
+    prior[:, 3:5] = 1 / np.clip(variance, min(LEAST, neighbours) ** 2, neighbours**2)
+    return prior
+
+
+def levelled(
+    solution: Solution, mean: Values, prior: Values, gathered: Gathered, where: Atlas
+) -> tuple[Values, Values]:
+    """`mean` and `prior` with the tilt drawn towards none where little is known of the texels around.
+
+    All that is known of a tilt there is how much tilts vary at all: the variance V among texels that are known. Of a
+    mean of precision P the share P / (P + 1 / V) is kept, and 1 / (P + 1 / V) of variance is left open. Where
+    observations do not fit, tilts would take up what the model lacks, and are held by the root of `misfit` more firmly:
+    more costs strong relief, less lets light between surfaces through.
+    """
+    precision = np.where(gathered.seen[:, None] > 0, 1 / open_tilts(solution, gathered) ** 2, 0).astype(np.float32)
+    precision = AMONG * neighbourhood(precision, np.ones_like(precision), gathered, where, BLUR, OVER_SEAMS[3:5])
+    left = 1 / (precision + 1 / varied(solution, gathered))
+    mean, prior = mean.copy(), prior.copy()
+    mean[:, 3:5] *= precision * left
+    prior[:, 3:5] = 1 / (1 / prior[:, 3:5] + left)
+    prior[:, 3:5] *= np.sqrt(1 + misfit(solution, gathered, where))[:, None]
+    return mean, prior
+
+
+def varied(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "2"]:
+    """The variance of tilts over the whole surface, by texels that are known: that of what was found, less what was
+    left open."""
+    open_ = open_tilts(solution, gathered)
+    weight = np.where(gathered.seen[:, None] > 0, 1 / (open_**2 + KNOWN**2) ** 2, 0)
+    mean = ((solution.values[:, 3:5] ** 2 - open_**2) * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
+    return np.clip(mean, LEAST**2, PRIOR_SPREAD[3] ** 2)
+
+
+def open_tilts(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "t 2"]:
+    """Standard deviations of the tilt that a texel's observations leave open."""
+    return likelihood(solution)[0][:, 3:5] * inflation(solution, gathered)
+
+
+def inflation(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "t 1"]:
+    """What standard deviations are multiplied by: observations that do not fit say less than their number promises."""
+    return np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
+
+
+def sureness(solution: Solution, gathered: Gathered) -> Values:
+    """What a texel counts in its neighbours' means: by its spread, and less where its observations do not fit."""
+    sure = 1 / np.maximum(solution.spread, 1e-4) ** 2
+    sure = np.minimum(sure, np.quantile(sure, 0.9, axis=0))
+    wrong = solution.cost / np.maximum(gathered.seen, 1) / MISFIT
+    sure = (sure / (1 + wrong[:, None]) ** 2).astype(np.float32)
+    sure[gathered.seen == 0] = 1e-6
+    return sure
+
+
+def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.ndarray, " t"]:
+    """Cost per observation that is one too many, of the texels around each one together; 0 where there is none.
+
+    An observation has three channels and a texel UNKNOWNS unknowns: one that few saw can explain whatever they saw, so
+    only those around it tell how far its model can be believed.
+    """
+    spare = np.maximum(gathered.seen - len(UNKNOWNS) / 3, 0)
+    each = np.where(spare[:, None] > 0, np.stack([solution.cost, spare], axis=1), 0).astype(np.float32)
+    cost, count = neighbourhood(each, np.ones_like(each), gathered, where, AROUND).T
+    return np.where(count > 1e-6, cost / np.maximum(count, 1e-6), 0).astype(np.float32)
+
+
+def told(solution: Solution, gathered: Gathered, where: Atlas) -> Values:
+    """Standard deviations of what a texel's observations tell, by how well they and those of the texels around it fit:
+    where they fit far better than `noise` and `relative` say, they also tell more; NOTHING where there are none."""
+    around = misfit(solution, gathered, where)
+    own = np.where(gathered.seen >= OFTEN, solution.cost / np.maximum(gathered.seen - len(UNKNOWNS) / 3, 1), 0)
+    scale = MARGIN * np.maximum(np.maximum(around, own) / 3, BEST_FIT)
+    return left_open(solution, gathered, scale)
+
+
+def decided(solution: Solution, gathered: Gathered) -> Float[np.ndarray, " t"]:
+    """The share of a texel's tilt that its own pictures decide and not its neighbours, 0..1. Texels that too few saw
+    whole are left to the pictures, which show parts of them that the solver knows nothing of, as far as tilts vary."""
+    variance = float(varied(solution, gathered).mean())
+    share = likelihood(solution)[1][:, 3:5].mean(axis=1)
+    return np.where(gathered.seen >= LEAST_SEEN, share, variance / (variance + KNOWN**2)).astype(np.float32)
+
+
+def likelihood(solution: Solution) -> tuple[Values, Values]:
+    """What the observations alone leave open (standard deviations), and the share of a texel's distance from its prior
+    that they decide: 1 all of it, 0 none. Unknown by unknown, as if they did not depend on each other."""
+    alone = np.maximum(1 / np.maximum(solution.spread, 1e-6) ** 2 - solution.prior, 1e-6)
+    return 1 / np.sqrt(alone), alone / (alone + solution.prior)
+
+
+def left_open(solution: Solution, gathered: Gathered, scale: float | Float[np.ndarray, " t"] = 1.0) -> Values:
+    """Standard deviations of what the texels' observations tell, `scale` on their variance; NOTHING without any."""
+    found = np.minimum(likelihood(solution)[0] * np.sqrt(np.reshape(scale, (-1, 1))), NOTHING)
+    found[gathered.seen == 0] = NOTHING
+    return found.astype(np.float32)
+
+
+def both(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) -> tuple[Values, Values, np.ndarray]:
+    """A prior and the belief that a texel is a metal or not as one prior, and the constant that this leaves."""
+    mean, prior, left = reflecting(mean, prior, metal)
+    mean[:, 6:], prior[:, 6:], constant = _product(mean[:, 6:], prior[:, 6:], metal[:, None], 1 / METAL_SPREAD**2)
+    return mean, prior, left + constant
+
+
+def reflecting(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) -> tuple[Values, Values, np.ndarray]:
+    """The same of a prior and of how much metals reflect, where a texel is one."""
+    mean, prior = mean.copy(), prior.copy()
+    mean[:, :3], prior[:, :3], constant = _product(
+        mean[:, :3], prior[:, :3], METAL_ALBEDO, metal[:, None] / METAL_ALBEDOS**2
+    )
+    return mean, prior, constant
+
+
+def _product(
+    mean: Float[np.ndarray, "t c"], prior: Float[np.ndarray, "t c"], other: Any, weight: Any
+) -> tuple[Float[np.ndarray, "t c"], Float[np.ndarray, "t c"], Float[np.ndarray, " t"]]:
+    """Mean, weight and constant of prior (x - mean)² + weight (x - other)²."""
+    both = prior + np.float32(weight)
+    constant = ((mean - other) ** 2 * prior * weight / both).sum(axis=1)
+    return ((mean * prior + np.float32(other) * weight) / both).astype(np.float32), both, constant.astype(np.float32)

@@ -1,0 +1,131 @@
+"""What a recovery knows of all texels of all texture sets, as one table, and means over neighbours in it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.image import nearest
+from mistyle.core.maps import Texels
+from mistyle.core.mesh import Mesh
+from mistyle.stages.neighbours import Links, believed, links
+from mistyle.stages.recover_observe import Gathered
+
+# Where a texel is thought to be before anything was seen.
+PRIOR_MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.5, 0.0)
+# Which of the unknowns go on across seams. Tilts would have to be turned into the other chart's frame, and where charts
+# meet at an edge, normal maps often bevel it: neighbours from beyond would level that.
+OVER_SEAMS = np.array([1, 1, 1, 0, 0, 1, 1], np.float32)
+
+Table = Float[np.ndarray, "a 8"]
+Values = Float[np.ndarray, "t 7"]
+
+
+@dataclass(frozen=True)
+class Atlas:
+    """All texels of all sets in one row after the other: which are covered, which covered one is closest to each, and
+    per set which are neighbours, where that was asked for."""
+
+    sizes: tuple[tuple[int, int], ...]
+    covered: tuple[np.ndarray, ...]
+    closest: tuple[np.ndarray, ...]
+    links: tuple[Links, ...] = ()
+
+    @property
+    def offsets(self) -> list[int]:
+        """Where each set begins, and the end."""
+        return [0, *np.cumsum([rows * columns for rows, columns in self.sizes]).tolist()]
+
+
+def atlas(texels: Sequence[Texels]) -> Atlas:
+    """The atlas of some texture sets."""
+    covered = tuple(t.covered for t in texels)
+    return Atlas(
+        sizes=tuple((t.covered.shape[0], t.covered.shape[1]) for t in texels),
+        covered=covered,
+        closest=tuple(nearest(c)[0].ravel() if c.any() else np.arange(c.size) for c in covered),
+    )
+
+
+def linked(mesh: Mesh, texels: Sequence[Texels]) -> Atlas:
+    """The same with neighbours."""
+    return replace(atlas(texels), links=tuple(links(mesh, t) for t in texels))
+
+
+def spread_out(values: Values, gathered: Gathered, where: Atlas) -> Table:
+    """The table of an atlas: covered texels have their values, the others those of the nearest covered one."""
+    table = np.zeros((where.offsets[-1], 8), np.float32)
+    table[:, :7] = PRIOR_MEAN
+    table[gathered.texel, :7] = values
+    return fill(table, where)
+
+
+def placed(values: np.ndarray, gathered: Gathered, where: Atlas, otherwise) -> np.ndarray:
+    """The covered texels' values in an array of the whole atlas, which has `otherwise` elsewhere."""
+    result = np.zeros((where.offsets[-1], *values.shape[1:]), values.dtype)
+    result[...] = otherwise
+    result[gathered.texel] = values
+    return result
+
+
+def fill(table: Float[np.ndarray, "a c"], where: Atlas, only: np.ndarray | None = None) -> Float[np.ndarray, "a c"]:
+    """Uncovered texels (of `only`, where given) take the values of the nearest covered one of their set."""
+    result = table.copy()
+    for k, closest in enumerate(where.closest):
+        low, high = where.offsets[k], where.offsets[k + 1]
+        empty = ~where.covered[k].ravel()
+        if only is not None:
+            empty &= only[low:high]
+        result[low:high][empty] = table[low:high][closest[empty]]
+    return result
+
+
+def neighbourhood(
+    values: Float[np.ndarray, "t c"],
+    weight: Float[np.ndarray, "t c"],
+    gathered: Gathered,
+    where: Atlas,
+    steps: int,
+    over: Float[np.ndarray, " c"] | float = 1.0,
+) -> Float[np.ndarray, "t c"]:
+    """Weighted mean over the neighbours and theirs; `over`: how much those beyond seams count, 0..1 (of each column).
+    Where none has a weight, the texel's own value."""
+    channels = values.shape[1]
+    full = np.zeros((2, where.offsets[-1], channels), np.float32)
+    full[0, gathered.texel], full[1, gathered.texel] = values * weight, weight
+    for k, size in enumerate(where.sizes):
+        part = full[:, where.offsets[k] : where.offsets[k + 1]].reshape(2, *size, channels)
+        part[...] = diffused(part, where.links[k], steps, over)
+    summed, weights = full[:, gathered.texel]
+    return np.where(weights > 1e-12, summed / np.maximum(weights, 1e-12), values).astype(np.float32)
+
+
+def diffused(
+    part: Float[np.ndarray, "n h w c"], among: Links, steps: int, over: Float[np.ndarray, " c"] | float = 1.0
+) -> Float[np.ndarray, "n h w c"]:
+    """Sums that every texel shares with the four around it, step by step. What would go to others is lost, so sums mean
+    something only beside sums of weights."""
+    right, below = among.right[..., None], among.below[..., None]
+    seams = among.seams if np.any(over) else ()
+    for _ in range(steps):
+        total = 2 * part
+        total[:, :, :-1] += part[:, :, 1:] * right
+        total[:, :, 1:] += part[:, :, :-1] * right
+        total[:, :-1] += part[:, 1:] * below
+        total[:, 1:] += part[:, :-1] * below
+        flat, sums = (grid.reshape(len(part), -1, part.shape[-1]) for grid in (part, total))
+        for seam in seams:
+            sums[:, seam.here] += flat[:, seam.there] * (seam.share[:, None] * over)
+        part = total * np.float32(0.2)
+    return part
+
+
+def joined(where: Atlas, values: Float[np.ndarray, "a 7"], spread: Float[np.ndarray, "a 7"]) -> Atlas:
+    """The same with seams believed by albedo and roughness; `spread`: standard deviations."""
+    found = []
+    for k, (among, size) in enumerate(zip(where.links, where.sizes, strict=True)):
+        part = slice(where.offsets[k], where.offsets[k + 1])
+        fields = ((values[part, c].reshape(size), spread[part, c].reshape(size)) for c in (0, 1, 2, 5))
+        found.append(believed(among, fields))
+    return replace(where, links=tuple(found))
