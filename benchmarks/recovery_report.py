@@ -39,6 +39,7 @@ STRONG_TARGETS = {
 # On the assets' own maps: the share of the best constant's error that may be left.
 SHARE_OF_CONSTANT = 0.2
 GAIN = 3.0
+CAPTION = 20  # rows of a sheet that name a picture
 
 
 def table(row: str, methods: Columns) -> str:
@@ -99,29 +100,39 @@ def write(
 
 def map_sheet(path: Path, rows: Mapping[str, Maps], confidence: np.ndarray | None, covered: np.ndarray) -> None:
     """One row a method: albedo, normal, roughness, metallic; ours with its confidence (share of the brightest)."""
-    grey = {name: [m.roughness, m.metallic] for name, m in rows.items()}
     lines = []
     for k, (name, m) in enumerate(rows.items()):
-        tiles = [srgb_from_linear(m.albedo), m.normal * 0.5 + 0.5]
-        tiles += [np.repeat(g[..., None], 3, axis=2) for g in grey[name]]
+        tiles = {"albedo": srgb_from_linear(m.albedo), "normal": m.normal * 0.5 + 0.5}
+        tiles |= {"roughness": _grey(m.roughness), "metallic": _grey(m.metallic)}
         if confidence is not None:
             top = float(np.percentile(confidence[covered], 95)) if k == 1 else 1.0
             shown = np.clip(confidence / max(top, 1e-12), 0, 1) if k == 1 else np.zeros_like(m.roughness)
-            tiles.append(np.repeat(shown[..., None], 3, axis=2))
-        lines.append(np.concatenate([_framed(t * covered[..., None]) for t in tiles], axis=1))
+            tiles["confidence" if k == 1 else ""] = _grey(shown)
+        framed = [_framed(t * covered[..., None], f"{name}: {what}" if what else "") for what, t in tiles.items()]
+        lines.append(np.concatenate(framed, axis=1))
     write_png(path, np.concatenate(lines, axis=0))
 
 
 def relit_sheet(path: Path, pictures: Mapping[str, Sequence[np.ndarray]]) -> None:
     """One column a method, one row a light, sRGB."""
     columns = [
-        np.concatenate([_framed(srgb_from_linear(p[..., :3])) for p in shown], axis=0) for shown in pictures.values()
+        np.concatenate([_framed(srgb_from_linear(p[..., :3]), name) for p in shown], axis=0)
+        for name, shown in pictures.items()
     ]
     write_png(path, np.concatenate(columns, axis=1))
 
 
-def _framed(tile: np.ndarray) -> np.ndarray:
-    """At most 512 pixels a side, with a grey line around."""
+def _grey(values: np.ndarray) -> np.ndarray:
+    return np.repeat(values[..., None], 3, axis=2)
+
+
+def _framed(tile: np.ndarray, caption: str) -> np.ndarray:
+    """At most 512 pixels a side, with a grey line around and a caption over it."""
+    import cv2
+
     step = max(1, tile.shape[0] // 512)
     small = np.asarray(tile[::step, ::step], np.float32)
-    return np.pad(small, ((1, 1), (1, 1), (0, 0)), constant_values=0.3)
+    above = np.zeros((CAPTION, small.shape[1], 3), np.uint8)
+    place, white = (4, CAPTION - 6), (200, 200, 200)
+    cv2.putText(above, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, white, 1, cv2.LINE_AA)
+    return np.pad(np.concatenate([above / np.float32(255), small]), ((1, 1), (1, 1), (0, 0)), constant_values=0.3)
