@@ -64,6 +64,18 @@ def _processor() -> str:
     return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), "unknown")
 
 
+def lettered(text: str, size: tuple[int, int]) -> Any:
+    """A strip of a picture, (rows, columns) float64 0..1, with a line of text as high as it."""
+    # Here, so that benchmarks of memory and time do not load them with the clocks.
+    import cv2
+    import numpy as np
+
+    height = size[0]
+    strip, place = np.zeros(size, np.uint8), (height // 4, height - height // 4)
+    cv2.putText(strip, text, place, cv2.FONT_HERSHEY_SIMPLEX, height / 42.5, 255, max(1, height // 17), cv2.LINE_AA)
+    return strip / 255
+
+
 def finish(figures: Mapping[str, float], json_file: Path | None) -> None:
     """Print the table; write {"figures": …, "machine": …} where asked."""
     result = {"figures": {k: round(float(v), 6) for k, v in figures.items()}, "machine": machine()}

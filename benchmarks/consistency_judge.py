@@ -6,6 +6,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.common import lettered
 from benchmarks.consistency_peer import save
 from benchmarks.consistency_rows import texture
 from benchmarks.consistency_scene import LPIPS, VGG, Scene, blank_maps, encoded
@@ -122,9 +123,8 @@ def sheet(path: Path, scene: Scene, rows: Mapping[str, Sequence[np.ndarray]]) ->
     lines = [np.concatenate([painting, *clay[1:]], axis=1)]
     for name, pictures in rows.items():
         line = np.concatenate([tile(pictures[k]) for k in SHOWN], axis=1)
-        label = np.zeros((34, TILE), np.uint8)
-        cv2.putText(label, name, (8, 26), cv2.FONT_HERSHEY_SIMPLEX, 0.8, 255, 2, cv2.LINE_AA)
-        line[: label.shape[0], :TILE] = np.maximum(line[: label.shape[0], :TILE], label[..., None] / 255)
+        label = lettered(name, (34, TILE))
+        line[: label.shape[0], :TILE] = np.maximum(line[: label.shape[0], :TILE], label[..., None])
         lines.append(line)
     path.parent.mkdir(parents=True, exist_ok=True)
     save(path, np.concatenate(lines))

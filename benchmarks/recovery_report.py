@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.common import machine
+from benchmarks.common import lettered, machine
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps
 from mistyle.files.images import write_png
@@ -104,10 +104,11 @@ def map_sheet(path: Path, rows: Mapping[str, Maps], confidence: np.ndarray | Non
     for k, (name, m) in enumerate(rows.items()):
         tiles = {"albedo": srgb_from_linear(m.albedo), "normal": m.normal * 0.5 + 0.5}
         tiles |= {"roughness": _grey(m.roughness), "metallic": _grey(m.metallic)}
-        if confidence is not None:
-            top = float(np.percentile(confidence[covered], 95)) if k == 1 else 1.0
-            shown = np.clip(confidence / max(top, 1e-12), 0, 1) if k == 1 else np.zeros_like(m.roughness)
-            tiles["confidence" if k == 1 else ""] = _grey(shown)
+        if confidence is not None and k == 1:
+            top = float(np.percentile(confidence[covered], 95))
+            tiles["confidence"] = _grey(np.clip(confidence / max(top, 1e-12), 0, 1))
+        elif confidence is not None:
+            tiles[""] = np.zeros_like(m.albedo)
         framed = [_framed(t * covered[..., None], f"{name}: {what}" if what else "") for what, t in tiles.items()]
         lines.append(np.concatenate(framed, axis=1))
     write_png(path, np.concatenate(lines, axis=0))
@@ -128,11 +129,7 @@ def _grey(values: np.ndarray) -> np.ndarray:
 
 def _framed(tile: np.ndarray, caption: str) -> np.ndarray:
     """At most 512 pixels a side, with a grey line around and a caption over it."""
-    import cv2
-
     step = max(1, tile.shape[0] // 512)
     small = np.asarray(tile[::step, ::step], np.float32)
-    above = np.zeros((CAPTION, small.shape[1], 3), np.uint8)
-    place, white = (4, CAPTION - 6), (200, 200, 200)
-    cv2.putText(above, caption, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, white, 1, cv2.LINE_AA)
-    return np.pad(np.concatenate([above / np.float32(255), small]), ((1, 1), (1, 1), (0, 0)), constant_values=0.3)
+    above = _grey(lettered(caption, (CAPTION, small.shape[1])))
+    return np.pad(np.concatenate([above, small]), ((1, 1), (1, 1), (0, 0)), constant_values=0.3)

@@ -156,10 +156,9 @@ def _recovered(work: Work, found: Found, table: np.ndarray, trace, residuals) ->
     variance = {n: (found.spread[:, CHANNELS[n]] ** 2).mean(axis=1) for n in CHANNELS}
     doubt = np.mean([variance[n] / HALF_SURE[n] ** 2 for n in names], axis=0)
     sure = np.where(found.seen > 0, 1 / (1 + doubt), 0).astype(np.float32)
-    parts = [slice(a, b) for a, b in zip(where.offsets[:-1], where.offsets[1:], strict=True)]
 
     def grids(values: np.ndarray) -> tuple[np.ndarray, ...]:
-        return tuple(values[part].reshape(size) for part, size in zip(parts, where.sizes, strict=True))
+        return tuple(values[part].reshape(size) for part, size in zip(where.parts, where.sizes, strict=True))
 
     seen = grids(found.seen.astype(np.int32))
     maps = [replace(m, known=s > 0) for m, s in zip(unpack(table, where.sizes), seen, strict=True)]
@@ -167,7 +166,7 @@ def _recovered(work: Work, found: Found, table: np.ndarray, trace, residuals) ->
     return Recovered(
         maps=tuple(maps),
         confidence=grids(sure),
-        spread=tuple({n: spreads[n][k] for n in CHANNELS} for k in range(len(parts))),
+        spread=tuple({n: spreads[n][k] for n in CHANNELS} for k in range(len(where.sizes))),
         seen=seen,
         views=grids(found.views.astype(np.int32)),
         trace=trace,

@@ -93,11 +93,10 @@ def firmness(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"], w
 def _fields(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Iterator[Field]:
     """The channel in every texture set."""
     held = _held(table, noise, where, channel) if channel in TILTS else np.zeros(len(table), np.float32)
-    for k, size in enumerate(where.sizes):
-        part = slice(where.offsets[k], where.offsets[k + 1])
+    for part, size, links in zip(where.parts, where.sizes, where.links, strict=True):
         found = table[part, channel].reshape(size)
         error = np.minimum(noise[part, channel].reshape(size), OPEN)
-        among = where.links[k] if OVER_SEAMS[channel] else within(where.links[k])
+        among = links if OVER_SEAMS[channel] else within(links)
         error, variance = _measured(found, error, among, LEAST[channel])
         yield Field(part, found, error, variance, held[part].reshape(size), among)
 
@@ -112,9 +111,8 @@ def _held(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> F
     weight = np.where(error < OPEN, 1 / (error**2 + KNOWN**2) ** 2, 0)
     sums = np.stack([weight * x2, weight], axis=1)
     every = sums.sum(axis=0) / max(sums[:, 1].sum(), 1e-12) * (ELSEWHERE / KNOWN**4)
-    for k, size in enumerate(where.sizes):
-        part = slice(where.offsets[k], where.offsets[k + 1])
-        sums[part] = diffused(sums[part].reshape(1, *size, 2), within(where.links[k]), AROUND).reshape(-1, 2)
+    for part, size, links in zip(where.parts, where.sizes, where.links, strict=True):
+        sums[part] = diffused(sums[part].reshape(1, *size, 2), within(links), AROUND).reshape(-1, 2)
     spread2, weights = (sums + every).T
     return (SHARE * weights / np.maximum(spread2, weights * LEAST[channel] ** 2 + 1e-12)).astype(np.float32)
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
@@ -36,6 +37,11 @@ class Atlas:
     def offsets(self) -> list[int]:
         """Where each set begins, and the end."""
         return [0, *np.cumsum([rows * columns for rows, columns in self.sizes]).tolist()]
+
+    @property
+    def parts(self) -> list[slice]:
+        """The rows of each set."""
+        return [slice(begin, end) for begin, end in pairwise(self.offsets)]
 
 
 def atlas(texels: Sequence[Texels]) -> Atlas:
@@ -72,12 +78,11 @@ def placed(values: np.ndarray, gathered: Gathered, where: Atlas, otherwise) -> n
 def fill(table: Float[np.ndarray, "a c"], where: Atlas, only: np.ndarray | None = None) -> Float[np.ndarray, "a c"]:
     """Uncovered texels (of `only`, where given) take the values of the nearest covered one of their set."""
     result = table.copy()
-    for k, closest in enumerate(where.closest):
-        low, high = where.offsets[k], where.offsets[k + 1]
-        empty = ~where.covered[k].ravel()
+    for part, covered, closest in zip(where.parts, where.covered, where.closest, strict=True):
+        empty = ~covered.ravel()
         if only is not None:
-            empty &= only[low:high]
-        result[low:high][empty] = table[low:high][closest[empty]]
+            empty &= only[part]
+        result[part][empty] = table[part][closest[empty]]
     return result
 
 
@@ -94,9 +99,9 @@ def neighbourhood(
     channels = values.shape[1]
     full = np.zeros((2, where.offsets[-1], channels), np.float32)
     full[0, gathered.texel], full[1, gathered.texel] = values * weight, weight
-    for k, size in enumerate(where.sizes):
-        part = full[:, where.offsets[k] : where.offsets[k + 1]].reshape(2, *size, channels)
-        part[...] = diffused(part, where.links[k], steps, over)
+    for part, size, among in zip(where.parts, where.sizes, where.links, strict=True):
+        sums = full[:, part].reshape(2, *size, channels)
+        sums[...] = diffused(sums, among, steps, over)
     summed, weights = full[:, gathered.texel]
     return np.where(weights > 1e-12, summed / np.maximum(weights, 1e-12), values).astype(np.float32)
 
@@ -124,8 +129,7 @@ def diffused(
 def joined(where: Atlas, values: Float[np.ndarray, "a 7"], spread: Float[np.ndarray, "a 7"]) -> Atlas:
     """The same with seams believed by albedo and roughness; `spread`: standard deviations."""
     found = []
-    for k, (among, size) in enumerate(zip(where.links, where.sizes, strict=True)):
-        part = slice(where.offsets[k], where.offsets[k + 1])
+    for part, size, among in zip(where.parts, where.sizes, where.links, strict=True):
         fields = ((values[part, c].reshape(size), spread[part, c].reshape(size)) for c in (0, 1, 2, 5))
         found.append(believed(among, fields))
     return replace(where, links=tuple(found))

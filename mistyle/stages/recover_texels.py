@@ -83,8 +83,8 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
     large = [
         np.concatenate(
             [
-                _enlarged(values[a:b].reshape(*size, -1), by).reshape((b - a) * by * by, -1)
-                for a, b, size in zip(where.offsets[:-1], where.offsets[1:], where.sizes, strict=True)
+                _enlarged(values[part].reshape(*size, -1), by).reshape(size[0] * size[1] * by * by, -1)
+                for part, size in zip(where.parts, where.sizes, strict=True)
             ]
         )
         for values in (found.table, found.spread, found.decided, found.noise, found.seen, found.views)
