@@ -22,6 +22,7 @@ from mistyle.render.scene import Frame
 
 # From the quickest to the defaults.
 EFFORTS: tuple[dict[str, Any], ...] = (
+    {"solver": "texels", "rounds": 0, "solver_iterations": 4, "smooth": False, "subsamples": 4},
     {"solver": "texels", "rounds": 0, "solver_iterations": 4},
     {"solver": "texels", "rounds": 0},
     {"solver": "texels", "rounds": 1},

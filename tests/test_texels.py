@@ -8,7 +8,7 @@ from scipy.spatial import Delaunay
 
 from mistyle.core.asset import Material
 from mistyle.core.errors import InputRefused
-from mistyle.core.maps import Maps, Texels
+from mistyle.core.maps import Maps, Texels, place_of, rows_of
 from mistyle.core.mesh import Mesh
 from mistyle.core.raster import fragments
 from mistyle.stages import texels as atlas
@@ -274,3 +274,14 @@ def test_pad_maps_pads_every_map(rng):
     padded = pad_maps(maps, texels, 4)
     assert np.array_equal(padded.roughness[6, 10:20], maps.roughness[8, 10:20])
     assert np.array_equal(padded.roughness, pad(maps.roughness, texels, 4))
+
+
+def test_a_row_of_the_table_of_all_sets_is_found_again_in_its_own():
+    sizes = [(2, 3), (4, 1), (1, 5)]
+    numbers = np.arange(15)
+    for part, (rows, size) in enumerate(zip(rows_of(sizes), sizes, strict=True)):
+        for (y, x), row in np.ndenumerate(numbers[rows].reshape(size)):
+            assert place_of(int(row), sizes) == (part, y, x)
+    assert rows_of(sizes)[-1].stop == 15
+    with pytest.raises(IndexError, match="Row 15 "):
+        place_of(15, sizes)

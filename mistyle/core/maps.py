@@ -1,7 +1,9 @@
 """Texture-space records. Row 0 of every map is v = 1: texel (row r, column c) of an (H, W) map has its centre at
 u = (c + 0.5) / W, v = 1 - (r + 0.5) / H."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate, pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -63,3 +65,18 @@ def flat_maps(size: int, albedo: float = 0.5, roughness: float = 0.5, metallic: 
         metallic=np.full((size, size), metallic, np.float32),
         known=np.zeros((size, size), bool),
     )
+
+
+def rows_of(sizes: Sequence[tuple[int, int]]) -> list[slice]:
+    """Of texture sets in one table, texel by texel, row by row and set after set, the rows of each."""
+    ends = accumulate((height * width for height, width in sizes), initial=0)
+    return [slice(begin, end) for begin, end in pairwise(ends)]
+
+
+def place_of(row: int, sizes: Sequence[tuple[int, int]]) -> tuple[int, int, int]:
+    """Which set a row of that table is of, and the texel's row and column there."""
+    for part, (rows, (_, width)) in enumerate(zip(rows_of(sizes), sizes, strict=True)):
+        if row < rows.stop:
+            y, x = divmod(row - rows.start, width)
+            return part, y, x
+    raise IndexError(f"Row {row} is past the texels of sets of {list(sizes)}.")

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.camera import Camera, zoom
 from mistyle.core.image import luminance
 from mistyle.core.light import Directional, Lights, direction_in_world
+from mistyle.core.maps import place_of
 from mistyle.stages import fit_table
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.fit_table import Table
@@ -86,8 +87,8 @@ class Run:
         self.trace: dict[str, list[float]] = {}
         self.order: list[int] = []
         self.beam = 0
-        self.struggle = np.zeros(table.offsets[-1], np.float32)
-        self.touched = np.zeros(table.offsets[-1], np.float32)
+        self.struggle = np.zeros(len(table.still), np.float32)
+        self.touched = np.zeros(len(table.still), np.float32)
         table.forget()
 
     def step(self, iteration: int) -> str:
@@ -202,8 +203,7 @@ class Run:
         return (next(iter(gradients)), 0) if broken else None
 
     def _stopped(self, iteration: int, name: str, texel: int, crop: "Crop") -> str:
-        part = int(np.searchsorted(self.table.offsets, texel, side="right")) - 1
-        row, column = divmod(texel - self.table.offsets[part], self.table.sizes[part][1])
+        part, row, column = place_of(texel, self.table.sizes)
         shape = "x".join(map(str, self.table.sizes[part]))
         view = self.world.cameras[crop.view].name
         return (

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core import memory
 from mistyle.core.image import gaussian, nearest, resized_rows
-from mistyle.core.maps import Maps, Texels
+from mistyle.core.maps import Maps, Texels, rows_of
 from mistyle.stages.texels import bands, beside
 
 MAPS = ("albedo", "normal", "roughness", "metallic")
@@ -51,9 +51,9 @@ class Table:
     squares: dict[str, tuple[float, int]] = field(default_factory=dict)
 
     @property
-    def offsets(self) -> list[int]:
-        """Where each set begins, and the end."""
-        return [0, *np.cumsum([rows * columns for rows, columns in self.sizes]).tolist()]
+    def parts(self) -> list[slice]:
+        """The rows of each set."""
+        return rows_of(self.sizes)
 
     def forget(self) -> None:
         """Drop Adam's moments: the next phase minimises something else."""
@@ -247,9 +247,9 @@ def _laid(
 def spread(table: Table, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) -> list[Float[np.ndarray, "h w"]]:
     """A figure per texel of the table at the maps' resolution (each texel takes that of the cell it lies in)."""
     result = []
-    for k, material in enumerate(maps):
+    for k, (material, part) in enumerate(zip(maps, table.parts, strict=True)):
         rows, columns = material.roughness.shape
-        cells = values[table.offsets[k] : table.offsets[k + 1]].reshape(table.sizes[k]).astype(np.float32)
+        cells = values[part].reshape(table.sizes[k]).astype(np.float32)
         by, made = rows // table.sizes[k][0], memory.empty((rows, columns))
         made.reshape(rows // by, by, columns // by, by)[...] = cells[:, None, :, None]
         result.append(made)
@@ -258,8 +258,7 @@ def spread(table: Table, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) 
 
 def _change(table: Table, k: int, name: str) -> Float[np.ndarray, "H W c"] | None:
     """What the fit changed, at the table's resolution; None where nothing."""
-    part = slice(table.offsets[k], table.offsets[k + 1])
-    size = table.sizes[k]
+    part, size = table.parts[k], table.sizes[k]
     change = (table.values[name][part] - table.start[name][part]).reshape(*size, -1)
     change = np.where(np.isfinite(change), change, 0)  # a texel that came as no number goes as it came
     moved = change.any(axis=-1)

@@ -121,7 +121,7 @@ def _and_dark(pixels: Pixels, every: Pixels) -> Pixels:
 def frames(work: Work, unknown: Unknown) -> Frames:
     """Tangent, bitangent and normal of the unknown texels; of uncovered ones those of the nearest covered one."""
     position, normal, face = points_of(work.texels)
-    every = np.zeros((work.where.offsets[-1], 9), np.float32)
+    every = np.zeros((work.where.count, 9), np.float32)
     own = texel_frames(work.traced.mesh, face, position, normal, work.tangents)
     every[covered_rows(work.texels)] = own.reshape(-1, 9)
     return fill(every, work.where)[unknown.rows]

@@ -93,14 +93,18 @@ def recover(
     pictured = partial(
         Shade, traced, captures, where.sizes, model=settings.model, frame=settings.frame, shadows=settings.shadows
     )
-    shade = pictured(subsamples=settings.subsamples, memory=settings.memory * 1e9, weights=trust(captures, indirect))
+    descends = settings.solver != "texels" and settings.iterations > 0
+    shade = pictured(
+        subsamples=settings.subsamples, memory=settings.memory * 1e9, weights=trust(captures, indirect),
+        gradients=descends,
+    )  # fmt: skip
     trace: dict[str, list[float]] = {}
     found = solve_level(work, shade, start, indirect, seed, trace, lambda done: progress(0.5 * done))
     if found.solved and settings.smooth:
         table = smoothed(found.table, found.noise, where, settings.roughness_floor, settings.metallic)
         found = replace(found, table=table)
     table = found.table
-    if settings.solver != "texels" and settings.iterations:
+    if descends:
         table = improved(work, shade, found, indirect, seed, trace, lambda d: progress(0.5 + 0.35 * d), save, resume)
         if found.solved and settings.joint:
             # Of finer pictures; what was kept for the others makes room.

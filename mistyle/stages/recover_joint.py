@@ -285,10 +285,9 @@ def _priors(table: Table, noise: Float[np.ndarray, "a 7"], rows: Int[np.ndarray,
     number = np.full(len(table), -1, np.int64)
     number[rows] = np.arange(len(rows))
     pairs = []
-    for k, closest in enumerate(where.closest):
-        first = where.offsets[k]
-        empty = np.flatnonzero(~where.covered[k].ravel())
-        pairs.append(np.stack([empty, closest[empty]], axis=1) + first)
+    for part, covered, closest in zip(where.parts, where.covered, where.closest, strict=True):
+        empty = np.flatnonzero(~covered.ravel())
+        pairs.append(np.stack([empty, closest[empty]], axis=1) + part.start)
     both = number[np.concatenate(pairs)]
     both = both[(both >= 0).all(axis=1)]
     ends = np.arange(0, both.size + 1, 2)

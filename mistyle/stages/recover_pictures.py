@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core import stopping
+from mistyle.core.maps import place_of
 from mistyle.stages.recover_prior import NOTHING
 from mistyle.stages.recover_settings import RecoverSettings, passes
 from mistyle.stages.recover_smooth import smoothed
@@ -165,10 +166,8 @@ def _usual(found: Found) -> Float[np.ndarray, "7"]:
 
 def _note_stopped(work: Work, stopped: list[tuple[int, str, int]]) -> None:
     """Say which texels stood still because their gradient was not a number."""
-    offsets = work.where.offsets
     for texel, name, picture in stopped[:3]:
-        part = int(np.searchsorted(offsets, texel, side="right")) - 1
-        row, column = divmod(texel - offsets[part], work.where.sizes[part][1])
+        part, row, column = place_of(texel, work.where.sizes)
         label = work.traced.mesh.parts[part]
         work.notes.append(
             f"The gradient of map '{name}' at texel (row {row}, column {column}) of set '{label}' is not a number in"

@@ -2,13 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.image import nearest
-from mistyle.core.maps import Texels
+from mistyle.core.maps import Texels, rows_of
 from mistyle.core.mesh import Mesh
 from mistyle.stages.neighbours import Links, believed, links
 from mistyle.stages.recover_observe import Gathered
@@ -34,14 +33,14 @@ class Atlas:
     links: tuple[Links, ...] = ()
 
     @property
-    def offsets(self) -> list[int]:
-        """Where each set begins, and the end."""
-        return [0, *np.cumsum([rows * columns for rows, columns in self.sizes]).tolist()]
-
-    @property
     def parts(self) -> list[slice]:
         """The rows of each set."""
-        return [slice(begin, end) for begin, end in pairwise(self.offsets)]
+        return rows_of(self.sizes)
+
+    @property
+    def count(self) -> int:
+        """How many texels there are."""
+        return self.parts[-1].stop
 
 
 def atlas(texels: Sequence[Texels]) -> Atlas:
@@ -61,7 +60,7 @@ def linked(mesh: Mesh, texels: Sequence[Texels]) -> Atlas:
 
 def spread_out(values: Values, gathered: Gathered, where: Atlas) -> Table:
     """The table of an atlas: covered texels have their values, the others those of the nearest covered one."""
-    table = np.zeros((where.offsets[-1], 8), np.float32)
+    table = np.zeros((where.count, 8), np.float32)
     table[:, :7] = PRIOR_MEAN
     table[gathered.texel, :7] = values
     return fill(table, where)
@@ -69,7 +68,7 @@ def spread_out(values: Values, gathered: Gathered, where: Atlas) -> Table:
 
 def placed(values: np.ndarray, gathered: Gathered, where: Atlas, otherwise) -> np.ndarray:
     """The covered texels' values in an array of the whole atlas, which has `otherwise` elsewhere."""
-    result = np.zeros((where.offsets[-1], *values.shape[1:]), values.dtype)
+    result = np.zeros((where.count, *values.shape[1:]), values.dtype)
     result[...] = otherwise
     result[gathered.texel] = values
     return result
@@ -97,7 +96,7 @@ def neighbourhood(
     """Weighted mean over the neighbours and theirs; `over`: how much those beyond seams count, 0..1 (of each column).
     Where none has a weight, the texel's own value."""
     channels = values.shape[1]
-    full = np.zeros((2, where.offsets[-1], channels), np.float32)
+    full = np.zeros((2, where.count, channels), np.float32)
     full[0, gathered.texel], full[1, gathered.texel] = values * weight, weight
     for part, size, among in zip(where.parts, where.sizes, where.links, strict=True):
         sums = full[:, part].reshape(2, *size, channels)

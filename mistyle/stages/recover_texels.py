@@ -74,7 +74,7 @@ def solve_level(work: Work, shade, start, indirect: dict[int, np.ndarray], seed:
     small = Shade(
         shade.traced, work.captures, where.sizes, model=settings.model, frame=settings.frame,
         subsamples=settings.subsamples, shadows=settings.shadows, memory=settings.memory * 1e9,
-        weights=trust(work.captures, indirect),
+        weights=trust(work.captures, indirect), gradients=False,
     )  # fmt: skip
     if start is not None:
         start = [_shrunk(maps, size) for maps, size in zip(start, where.sizes, strict=True)]

@@ -148,9 +148,9 @@ def _maps(state: State, gathered: Gathered, texels: Sequence[Texels]) -> tuple[M
     from mistyle.render.shade import unpack
 
     where = atlas(texels)
-    known = np.split(placed(gathered.seen > 0, gathered, where, False), where.offsets[1:-1])
+    known = placed(gathered.seen > 0, gathered, where, False)
     found = unpack(spread_out(state.values, gathered, where), where.sizes)
-    return tuple(replace(m, known=k.reshape(m.known.shape)) for m, k in zip(found, known, strict=True))
+    return tuple(replace(m, known=known[p].reshape(m.known.shape)) for m, p in zip(found, where.parts, strict=True))
 
 
 def _small(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
