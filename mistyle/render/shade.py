@@ -25,7 +25,7 @@ from jaxtyping import Float
 from mistyle.core.capture import Captures
 from mistyle.core.lanes import aligned
 from mistyle.core.light import SOFT, Lights
-from mistyle.core.maps import Maps
+from mistyle.core.maps import Maps, rows_of
 from mistyle.render import bsdf, device, shading
 from mistyle.render import hits as collecting
 from mistyle.render.draw import Tracer
@@ -47,10 +47,9 @@ def pack(maps: Sequence[Maps]) -> Table:
 
 def unpack(table: Table, sizes: Sequence[tuple[int, int]]) -> list[Maps]:
     """`pack` undone; `known` is True everywhere."""
-    result, start = [], 0
-    for size in sizes:
-        rows = table[start : start + size[0] * size[1]].reshape(*size, 8).astype(np.float32)
-        start += size[0] * size[1]
+    result = []
+    for part, size in zip(rows_of(sizes), sizes, strict=True):
+        rows = table[part].reshape(*size, 8).astype(np.float32)
         z = np.sqrt(np.maximum(1 - (rows[..., 3:5] ** 2).sum(-1, keepdims=True), shading.LEAST_Z**2))
         normal = np.concatenate([rows[..., 3:5], z], axis=-1)
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)

@@ -31,7 +31,7 @@ from mistyle.run.budget import (
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import thread_count
 from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
-from mistyle.stages.recover_settings import all_rounds, estimates, joint_estimates, joint_steps, passes
+from mistyle.stages.recover_settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4
@@ -110,7 +110,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     solves = s.recover.solver != "pictures"
     rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
     begun = solves * (1 + len(estimated[0]))
-    steps, joint = 0 if s.recover.solver == "texels" else s.recover.iterations, joint_steps(s.recover)
+    steps, joint = descent_steps(s.recover), joint_steps(s.recover)
     samples = solves * sum(sum(part) for part in estimated)
     again = joint_estimates(s.recover)
     samples += sum(again)

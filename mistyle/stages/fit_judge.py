@@ -18,7 +18,7 @@ from mistyle.core import memory
 from mistyle.core.camera import Camera, px_from_world, world_from_px, zoom
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.core.light import Directional, Lights, direction_in_world
-from mistyle.core.maps import Maps
+from mistyle.core.maps import Maps, rows_of
 from mistyle.core.view import View
 from mistyle.stages.texels import BAND_TEXELS
 
@@ -127,14 +127,15 @@ def _window(view: View, centre: Float[np.ndarray, "2"], size: int) -> View:
 def _tables(maps: Sequence[Maps]) -> tuple[list[tuple[int, int]], Float[np.ndarray, "t 8"]]:
     from mistyle.render.seam import CHANNELS
 
-    starts = np.cumsum([0] + [m.roughness.size for m in maps])
-    table = memory.empty((int(starts[-1]), sum(CHANNELS.values())))
-    for m, start in zip(maps, starts[:-1], strict=True):
-        flat = [getattr(m, name).reshape(-1, count) for name, count in CHANNELS.items()]
+    sizes = [m.roughness.shape for m in maps]
+    parts = rows_of(sizes)
+    table = memory.empty((parts[-1].stop, sum(CHANNELS.values())))
+    for m, rows in zip(maps, parts, strict=True):
+        flat, own = [getattr(m, name).reshape(-1, count) for name, count in CHANNELS.items()], table[rows]
         for low in range(0, m.roughness.size, BAND_TEXELS):
             high = min(low + BAND_TEXELS, m.roughness.size)
-            np.concatenate([part[low:high] for part in flat], axis=1, out=table[start + low : start + high])
-    return [m.roughness.shape for m in maps], table
+            np.concatenate([part[low:high] for part in flat], axis=1, out=own[low:high])
+    return sizes, table
 
 
 def _draw(where: Bench, table: tuple, camera: Camera, lights: Lights, gloss: bool) -> Float[np.ndarray, "h w 3"]:

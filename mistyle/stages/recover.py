@@ -23,7 +23,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.stages.recover_check import trust, usable, without
 from mistyle.stages.recover_joint import together, where_possible
 from mistyle.stages.recover_pictures import improved
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.recover_settings import RecoverSettings, descent_steps
 from mistyle.stages.recover_smooth import smoothed
 from mistyle.stages.recover_table import atlas, linked
 from mistyle.stages.recover_texels import Found, Work, solve_level
@@ -93,7 +93,7 @@ def recover(
     pictured = partial(
         Shade, traced, captures, where.sizes, model=settings.model, frame=settings.frame, shadows=settings.shadows
     )
-    descends = settings.solver != "texels" and settings.iterations > 0
+    descends = descent_steps(settings) > 0
     shade = pictured(
         subsamples=settings.subsamples, memory=settings.memory * 1e9, weights=trust(captures, indirect),
         gradients=descends,

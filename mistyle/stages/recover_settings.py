@@ -140,10 +140,15 @@ class RecoverSettings(BaseModel):
         return value
 
 
+def descent_steps(settings: RecoverSettings) -> int:
+    """How many steps on whole pictures there are: none where texels are only solved one by one."""
+    return 0 if settings.solver == "texels" else settings.iterations
+
+
 def joint_steps(settings: RecoverSettings) -> int:
     """How many joint steps there are: none where texels are not solved one by one before and then whole pictures, or
     where neighbours shall have no word."""
-    return settings.joint if settings.solver == "both" and settings.smooth and settings.iterations else 0
+    return settings.joint if settings.solver == "both" and settings.smooth and descent_steps(settings) else 0
 
 
 def joint_estimates(settings: RecoverSettings) -> tuple[int, ...]:
