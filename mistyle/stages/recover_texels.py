@@ -132,56 +132,83 @@ def solve_texels(
     first = mean.copy() if start is None else pack(start)[gathered.texel, :7].copy()
     mean[:, 6] = first[:, 6]
     spread = np.tile(np.array(recover_prior.PRIOR_SPREAD, np.float32), (len(mean), 1))
-    decided, noise = np.ones(len(mean), np.float32), np.full(mean.shape, recover_prior.NOTHING, np.float32)
-    values, solved = first, settings.solver != "pictures" and len(gathered.observations.rgb) > 0
-    if solved:
-        problem = Problem(
-            gathered.points, gathered.rig, gathered.observations,
-            Options(settings.model, settings.metallic, floor=settings.roughness_floor),
-        )  # fmt: skip
+    if settings.solver == "pictures" or not len(gathered.observations.rgb):
+        if settings.solver != "pictures":
+            work.notes.append("No texel was observed in the light: texels were not solved one by one.")
+        noise = np.full(mean.shape, recover_prior.NOTHING, np.float32)
+        return _everywhere(gathered, where, (first, spread, np.ones(len(mean), np.float32), noise), False)
+    problem = Problem(
+        gathered.points, gathered.rig, gathered.observations,
+        Options(settings.model, settings.metallic, floor=settings.roughness_floor),
+    )  # fmt: skip
 
-        def solved_first(heard: Callable[[float], None]) -> Solution:
-            return recover_solve.first_solve(problem, first, mean, gathered.seen, settings, heard)
+    def begun(heard: Callable[[float], None]) -> Solution:
+        return recover_solve.first_solve(problem, first, mean, gathered.seen, settings, heard)
 
-        solution = solved_first(lambda done: progress(0.3 + 0.2 * done))
-        pictures, sure = len(work.captures), gathered.observations.weight
-        estimated, total = estimates(settings, pictures)[0], all_rounds(settings, pictures)
-        for number in range(total):
+    solution = begun(lambda done: progress(0.3 + 0.2 * done))
+    solution, gathered = _rounds(
+        work, shade, problem, begun, solution, gathered,
+        indirect=indirect, seed=seed, trace=trace, progress=lambda done: progress(0.5 + 0.5 * done),
+    )  # fmt: skip
+    bad = ~np.isfinite(solution.values).all(axis=1, keepdims=True)
+    if bad.any():
+        work.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
+    values = np.where(bad, mean, solution.values)
+    spread = np.where(bad, spread, solution.spread * recover_prior.inflation(solution, gathered))
+    told = recover_prior.decided(solution, gathered), recover_prior.told(solution, gathered, where)
+    return _everywhere(gathered, where, (values, spread, *told), True)
+
+
+def _rounds(
+    work: Work,
+    shade,
+    problem: Problem,
+    begun: Callable[[Callable[[float], None]], Solution],
+    solution: Solution,
+    gathered: Gathered,
+    *,
+    indirect: dict[int, np.ndarray],
+    seed: int,
+    trace: dict[str, list[float]],
+    progress: Callable[[float], None],
+) -> tuple[Solution, Gathered]:
+    """All rounds from `solution`, and the observations as they are after the last estimate of indirect light; `begun`
+    solves anew from the start."""
+    settings, where, pictures = work.settings, work.where, len(work.captures)
+    sure, estimated = gathered.observations.weight, estimates(settings, pictures)[0]
+    total = all_rounds(settings, pictures)
+    for number in range(total):
+
+        def heard(done: float, number=number) -> None:
+            progress((number + done) / total)
+
+        table = spread_out(solution.values, gathered, where)
+        if 0 < number <= settings.rounds * len(estimated) and number % settings.rounds == 0:
+            samples = estimated[number // settings.rounds - 1]
+            take_off_indirect(work, shade, table, indirect, samples, seed + number, lambda d, f=heard: f(0.4 * d))
+            gathered = direct(gathered, sure, work.captures, indirect)
+            problem.reweight(gathered.observations.weight)
+            problem.retarget(gathered.observations.rgb)
+            solution = begun(lambda d, f=heard: f(0.4 + 0.4 * d))
             table = spread_out(solution.values, gathered, where)
+        shade.table = table
+        lost: list[float] = []
 
-            def heard(done: float, number=number) -> None:
-                progress(0.5 + 0.5 * (number + done) / total)
+        def differences(k: int, lost=lost) -> np.ndarray:
+            rgb, mask = work.captures.load(k)
+            wrong = np.where(mask[..., None], np.nan_to_num(rgb) - shade.image(k), 0).astype(np.float32)
+            lost.append(float((wrong**2).mean()))
+            return wrong
 
-            if 0 < number <= settings.rounds * len(estimated) and number % settings.rounds == 0:
-                samples = estimated[number // settings.rounds - 1]
-                take_off_indirect(work, shade, table, indirect, samples, seed + number, lambda d: heard(0.4 * d))
-                gathered = direct(gathered, sure, work.captures, indirect)
-                problem.reweight(gathered.observations.weight)
-                problem.retarget(gathered.observations.rgb)
-                solution = solved_first(lambda d: heard(0.4 + 0.4 * d))
-                table = spread_out(solution.values, gathered, where)
-            shade.table = table
-            lost: list[float] = []
+        solution = recover_solve.another_round(problem, gathered, where, solution, differences, settings, number)
+        trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
+        heard(1.0)
+    return solution, gathered
 
-            def differences(k: int, lost=lost) -> np.ndarray:
-                rgb, mask = work.captures.load(k)
-                wrong = np.where(mask[..., None], np.nan_to_num(rgb) - shade.image(k), 0).astype(np.float32)
-                lost.append(float((wrong**2).mean()))
-                return wrong
 
-            solution = recover_solve.another_round(problem, gathered, where, solution, differences, settings, number)
-            trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(lost))))
-            heard(1.0)
-        values = solution.values
-        decided, noise = recover_prior.decided(solution, gathered), recover_prior.told(solution, gathered, where)
-        spread = solution.spread * recover_prior.inflation(solution, gathered)
-        bad = np.asarray(~np.isfinite(values).all(axis=1))
-        if bad.any():
-            work.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
-            values = np.where(bad.reshape(-1, 1), mean, values)
-            spread = np.where(bad.reshape(-1, 1), np.array(recover_prior.PRIOR_SPREAD, np.float32), spread)
-    elif settings.solver != "pictures":
-        work.notes.append("No texel was observed in the light: texels were not solved one by one.")
+def _everywhere(gathered: Gathered, where: Atlas, of_texels: tuple[np.ndarray, ...], solved: bool) -> Found:
+    """What is known `of_texels` (values, spread, decided, noise) for the whole atlas."""
+    values, spread, decided, noise = of_texels
     return Found(
         spread_out(values, gathered, where),
         placed(spread, gathered, where, np.array(recover_prior.PRIOR_SPREAD, np.float32)),
