@@ -145,11 +145,7 @@ def solve_texels(
     def begun(heard: Callable[[float], None]) -> Solution:
         return recover_solve.first_solve(problem, first, mean, gathered.seen, settings, heard)
 
-    solution = begun(lambda done: progress(0.3 + 0.2 * done))
-    solution, gathered = _rounds(
-        work, shade, problem, begun, solution, gathered,
-        indirect=indirect, seed=seed, trace=trace, progress=lambda done: progress(0.5 + 0.5 * done),
-    )  # fmt: skip
+    solution, gathered = _rounds(work, shade, problem, begun, gathered, indirect, seed, trace, progress)
     bad = ~np.isfinite(solution.values).all(axis=1, keepdims=True)
     if bad.any():
         work.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
@@ -164,23 +160,21 @@ def _rounds(
     shade,
     problem: Problem,
     begun: Callable[[Callable[[float], None]], Solution],
-    solution: Solution,
     gathered: Gathered,
-    *,
     indirect: dict[int, np.ndarray],
     seed: int,
     trace: dict[str, list[float]],
     progress: Callable[[float], None],
 ) -> tuple[Solution, Gathered]:
-    """All rounds from `solution`, and the observations as they are after the last estimate of indirect light; `begun`
-    solves anew from the start."""
+    """What all rounds end with, and the observations as they are after the last estimate of indirect light; `begun`
+    solves from the start, at first and after each estimate."""
     settings, where, pictures = work.settings, work.where, len(work.captures)
     sure, estimated = gathered.observations.weight, estimates(settings, pictures)[0]
-    total = all_rounds(settings, pictures)
+    total, solution = all_rounds(settings, pictures), begun(lambda done: progress(0.3 + 0.2 * done))
     for number in range(total):
 
         def heard(done: float, number=number) -> None:
-            progress((number + done) / total)
+            progress(0.5 + 0.5 * (number + done) / total)
 
         table = spread_out(solution.values, gathered, where)
         if 0 < number <= settings.rounds * len(estimated) and number % settings.rounds == 0:
