@@ -11,13 +11,26 @@ Report = Callable[[float], None]
 
 
 class Progress:
-    """Names the stage that runs, times it and watches its memory; `seconds` and `peaks` (GB) hold the finished ones."""
+    """Names the stage that runs, times it and watches its memory.
+
+    `seconds` and `peaks` (GB) hold the finished stages, `notes` what the user has to know about the result.
+    """
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
         self.seconds: dict[str, float] = {}
         self.peaks: dict[str, float] = {}
         self.reused: list[str] = []
+        self.notes: list[str] = []
+
+    def note(self, *texts: str) -> None:
+        """Keep sentences about what was left out, guessed, repaired or not understood, each once, for `tell_notes`."""
+        self.notes += [text for text in dict.fromkeys(texts) if text not in self.notes]
+
+    def tell_notes(self) -> None:
+        """Print the notes, a line each. A verb does this at its end, after the last progress line."""
+        for text in self.notes:
+            self.say(f"note      {' '.join(text.split())}")
 
     def say(self, text: str) -> None:
         if not self.quiet:
