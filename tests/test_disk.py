@@ -16,7 +16,8 @@ from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.paths import PACKAGE, scenes
 from mistyle.files import faults, store
 from mistyle.files.images import write_png
-from mistyle.files.store import Keeper, atomic_folder, atomic_write
+from mistyle.files.keeper import Keeper
+from mistyle.files.store import atomic_folder, atomic_write
 from mistyle.run import engines, exits
 from mistyle.run.batch import Choices, planned, summarise
 from mistyle.run.cli import main
@@ -86,7 +87,8 @@ from pathlib import Path
 from mistyle.core.errors import MistyleError
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.records import save_record
-from mistyle.files.store import Keeper, atomic_write
+from mistyle.files.keeper import Keeper
+from mistyle.files.store import atomic_write
 root = Path(sys.argv[1])
 noise = np.random.default_rng(0).random((200, 200)).astype(np.float32)
 writers = {
@@ -126,7 +128,8 @@ FORBIDDEN = """
 import os, sys
 from pathlib import Path
 from mistyle.core.errors import MistyleError
-from mistyle.files.store import Keeper, atomic_folder, atomic_write
+from mistyle.files.keeper import Keeper
+from mistyle.files.store import atomic_folder, atomic_write
 place = Path(sys.argv[1])
 if os.getuid() == 0:
     os.setgroups([]); os.setgid(65534); os.setuid(65534)

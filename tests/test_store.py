@@ -16,15 +16,16 @@ import pytest
 from pydantic import BaseModel
 
 from mistyle.core.errors import MistyleError, UsageError
-from mistyle.files import faults, lock, store
-from mistyle.files.store import Keeper, atomic_folder, atomic_write, digest, sha256_file
+from mistyle.files import faults, lock, output, store
+from mistyle.files.keeper import Keeper
+from mistyle.files.store import atomic_folder, atomic_write, digest, sha256_file
 from mistyle.run import checkpoint
 
 ROOT = Path(__file__).parents[1]
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir() if p.name != store.LOCK)
+    return sorted(p.name for p in folder.iterdir() if p.name not in (store.LOCK, output.RECORD))
 
 
 def text(content: str):
@@ -142,7 +143,7 @@ def test_what_a_user_did_in_a_stage_is_not_lost(tmp_path):
         (folder / "a.txt").write_text("retouched by hand")
         keeper.put("asset", "3", text("three"))
         assert (tmp_path / "asset.broken-1" / "a.txt").read_text() == "retouched by hand"
-        assert names(folder) == ["a.txt", "done.json"]
+        assert names(folder) == ["a.txt", "done.json", "notes"], "what is not ours stays in its place"
 
 
 def test_a_linked_folder_stays_linked(tmp_path):
@@ -165,7 +166,7 @@ def test_killed_run_leaves_nothing(tmp_path, moment):
     code = f"""
 import os, signal
 from pathlib import Path
-from mistyle.files.store import Keeper
+from mistyle.files.keeper import Keeper
 keeper = Keeper(Path({str(tmp_path)!r}))
 keeper.put("bake", "old", lambda f: (f / "a").write_text("old"))
 def write(f):
@@ -234,7 +235,7 @@ def test_lock_of_a_living_process_another_host_and_the_dead(tmp_path):
 HOLDS = """
 import sys, time
 from pathlib import Path
-from mistyle.files.store import Keeper
+from mistyle.files.keeper import Keeper
 keeper = Keeper(Path(sys.argv[1]))
 print("holds", flush=True)
 time.sleep(60)
@@ -275,7 +276,7 @@ TAKES = """
 import sys
 from pathlib import Path
 from mistyle.core.errors import UsageError
-from mistyle.files.store import Keeper
+from mistyle.files.keeper import Keeper
 root, mark = Path(sys.argv[1]), Path(sys.argv[2])
 for turn in range(60):
     try:

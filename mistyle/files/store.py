@@ -1,4 +1,4 @@
-"""Files that are whole or not there: atomic writes, content hashes, and the keeper of finished stages.
+"""Files that are whole or not there: atomic writes, content hashes, and the markers of finished folders.
 
 Everything is written under a hidden temporary name beside its place (`.<name>.tmp-<host>-<pid>-<n>`), flushed to the
 disk and then renamed. A run that is killed at any moment leaves only such names behind; the next run removes them.
@@ -13,20 +13,18 @@ import json
 import os
 import re
 import shutil
-import weakref
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
 from pydantic import BaseModel
 
-from mistyle.core.errors import MistyleError
 from mistyle.files import faults, lock
 from mistyle.files.own import read_own
 
 DONE = "done.json"
 LOCK = ".mistyle.lock"
-_COUNTER = itertools.count()
+COUNTER = itertools.count()
 _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>tmp|old)-(?P<host>.+)-(?P<pid>\d+)-(?P<n>\d+)(\.\w+)?")
 
 
@@ -37,7 +35,7 @@ def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
     A disk that is full, not to be written or gone raises MistyleError (`files/faults.py`) and leaves neither the file
     nor a temporary one; any other error passes through.
     """
-    temporary = _hidden(path, next(_COUNTER), "tmp", path.suffix)
+    temporary = hidden(path, next(COUNTER), "tmp", path.suffix)
     with faults.told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     try:
@@ -46,9 +44,9 @@ def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
                 data(temporary)
             else:
                 temporary.write_bytes(data)
-            _flush(temporary)
+            flush(temporary)
             os.replace(temporary, path)
-            _flush_folder(path.parent)
+            flush_folder(path.parent)
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -57,12 +55,15 @@ def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
 def atomic_folder(target: Path, write: Callable[[Path], None]) -> None:
     """Fill a new folder by `write(folder)` and put it at `target`, in the place of an older one, when it is complete.
 
+    For folders that are mistyle's alone (checkpoints): all that an older one holds goes. Folders in which a user may
+    have files are `output.put_folder`'s and `output.replace_files`'s.
+
     The older folder stays until then. Between the two renames of the swap `target` is absent for an instant; a run
     killed just there is mended by the next call (or the next Keeper) for the same place.
     """
     target = Path(os.path.realpath(target))  # a link to a folder elsewhere stays a link
-    count = next(_COUNTER)
-    temporary, old = _hidden(target, count, "tmp"), _hidden(target, count, "old")
+    count = next(COUNTER)
+    temporary, old = hidden(target, count, "tmp"), hidden(target, count, "old")
     with faults.told(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         clean_leftovers(target.parent, name=target.name)
@@ -70,17 +71,14 @@ def atomic_folder(target: Path, write: Callable[[Path], None]) -> None:
     try:
         with faults.told(target, temporary):
             write(temporary)
-            for path in _files(temporary):
-                _flush(path)
-            for folder in [*(p for p in sorted(temporary.rglob("*")) if p.is_dir()), temporary]:
-                _flush_folder(folder)
-            _swap(temporary, target, old)
-            _flush_folder(target.parent)
+            flush_all(temporary)
+            swap(temporary, target, old)
+            flush_folder(target.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def _swap(temporary: Path, target: Path, old: Path) -> None:
+def swap(temporary: Path, target: Path, old: Path) -> None:
     with contextlib.suppress(FileNotFoundError):  # none there, or another run has just taken it away
         os.rename(target, old)
     try:
@@ -179,133 +177,26 @@ def intact(folder: Path, editable: Callable[[str], bool] = lambda name: False) -
 
     Files whose names are `editable` may have changed.
     """
-    done = _done(folder)
-    if done is None:
+    found = done(folder)
+    if found is None:
         return None
     whole = all(
         (folder / name).is_file() and (editable(name) or sha256_file(folder / name) == value)
-        for name, value in done[1].items()
+        for name, value in found[1].items()
     )
-    return {DONE, *done[1]} if whole else None
+    return {DONE, *found[1]} if whole else None
 
 
-class Keeper:
-    """Keeps the folders of finished stages of one run and lets one process at a time work there.
-
-    `root/<stage>/` holds a stage's files and `done.json` (its key and the sha256 of every file). The lock
-    `root/.mistyle.lock` names process, host and time; it is released by `close`, at the end of a `with` block, and
-    when the object or the process goes. A lock whose process is gone is taken over.
-    """
-
-    def __init__(self, root: Path, say: Callable[[str], None] = lambda text: None, *, shared: bool = False) -> None:
-        """Take the lock (UsageError when another run holds it) and clear away what killed runs left.
-
-        `say` gets a sentence about every folder that is set aside. In a `shared` folder others write single files
-        without the lock: only what dead processes of this computer left is cleared.
-        """
-        self.root, self._say = Path(os.path.abspath(root)), say
-        with faults.told(self.root):
-            self.root.mkdir(parents=True, exist_ok=True)
-            self._owner = lock.take(self.root / LOCK)
-        self._release = weakref.finalize(self, lock.release, self.root / LOCK, self._owner)
-        clean_leftovers(self.root, everyones=not shared)
-
-    def __enter__(self) -> "Keeper":
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Release the lock; may be called twice."""
-        self._release()
-
-    def get(self, stage: str, key: str, editable: Callable[[str], bool] = lambda name: False) -> Path | None:
-        """The folder of a stage finished under this key with every file as it was written, else None.
-
-        A folder of another key stays where it is; a damaged one is renamed to `<stage>.broken-N`, never deleted.
-        Files that the stage did not write are ignored, and `editable` ones may have changed (run/edits.py).
-        """
-        folder = self.root / _checked(stage)
-        self._check_lock()
-        if not folder.exists():
-            return None
-        done = _done(folder)
-        if done is not None and done[0] != key:
-            return None
-        if done is not None and intact(folder, editable) is not None:
-            return folder
-        self._set_aside(folder)
-        return None
-
-    def put(self, stage: str, key: str, write: Callable[[Path], None], edited: Mapping[str, str] | None = None) -> Path:
-        """Run `write(folder)` on a new empty folder and keep it as the stage's result under `key`.
-
-        An older result of the stage is replaced only once the new one is complete; when `write` raises, or the disk
-        is full (MistyleError), the older one stays and nothing else does. What a user did there is not lost: an older
-        result with changed files is set aside like a broken one, and files that the stage had not written come along.
-        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them.
-        """
-        target = self.root / _checked(stage)
-        self._check_lock()
-
-        def fill(folder: Path) -> None:
-            write(folder)
-            self._check_lock()
-            seal(folder, stage=stage, key=key, **({"edited": dict(edited)} if edited else {}))
-            if target.exists():
-                written = intact(target, lambda name: name in (edited or {}))
-                if written is None:
-                    self._set_aside(target)
-                else:
-                    carry_over(target, folder, without=written)
-
-        atomic_folder(target, fill)
-        return target
-
-    def _set_aside(self, folder: Path) -> None:
-        number = next(n for n in itertools.count(1) if not (self.root / f"{folder.name}.broken-{n}").exists())
-        aside = self.root / f"{folder.name}.broken-{number}"
-        os.rename(folder, aside)
-        self._say(f"{folder}: not as it was finished (a file is missing or has changed); set aside as {aside.name}")
-
-    def _check_lock(self) -> None:
-        """Raises MistyleError where the folder was removed, or removed and taken by another run."""
-        if not lock.held(self.root / LOCK, self._owner):
-            raise MistyleError(
-                f"{self.root}: this folder, or the lock in it, was removed while a run worked there; it stops, so that "
-                "it cannot mix with another run. Run the same command again"
-            )
-
-
-def carry_over(old: Path, new: Path, *, without: set[str]) -> None:
-    """Bring the files of folder `old` that are not in `without` (paths inside it) and not in `new` to `new`."""
-    for path in _files(old):
-        name = path.relative_to(old)
-        if name.as_posix() not in without and not (new / name).exists():
-            (new / name).parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.link(path, new / name)  # the old folder goes; its files need not be copied for that
-            except OSError:
-                shutil.copy2(path, new / name)
-
-
-def _done(folder: Path) -> tuple[str, dict[str, str]] | None:
+def done(folder: Path) -> tuple[str, dict[str, str]] | None:
     """Key and hashes of a finished stage's marker; None when there is no readable one."""
     try:
-        done = read_own(folder / DONE)
-        return str(done["key"]), {str(k): str(v) for k, v in done["files"].items()}
+        found = read_own(folder / DONE)
+        return str(found["key"]), {str(k): str(v) for k, v in found["files"].items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):
         return None
 
 
-def _checked(stage: str) -> str:
-    if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", stage):
-        raise ValueError(f"'{stage}' is no name for a stage; use letters, digits, '-' and '_'")
-    return stage
-
-
-def _hidden(path: Path, count: int, kind: str, suffix: str = "") -> Path:
+def hidden(path: Path, count: int, kind: str, suffix: str = "") -> Path:
     return path.with_name(f".{path.name}.{kind}-{lock.this_host()}-{os.getpid()}-{count}{suffix}")
 
 
@@ -313,12 +204,20 @@ def _files(folder: Path) -> list[Path]:
     return sorted(p for p in folder.rglob("*") if p.is_file())
 
 
-def _flush(path: Path) -> None:
+def flush_all(folder: Path) -> None:
+    """Bring a folder's files and folders to the disk."""
+    for path in _files(folder):
+        flush(path)
+    for place in [*(p for p in sorted(folder.rglob("*")) if p.is_dir()), folder]:
+        flush_folder(place)
+
+
+def flush(path: Path) -> None:
     with open(path, "rb+") as file:
         os.fsync(file.fileno())
 
 
-def _flush_folder(folder: Path) -> None:
+def flush_folder(folder: Path) -> None:
     if os.name != "posix":
         return
     handle = os.open(folder, os.O_RDONLY)

@@ -64,6 +64,12 @@ def write_views(
     _write_json(folder / "lights.json", to_json(lights))
 
 
+def file_names(names: Sequence[str], paper_files: bool) -> list[str]:
+    """The files that `write_views` writes for views of these names."""
+    endings = [".exr", ".png", *(["_depth.png", "_canny.png"] if paper_files else [])]
+    return ["camera.json", "transforms.json", "lights.json", *(f"{name}{e}" for name in names for e in endings)]
+
+
 def _write_view(folder: Path, view: View, paper_files: bool) -> dict[str, Any]:
     name = view.camera.name
     write_exr(folder / f"{name}.exr", channels(view))

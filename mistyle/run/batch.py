@@ -17,7 +17,8 @@ from typing import Any
 
 from mistyle.core.cores import cores
 from mistyle.core.errors import MistyleError, UsageError
-from mistyle.files.store import Keeper, atomic_write, clean_leftovers
+from mistyle.files.keeper import Keeper
+from mistyle.files.store import atomic_write, clean_leftovers
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs
 from mistyle.run.batch_plan import PLAN, Plan, read_plan, write_plan

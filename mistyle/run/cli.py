@@ -287,7 +287,7 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     from mistyle.run.progress import Progress
     from mistyle.run.stages import Job
 
-    job = Job(mesh, style, options.out, settings, called, options.redo_from)
+    job = Job(mesh, style, options.out, settings, called, options.redo_from, options.overwrite)
     if options.dry_run:
         estimate = plan(job)
         print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
@@ -295,7 +295,7 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     if options.variations:
         from mistyle.run.variations import sheet
 
-        made = sheet(mesh, style, options.out, settings, options.variations, Progress())
+        made = sheet(mesh, style, options.out, settings, options.variations, Progress(), overwrite=options.overwrite)
         print(json.dumps(made) if options.json else "\n".join([f"sheet     {made['sheet']}", *made["variations"]]))
         return 0
     summary = stylize(job, Progress())
@@ -314,7 +314,7 @@ def _render(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import render_views
 
-    written = render_views(options.mesh, options.out, settings, Progress())
+    written = render_views(options.mesh, options.out, settings, Progress(), overwrite=options.overwrite)
     print(json.dumps({"views": [str(p) for p in written]}) if options.json else f"views     {options.out}")
     return 0
 
@@ -326,8 +326,9 @@ def _bake(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import bake_views
 
+    name = options.name or options.mesh.stem
     summary = bake_views(
-        options.mesh, options.views, options.out, settings, options.name or options.mesh.stem, Progress()
+        options.mesh, options.views, options.out, settings, name, Progress(), overwrite=options.overwrite
     )
     print(json.dumps(summary) if options.json else f"asset     {summary['asset']}")
     return 0

@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.children import PARENT
-from mistyle.run.options import DELIVERY_OPTIONS, NAME_HELP, add_delivery_options, examples, said_settings
+from mistyle.run.options import (
+    DELIVERY_OPTIONS,
+    NAME_HELP,
+    add_delivery_options,
+    add_overwrite_option,
+    examples,
+    said_settings,
+)
 
 
 def add_batch(verbs: Any) -> None:
@@ -137,6 +144,7 @@ def _add_pack(verbs: Any) -> None:
     )
     verb.add_argument("-o", "--out", type=Path, required=True, metavar="DIR")
     verb.add_argument("--extras", nargs="+", default=[], metavar="NAME", help="optional parts to take along")
+    add_overwrite_option(verb)
     verb.set_defaults(command=_pack)
 
 
@@ -144,7 +152,7 @@ def _pack(options: argparse.Namespace) -> int:
     from mistyle.run.pack import pack
     from mistyle.run.progress import Progress
 
-    folder = pack(options.out, options.extras, Progress())
+    folder = pack(options.out, options.extras, Progress(), overwrite=options.overwrite)
     print(f"packed: {folder} (install with {folder / 'install.sh'} TARGET)", file=sys.stderr)
     return 0
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
-from mistyle.run.options import examples
+from mistyle.run.options import add_overwrite_option, examples
 
 
 def add_compare(verbs: Any) -> None:
@@ -27,6 +27,7 @@ def add_compare(verbs: Any) -> None:
     )
     verb.add_argument("pictures", type=Path, nargs="*", metavar="PICTURE", help="REFERENCE TEST…: files, or folders")
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="folder for the page and the tables")
+    add_overwrite_option(verb)
     verb.add_argument("--json", action="store_true", help="compare.json on stdout, logs on stderr")
     _add_what(verb)
     _add_limits(verb)
@@ -61,6 +62,7 @@ def add_converge(verbs: Any) -> None:
     verb.add_argument("--sensor", type=int, default=0, metavar="K", help="of a scene file: the sensor")
     verb.add_argument("--blender", metavar="PYTHON", help="Python with bpy, for blender:cycles")
     verb.add_argument("--threads", type=int, metavar="N", help="threads of blender:cycles (default: all)")
+    add_overwrite_option(verb)
     verb.add_argument("--json", action="store_true", help="converge.json on stdout, logs on stderr")
     verb.set_defaults(command=_converge)
 
@@ -164,7 +166,7 @@ def _approve(options: argparse.Namespace) -> int:
         raise UsageError("--approve NAME needs --baseline DIR and one folder of new pictures")
     from mistyle.run.compare_baseline import approve
 
-    names = approve(options.baseline, options.pictures[0], options.approve)
+    names = approve(options.baseline, options.pictures[0], options.approve, overwrite=options.overwrite)
     print(json.dumps({"approved": names}) if options.json else "\n".join(f"approved {name}" for name in names))
     return 0
 
@@ -202,6 +204,7 @@ def job_of(options: argparse.Namespace, reference: Path | None = None, tests: tu
         allow_missing=options.allow_missing,
         pictures=options.show,
         crop=_crop(options.crop),
+        overwrite=options.overwrite,
     )
 
 
@@ -237,17 +240,10 @@ def _limits_file(options: argparse.Namespace, reference: Path) -> Path | None:
 
 
 def safe(out: Path, inputs: list[Path]) -> None:
-    """UsageError where writing OUT would replace something that no comparison wrote, or an input."""
-    safe_folder(out, "compare.json")
+    """UsageError where OUT holds an input: the next comparison would take this one's pictures for it."""
     for path in inputs:
         if path.resolve().is_relative_to(out.resolve()):
-            raise UsageError(f"-o {out}: holds the input {path}, which would be replaced; choose another folder")
-
-
-def safe_folder(out: Path, mark: str) -> None:
-    """UsageError where OUT holds something and not the `mark` of an earlier run."""
-    if out.exists() and (not out.is_dir() or (any(out.iterdir()) and not (out / mark).is_file())):
-        raise UsageError(f"-o {out}: found something that this command did not write; choose a new or empty folder")
+            raise UsageError(f"-o {out}: holds the input {path}; choose another folder")
 
 
 def _viewing(options: argparse.Namespace) -> Any:

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mistyle.run.options import NAME_HELP, examples
+from mistyle.run.options import NAME_HELP, add_overwrite_option, examples
 
 
 def add_export(verbs: Any) -> None:
@@ -40,6 +40,7 @@ def add_export(verbs: Any) -> None:
         "--metres-per-unit", type=float, default=1.0, metavar="X", help="what USD says of the mesh's units"
     )
     verb.add_argument("--colorspace", metavar="NAME", help="linear space of EXR textures (default: linear Rec.709)")
+    add_overwrite_option(verb)
     verb.add_argument("--json", action="store_true", help="the files as one JSON object on stdout")
     verb.set_defaults(command=_export)
 
@@ -63,6 +64,7 @@ def _export(options: argparse.Namespace) -> int:
             metres_per_unit=options.metres_per_unit,
             colour=colour,
             source=options.source,
+            overwrite=options.overwrite,
         )
     if options.json:
         print(json.dumps({"files": [str(p) for p in files]}))
@@ -94,6 +96,7 @@ def add_verify(verbs: Any) -> None:
     verb.add_argument("--spp", type=int, default=128, metavar="N", help="samples per pixel (default 128)")
     verb.add_argument("--light", default="studio", metavar="L", help="studio (default), key, grazing, or an .exr, .hdr")
     verb.add_argument("--threads", type=int, default=0, metavar="N", help="threads of the renderers (default: all)")
+    add_overwrite_option(verb)
     verb.add_argument("--json", action="store_true", help="the outcome as one JSON object on stdout")
     verb.set_defaults(command=_verify)
 
@@ -104,7 +107,7 @@ def _verify(options: argparse.Namespace) -> int:
     rendering = None
     if not options.no_render:
         rendering = Rendering(options.views, options.size, options.spp, options.light, options.threads)
-    told = verify(options.asset, options.out, blender=options.blender, rendering=rendering)
+    told = verify(options.asset, options.out, blender=options.blender, rendering=rendering, overwrite=options.overwrite)
     if options.json:
         print(json.dumps(told))
     print(table(told), file=sys.stderr)

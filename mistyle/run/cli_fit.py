@@ -173,6 +173,7 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
         options.exposure,
         options.pictures,
         options.redo_from,
+        options.overwrite,
     )
     if options.dry_run:
         estimate = plan_material(job)

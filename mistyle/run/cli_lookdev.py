@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused
-from mistyle.run.options import examples
+from mistyle.run.options import add_overwrite_option, examples
 
 
 def add_view(verbs: Any) -> None:
@@ -53,6 +53,7 @@ def add_lookdev(verbs: Any) -> None:
     verb.add_argument("--seed", type=int, metavar="N", help="every random choice follows from it (0)")
     verb.add_argument("--threads", type=int, metavar="N", help="threads to use (all cores)")
     verb.add_argument("--date", metavar="TEXT", help="the date in the burn-in (that of the asset's file)")
+    add_overwrite_option(verb)
     verb.add_argument("--json", action="store_true", help="the paths as one JSON object on stdout")
     verb.set_defaults(command=_lookdev)
 
@@ -66,7 +67,14 @@ def _lookdev(options: argparse.Namespace) -> int:
     said = {name: value for name in names if (value := getattr(options, name, None)) is not None}
     settings = validate(said, "lookdev", LookSettings)
     files = lookdev(
-        options.asset, options.out, settings, Progress(), hdri=options.hdri, date=options.date, mp4=options.mp4
+        options.asset,
+        options.out,
+        settings,
+        Progress(),
+        hdri=options.hdri,
+        date=options.date,
+        mp4=options.mp4,
+        overwrite=options.overwrite,
     )
     print(json.dumps(files) if options.json else "\n".join(f"{k:<10} {v}" for k, v in files.items()))
     return 0

@@ -19,7 +19,8 @@ import numpy as np
 
 from mistyle.core.errors import InputRefused
 from mistyle.files.layers import BEAUTY, Frame
-from mistyle.files.store import atomic_folder, atomic_write
+from mistyle.files.output import claim, replace_files
+from mistyle.files.store import atomic_write
 from mistyle.measure import compare_metrics as metrics
 from mistyle.measure import compare_protocols as protocols
 from mistyle.measure.compare_metrics import METRICS, Measured
@@ -38,6 +39,7 @@ NONFINITE = (
     "Pixels with a NaN or infinite channel are left out of every metric, magenta in every picture, and fail their row "
     "unless --allow-nonfinite; in data layers equal infinities (depth where nothing is) are no failure."
 )
+FILES = ("compare.json", "compare.csv", "junit.xml", "index.html")
 # What a frame is ranked by: the first of these that it has.
 RANK = ("flip", "hdr_flip", "relmse", "psnr", "psnr_h", "rms_error", "rmse")
 
@@ -83,7 +85,9 @@ def compare(
         result["figures"] = extras(folder) if extras is not None else []
         _write_files(folder, result, found, overall)
 
-    atomic_folder(job.out, write)
+    inputs = [job.reference, *job.tests]
+    claim(job.out, FILES, inputs=inputs, overwrite=job.overwrite)
+    replace_files(job.out, "compare", write, inputs=inputs, overwrite=job.overwrite)
     return result
 
 

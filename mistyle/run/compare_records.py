@@ -27,6 +27,7 @@ class CompareJob:
     pictures  how many pictures the page shows, the worst ones
     crop      x, y, width, height of the inset figure
     titles    what reference and tests are called on the page; empty: their paths
+    overwrite whether files of the same names that mistyle did not write are replaced in `out`
     """
 
     reference: Path
@@ -44,6 +45,7 @@ class CompareJob:
     pictures: int = 48
     crop: tuple[int, int, int, int] | None = None
     titles: tuple[str, ...] = ()
+    overwrite: bool = False
 
 
 @dataclass(frozen=True)

@@ -16,10 +16,11 @@ import numpy as np
 
 from mistyle.core.errors import UsageError
 from mistyle.files.images import write_exr
+from mistyle.files.output import claim
 from mistyle.files.store import atomic_write
 from mistyle.measure.compare_stats import Tested, same_picture
-from mistyle.run.cli_compare import job_of, safe, told
-from mistyle.run.compare import compare
+from mistyle.run.cli_compare import job_of, told
+from mistyle.run.compare import FILES, compare
 from mistyle.run.compare_pictures import DIVERGING, mapped, webp
 from mistyle.run.progress import Progress
 from mistyle.run.render_files import Shot
@@ -37,7 +38,7 @@ def run_render(options: argparse.Namespace) -> int:
     if min(options.spp, options.size, options.seeds, options.views) < 1:
         raise UsageError("--spp, --size, --seeds and --views are 1 at least")
     chosen = [renderer(text, options.blender) for text in options.renderers]
-    safe(options.out, [])
+    claim(options.out, FILES, inputs=[options.render], overwrite=options.overwrite)
     progress = Progress()
     with TemporaryDirectory(prefix="mistyle-") as work:
         folders, tests, context = _draw(options, chosen, Path(work), progress)

@@ -19,16 +19,17 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.files.output import claim, replace_files
 from mistyle.files.store import atomic_write
 from mistyle.measure.compare_metrics import definitions, measure_colour
 from mistyle.measure.compare_stats import interval, slope
 from mistyle.run.charts import Chart
-from mistyle.run.cli_compare import safe_folder
 from mistyle.run.progress import Progress
 from mistyle.run.render_files import Shot, Subject
 from mistyle.run.renderers import Renderer, renderer, shots, subject
 from mistyle.run.summary import versions
 
+FILES = ("converge.json", "converge.csv", "index.html")
 METRICS = ("relmse", "smape", "flip")
 FIRST_SEED = 1_000_003  # of the reference: none of the measured renders shares its samples
 
@@ -65,7 +66,8 @@ def run_converge(options: argparse.Namespace) -> int:
     if options.seeds < 2 or options.max_spp < 2 or options.size < 1:
         raise UsageError("--seeds and --max-spp are 2 at least: intervals and slopes need two points")
     chosen = [renderer(text, options.blender) for text in names]
-    safe_folder(options.out, "converge.json")
+    inputs = [path for path in (options.scene, options.reference) if path is not None]
+    claim(options.out, FILES, inputs=inputs, overwrite=options.overwrite)
     counts = [2**k for k in range(int(math.log2(options.max_spp)) + 1)]
     progress = Progress()
     with TemporaryDirectory(prefix="mistyle-") as work:
@@ -81,7 +83,8 @@ def run_converge(options: argparse.Namespace) -> int:
         "renderers": drew,
         "versions": versions(),
     }
-    write(options.out, record, found)
+    how = {"inputs": inputs, "overwrite": options.overwrite}
+    replace_files(options.out, "converge", lambda folder: write(folder, record, found), **how)
     _tell(options, record)
     return 0
 

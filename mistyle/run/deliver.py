@@ -17,9 +17,10 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.files.bounds import USD
+from mistyle.files.output import claim, read_written, replace_files
 from mistyle.files.own import read_own
 from mistyle.files.packing import TARGETS
-from mistyle.files.store import atomic_folder, atomic_write, carry_over, digest, sha256_file
+from mistyle.files.store import atomic_write, digest, sha256_file
 from mistyle.files.textures import safe_name
 from mistyle.run.colour import key_of, light_space, picture_space
 from mistyle.run.deliver_files import Delivery, fields_for, write_delivery
@@ -39,6 +40,7 @@ def export(
     metres_per_unit: float = 1.0,
     colour: ColourSettings | None = None,
     source: Path | None = None,
+    overwrite: bool = False,
 ) -> list[Path]:
     """Deliver the asset found at `place` into the folder `out`; returns the delivery's files.
 
@@ -56,8 +58,6 @@ def export(
         checked_textures(names)
     except ValueError as error:
         raise UsageError(str(error)) from None
-    if out.exists() and any(out.iterdir()) and not list(out.glob("*.export.json")):
-        raise UsageError(f"{out}: this folder holds other things; choose an empty or new one")
     colour = colour or ColourSettings()
     folder, manifest = read_listing(place)
     files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != "done.json"]
@@ -65,8 +65,13 @@ def export(
     called, version = _called(out, name, fields_for(manifest, target), of)
     chosen = Delivery(tuple(formats), target, called, version, names, metres_per_unit, light_space(colour), source)
     if not _whole(out, called, of):
+        inputs = [place, folder, *([source] if source else [])]
+        claim(out, named_files(chosen), inputs=inputs, overwrite=overwrite)
         finished = read_finished(place)
-        atomic_folder(out, lambda new: _deliver(new, out, finished, chosen, of))
+        replace_files(
+            out, f"export {called}", lambda new: _deliver(new, out, finished, chosen, of), inputs=inputs,
+            overwrite=overwrite, lasting=lambda name: name.endswith("_look.usda"),
+        )  # fmt: skip
     record = read_own(out / f"{called}.export.json")
     return sorted([out / f"{called}.export.json", *(out / str(e["file"]) for e in record["files"])])
 
@@ -106,31 +111,24 @@ def _whole(out: Path, name: str, of: str) -> bool:
 
 
 def _deliver(new: Path, out: Path, finished: Finished, chosen: Delivery, of: str) -> None:
-    """Fill the folder, and take along what other deliveries left there. UsageError where this one would replace it."""
+    """Fill the folder. UsageError where this delivery would replace a file of another one."""
     record: dict[str, Any] = write_delivery(new, out, finished, chosen) | {"of": of}
     path = new / f"{chosen.name}.export.json"
     atomic_write(path, (json.dumps(record, indent=1) + "\n").encode())
-    if not out.exists():
-        return
-    earlier = _earlier(out, chosen.name)
     own = {e["file"] for e in record["files"] if not e.get("shared")}
-    others = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()} - earlier
+    others = {file for file, entry in read_written(out).files.items() if entry.by != f"export {chosen.name}"}
     if own & others:
         raise UsageError(
             f"{out}: {sorted(own & others)[0]} is another delivery's file; put {{asset}} into --texture-name, or "
             "deliver into another folder"
         )
-    carry_over(out, new, without=earlier)
 
 
-def _earlier(out: Path, name: str) -> set[str]:
-    """What an earlier delivery of this name wrote for itself."""
-    listing = f"{name}.export.json"
-    try:
-        files = read_own(out / listing)["files"]
-        return {listing, *(str(e["file"]) for e in files if not e.get("shared"))}
-    except (OSError, ValueError, LookupError, TypeError):
-        return {listing}
+def named_files(chosen: Delivery) -> list[str]:
+    """The files of a delivery that are called like it; those of textures hang on the asset."""
+    endings = {"glb": (".glb",), "usd": (".usda", ".usdz"), "mtlx": (".mtlx",), "obj": (".obj", ".mtl")}
+    every = (".export.json", *(e for f in chosen.formats for e in endings.get(f, ())))
+    return [f"{chosen.name}{ending}" for ending in every]
 
 
 def with_delivery(plan: Any, said: Mapping[str, Any]) -> Any:
@@ -177,6 +175,7 @@ def deliver(job: Any, progress: Any) -> dict[str, dict[str, list[str]]]:
                 metres_per_unit=chosen.metres_per_unit,
                 colour=job.settings.colour,
                 source=job.mesh if job.mesh.suffix.lower() in USD else None,
+                overwrite=job.overwrite,
             )
             made[target] = [str(path) for path in files]
             report(len(made) / len(chosen.chosen_targets))

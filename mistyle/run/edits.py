@@ -8,7 +8,6 @@ An edited file is noticed by its sha256, stays as it is, and what depends on it 
 folder may be edited: a finished stage with another changed file is set aside and made again.
 """
 
-import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -59,15 +58,6 @@ def found(folder: Path, stage: str) -> tuple[dict[str, str], dict[str, str]]:
     ours = [name for name in names if editable(stage, name) and name.rpartition(".")[0] in stems]
     hashes = {name: sha256_file(folder / name) for name in ours}
     return taken_up, {name: value for name, value in hashes.items() if written.get(name) != value}
-
-
-def set_aside(folder: Path) -> Path:
-    """Rename a folder to `<name>.edited-N`; its new place."""
-    number = 1
-    while (aside := folder.with_name(f"{folder.name}.edited-{number}")).exists():
-        number += 1
-    os.rename(folder, aside)
-    return aside
 
 
 def sentence(stage: str, names: Sequence[str], new: bool) -> str:

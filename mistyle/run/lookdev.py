@@ -20,6 +20,7 @@ from mistyle import __version__
 from mistyle.core.asset import Asset
 from mistyle.core.errors import MistyleError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
+from mistyle.files.output import claim, replace_files
 from mistyle.files.store import atomic_write, sha256_file
 from mistyle.run.progress import Progress
 from mistyle.run.report_overlays import MAGENTA, viridis
@@ -27,6 +28,7 @@ from mistyle.run.sheet_canvas import PANEL, Panel, Row, Sheet, beside, compose, 
 
 VIEW_TRANSFORM = "sRGB (Rec.709), no tone curve"
 USUAL = 560  # pixels of a hero picture for which the sheet's type is made
+TURNS = {"turntable": "turn the asset", "light_turn": "turn the light"}
 LIGHT_STEPS = 8  # pictures of the HDRI's rotation on the sheet
 
 
@@ -63,6 +65,7 @@ def lookdev(
     hdri: Path | None = None,
     date: str | None = None,
     mp4: bool = False,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Draw the sheet of a mesh file or run folder into `out`; returns the paths of what was written.
 
@@ -77,6 +80,8 @@ def lookdev(
 
     if mp4:
         encoder()
+    inputs = [place, *([hdri] if hdri is not None else [])]
+    claim(out, files_of_sheet(settings, mp4), inputs=inputs, overwrite=overwrite)
     start_engines(settings)
     with progress.stage("read", "read the asset"):
         subject = read_subject(place)
@@ -88,19 +93,11 @@ def lookdev(
     with progress.stage("sheet", "draw the sheet") as report:
         day = date or datetime.datetime.fromtimestamp(subject.path.stat().st_mtime, datetime.UTC).date().isoformat()
         picture = compose(*sheet(subject, stage, lights, settings, day, report))
-    write_png(out / "lookdev.png", srgb_from_linear(np.clip(picture, 0, 1)))
-    write_exr(out / "lookdev.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)), half=True)
     written = {"sheet": str(out / "lookdev.png"), "exr": str(out / "lookdev.exr")}
     turns = {
         "turntable": (settings.turntable, stage.turn, lights[0]),
         "light_turn": (settings.hdri_turn, stage.light_turn, lights[2]),
     }
-    for name, (frames, draw, rig) in turns.items():
-        if frames:
-            with progress.stage(name, {"turntable": "turn the asset", "light_turn": "turn the light"}[name]) as report:
-                drawn = draw(frames, rig.light, settings.frame, max(settings.spp // 2, 1), settings.seed, report)
-                paths = write_turn(out / name, [shown(p) for p in drawn], mp4)
-                written[name] = str(paths[-1])
     record = {"asset": subject.path.name, "sha256": sha256_file(subject.path), "date": day, "mistyle": __version__}
     record |= {
         "settings": settings.model_dump(mode="json"),
@@ -108,8 +105,29 @@ def lookdev(
         "hdri": hdri.name if hdri else None,
     }
     record["exposure_stops"] = {rig.name: round(rig.stops, 3) for rig in lights}
-    atomic_write(out / "lookdev.json", (json.dumps(record, indent=1) + "\n").encode())
+
+    def fill(folder: Path) -> None:
+        write_png(folder / "lookdev.png", srgb_from_linear(np.clip(picture, 0, 1)))
+        write_exr(folder / "lookdev.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)), half=True)
+        for name, (frames, draw, rig) in turns.items():
+            if frames:
+                with progress.stage(name, TURNS[name]) as report:
+                    drawn = draw(frames, rig.light, settings.frame, max(settings.spp // 2, 1), settings.seed, report)
+                    paths = write_turn(folder / name, [shown(p) for p in drawn], mp4)
+                    written[name] = str(out / paths[-1].relative_to(folder))
+        atomic_write(folder / "lookdev.json", (json.dumps(record, indent=1) + "\n").encode())
+
+    replace_files(out, "lookdev", fill, inputs=inputs, overwrite=overwrite)
     return written
+
+
+def files_of_sheet(settings: LookSettings, mp4: bool) -> list[str]:
+    """What a sheet with these settings consists of."""
+    names = ["lookdev.png", "lookdev.exr", "lookdev.json"]
+    for name, frames in (("turntable", settings.turntable), ("light_turn", settings.hdri_turn)):
+        if frames:
+            names += [*(f"{name}/{k:03}.png" for k in range(frames)), f"{name}.webp", *([f"{name}.mp4"] * mp4)]
+    return names
 
 
 def read_subject(place: Path) -> Subject:

@@ -27,7 +27,7 @@ from mistyle.run.material_files import scene, write
 from mistyle.run.material_pictures import look_through, looked
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 from mistyle.run.progress import Progress, Report
-from mistyle.run.stages import MATERIAL_STAGES, Run
+from mistyle.run.stages import MATERIAL_STAGES, Run, claim_run
 from mistyle.run.start import read, start_engines
 
 
@@ -46,6 +46,7 @@ class MaterialJob:
     exposure: Path | None = None
     pictures: Path | None = None
     redo_from: str | None = None
+    overwrite: bool = False
 
 
 @dataclass(frozen=True)
@@ -102,6 +103,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
 
     files = input_files(job.mesh)
     s = job.settings
+    claim_run(job, MATERIAL_STAGES, inputs_of(job))
     check(s)
     captures = references_of(job)
     check_material(s, pixels_of(captures))
@@ -141,6 +143,13 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
             lambda f, r: material_report(f, made, progress, r),
         )
         return deliver(job, progress) | write_summary(made, run)
+
+
+def inputs_of(job: MaterialJob) -> list[Path]:
+    """Every file and folder of the user's that the job reads."""
+    lights = job.lights if isinstance(job.lights, Path) else None
+    given = (job.references, lights, job.masks, job.exposure, job.pictures)
+    return [*input_files(job.mesh), *(path for path in given if path is not None)]
 
 
 def references_of(job: MaterialJob) -> Captures:

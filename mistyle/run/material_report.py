@@ -1,6 +1,5 @@
 """What `mistyle fit` reports: the page, and `run.json`."""
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -8,7 +7,6 @@ from typing import Any, Literal
 import numpy as np
 
 from mistyle.core.image import luminance, srgb_from_linear
-from mistyle.files.store import atomic_write
 from mistyle.run import report_overlays
 from mistyle.run.charts import Chart
 from mistyle.run.pages import close_up, file_list, frames, heat, map_shots, render, setting_groups, shown, side_by_side
@@ -17,7 +15,7 @@ from mistyle.run.report import Figure, MapSet, Note, Pair, Report, Shot, Step, T
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
 from mistyle.run.stages import MATERIAL_STAGES, Run
-from mistyle.run.summary import earlier, merged_peaks, merged_seconds, peak_gb, versions
+from mistyle.run.summary import earlier, merged_peaks, merged_seconds, peak_gb, versions, write_record
 from mistyle.run.turntable import write_turn
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
@@ -215,5 +213,5 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "settings": job.settings.model_dump(mode="json"),
         "versions": versions(),
     }
-    atomic_write(path, (json.dumps(record, indent=1) + "\n").encode())
+    write_record(job, record, run.progress)
     return summary

@@ -37,6 +37,16 @@ def add_job_options(
     verb.add_argument("--threads", type=int, help="threads to use; the result depends on it (default: all cores)")
     verb.add_argument("--json", action="store_true", help="one JSON object on stdout, logs on stderr")
     verb.add_argument("--print-config", action="store_true", help="print every setting as TOML and stop")
+    add_overwrite_option(verb)
+
+
+def add_overwrite_option(verb: argparse.ArgumentParser) -> None:
+    """What may be covered in an output folder."""
+    verb.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace files of colliding names that mistyle did not write, or that were edited; never an input",
+    )
 
 
 def gigabytes(text: str) -> float:

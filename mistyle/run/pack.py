@@ -20,7 +20,8 @@ from pathlib import Path
 from mistyle import __version__
 from mistyle.bootstrap import CONSTRAINTS, ROOT, home, in_clone, read_record
 from mistyle.core.errors import EnvironmentMissing, MistyleError
-from mistyle.files.store import atomic_folder, sha256_file
+from mistyle.files.output import claim, replace_files
+from mistyle.files.store import sha256_file
 from mistyle.run.progress import Progress
 
 INSTALL = """#!/bin/sh
@@ -54,11 +55,12 @@ exec "$here/bin/python" -m mistyle "$@"
 """
 
 
-def pack(folder: Path, extras: Sequence[str], progress: Progress) -> Path:
-    """Make the folder anew; needs the network once, here. Raises EnvironmentMissing without a libLLVM to take along."""
+def pack(folder: Path, extras: Sequence[str], progress: Progress, *, overwrite: bool = False) -> Path:
+    """Make the pack's files anew; needs the network once, here. Raises EnvironmentMissing without a libLLVM to take along."""
     library, beside = llvm_files()
+    claim(folder, ["install.sh", "constraints.txt", "SHA256SUMS"], overwrite=overwrite)
     with progress.stage("pack", "collect the wheels"):
-        atomic_folder(folder, lambda new: _fill(new, extras, library, beside))
+        replace_files(folder, "pack", lambda new: _fill(new, extras, library, beside), overwrite=overwrite)
     return folder
 
 

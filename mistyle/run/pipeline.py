@@ -25,7 +25,7 @@ from mistyle.run.made import Atlas, Baked, Repaired
 from mistyle.run.painting import bake, check_coat, coat, coat_files, stylized_stage, unlit_views
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
-from mistyle.run.stages import Job, Run
+from mistyle.run.stages import STAGES, Job, Run, claim_run
 from mistyle.run.start import draw, lay_out, read, start_engines
 
 
@@ -57,6 +57,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     from mistyle.run.summary import write_summary
 
     files = input_files(job.mesh)
+    claim_run(job, STAGES, inputs_of(job))
     check(job.settings)
     style = read_style(job.style, job.settings.colour)
     check_coat(job.settings.coat)
@@ -77,6 +78,12 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
             lambda folder, r: job_report(folder, made, progress, r),
         )
         return deliver(job, progress) | write_summary(made, run)
+
+
+def inputs_of(job: Job) -> list[Path]:
+    """Every file and folder of the user's that the job reads."""
+    s = job.settings
+    return [*input_files(job.mesh), job.style, *coat_files(s.coat), *filter(None, (s.rig.file, s.draw.scene))]
 
 
 def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Callable[[int, int], None]) -> Made:

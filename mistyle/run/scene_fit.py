@@ -18,16 +18,19 @@ from jaxtyping import Float
 from mistyle.core import stopping
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import linear_from_srgb
-from mistyle.files.store import Keeper, atomic_folder, atomic_write, digest
+from mistyle.files.keeper import Keeper
+from mistyle.files.output import claim
+from mistyle.files.store import atomic_write, digest
 from mistyle.run import checkpoint
 from mistyle.run.charts import Chart
 from mistyle.run.material_report import difference, encoded
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, Note, Pair, Report, Shot, Step, write_report
 from mistyle.run.stages import program
-from mistyle.run.summary import peak_gb, versions
+from mistyle.run.summary import peak_gb, versions, write_record
 
 PICTURES = (".exr", ".png", ".tif", ".tiff", ".jpg", ".jpeg", ".webp")
+FOLDERS = ("scene", "pictures", "report", "work")
 ITERATIONS = {"draft": 64, "standard": 256}
 
 
@@ -54,8 +57,10 @@ def run_scene(options: argparse.Namespace) -> int:
         raise UsageError(f"-s {options.sensor}: the scene has {len(every)} sensor(s), numbered from 0")
     numbers = list(range(len(every))) if options.sensor is None else [options.sensor]
     paths = reference_files(options.shots, [every[k].id() for k in numbers], len(every), numbers)
-    with Keeper(options.out, shared=True), Keeper(options.out / "work"):
-        summary = _fit(options, file, [p.key for p in chosen], numbers, paths, Progress())
+    inputs = [options.scene, options.shots]
+    claim(options.out, ["run.json"], FOLDERS, inputs, aside=True, overwrite=options.overwrite)
+    with Keeper(options.out, overwrite=options.overwrite) as keeper, Keeper(options.out / "work"):
+        summary = _fit(options, keeper, file, [p.key for p in chosen], numbers, paths, Progress())
     if options.json:
         print(json.dumps(summary))
     else:
@@ -66,6 +71,7 @@ def run_scene(options: argparse.Namespace) -> int:
 
 def _fit(
     options: argparse.Namespace,
+    keeper: Keeper,
     file: Any,
     keys: Sequence[str],
     numbers: Sequence[int],
@@ -99,13 +105,14 @@ def _fit(
     name = options.name or options.scene.stem
     written: list[Any] = []
     with progress.stage("scene", "write the scene"):
-        atomic_folder(
-            options.out / "scene",
+        keeper.put(
+            "scene",
+            key,
             lambda new: written.append(write_scene(new / f"{name}.xml", file, fitted, write_exr, atomic_write)),
         )
     with progress.stage("pictures", "render the sensors") as report:
         drawn = draw(file.scene, numbers, seed, report)
-        atomic_folder(options.out / "pictures", lambda new: write_pictures(new, file.scene, numbers, drawn))
+        keeper.put("pictures", key, lambda new: write_pictures(new, file.scene, numbers, drawn))
     xml = written[0].xml
     notes = [*file.notes, *fitted.notes, *written[0].notes]
     summary = {
@@ -119,9 +126,9 @@ def _fit(
         "figures": figures(fitted),
         "notes": notes,
     }
-    write_page(options, fitted, read, drawn, [every_name(file.scene, k) for k in numbers], summary, seed)
-    record = summary | {"iterations": iterations, "seed": seed, "versions": versions()}
-    atomic_write(options.out / "run.json", (json.dumps(record, indent=1) + "\n").encode())
+    names = [every_name(file.scene, k) for k in numbers]
+    keeper.put("report", key, lambda new: write_page(new, options, fitted, read, drawn, names, summary, seed))
+    write_record(options, summary | {"iterations": iterations, "seed": seed, "versions": versions()}, progress)
     checkpoint.clear(options.out)
     return summary
 
@@ -236,7 +243,7 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
 }
 
 
-def write_page(options, fitted, read, drawn, names, summary: dict[str, Any], seed: int) -> None:
+def write_page(folder: Path, options, fitted, read, drawn, names, summary: dict[str, Any], seed: int) -> None:
     """The report: predictions beside references, the loss, what was fitted."""
     pairs, errors = [], []
     for (rgb, _), picture, name, residual in zip(read, drawn, names, fitted.residuals, strict=True):
@@ -267,4 +274,4 @@ def write_page(options, fitted, read, drawn, names, summary: dict[str, Any], see
         figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k]) for k, v in summary["figures"].items()),
         versions=tuple(versions().items()),
     )
-    write_report(options.out / "report" / "index.html", page)
+    write_report(folder / "index.html", page)

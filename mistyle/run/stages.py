@@ -1,7 +1,7 @@
 """The stages of a run and how each is kept: under a key made of everything it depends on."""
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -10,8 +10,10 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 from mistyle.core import memory, stopping
 from mistyle.core.errors import UsageError
 from mistyle.core.paths import PACKAGE
+from mistyle.files import output, store
+from mistyle.files.keeper import Keeper
 from mistyle.files.records import load_record, save_record
-from mistyle.files.store import Keeper, digest
+from mistyle.files.store import digest
 from mistyle.run import edits
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings, thread_count
@@ -58,6 +60,7 @@ class Job:
     settings: Settings
     name: str
     redo_from: str | None = None
+    overwrite: bool = False
 
 
 @runtime_checkable
@@ -73,6 +76,9 @@ class Kept(Protocol):
     @property
     def redo_from(self) -> str | None: ...
 
+    @property
+    def overwrite(self) -> bool: ...
+
 
 Work = TypeVar("Work", bound=Kept)
 
@@ -82,6 +88,13 @@ def program() -> str:
     """A hash of mistyle itself: all of its files that could change a result, as they were when first asked for."""
     files = sorted(p for p in PACKAGE.rglob("*") if p.suffix in (".py", ".j2", ".css", ".js"))
     return digest({str(p.relative_to(PACKAGE)): p.read_bytes() for p in files})
+
+
+def claim_run(job: Kept, stages: Iterable[str], inputs: Sequence[Path]) -> None:
+    """UsageError where a run of `stages` into the job's folder would cover an input or a file that is not mistyle's."""
+    deliver, folders = job.settings.deliver, [name for name in VISIBLE if name in stages]
+    targets = [f"delivered/{target}" for target in deliver.chosen_targets] if deliver.wanted else []
+    output.claim(job.out, ["run.json"], [*folders, "work", *targets], inputs, aside=True, overwrite=job.overwrite)
 
 
 class Run(Generic[Work]):
@@ -101,9 +114,9 @@ class Run(Generic[Work]):
         self.notes: list[str] = []
         # A changed program or thread count may change bytes: both belong to every key.
         self.base = digest([program(), thread_count(job.settings), job.settings.variant])
-        self.visible = Keeper(job.out, progress.say)
+        self.visible = Keeper(job.out, progress.say, overwrite=job.overwrite)
         try:
-            self.hidden = Keeper(job.out / "work", progress.say)
+            self.hidden = Keeper(job.out / "work", progress.say, overwrite=job.overwrite)
         except BaseException:
             self.visible.close()
             raise
@@ -165,7 +178,10 @@ class Run(Generic[Work]):
             return
         taken_up, changed = edits.found(keeper.root / name, name)
         if taken_up | changed:
-            place = edits.set_aside(keeper.root / name)
+            done = store.done(keeper.root / name)
+            place = output.move_aside(
+                keeper.root / name, "edited", {store.DONE, *done[1], *changed} if done else changed
+            )
             files = ", ".join(sorted(taken_up | changed))
             text = f"{name}/ is made anew, as what it stands on has changed; your edited {files} now lies in {place}."
             self.notes.append(text)

@@ -7,8 +7,9 @@ from typing import Any, Literal
 
 from mistyle import __version__
 from mistyle.core import memory
+from mistyle.files.output import write_file
 from mistyle.files.own import read_own
-from mistyle.files.store import atomic_write
+from mistyle.run.progress import Progress
 from mistyle.run.stages import Run
 
 PACKAGES = (
@@ -50,8 +51,15 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "settings": job.settings.model_dump(mode="json"),
         "versions": versions(),
     }
-    atomic_write(path, (json.dumps(record, indent=1) + "\n").encode())
+    write_record(job, record, run.progress)
     return summary
+
+
+def write_record(job: Any, record: dict[str, Any], progress: Progress) -> None:
+    """Write the job's `run.json`; an edited one is set aside, and that is said."""
+    aside = write_file(job.out, "run.json", (json.dumps(record, indent=1) + "\n").encode(), overwrite=job.overwrite)
+    if aside is not None:
+        progress.note(f"run.json was edited: your version now lies in {aside}.")
 
 
 def earlier(path: Any) -> dict[str, Any]:

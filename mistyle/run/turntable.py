@@ -17,6 +17,8 @@ GROUND = (0.115, 0.115, 0.12)  # sRGB, behind the asset where a file has no tran
 def write_turn(place: Path, frames: Sequence[Float[np.ndarray, "h w 4"]], mp4: bool = False) -> list[Path]:
     """Write straight sRGB frames with alpha (0..1) as `place`/000.png …, `place`.webp and, if asked for, `place`.mp4.
 
+    `place` is new: frames of an earlier turn are not removed here.
+
     The same frames give the same PNG and WebP bytes. EnvironmentMissing where mp4 is asked for and nothing encodes it.
     """
     if mp4:
@@ -24,8 +26,6 @@ def write_turn(place: Path, frames: Sequence[Float[np.ndarray, "h w 4"]], mp4: b
     place.mkdir(parents=True, exist_ok=True)
     for k, frame in enumerate(frames):
         write_png(place / f"{k:03}.png", frame)
-    for old in sorted(place.glob("[0-9][0-9][0-9].png"))[len(frames) :]:
-        old.unlink()
     flat = [grounded(frame) for frame in frames]
     written = [place, place.with_suffix(".webp")]
     write_webp(written[1], flat)

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +11,7 @@ from jaxtyping import Float
 
 from mistyle.core.camera import RigSettings, rig
 from mistyle.core.image import srgb_from_linear
+from mistyle.files.output import claim, replace_files
 from mistyle.run.progress import Progress
 from mistyle.run.settings import Settings
 
@@ -17,6 +19,7 @@ SAMPLES, ATLAS, RESOLUTION = 40_000, 1024, 384
 VIEWS = (0, 13)  # of the paper's rig: front right and front left
 STROKES = (1.0, 1.6, 0.7)  # sizes of strokes, as factors, that take turns
 COLUMNS = 4
+SHEET = "variations.png"
 
 
 @dataclass(frozen=True)
@@ -44,12 +47,16 @@ def variations(settings: Settings, count: int) -> list[Variation]:
     return result
 
 
-def sheet(mesh: Path, style: Path, out: Path, settings: Settings, count: int, progress: Progress) -> dict[str, Any]:
+def sheet(
+    mesh: Path, style: Path, out: Path, settings: Settings, count: int, progress: Progress, *, overwrite: bool = False
+) -> dict[str, Any]:
     """Write OUT/variations.png; returns its path and, picture by picture, the options that make it."""
-    from mistyle.files.images import write_png
     from mistyle.run import start
     from mistyle.run.colour import read_style
+    from mistyle.run.inputs import input_files
 
+    inputs = [*input_files(mesh), style]
+    claim(out, [SHEET], inputs=inputs, overwrite=overwrite)
     picture = read_style(style, settings.colour)
     start.start_engines(settings)
     cameras = rig(RigSettings(resolution=RESOLUTION))
@@ -60,10 +67,15 @@ def sheet(mesh: Path, style: Path, out: Path, settings: Settings, count: int, pr
         with progress.stage("surface", f"paint with {variation.label}") as report:
             tiles.append(tile(asset, picture, variation.settings, [cameras[k] for k in VIEWS], report))
         labels.append(variation.label)
-    out.mkdir(parents=True, exist_ok=True)
-    target = out / "variations.png"
-    write_png(target, arranged(tiles))
-    return {"sheet": str(target), "variations": labels}
+    fill = partial(_write_sheet, tiles)
+    replace_files(out, "variations", fill, inputs=inputs, overwrite=overwrite)
+    return {"sheet": str(out / SHEET), "variations": labels}
+
+
+def _write_sheet(tiles: list[Float[np.ndarray, "h w 3"]], folder: Path) -> None:
+    from mistyle.files.images import write_png
+
+    write_png(folder / SHEET, arranged(tiles))
 
 
 def tile(asset: Any, picture: Any, settings: Settings, cameras: Any, report: Any) -> Float[np.ndarray, "h w 3"]:

@@ -4,6 +4,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mistyle.files.output import claim, read_written, replace_files
 from mistyle.run.inputs import input_files
 from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
@@ -13,30 +14,53 @@ from mistyle.run.stages import Job
 from mistyle.run.start import draw, lay_out, read, start_engines
 
 
-def render_views(mesh: Path, out: Path, settings: Settings, progress: Progress) -> list[Path]:
+def render_views(
+    mesh: Path, out: Path, settings: Settings, progress: Progress, *, overwrite: bool = False
+) -> list[Path]:
     """`mistyle render`: the views of section 4.1.1 for any mesh."""
-    from mistyle.files.store import atomic_folder
-
-    input_files(mesh)
+    inputs = [*input_files(mesh), *filter(None, (settings.rig.file, settings.draw.scene))]
+    claim(out, files_of_views(settings), inputs=inputs, overwrite=overwrite)
     start_engines(settings)
     with progress.stage("mesh", "read the mesh") as report:
         asset = read(mesh, settings.read, settings.atlas.size, report)
         atlas = lay_out(asset, settings, lambda done: None)
     with progress.stage("views", "render the views") as report:
-        atomic_folder(out, lambda folder: draw(folder, asset, atlas.start, settings, report, progress.say))
-    return sorted(out.iterdir())
+        replace_files(
+            out, "render", lambda folder: draw(folder, asset, atlas.start, settings, report, progress.say),
+            inputs=inputs, overwrite=overwrite,
+        )  # fmt: skip
+    return sorted(out / name for name, entry in read_written(out).files.items() if entry.by == "render")
 
 
-def bake_views(mesh: Path, views: Path, out: Path, settings: Settings, name: str, progress: Progress) -> dict[str, Any]:
+def files_of_views(settings: Settings) -> list[str]:
+    """What a folder of views will consist of; of a rig made for the mesh, of all views that it may choose from."""
+    from mistyle.core.camera import rig
+    from mistyle.core.rigs import candidate_cameras
+    from mistyle.files.views import file_names, read_cameras
+
+    chosen = settings.rig
+    if chosen.kind == "file":
+        assert chosen.file is not None
+        cameras = read_cameras(chosen.file)
+    else:
+        cameras = candidate_cameras(chosen) if chosen.kind == "nbv" else rig(chosen)
+    return file_names([camera.name for camera in cameras], settings.draw.paper_files)
+
+
+def bake_views(
+    mesh: Path, views: Path, out: Path, settings: Settings, name: str, progress: Progress, *, overwrite: bool = False
+) -> dict[str, Any]:
     """`mistyle bake`: anyone's pictures of known cameras projected onto the texture (section 4.1.4)."""
-    from mistyle.files.store import atomic_folder
     from mistyle.files.views import read_views
     from mistyle.stages.backproject import backproject, fill
+    from mistyle.stages.export import asset_names
 
-    input_files(mesh)
+    inputs = [*input_files(mesh), views]
+    claim(out, [f"{name}.glb", f"{name}.json"], inputs=inputs, overwrite=overwrite)
     start_engines(settings)
     with progress.stage("mesh", "read the mesh") as report:
         asset = read(mesh, settings.read, settings.atlas.size, report)
+        claim(out, asset_names(name, asset.mesh.parts), inputs=inputs, overwrite=overwrite)
         atlas = lay_out(asset, settings, lambda done: None)
     seen_by = with_geometry(asset, read_views(views))
     maps = []
@@ -47,6 +71,9 @@ def bake_views(mesh: Path, views: Path, out: Path, settings: Settings, name: str
             report((part + 1) / len(atlas.texels))
     job = Job(mesh, views, out, settings, name)
     with progress.stage("asset", "write the asset") as report:
-        atomic_folder(out, lambda folder: write_asset(folder, job, asset, atlas, maps, report))
+        replace_files(
+            out, "bake", lambda folder: write_asset(folder, job, asset, atlas, maps, report), inputs=inputs,
+            overwrite=overwrite,
+        )  # fmt: skip
     shares = [float(m.known.sum() / max(t.covered.sum(), 1)) for m, t in zip(maps, atlas.texels, strict=True)]
     return {"asset": str(out / f"{name}.glb"), "painted": dict(zip(asset.mesh.parts, shares, strict=True))}

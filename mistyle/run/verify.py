@@ -15,9 +15,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.files.images import write_exr, write_png
-from mistyle.files.store import DONE, atomic_folder
+from mistyle.files.output import claim, replace_files
+from mistyle.files.store import DONE
 from mistyle.run.blender import BLENDER, find_blender
 from mistyle.run.verify_checks import MODELS, READERS, Check, by_blender, exr, listed_files, png
 
@@ -54,7 +55,12 @@ class Difference:
 
 
 def verify(
-    place: Path, out: Path | None = None, *, blender: str | None = None, rendering: Rendering | None = None
+    place: Path,
+    out: Path | None = None,
+    *,
+    blender: str | None = None,
+    rendering: Rendering | None = None,
+    overwrite: bool = False,
 ) -> dict[str, Any]:
     """Check a run, an asset or a delivered folder, or one file; returns the content of verify.json.
 
@@ -64,8 +70,7 @@ def verify(
     if not place.exists():
         raise InputRefused(f"{place}: found nothing, expected a run, an asset, a delivered folder, or one file")
     out = out or (place if place.is_dir() else place.parent) / "verify"
-    if out.exists() and any(out.iterdir()) and not (out / "verify.json").is_file():
-        raise UsageError(f"{out}: this folder holds other things; choose an empty or new one with -o")
+    claim(out, ["verify.json"], overwrite=overwrite)
     found = find_blender(blender)
     files = _files(place, out)
     if not files:
@@ -86,7 +91,7 @@ def verify(
         )
         (folder / "verify.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
 
-    atomic_folder(out, fill)
+    replace_files(out, "verify", fill, inputs=[place], overwrite=overwrite)
     return told
 
 

@@ -24,8 +24,9 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.files.gltf import patch_glb, write_glb
 from mistyle.files.gltf_alpha import Cutout, cutouts
 from mistyle.files.images import write_exr, write_png
+from mistyle.files.output import put_folder
 from mistyle.files.own import read_own
-from mistyle.files.store import atomic_folder, atomic_write, carry_over, sha256_file
+from mistyle.files.store import atomic_write, sha256_file
 from mistyle.files.textures import Pictures, encode_pictures, normal_colours, orm_colours, part_stems, safe_name
 from mistyle.stages.texels import corner_weights
 
@@ -63,8 +64,9 @@ def write_asset(
     their islands. glTF sources are patched, all others written anew. `provenance` must hold JSON values and nothing
     that differs from run to run (no times): it goes into the GLB and the list, and equal inputs give equal bytes.
 
-    The folder is filled beside its place and swapped in when complete; what an earlier export of the same name wrote
-    there goes, all other files stay. Raises UsageError for a name that is no file name.
+    The folder is filled beside its place and put there when complete; what an earlier export of the same name wrote
+    and nobody edited goes, all other files stay. Raises UsageError for a name that is no file name, and where a file
+    that no export wrote has the name of a new one.
     """
     if not name or safe_name(name) != name:
         raise UsageError(f"--name {name!r}: found characters that do not suit file names; try {safe_name(name)!r}")
@@ -72,10 +74,8 @@ def write_asset(
 
     def fill(new: Path) -> None:
         result.update(_write(new, name, asset, maps, occlusion, texels, provenance))
-        if folder.exists():
-            carry_over(folder, new, without=_earlier(folder, name))
 
-    atomic_folder(folder, fill)
+    put_folder(folder, fill, lambda target: _earlier(target, name))
     return result
 
 
@@ -107,6 +107,13 @@ def _write(new: Path, name: str, asset: Asset, maps, occlusion, texels, provenan
     }
     atomic_write(new / f"{name}.json", (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode())
     return manifest
+
+
+def asset_names(name: str, parts: Sequence[str]) -> list[str]:
+    """The files that `write_asset` writes for an asset with these parts, inside its folder."""
+    stems = part_stems(name, parts)
+    maps = [f"textures/{stem}_{kind}.{ext}" for stem in stems for kind in CHANNELS for ext in ("png", "exr")]
+    return [f"{name}.glb", f"{name}.json", *maps]
 
 
 def _write_textures(
@@ -149,13 +156,16 @@ def _entry(folder: Path, path: Path, **about: Any) -> dict[str, Any]:
 
 
 def _earlier(folder: Path, name: str) -> set[str]:
-    """What an earlier export of this name wrote, by its list."""
+    """What an earlier export of this name wrote, by its list, as far as it is there unchanged."""
     own = f"{name}.json"
     try:
-        listed = read_own(folder / own)["files"]
-        return {own, *(str(entry["file"]) for entry in listed)}
+        told = read_own(folder / own)
+        listed = {str(entry["file"]): entry["sha256"] for entry in told["files"]}
+        if not str(told["generator"]).startswith("mistyle "):
+            return set()
     except (OSError, ValueError, LookupError, TypeError):
-        return {own}
+        return set()
+    return {own, *(f for f, value in listed.items() if (folder / f).is_file() and sha256_file(folder / f) == value)}
 
 
 def _alphas(asset: Asset, texels: Sequence[Texels]) -> list[Float[np.ndarray, "h w"] | None]:
