@@ -189,7 +189,11 @@ def done_by_hand(plan, index: int) -> None:
     asset = plan.out / job.name / "asset" / "a.glb"
     asset.parent.mkdir(parents=True)
     asset.write_bytes(b"glTF")
+    from mistyle.files.output import keep_folder
     from mistyle.files.store import sha256_file
+
+    keep_folder(plan.out / job.name, "asset")
+    keep_folder(plan.out, "shards")
 
     told = {
         "name": job.name, "key": key_of(job), "files": {f"{job.name}/asset/a.glb": sha256_file(asset)},

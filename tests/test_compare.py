@@ -73,9 +73,9 @@ def test_two_renders_and_everything_that_is_written(pair, capsys):
     # The same again replaces it; anything else is left alone.
     assert run(capsys, a, b, "-o", out, *FAST)[0] == 0
     assert not (out / "inset.png").exists()
-    (out / "compare.json").unlink()
+    (out / "index.html").write_text("mine")
     code, _, said = run(capsys, a, b, "-o", out)
-    assert code == 2 and "did not write" in said
+    assert code == 2 and "edited after mistyle wrote it" in said and (out / "index.html").read_text() == "mine"
 
 
 def test_the_worst_region_is_where_the_error_is(pair, capsys, rng):

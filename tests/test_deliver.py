@@ -209,10 +209,10 @@ def test_what_cannot_be_delivered_is_refused(made, tmp_path):
         export(made, tmp_path / "out", formats=["glb"], target="maya")
     mine = tmp_path / "mine"
     mine.mkdir()
-    (mine / "work.psd").write_text("mine")
-    with pytest.raises(UsageError, match="holds other things"):
+    (mine / "ball.glb").write_text("mine")
+    with pytest.raises(UsageError, match="mistyle did not write this file"):
         export(made, mine, formats=["glb"])
-    assert (mine / "work.psd").read_text() == "mine"
+    assert (mine / "ball.glb").read_text() == "mine" and len(list(mine.iterdir())) == 1
     (tmp_path / "broken.json").write_text("{}")
     with pytest.raises(InputRefused, match="not the list"):
         export(tmp_path / "broken.json", tmp_path / "out", formats=["glb"])
@@ -226,14 +226,18 @@ def test_what_cannot_be_delivered_is_refused(made, tmp_path):
     assert not (tmp_path / "out").exists()
 
 
+def contents(folder: Path) -> dict[Path, bytes]:
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file() and p.name != output.RECORD}
+
+
 def test_versions_go_up_and_nothing_delivered_is_overwritten(single, tmp_path):
     run, out = Path(shutil.copytree(single, tmp_path / "run")), tmp_path / "out"
     first = export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}")
     assert {p.name for p in first} >= {"thing_look_v001.glb", "thing_look_v001_albedo.png"}
-    kept = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    kept = contents(out)
     # The same asset again is the same delivery.
     assert export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}") == first
-    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == kept
+    assert contents(out) == kept
     # Another program, or an edited texture, is a new one; the earlier files stay as they are.
     export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}", target="unreal")
     Image.new("RGB", (16, 16), (255, 0, 0)).save(run / "asset" / "textures" / "tile_albedo.png")
@@ -248,7 +252,7 @@ def test_versions_go_up_and_nothing_delivered_is_overwritten(single, tmp_path):
 def test_other_deliveries_in_the_folder_stay_and_are_not_replaced(made, single, tmp_path):
     out = tmp_path / "out"
     export(made, out, formats=["glb", "maps"])
-    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+    before = contents(out)
     export(single, out, formats=["glb", "maps"])
     assert all(p.read_bytes() == content for p, content in before.items())
     # The same name again replaces its own files only.
@@ -278,7 +282,7 @@ def test_a_job_delivers_what_its_settings_say(single, tmp_path):
     quiet = Progress(quiet=True)
 
     def job(**deliver):
-        return SimpleNamespace(settings=settings_of(deliver), out=run, mesh=Path("thing.obj"))
+        return SimpleNamespace(settings=settings_of(deliver), out=run, mesh=Path("thing.obj"), overwrite=False)
 
     assert deliver(job(), quiet) == {} and not (run / "delivered").exists()
     told = deliver(job(formats="maps,glb", target=["unreal,blender"], name="{asset}_v{v}"), quiet)["delivered"]

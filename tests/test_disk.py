@@ -14,7 +14,7 @@ import pytest
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.paths import PACKAGE, scenes
-from mistyle.files import faults, store
+from mistyle.files import faults, output, store
 from mistyle.files.images import write_png
 from mistyle.files.keeper import Keeper
 from mistyle.files.store import atomic_folder, atomic_write
@@ -121,7 +121,7 @@ def test_writers_that_hide_the_reason_are_asked_again(tmp_path):
     assert all("ulimit -f" in text and ".tmp-" not in text for text in said.values()), said
     with Keeper(tmp_path) as keeper:
         assert all(keeper.get(name, "old") is not None for name in said)
-        assert not [p for p in tmp_path.rglob(".*") if p.name != store.LOCK]
+        assert not [p for p in tmp_path.rglob(".*") if p.name not in (store.LOCK, output.RECORD)]
 
 
 FORBIDDEN = """
@@ -218,7 +218,7 @@ def test_a_shard_that_cannot_be_started_does_not_stop_the_batch(tmp_path, monkey
 def test_fetching_models_names_the_full_disk_and_not_the_network(tmp_path, monkeypatch, capsys):
     from mistyle.backends import models_fetch
 
-    def full(model, place) -> dict[str, str]:
+    def full(model, place, known) -> dict[str, str]:
         (place / models_fetch.PARTIAL).mkdir(parents=True)
         (place / models_fetch.PARTIAL / "part").write_bytes(b"so far")
         raise OSError(errno.ENOSPC, "No space left on device")

@@ -204,6 +204,6 @@ def test_what_cannot_be_verified_is_refused(tmp_path, run):
     with pytest.raises(InputRefused, match="none of our files"):
         verify(tmp_path / "empty")
     (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "work.psd").write_text("mine")
-    with pytest.raises(UsageError, match="holds other things"):
+    (tmp_path / "mine" / "verify.json").write_text("mine")
+    with pytest.raises(UsageError, match="mistyle did not write this file"):
         verify(run, tmp_path / "mine")

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from mistyle.backends import models
 from mistyle.backends.diffusion_settings import ModelSettings, TrainSettings
+from mistyle.core.errors import UsageError
 from mistyle.files.store import digest
 
 NETWORKS = ("unet", "vae", "text_encoder", "text_encoder_2")
@@ -58,6 +59,18 @@ def paths(folder: Path, name: str, key: str) -> Halves:
     """Where a picture's LoRAs are kept: readable, and different for different keys."""
     stem = f"{re.sub(r'[^A-Za-z0-9._+-]+', '_', name)}-{key[:10]}"
     return Halves(folder / f"{stem}.content.safetensors", folder / f"{stem}.style.safetensors")
+
+
+def refuse_unknown(every: Sequence[Halves]) -> None:
+    """UsageError for a file at the place of a LoRA that no training of ours wrote."""
+    from mistyle.backends.consislora import notes_of
+
+    for path in (p for halves in every for p in (halves.content, halves.style)):
+        if path.exists() and not (path.is_file() and "mistyle_key" in notes_of(path)):
+            raise UsageError(
+                f"{path}: mistyle did not train this LoRA, and would replace it. Choose another folder with -o "
+                "(--loras of stylize), or move it away"
+            )
 
 
 def steps_left(kind: Literal["content", "style"], halves: Halves, key: str, training: TrainSettings) -> int:
@@ -168,6 +181,8 @@ def make_all(
     seed: int,
     say: Callable[[str], None],
     watch: Callable[[int, int, float], None] = lambda step, steps, loss: None,
+    *,
+    overwrite: bool = False,
 ) -> list[Halves]:
     """LoRAs of several pictures, each (kind, name, sRGB picture, word): what is missing is trained, in this order.
 
@@ -175,6 +190,8 @@ def make_all(
     """
     keys = [lora_key(kind, rgb, word, training, settings, seed) for kind, _, rgb, word in wanted]
     made = [paths(folder, name, key) for (_, name, _, _), key in zip(wanted, keys, strict=True)]
+    if not overwrite:
+        refuse_unknown(made)
     left = [steps_left(w[0], h, k, training) for w, h, k in zip(wanted, made, keys, strict=True)]
     say(f"LoRAs: {forecast(sum(left), training.resolution)}")
     if not any(left):

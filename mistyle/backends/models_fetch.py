@@ -5,6 +5,7 @@ import hashlib
 import os
 import re
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlparse
@@ -18,10 +19,11 @@ from mistyle.files.store import atomic_write, sha256_file
 PARTIAL = ".partial"
 
 
-def fetch(name: str, folder: Path, allowed: bool) -> Path:
+def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) -> Path:
     """Download a model into `folder/name`, check its hashes, note them in the folder's lock; goes on where it stopped.
 
-    A file's sha256 must be the pinned one, else the one that the hub states for it. `HF_ENDPOINT`, `HF_TOKEN` and the
+    A file's sha256 must be the pinned one, else the one that the hub states for it. UsageError for a file of the
+    folder's own that differs, unless `overwrite`. `HF_ENDPOINT`, `HF_TOKEN` and the
     proxies are huggingface_hub's. Raises UsageError unless downloading was allowed.
     """
     model = models.get(name)
@@ -37,7 +39,9 @@ def fetch(name: str, folder: Path, allowed: bool) -> Path:
     transport: Any = next(base for base in HfHubHTTPError.__mro__ if base.__name__ == "HTTPError")
     place = folder / name
     try:
-        wanted = _download(model, place) | dict(model.sha256)
+        known = models.read_lock(folder).get(name, {}).get("files", {})
+        own = set(_files(place)) - set(known)  # put there by hand: never removed
+        wanted = _download(model, place, None if overwrite else known) | dict(model.sha256)
     except (transport, OSError) as error:
         if isinstance(error, OSError) and error.errno in (*faults.FULL, errno.EFBIG, *faults.NOT_TO_BE_WRITTEN):
             raise MistyleError(
@@ -50,11 +54,11 @@ def fetch(name: str, folder: Path, allowed: bool) -> Path:
             "HF_HUB_OFFLINE; HF_TOKEN where the licence must be accepted) and run the same command again: it goes on "
             "where it stopped"
         ) from None
-    entries = {path: _checked(place / path, wanted.get(path)) for path in _files(place)}
+    entries = {path: _checked(place / path, wanted.get(path), fetched=path not in own) for path in _files(place)}
     if not entries:
         raise EnvironmentMissing(f"{model.repo} at {model.revision} holds none of {', '.join(model.patterns)}")
     if list(place.glob("*.bin")) and not models.weights(place):
-        convert(place / "diffusion_pytorch_model.bin", place)
+        convert(place / "diffusion_pytorch_model.bin", place, overwrite=overwrite)
         entries = {path: entries.get(path) or _checked(place / path, None) for path in _files(place)}
     lock = models.read_lock(folder)
     lock[name] = {"repo": model.repo, "revision": model.revision, "files": entries}
@@ -86,8 +90,10 @@ def _files(place: Path) -> list[str]:
     return [p.as_posix() for p in every if p.parts[0] != PARTIAL]
 
 
-def _download(model: models.Model, place: Path) -> dict[str, str]:
+def _download(model: models.Model, place: Path, known: Mapping[str, Any] | None) -> dict[str, str]:
     """Fetch what is not there; returns the sha256 that the hub states for its large files.
+
+    A file of another size is replaced if it is `known`, noted in the folder's lock (None: all are). UsageError else.
 
     Parts of files stay in `place/.partial` when the connection breaks (huggingface_hub's own downloads begin anew in
     every process).
@@ -107,6 +113,11 @@ def _download(model: models.Model, place: Path) -> dict[str, str]:
             stated[path] = tag
         if target.is_file() and target.stat().st_size == found.size:
             continue
+        if target.exists() and known is not None and path not in known:
+            raise UsageError(
+                f"{target}: found {target.stat().st_size} bytes that mistyle did not fetch, {model.repo} has "
+                f"{found.size}. Move the file away, take it with `mistyle models adopt`, or replace it with --overwrite"
+            )
         headers = build_hf_headers()
         if urlparse(found.location).netloc != urlparse(url).netloc:
             url = found.location  # a signed address elsewhere, to which the token must not go
@@ -130,35 +141,48 @@ def _inside(place: Path, path: str) -> Path:
     return target
 
 
-def _checked(path: Path, wanted: str | None) -> dict[str, Any]:
+def _checked(path: Path, wanted: str | None, fetched: bool = False) -> dict[str, Any]:
+    """What the lock notes of a file. One of another hash is refused, and removed if it was `fetched`."""
     found = sha256_file(path)
     if wanted is not None and found != wanted:
-        path.unlink()
+        if fetched:
+            path.unlink()
+        what = "the file was removed. Run" if fetched else "this file was put there by hand. Move it away and run"
         raise EnvironmentMissing(
-            f"{path}: sha256 is {found}, expected {wanted}; the file was removed. Run the same command again; if it "
-            "stays so, the file at its source is not the one that mistyle knows"
+            f"{path}: sha256 is {found}, expected {wanted}; {what} the same command again; if it stays so, the file at "
+            "its source is not the one that mistyle knows"
         )
     stat = path.stat()
     return {"sha256": found, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
 
 
-def convert(pickle: Path, into: Path) -> Path:
+def convert(pickle: Path, into: Path, *, overwrite: bool = False) -> Path:
     """A pickled state dict as safetensors in the folder `into`, beside a copy of its config.json.
 
     The pickle is opened in a child process with `weights_only=True`: tensors and nothing that could run. Anything else
-    is refused.
+    is refused. UsageError where another file would be replaced, unless `overwrite`.
     """
     from safetensors.torch import save_file
 
     if not pickle.is_file():
         raise InputRefused(f"{pickle}: found nothing, expected a pickled state dict (.bin)")
-    tensors = converted(pickle)
     target = into / "diffusion_pytorch_model.safetensors"
+    if not overwrite:
+        _refuse_others(pickle, target)
+    tensors = converted(pickle)
     atomic_write(target, lambda path: save_file(tensors, path, {"format": "pt"}))
     config = pickle.with_name("config.json")
     if config.is_file() and config.parent != into:
         atomic_write(into / "config.json", config.read_bytes())
     return target
+
+
+def _refuse_others(pickle: Path, target: Path) -> None:
+    """UsageError for weights, or a configuration that differs, at the place of what a conversion writes."""
+    config, there = pickle.with_name("config.json"), target.with_name("config.json")
+    differs = config.is_file() and there.is_file() and config.read_bytes() != there.read_bytes()
+    for path in (target,) * target.exists() + (there,) * differs:
+        raise UsageError(f"{path}: this file is there and would be replaced. Move it away, or say --overwrite")
 
 
 def listing(folder: Path | None) -> list[dict[str, Any]]:

@@ -253,7 +253,7 @@ def move(source: Path, target: Path) -> None:
     except OSError as error:
         if error.errno != errno.EXDEV:
             raise
-        atomic_write(target, lambda path: shutil.copyfile(source, path))
+        atomic_write(target, source.read_bytes())
 
 
 def write_file(root: Path, name: str, data: bytes, *, overwrite: bool = False) -> Path | None:
@@ -318,8 +318,8 @@ def _lay_into(temporary: Path, target: Path, old: set[str], overwrite: bool) -> 
     foreign = [name for name in new if os.path.lexists(target / name) and name not in old]
     if foreign and not overwrite:
         raise UsageError(
-            f"{target / foreign[0]}: mistyle did not write this file, and would replace it. {WAY_OUT}, or replace files "
-            "of such names with --overwrite"
+            f"{target / foreign[0]}: mistyle did not write this file, and would replace it. {WAY_OUT}, or replace "
+            "files of such names with --overwrite"
         )
     for name in old.difference(new):
         (target / name).unlink(missing_ok=True)

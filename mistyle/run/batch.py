@@ -18,11 +18,12 @@ from typing import Any
 from mistyle.core.cores import cores
 from mistyle.core.errors import MistyleError, UsageError
 from mistyle.files.keeper import Keeper
-from mistyle.files.store import atomic_write, clean_leftovers
+from mistyle.files.output import keep_folder, write_file
+from mistyle.files.store import clean_leftovers
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs
 from mistyle.run.batch_plan import PLAN, Plan, read_plan, write_plan
-from mistyle.run.shard import SHARDS, finished, job_of, marker, outcome
+from mistyle.run.shard import SHARDS, claim_batch, finished, job_of, marker, outcome
 
 
 @dataclass(frozen=True)
@@ -71,9 +72,11 @@ def run_batch(plan: Plan, choices: Choices) -> dict[str, Any]:
     unknown = [name for name in choices.only if name not in known]
     if unknown:
         raise UsageError(f"--only {unknown[0]}: no such job; the plan has {', '.join(sorted(known))[:300]}")
+    claim_batch(plan)
     start = time.monotonic()
     with Keeper(plan.out / SHARDS, shared=True):
         clean_leftovers(plan.out)
+        keep_folder(plan.out, SHARDS)
         write_plan(plan)
         chosen = [k for k, job in enumerate(plan.jobs) if not choices.only or job.name in choices.only]
         todo = [k for k in chosen if finished(plan, plan.jobs[k]) is None]
@@ -81,7 +84,8 @@ def run_batch(plan: Plan, choices: Choices) -> dict[str, Any]:
             marker(plan, plan.jobs[k], failed=True).unlink(missing_ok=True)
         ended = {e.index: e for e in _run(plan, todo, choices, len(chosen) - len(todo))}
         summary = summarise(plan, ended, time.monotonic() - start, reused=len(chosen) - len(todo))
-        atomic_write(plan.out / "batch.json", (json.dumps(summary, indent=1) + "\n").encode())
+        data = (json.dumps(summary, indent=1) + "\n").encode()
+        write_file(plan.out, "batch.json", data, overwrite=plan.overwrite)
         from mistyle.run.batch_page import write_page
 
         write_page(plan, summary)

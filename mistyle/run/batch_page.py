@@ -6,7 +6,7 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from mistyle.files.store import atomic_write
+from mistyle.files.output import write_file
 from mistyle.run.batch_plan import Plan
 
 THUMBNAIL = 288  # pixels
@@ -59,9 +59,8 @@ def write_page(plan: Plan, summary: dict[str, Any]) -> Path:
         style_hash=_hash(STYLE),
         script_hash=_hash(SCRIPT),
     )
-    path = plan.out / "batch.html"
-    atomic_write(path, text.encode())
-    return path
+    write_file(plan.out, "batch.html", text.encode(), overwrite=plan.overwrite)
+    return plan.out / "batch.html"
 
 
 def _row(plan: Plan, row: dict[str, Any]) -> dict[str, Any]:

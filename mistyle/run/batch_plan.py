@@ -12,8 +12,8 @@ from typing import Any
 
 from mistyle import __version__
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.files.output import write_file
 from mistyle.files.own import read_own
-from mistyle.files.store import atomic_write
 from mistyle.run.batch_jobs import Record
 from mistyle.run.settings import validate
 
@@ -24,23 +24,26 @@ MAX_PLAN_BYTES = 1 << 30  # some hundred thousand jobs
 
 @dataclass(frozen=True)
 class Plan:
-    """The jobs of a batch, and the folder that their run folders lie in."""
+    """The jobs of a batch, and the folder that their run folders lie in.
+
+    `overwrite` is how this call was asked to treat files there that are not mistyle's; plan.json does not hold it.
+    """
 
     out: Path
     jobs: tuple[Record, ...]
+    overwrite: bool = False
 
 
 def write_plan(plan: Plan) -> Path:
-    """OUT/plan.json; the same jobs give the same bytes."""
-    path = plan.out / PLAN
+    """OUT/plan.json; the same jobs give the same bytes. An edited one is set aside; UsageError for a user's file."""
     values = {
         "version": VERSION,
         "mistyle": __version__,
         "out": str(plan.out.absolute()),
         "jobs": [job.model_dump(mode="json") for job in plan.jobs],
     }
-    atomic_write(path, (json.dumps(values, indent=1, sort_keys=True) + "\n").encode())
-    return path
+    write_file(plan.out, PLAN, (json.dumps(values, indent=1, sort_keys=True) + "\n").encode(), overwrite=plan.overwrite)
+    return plan.out / PLAN
 
 
 def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> Plan:

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,7 @@ def _add_batch(verbs: Any) -> None:
     verb.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these jobs of the plan")
     verb.add_argument("--watch", action="store_true", help="a live table instead of a line per job")
     verb.add_argument("--dry-run", action="store_true", help="print the plan with time, disk and memory, and stop")
+    add_overwrite_option(verb)
     verb.add_argument("--json", action="store_true", help="the summary as one JSON object on stdout")
     verb.add_argument("--name", type=_pattern, metavar="PATTERN", help=NAME_HELP.format(default=", of every job"))
     add_delivery_options(verb, "OUT/<job>/delivered/<target>")
@@ -92,6 +94,7 @@ def _add_shard(verbs: Any) -> None:
     verb.add_argument("--index", required=True, metavar="I", help="number of the shard, from 0; ranges run in order")
     _add_map_option(verb)
     verb.add_argument("--progress", choices=["lines", "openjd"], default="lines", help="openjd: for farms that read it")
+    add_overwrite_option(verb)
     verb.set_defaults(command=_shard)
 
 
@@ -125,6 +128,7 @@ def _add_farm(verbs: Any) -> None:
     verb.add_argument("--chunk", type=int, default=1, metavar="N", help="Open Job Description: shards of a task")
     _add_machine_options(verb)
     _add_map_option(verb)
+    add_overwrite_option(verb)
     verb.add_argument("--json", action="store_true", help="the files as one JSON object on stdout")
     verb.add_argument("--name", type=_pattern, metavar="PATTERN", help=NAME_HELP.format(default=", of every job"))
     add_delivery_options(verb, "OUT/<job>/delivered/<target>")
@@ -173,7 +177,8 @@ def _batch(options: argparse.Namespace) -> int:
     )
     from mistyle.run.deliver import with_delivery
 
-    plan = with_delivery(planned(options.jobs, options.out, choices), said_settings(options, DELIVERY_OPTIONS))
+    given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
+    plan = with_delivery(given, said_settings(options, DELIVERY_OPTIONS))
     if options.dry_run:
         told = dry_run(plan, choices)
         print(json.dumps(told) if options.json else describe_dry_run(told))
@@ -190,7 +195,7 @@ def _shard(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.shard import FarmProgress, run_shard, stages_of
 
-    plan = read_plan(options.plan, path_maps(options.path_map))
+    plan = replace(read_plan(options.plan, path_maps(options.path_map)), overwrite=options.overwrite)
     chosen: Sequence[int] = indices(options.index, len(plan.jobs))
     if len(chosen) > 1:
         return _several(options, chosen)
@@ -206,6 +211,7 @@ def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
 
     worst = 0
     maps = [part for pair in options.path_map for part in ("--path-map", pair)]
+    maps += ["--overwrite"] * options.overwrite
     for index in chosen:
         line = [sys.executable, "-m", "mistyle", "shard", str(options.plan), "--index", str(index)]
         own = os.environ | {PARENT: str(os.getpid())}
@@ -226,7 +232,8 @@ def _farm(options: argparse.Namespace) -> int:
     from mistyle.run.farm import export
 
     choices = Choices(workers=options.workers, threads=options.threads)
-    plan = with_delivery(planned(options.jobs, options.out, choices), said_settings(options, DELIVERY_OPTIONS))
+    given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
+    plan = with_delivery(given, said_settings(options, DELIVERY_OPTIONS))
     files = export(
         plan,
         options.bundle or plan.out / "farm",

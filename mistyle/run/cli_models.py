@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
-from mistyle.run.options import examples
+from mistyle.run.options import add_overwrite_option, examples
 
 # Option -> dotted setting, for `add_generative_options`.
 GENERATIVE_OPTIONS = {
@@ -71,6 +71,7 @@ def add_models(verbs: Any) -> None:
     )
     verb.add_argument("--models", type=Path, metavar="DIR", help="folder of models (else the Hugging Face cache)")
     verb.add_argument("--allow-download", action="store_true", help="fetch may use the network")
+    add_overwrite_option(verb)
     verb.add_argument("--json", action="store_true", help="one JSON object on stdout")
     verb.set_defaults(command=run_models)
 
@@ -95,7 +96,7 @@ def run_models(options: argparse.Namespace) -> int:
         if options.action == "adopt":
             places[name] = str(adopt(name, options.models))
         else:
-            places[name] = str(fetch(name, options.models, options.allow_download))
+            places[name] = str(fetch(name, options.models, options.allow_download, overwrite=options.overwrite))
         print(f"{name}: {places[name]}", file=sys.stderr)
     if options.json:
         print(json.dumps(places))
@@ -112,7 +113,7 @@ def _convert(options: argparse.Namespace) -> int:
     need_extra()
     pickle = source / "diffusion_pytorch_model.bin" if source.is_dir() else source
     place = options.models / model.name
-    print(convert(pickle, place))
+    print(convert(pickle, place, overwrite=options.overwrite))
     if not lacking(model, place, model.loose):
         adopt(model.name, options.models)
     return 0

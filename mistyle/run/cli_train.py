@@ -69,7 +69,8 @@ def run_train(options: argparse.Namespace) -> int:
     check_models(settings.models, settings.train)
     progress = Progress()
     with bar(progress.say) as watch:
-        made = make_all(settings.models, wanted, options.out, settings.train, settings.seed, progress.say, watch)
+        given = (settings.models, wanted, options.out, settings.train, settings.seed, progress.say, watch)
+        made = make_all(*given, overwrite=options.overwrite)
     files = [str(halves.style if options.kind == "style" else halves.content) for halves in made]
     print(json.dumps({"loras": files}) if options.json else "\n".join(files))
     return 0

@@ -50,6 +50,7 @@ Watch = Callable[[int, Ended | None], None]
 def command(plan: Plan, index: int, maps: Sequence[tuple[str, str]] = ()) -> list[str]:
     """The process of one shard."""
     options = [part for source, target in maps for part in ("--path-map", f"{source}={target}")]
+    options += ["--overwrite"] * plan.overwrite
     return [sys.executable, "-m", "mistyle", "shard", str(plan.out / PLAN), "--index", str(index), *options]
 
 

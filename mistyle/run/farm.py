@@ -9,10 +9,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+from mistyle.files.output import claim, keep_folder, replace_files
 from mistyle.files.store import atomic_write
 from mistyle.run.batch_plan import PLAN, Plan, write_plan
+from mistyle.run.shard import SHARDS, claim_batch
 
 Form = Literal["openjd", "sbatch", "commands"]
+BUNDLE = ("template.yaml", "parameter_values.yaml", "asset_references.yaml")
 SHARD_GRACE = 60  # seconds between the request to stop and the end
 
 
@@ -33,8 +36,11 @@ def export(
     `program` is how a worker calls mistyle; `maps` how workers see this machine's folders; `chunk` how many shards a
     task has at first.
     """
+    names = {"openjd": BUNDLE, "sbatch": ("mistyle.sbatch",), "commands": ("commands.txt",)}[form]
+    claim_batch(plan)
+    claim(folder, names, overwrite=plan.overwrite)
+    keep_folder(plan.out, SHARDS)
     write_plan(plan)
-    folder.mkdir(parents=True, exist_ok=True)
     if form == "openjd":
         files = _openjd(plan, threads, memory_gb, gpus, chunk, program, maps)
     elif form == "sbatch":
@@ -42,8 +48,12 @@ def export(
     else:
         lines = [_line(plan, program, str(k), maps) for k in range(len(plan.jobs))]
         files = {"commands.txt": "\n".join(lines) + "\n"}
-    for name, text in files.items():
-        atomic_write(folder / name, text.encode())
+
+    def fill(new: Path) -> None:
+        for name, text in files.items():
+            atomic_write(new / name, text.encode())
+
+    replace_files(folder, "farm", fill, overwrite=plan.overwrite)
     return [folder / name for name in files]
 
 
@@ -52,6 +62,7 @@ def _line(plan: Plan, program: str, index: str, maps: Sequence[tuple[str, str]])
     from mistyle.run.batch_plan import replaced
 
     options = [part for source, target in maps for part in ("--path-map", f"{source}={target}")]
+    options += ["--overwrite"] * plan.overwrite
     place = replaced(str(plan.out / PLAN), maps)
     return f"{program} shard {shlex.quote(place)} --index {index} {shlex.join(options)}".rstrip()
 
@@ -91,6 +102,7 @@ def _openjd(plan: Plan, threads: int, memory_gb: float, gpus: int, chunk: int, p
     if gpus:
         amounts.append({"name": "amount.worker.gpu", "min": gpus})
     options = [part for source, target in maps for part in ("--path-map", f"{source}={target}")]
+    options += ["--overwrite"] * plan.overwrite
     words = shlex.split(program)
     arguments = [
         *words[1:],

@@ -56,7 +56,10 @@ exec "$here/bin/python" -m mistyle "$@"
 
 
 def pack(folder: Path, extras: Sequence[str], progress: Progress, *, overwrite: bool = False) -> Path:
-    """Make the pack's files anew; needs the network once, here. Raises EnvironmentMissing without a libLLVM to take along."""
+    """Make the pack's files anew; needs the network once, here.
+
+    Raises EnvironmentMissing without a libLLVM to take along, UsageError where a file in `folder` is not ours.
+    """
     library, beside = llvm_files()
     claim(folder, ["install.sh", "constraints.txt", "SHA256SUMS"], overwrite=overwrite)
     with progress.stage("pack", "collect the wheels"):

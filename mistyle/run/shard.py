@@ -17,13 +17,14 @@ from typing import Any
 from mistyle.core.errors import MistyleError, Stopped
 from mistyle.files import lock
 from mistyle.files.faults import unexpected
+from mistyle.files.output import claim
 from mistyle.files.own import read_own
 from mistyle.files.store import LOCK, atomic_write, digest, sha256_file
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import Plan
 from mistyle.run.inputs import input_files
 from mistyle.run.progress import Progress
-from mistyle.run.stages import MATERIAL_STAGES, STAGES, program
+from mistyle.run.stages import MATERIAL_STAGES, STAGES, claim_run, program
 
 SHARDS = "shards"
 
@@ -67,9 +68,19 @@ def finished(plan: Plan, job: Record, key: str | None = None) -> dict[str, Any] 
     return told if whole and files else None
 
 
+def claim_batch(plan: Plan) -> None:
+    """UsageError where the batch would cover an input or a file that mistyle did not write, in any job's folder."""
+    every = [given for job in plan.jobs for given in (job.mesh, job.style, job.references) if given is not None]
+    claim(plan.out, ("plan.json", "batch.json", "batch.html"), [SHARDS], every, aside=True, overwrite=plan.overwrite)
+    for job in plan.jobs:
+        stages = MATERIAL_STAGES if job.kind == "fit" else STAGES
+        claim_run(job_of(plan, job), stages, every)
+
+
 def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
     """Run job `index` unless it is done; returns its marker's content. Raises what the job raises."""
     job = plan.jobs[index]
+    claim(plan.out, folders=[SHARDS], overwrite=plan.overwrite)
     key = key_of(job)  # of the files as they are now: one that changes meanwhile makes another job
     told = finished(plan, job, key)
     if told is not None:
@@ -127,14 +138,14 @@ def job_of(plan: Plan, record: Record) -> Any:
         assert record.references is not None
         lights = record.lights if record.lights in (None, "unknown") else Path(record.lights)
         settings = MaterialSettings.model_validate(record.settings)
-        return MaterialJob(
-            record.mesh, record.references, out, settings, record.name, lights, record.masks, record.exposure
-        )
+        given = (record.mesh, record.references, out, settings, record.name, lights, record.masks, record.exposure)
+        return MaterialJob(*given, overwrite=plan.overwrite)
     from mistyle.run.settings import Settings
     from mistyle.run.stages import Job
 
     assert record.style is not None
-    return Job(record.mesh, record.style, out, Settings.model_validate(record.settings), record.name)
+    settings = Settings.model_validate(record.settings)
+    return Job(record.mesh, record.style, out, settings, record.name, overwrite=plan.overwrite)
 
 
 def _run(plan: Plan, record: Record, progress: Progress) -> dict[str, Any]:
