@@ -14,6 +14,7 @@ from PIL import Image
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
+from mistyle.files import output
 from mistyle.files.packing import TARGETS
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import Plan

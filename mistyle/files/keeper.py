@@ -81,24 +81,23 @@ class Keeper:
         """
         target = self.root / _checked(stage)
         self._check_lock()
-        self._claimed(stage)
+        claimed = self._claimed(stage)
 
         def fill(folder: Path) -> None:
             write(folder)
             self._check_lock()
             store.seal(folder, stage=stage, key=key, **({"edited": dict(edited)} if edited else {}))
             output.keep_folder(self.root, stage)
-            if target.exists() and self._claimed(stage):
-                if store.intact(target, lambda name: name in (edited or {})) is None and any(output.files_of(target)):
+            if claimed and target.exists() and any(output.files_of(target)):
+                if store.intact(target, lambda name: name in (edited or {})) is None:
                     self._set_aside(target)
 
-        output.put_folder(target, fill, self._written, overwrite=self._overwrite)
-        return target
+        def written(folder: Path) -> set[str]:
+            done = store.done(folder)
+            return {DONE, *done[1]} if claimed and done is not None else set()
 
-    def _written(self, folder: Path) -> set[str]:
-        """What the marker of an older result says that it wrote; nothing of a user's folder."""
-        done = store.done(folder)
-        return {DONE, *done[1]} if done is not None and self._claimed(folder.name) else set()
+        output.put_folder(target, fill, written, overwrite=self._overwrite)
+        return target
 
     def _claimed(self, stage: str) -> bool:
         """Whether the stage's folder is ours; UsageError for a user's, unless that was allowed (then False)."""

@@ -42,6 +42,9 @@ def run_scene(options: argparse.Namespace) -> int:
 
     if not options.scene.is_file():
         raise InputRefused(f"{options.scene}: found nothing, expected a Mitsuba scene file; check the path")
+    if options.out is not None and not options.list:
+        inputs = [path for path in (options.scene, options.shots) if path is not None]
+        claim(options.out, ["run.json"], FOLDERS, inputs, aside=True, overwrite=options.overwrite)
     device.use(options.variant, options.threads)
     file = load_scene_for_fit(options.scene, _defines(options.defines))
     listed = parameters(file.scene)
@@ -57,8 +60,6 @@ def run_scene(options: argparse.Namespace) -> int:
         raise UsageError(f"-s {options.sensor}: the scene has {len(every)} sensor(s), numbered from 0")
     numbers = list(range(len(every))) if options.sensor is None else [options.sensor]
     paths = reference_files(options.shots, [every[k].id() for k in numbers], len(every), numbers)
-    inputs = [options.scene, options.shots]
-    claim(options.out, ["run.json"], FOLDERS, inputs, aside=True, overwrite=options.overwrite)
     with Keeper(options.out, overwrite=options.overwrite) as keeper, Keeper(options.out / "work"):
         summary = _fit(options, keeper, file, [p.key for p in chosen], numbers, paths, Progress())
     if options.json:

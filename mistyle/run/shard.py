@@ -17,7 +17,7 @@ from typing import Any
 from mistyle.core.errors import MistyleError, Stopped
 from mistyle.files import lock
 from mistyle.files.faults import unexpected
-from mistyle.files.output import claim
+from mistyle.files.output import claim, keep_folder
 from mistyle.files.own import read_own
 from mistyle.files.store import LOCK, atomic_write, digest, sha256_file
 from mistyle.run.batch_jobs import Record
@@ -81,6 +81,7 @@ def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
     """Run job `index` unless it is done; returns its marker's content. Raises what the job raises."""
     job = plan.jobs[index]
     claim(plan.out, folders=[SHARDS], overwrite=plan.overwrite)
+    keep_folder(plan.out, SHARDS)
     key = key_of(job)  # of the files as they are now: one that changes meanwhile makes another job
     told = finished(plan, job, key)
     if told is not None:

@@ -57,10 +57,10 @@ def bake_views(
 
     inputs = [*input_files(mesh), views]
     claim(out, [f"{name}.glb", f"{name}.json"], inputs=inputs, overwrite=overwrite)
-    start_engines(settings)
     with progress.stage("mesh", "read the mesh") as report:
         asset = read(mesh, settings.read, settings.atlas.size, report)
         claim(out, asset_names(name, asset.mesh.parts), inputs=inputs, overwrite=overwrite)
+        start_engines(settings)
         atlas = lay_out(asset, settings, lambda done: None)
     seen_by = with_geometry(asset, read_views(views))
     maps = []
