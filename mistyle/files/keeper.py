@@ -3,7 +3,7 @@
 import os
 import re
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,14 +70,22 @@ class Keeper:
         self._set_aside(folder)
         return None
 
-    def put(self, stage: str, key: str, write: Callable[[Path], Any], edited: Mapping[str, str] | None = None) -> Path:
+    def put(
+        self,
+        stage: str,
+        key: str,
+        write: Callable[[Path], Any],
+        edited: Mapping[str, str] | None = None,
+        notes: Callable[[], Sequence[str]] = lambda: (),
+    ) -> Path:
         """Run `write(folder)` on a new empty folder and keep it as the stage's result under `key`.
 
         An older result of the stage is replaced only once the new one is complete; when `write` raises, or the disk
         is full (MistyleError), the older one stays and nothing else does. What a user did there is not lost: an older
         result with changed files is set aside like a broken one, and files that the stage had not written stay.
-        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them. UsageError
-        where a file that the stage did not write has the name of one that it writes now.
+        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them, and the
+        sentences that `notes()` gives after `write`. UsageError where a file that the stage did not write has the name
+        of one that it writes now.
         """
         target = self.root / _checked(stage)
         self._check_lock()
@@ -86,7 +94,8 @@ class Keeper:
         def fill(folder: Path) -> None:
             write(folder)
             self._check_lock()
-            store.seal(folder, stage=stage, key=key, **({"edited": dict(edited)} if edited else {}))
+            about = {"edited": dict(edited or {}), "notes": list(notes())}
+            store.seal(folder, stage=stage, key=key, **{name: value for name, value in about.items() if value})
             output.keep_folder(self.root, stage)
             if claimed and target.exists() and any(output.files_of(target)):
                 if store.intact(target, lambda name: name in (edited or {})) is None:
@@ -105,6 +114,10 @@ class Keeper:
         if not known and not self._overwrite:
             output.claim(self.root, folders=[stage])
         return known
+
+    def notes(self, stage: str) -> list[str]:
+        """The sentences that a finished stage's marker remembers."""
+        return store.notes_of(self.root / _checked(stage))
 
     def _set_aside(self, folder: Path) -> None:
         done = store.done(folder)

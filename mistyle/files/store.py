@@ -196,6 +196,14 @@ def done(folder: Path) -> tuple[str, dict[str, str]] | None:
         return None
 
 
+def notes_of(folder: Path) -> list[str]:
+    """The sentences in a finished stage's marker; none where there is no readable one."""
+    try:
+        return [str(text) for text in read_own(folder / DONE).get("notes", [])]
+    except (OSError, ValueError, AttributeError, TypeError):
+        return []
+
+
 def hidden(path: Path, count: int, kind: str, suffix: str = "") -> Path:
     return path.with_name(f".{path.name}.{kind}-{lock.this_host()}-{os.getpid()}-{count}{suffix}")
 

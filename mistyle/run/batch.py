@@ -23,6 +23,7 @@ from mistyle.files.store import clean_leftovers
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs
 from mistyle.run.batch_plan import PLAN, Plan, read_plan, write_plan
+from mistyle.run.progress import grouped
 from mistyle.run.shard import SHARDS, claim_batch, finished, job_of, marker, outcome
 
 
@@ -131,7 +132,7 @@ def _row(plan: Plan, index: int, job: Record, ended: engines.Ended | None) -> di
         state = "failed" if ended.code not in (75, 130) else "open"
     row: dict[str, Any] = {"name": job.name, "kind": job.kind, "state": state, "index": index}
     if state == "done":
-        row |= {k: told[k] for k in ("seconds", "peak_gb", "figures")}
+        row |= {k: told[k] for k in ("seconds", "peak_gb", "figures", "notes")}
     if state == "failed":
         code = ended.code if ended is not None else told.get("exit_code", 1)
         error = ended.why if ended is not None else ""
@@ -152,6 +153,8 @@ def describe(summary: dict[str, Any]) -> str:
             lines.append(f"  {row['name']}: exit {row['exit_code']}: {row['error']}")
             if engines.crashed(row["exit_code"]):
                 lines += [f"    | {line}" for line in row["last_lines"].splitlines()]
+    notes = grouped((row["name"], text) for row in summary["rows"] for text in row.get("notes", ()))
+    lines += [f"note      {text}" for text in notes]
     if summary["retry"]:
         lines.append(f"retry what failed: {summary['retry']}")
     lines.append(f"all of them: {Path(summary['out']) / 'batch.html'}")

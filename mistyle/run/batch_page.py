@@ -75,6 +75,7 @@ def _row(plan: Plan, row: dict[str, Any]) -> dict[str, Any]:
         "report": f"{row['name']}/report/index.html" if report.is_file() else "",
         "picture": _thumbnail(folder / "beauty.png") if row["state"] == "done" else "",
         "values": values,
+        "notes": row.get("notes", []),
     }
 
 

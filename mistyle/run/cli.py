@@ -292,18 +292,21 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
         estimate = plan(job)
         print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
         return 0
+    progress = Progress()
     if options.variations:
         from mistyle.run.variations import sheet
 
-        made = sheet(mesh, style, options.out, settings, options.variations, Progress(), overwrite=options.overwrite)
+        made = sheet(mesh, style, options.out, settings, options.variations, progress, overwrite=options.overwrite)
         print(json.dumps(made) if options.json else "\n".join([f"sheet     {made['sheet']}", *made["variations"]]))
+        progress.tell_notes()
         return 0
-    summary = stylize(job, Progress())
+    summary = stylize(job, progress)
     if options.json:
         print(json.dumps(summary))
     else:
         for label in ("asset", "textures", "report", "picture", "views", "stylized"):
             print(f"{label:<9} {summary[label]}", file=sys.stderr)
+    progress.tell_notes()
     return 0
 
 
@@ -314,8 +317,11 @@ def _render(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import render_views
 
-    written = render_views(options.mesh, options.out, settings, Progress(), overwrite=options.overwrite)
-    print(json.dumps({"views": [str(p) for p in written]}) if options.json else f"views     {options.out}")
+    progress = Progress()
+    written = render_views(options.mesh, options.out, settings, progress, overwrite=options.overwrite)
+    told = {"views": [str(p) for p in written], "notes": progress.notes}
+    print(json.dumps(told) if options.json else f"views     {options.out}")
+    progress.tell_notes()
     return 0
 
 
@@ -326,11 +332,12 @@ def _bake(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import bake_views
 
-    name = options.name or options.mesh.stem
+    name, progress = options.name or options.mesh.stem, Progress()
     summary = bake_views(
-        options.mesh, options.views, options.out, settings, name, Progress(), overwrite=options.overwrite
+        options.mesh, options.views, options.out, settings, name, progress, overwrite=options.overwrite
     )
     print(json.dumps(summary) if options.json else f"asset     {summary['asset']}")
+    progress.tell_notes()
     return 0
 
 

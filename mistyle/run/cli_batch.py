@@ -201,7 +201,9 @@ def _shard(options: argparse.Namespace) -> int:
         return _several(options, chosen)
     for index in chosen:
         farm = options.progress == "openjd"
-        run_shard(plan, index, FarmProgress(len(stages_of(plan.jobs[index]))) if farm else Progress())
+        progress = FarmProgress(len(stages_of(plan.jobs[index]))) if farm else Progress()
+        progress.note(*run_shard(plan, index, progress)["notes"])
+        progress.tell_notes()
     return 0
 
 

@@ -292,6 +292,8 @@ def told(options: argparse.Namespace, record: dict[str, Any]) -> int:
         print(json.dumps(record))
     else:
         _print(record, options.out)
+    for text in record["notes"]:
+        print(f"note      {text}", file=sys.stderr)
     for text in record["failures"][:20]:
         print(f"mistyle: failed: {text}", file=sys.stderr)
     if len(record["failures"]) > 20:

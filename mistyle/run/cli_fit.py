@@ -179,7 +179,8 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
         estimate = plan_material(job)
         print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
         return 0
-    summary = fit_material(job, Progress())
+    progress = Progress()
+    summary = fit_material(job, progress)
     if options.json:
         print(json.dumps(summary))
     else:
@@ -187,4 +188,5 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
             print(f"{label:<9} {summary[label]}", file=sys.stderr)
         for name, value in summary["figures"].items():
             print(f"{name:<17} {value:.4g}", file=sys.stderr)
+    progress.tell_notes()
     return 0

@@ -66,17 +66,20 @@ def _lookdev(options: argparse.Namespace) -> int:
     names = LookSettings.model_fields
     said = {name: value for name in names if (value := getattr(options, name, None)) is not None}
     settings = validate(said, "lookdev", LookSettings)
+    progress = Progress()
     files = lookdev(
         options.asset,
         options.out,
         settings,
-        Progress(),
+        progress,
         hdri=options.hdri,
         date=options.date,
         mp4=options.mp4,
         overwrite=options.overwrite,
     )
-    print(json.dumps(files) if options.json else "\n".join(f"{k:<10} {v}" for k, v in files.items()))
+    told = files | {"notes": progress.notes}
+    print(json.dumps(told) if options.json else "\n".join(f"{k:<10} {v}" for k, v in files.items()))
+    progress.tell_notes()
     return 0
 
 

@@ -28,7 +28,7 @@ from mistyle.run.compare_inputs import Match, Planes, alpha_mask, chosen_layers,
 from mistyle.run.compare_limits import broken, without_effect
 from mistyle.run.compare_pictures import Written, thumbnail, worst_regions, write_pictures
 from mistyle.run.compare_records import CompareJob, Row, columns, csv_text, junit_text, number, row_record
-from mistyle.run.progress import Progress
+from mistyle.run.progress import Progress, grouped
 from mistyle.run.summary import peak_gb, versions
 
 ALPHA = (
@@ -288,6 +288,7 @@ def _record(job: CompareJob, found: Found, overall: Sequence[str], seconds: floa
         "rows": [row_record(r) for r in rows],
         "failures": [f"{_called(r)}: {text}" for r in failed for text in r.failures] + list(overall),
         "passed": not failed and not overall,
+        "notes": grouped((r.image, text) for r in rows for text in r.notes),
         "context": dict(context),
         "seconds": round(seconds, 3),
         "peak_gb": round(peak_gb(), 3),

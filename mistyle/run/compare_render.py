@@ -75,6 +75,7 @@ def _draw(options, chosen: Sequence[Renderer], work: Path, progress: Progress):
     missing = left_out(what) if any("mitsuba" in r.kind for r in chosen) else []
     if missing:
         context["not drawn by Mitsuba here"] = ", ".join(missing)
+        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {options.render.name} here.")
     if tests:
         context["z-test"] = "; ".join(f"{name}: {said(found)}" for name, found in tests)
     return folders, tests, context

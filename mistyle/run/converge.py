@@ -26,7 +26,7 @@ from mistyle.measure.compare_stats import interval, slope
 from mistyle.run.charts import Chart
 from mistyle.run.progress import Progress
 from mistyle.run.render_files import Shot, Subject
-from mistyle.run.renderers import Renderer, renderer, shots, subject
+from mistyle.run.renderers import Renderer, left_out, renderer, shots, subject
 from mistyle.run.summary import versions
 
 FILES = ("converge.json", "converge.csv", "index.html")
@@ -75,6 +75,9 @@ def run_converge(options: argparse.Namespace) -> int:
         shot = shots(what, [options.lights], 1, options.size)[options.sensor]
         reference, said = _reference(options, what, shot, chosen[0], progress)
         found, drew = measure(what, shot, chosen, counts, options.seeds, reference, progress)
+    missing = left_out(what) if any("mitsuba" in r.kind for r in chosen) else []
+    if missing:
+        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {options.scene.name} here.")
     record = summary(found, [r.name for r in chosen], counts) | {
         "scene": str(options.scene),
         "shot": shot.name,
@@ -82,10 +85,12 @@ def run_converge(options: argparse.Namespace) -> int:
         "definitions": definitions_of(),
         "renderers": drew,
         "versions": versions(),
+        "notes": progress.notes,
     }
     how = {"inputs": inputs, "overwrite": options.overwrite}
     replace_files(options.out, "converge", lambda folder: write(folder, record, found), **how)
     _tell(options, record)
+    progress.tell_notes()
     return 0
 
 

@@ -119,9 +119,7 @@ def tell_edits(run: Any) -> None:
     # The first stage that hangs on an edited one; an asset is its own.
     next_one = {"stylized": "retouch", "masks": "repair", "asset": "asset"}
     for stage, files in run.edited.items():
-        text = sentence(stage, sorted(files), next_one[stage] not in run.progress.reused)
-        run.notes.append(text)
-        run.progress.say(text)
+        run.progress.note(sentence(stage, sorted(files), next_one[stage] not in run.progress.reused))
 
 
 def write_mask(path: Path, mask: np.ndarray) -> None:

@@ -86,6 +86,7 @@ def lookdev(
     with progress.stage("read", "read the asset"):
         subject = read_subject(place)
         sky = None if hdri is None else read_radiance(hdri)
+    progress.note(*subject.asset.source.notes)
     with progress.stage("light", "expose the lights"):
         name = "" if hdri is None else hdri.stem
         lights = [drawing.exposed(rig, settings.seed) for rig in drawing.rigs(sky, name, read_radiance)]

@@ -88,7 +88,6 @@ class MadeMaterial:
     recovered: Any
     measured: Measured
     folder: Path
-    notes: tuple[str, ...] = ()
 
 
 def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
@@ -135,7 +134,8 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         recovered = replace(recovered, maps=tuple(maps))
         shown = replace(captures, cameras=whole.cameras)
         run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, shown))
-        made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder, tuple(run.notes))
+        made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
+        progress.note(*asset.source.notes, *placed.notes, *recovered.notes)
         run.stage(
             "report",
             ["asset", "measure"],
@@ -302,7 +302,7 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
         report,
         start=start,
         save=lambda arrays: checkpoint.save(folder, arrays),
-        resume=checkpoint.load(folder, run.progress.say),
+        resume=checkpoint.load(folder, run.progress.note),
     )
 
 

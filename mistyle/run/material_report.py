@@ -56,7 +56,7 @@ def material_report(folder: Path, made: Any, progress: Progress, report: Callabl
         turntable=tuple(turntable),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
-        notes=tuple(Note(t) for t in (*made.notes, *notes(made))),
+        notes=tuple(Note(text) for text in progress.notes),
         steps=steps(made),
         maps=map_sets(made),
         model=page_model(made.folder / f"{made.job.name}.glb"),
@@ -67,10 +67,6 @@ def material_report(folder: Path, made: Any, progress: Progress, report: Callabl
         files=file_list(made.folder, made.job.name),
     )
     write_report(folder / "index.html", page)
-
-
-def notes(made: Any) -> tuple[str, ...]:
-    return (*made.asset.source.notes, *made.placed.notes, *made.recovered.notes)
 
 
 def encoded(picture: np.ndarray, exposed_by: np.ndarray) -> np.ndarray:
@@ -201,7 +197,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
         "peaks_gb": merged_peaks(path, run),
         "figures": figures(made),
-        "notes": list(notes(made)),
+        "notes": list(run.progress.notes),
     }
     record = summary | {
         "inputs": {"mesh": job.mesh.name, "references": job.references.name},

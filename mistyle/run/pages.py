@@ -21,6 +21,7 @@ from mistyle.run.report_pictures import Sizes, eight_bit, in_bands, kind_in_step
 from mistyle.run.stages import RETOUCH, STAGES
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
+from mistyle.stages.fit_judge import undone_where
 
 ELEVATION = 15.0
 
@@ -55,7 +56,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         plain=tuple(plain),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
-        notes=tuple(Note(text) for text in (*made.notes, *made.asset.source.notes, *made.style.notes, *made.fit.notes)),
+        notes=tuple(Note(text) for text in progress.notes),
         steps=steps(made, Shot(before, "as baked"), Shot(beauty, "after fit and repair")),
         maps=map_sets(made),
         model=page_model(made.folder / f"{made.job.name}.glb"),
@@ -180,8 +181,8 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
     )
     fit = Step(
         "Differentiable fit",
-        "Normal and roughness under directional light, then albedo under ambient light. A phase is kept only where it "
-        "makes nothing worse.",
+        "Normal and roughness under directional light, then albedo under ambient light. "
+        + (undone_where() if made.job.settings.fit.judge else "Every phase is kept: fit.judge is off."),
         "4.2",
         pairs=(Pair(before, after, "Under the same studio light"),),
         facts=fit_facts(made.fit),
@@ -237,7 +238,11 @@ def mask_over(mask: np.ndarray, maps: Maps, texels: Texels, longest: int) -> np.
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
     """Each phase: kept or undone, and the figures that decided."""
     kept = [(f"{phase}", "kept" if good else "undone: it made a figure worse") for phase, good in fit.kept.items()]
-    return (*kept, *((name, f"{a:.4g} → {b:.4g}") for name, (a, b) in fit.figures.items()))
+    figures = []
+    for name, (before, after) in fit.figures.items():
+        undone = "" if fit.kept[name.partition(".")[0]] else f" (undone: the result has {before:.4g})"
+        figures.append((name, f"{before:.4g} → {after:.4g}{undone}"))
+    return (*kept, *figures)
 
 
 def map_shots(maps: Maps, longest: int) -> tuple[Shot, ...]:

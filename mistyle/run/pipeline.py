@@ -43,7 +43,6 @@ class Made:
     fit: Any
     repaired: Repaired
     folder: Path
-    notes: tuple[str, ...] = ()
 
 
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
@@ -69,6 +68,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     with kept(job.settings, job.out / "work") as look_again, Run(job, progress) as run:
         start_engines(job.settings)
         made = _stages(run, files, style, look_again)
+        progress.note(*made.asset.source.notes, *style.notes, *made.fit.notes)
         from mistyle.run.pages import job_report
 
         run.stage(
@@ -115,7 +115,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Callabl
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
-    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, tuple(run.notes))
+    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder)
 
 
 def retouched_stage(
@@ -178,7 +178,7 @@ def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:
 
     s = run.job.settings
     inputs = [s.rig, s.rig.file, s.draw, s.draw.scene, s.seed]
-    folder = run.stage("views", ["texels"], inputs, lambda f, r: draw(f, asset, atlas.start, s, r, run.progress.say))
+    folder = run.stage("views", ["texels"], inputs, lambda f, r: draw(f, asset, atlas.start, s, r, run.progress.note))
     return read_views(folder)
 
 

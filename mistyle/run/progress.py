@@ -2,7 +2,7 @@
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
 from mistyle.core import memory
@@ -56,6 +56,16 @@ class Progress:
         self.reused.append(name)
         self.seconds[name] = 0.0
         self.say(f"{what}: done before, taken over")
+
+
+def grouped(notes: Iterable[tuple[str, str]]) -> list[str]:
+    """Sentences about many things (name, sentence), each once, with the first names that it holds for."""
+    names: dict[str, list[str]] = {}
+    for name, text in notes:
+        names.setdefault(text, []).append(name)
+    return [
+        f"{', '.join(who[:3])}{f' and {len(who) - 3} more' * (len(who) > 3)}: {text}" for text, who in names.items()
+    ]
 
 
 @contextmanager

@@ -60,13 +60,15 @@ def run_scene(options: argparse.Namespace) -> int:
         raise UsageError(f"-s {options.sensor}: the scene has {len(every)} sensor(s), numbered from 0")
     numbers = list(range(len(every))) if options.sensor is None else [options.sensor]
     paths = reference_files(options.shots, [every[k].id() for k in numbers], len(every), numbers)
-    with Keeper(options.out, overwrite=options.overwrite) as keeper, Keeper(options.out / "work"):
-        summary = _fit(options, keeper, file, [p.key for p in chosen], numbers, paths, Progress())
+    progress = Progress()
+    with Keeper(options.out, progress.note, overwrite=options.overwrite) as keeper, Keeper(options.out / "work"):
+        summary = _fit(options, keeper, file, [p.key for p in chosen], numbers, paths, progress)
     if options.json:
         print(json.dumps(summary))
     else:
         for label in ("scene", "pictures", "report"):
             print(f"{label:<9} {summary[label]}", file=sys.stderr)
+    progress.tell_notes()
     return 0
 
 
@@ -100,7 +102,7 @@ def _fit(
             iterations=iterations,
             seed=seed,
             save=lambda arrays: checkpoint.save(folder, arrays),
-            resume=checkpoint.load(folder, progress.say),
+            resume=checkpoint.load(folder, progress.note),
             progress=report,
         )
     name = options.name or options.scene.stem
@@ -115,7 +117,7 @@ def _fit(
         drawn = draw(file.scene, numbers, seed, report)
         keeper.put("pictures", key, lambda new: write_pictures(new, file.scene, numbers, drawn))
     xml = written[0].xml
-    notes = [*file.notes, *fitted.notes, *written[0].notes]
+    progress.note(*file.notes, *fitted.notes, *written[0].notes)
     summary = {
         "name": name,
         "scene": str(options.out / "scene" / xml.name) if xml is not None else str(options.out / "scene"),
@@ -125,7 +127,7 @@ def _fit(
         "seconds": {k: round(v, 3) for k, v in progress.seconds.items()},
         "peak_gb": peak_gb(),
         "figures": figures(fitted),
-        "notes": notes,
+        "notes": list(progress.notes),
     }
     names = [every_name(file.scene, k) for k in numbers]
     keeper.put("report", key, lambda new: write_page(new, options, fitted, read, drawn, names, summary, seed))

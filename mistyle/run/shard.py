@@ -114,6 +114,7 @@ def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
         "peak_gb": round(float(summary["peak_gb"]), 3),
         "figures": summary["figures"],
         "stages": summary["seconds"],
+        "notes": summary["notes"],
     }
     _write(marker(plan, job), told)
     failure.unlink(missing_ok=True)

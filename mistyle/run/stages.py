@@ -111,12 +111,11 @@ class Run(Generic[Work]):
         self.edited: dict[str, dict[str, str]] = {}
         self.changed: dict[str, dict[str, str]] = {}
         self.plain: dict[str, str] = {}
-        self.notes: list[str] = []
         # A changed program or thread count may change bytes: both belong to every key.
         self.base = digest([program(), thread_count(job.settings), job.settings.variant])
-        self.visible = Keeper(job.out, progress.say, overwrite=job.overwrite)
+        self.visible = Keeper(job.out, progress.note, overwrite=job.overwrite)
         try:
-            self.hidden = Keeper(job.out / "work", progress.say, overwrite=job.overwrite)
+            self.hidden = Keeper(job.out / "work", progress.note, overwrite=job.overwrite)
         except BaseException:
             self.visible.close()
             raise
@@ -141,6 +140,7 @@ class Run(Generic[Work]):
         found = None if self.redoing else keeper.get(name, key, lambda file: edits.editable(name, file))
         if found is not None:
             self.progress.skip(name, self.stages[name])
+            self.progress.note(*keeper.notes(name))
             self._take_note(keeper, name)
             return found
         self._spare(keeper, name)
@@ -148,8 +148,9 @@ class Run(Generic[Work]):
         def fill(folder: Path) -> None:
             write(folder, report)
 
+        before = len(self.progress.notes)
         with self.progress.stage(name, self.stages[name]) as report:
-            return keeper.put(name, key, fill)
+            return keeper.put(name, key, fill, notes=lambda: self.progress.notes[before:])
 
     def absorb(self, name: str, write: Callable[[Path, Report], object]) -> Path:
         """Write a taken-over stage anew with the edits that it was found with, which are then part of it."""
@@ -184,8 +185,7 @@ class Run(Generic[Work]):
             )
             files = ", ".join(sorted(taken_up | changed))
             text = f"{name}/ is made anew, as what it stands on has changed; your edited {files} now lies in {place}."
-            self.notes.append(text)
-            self.progress.say(text)
+            self.progress.note(text)
 
     def record(self, name: str, after: Sequence[str], inputs: Any, make: Callable[[Report], Any]) -> Any:
         """Like `stage`, for a stage whose result is a record."""

@@ -43,7 +43,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
         "peaks_gb": merged_peaks(path, run),
         "figures": figures(made),
-        "notes": list(made.asset.source.notes),
+        "notes": list(run.progress.notes),
     }
     record = summary | {
         "inputs": {"mesh": job.mesh.name, "style": job.style.name},
@@ -112,7 +112,7 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
 
 
 def figures(made: Any) -> dict[str, float]:
-    """How good the result is, over all texture sets."""
+    """How good the result is, over all texture sets. Of a phase that was undone, the figures are those before it."""
     covered = [t.covered for t in made.atlas.texels]
     total = max(sum(int(c.sum()) for c in covered), 1)
 
@@ -123,5 +123,5 @@ def figures(made: Any) -> dict[str, float]:
         "painted_share": share([m.known for m in made.repaired.maps]),
         "seen_share": share([s > 0 for s in made.baked.seen]),
         "repaired_share": share(made.repaired.mask),
-        **{name: after for name, (_, after) in made.fit.figures.items()},
+        **{name: pair[made.fit.kept[name.partition(".")[0]]] for name, pair in made.fit.figures.items()},
     }

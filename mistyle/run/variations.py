@@ -62,6 +62,7 @@ def sheet(
     cameras = rig(RigSettings(resolution=RESOLUTION))
     with progress.stage("mesh", "read the mesh") as report:
         asset = start.read(mesh, settings.read, ATLAS, report)
+    progress.note(*asset.source.notes, *picture.notes)
     tiles, labels = [], []
     for variation in variations(settings, count):
         with progress.stage("surface", f"paint with {variation.label}") as report:
@@ -69,7 +70,7 @@ def sheet(
         labels.append(variation.label)
     fill = partial(_write_sheet, tiles)
     replace_files(out, "variations", fill, inputs=inputs, overwrite=overwrite)
-    return {"sheet": str(out / SHEET), "variations": labels}
+    return {"sheet": str(out / SHEET), "variations": labels, "notes": list(progress.notes)}
 
 
 def _write_sheet(tiles: list[Float[np.ndarray, "h w 3"]], folder: Path) -> None:

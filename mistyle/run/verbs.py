@@ -24,9 +24,10 @@ def render_views(
     with progress.stage("mesh", "read the mesh") as report:
         asset = read(mesh, settings.read, settings.atlas.size, report)
         atlas = lay_out(asset, settings, lambda done: None)
+    progress.note(*asset.source.notes)
     with progress.stage("views", "render the views") as report:
         replace_files(
-            out, "render", lambda folder: draw(folder, asset, atlas.start, settings, report, progress.say),
+            out, "render", lambda folder: draw(folder, asset, atlas.start, settings, report, progress.note),
             inputs=inputs, overwrite=overwrite,
         )  # fmt: skip
     return sorted(out / name for name, entry in read_written(out).files.items() if entry.by == "render")
@@ -62,6 +63,7 @@ def bake_views(
         claim(out, asset_names(name, asset.mesh.parts), inputs=inputs, overwrite=overwrite)
         start_engines(settings)
         atlas = lay_out(asset, settings, lambda done: None)
+    progress.note(*asset.source.notes)
     seen_by = with_geometry(asset, read_views(views))
     maps = []
     with progress.stage("bake", "bake the texture") as report:
@@ -76,4 +78,5 @@ def bake_views(
             overwrite=overwrite,
         )  # fmt: skip
     shares = [float(m.known.sum() / max(t.covered.sum(), 1)) for m, t in zip(maps, atlas.texels, strict=True)]
-    return {"asset": str(out / f"{name}.glb"), "painted": dict(zip(asset.mesh.parts, shares, strict=True))}
+    painted = dict(zip(asset.mesh.parts, shares, strict=True))
+    return {"asset": str(out / f"{name}.glb"), "painted": painted, "notes": list(progress.notes)}

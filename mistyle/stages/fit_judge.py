@@ -106,6 +106,15 @@ def worse(before: dict[str, float], after: dict[str, float]) -> list[str]:
     return result
 
 
+def undone_where() -> str:
+    """When a phase is undone, in words, with the tolerances."""
+    parts = []
+    for name, (share, absolute) in TOLERANCE.items():
+        by = " and ".join(text for text in (f"{share:.0%}" * (share > 0), f"{absolute:g}" * (absolute > 0)) if text)
+        parts.append(f"{name} {'falls' if HIGHER_IS_BETTER[name] else 'grows'} by more than {by}")
+    return f"A phase is undone where {', '.join(parts[:-1])} or {parts[-1]}."
+
+
 def _nearest(targets: Sequence[View], k: int) -> int:
     """The other view whose camera stands at the smallest angle to view k's; the view itself if it is the only one."""
     directions = np.stack([view.camera.position / np.linalg.norm(view.camera.position) for view in targets])
