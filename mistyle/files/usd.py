@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import EnvironmentMissing, MistyleError
-from mistyle.core.mesh import Mesh
+from mistyle.core.mesh import Mesh, local_origin
 from mistyle.files.materialx import Look
 
 NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdUtils", "UsdValidation", "Vt")
@@ -40,7 +40,8 @@ def write_usd(
 
     Normals and `primvars:st` (v up) are per corner, Y up, subdivision off. Textures are 8- or 16-bit files beside the
     stage: albedo sRGB, everything else raw; normals +Y. UDIM tiles are one texture with <UDIM> in its name, which the
-    preview surface reads; the UVs must lie in their tiles already.
+    preview surface reads; the UVs must lie in their tiles already. A mesh far from its origin has points about a local
+    one, which are float32, and a translation in double.
     """
     pxr = library()
     path.unlink(missing_ok=True)
@@ -52,7 +53,10 @@ def write_usd(
     pxr.Usd.ModelAPI(root.GetPrim()).SetKind(pxr.Kind.Tokens.component)
     pxr.UsdGeom.Scope.Define(stage, f"/{name}/Materials")
     shape = pxr.UsdGeom.Mesh.Define(stage, f"/{name}/Mesh")
-    points = np.ascontiguousarray(positions, np.float32)
+    origin = local_origin(positions)
+    points = np.ascontiguousarray(positions - origin, np.float32)
+    if origin.any():
+        shape.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*origin.tolist()))
     shape.CreatePointsAttr(pxr.Vt.Vec3fArray.FromNumpy(points))
     shape.CreateFaceVertexCountsAttr(pxr.Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
     shape.CreateFaceVertexIndicesAttr(pxr.Vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
@@ -81,6 +85,8 @@ def write_usd(
 def define_material(pxr: Any, stage: Any, place: str, look: Look, primvar: str = "st") -> Any:
     """A preview surface with the four textures of a look, looked up at `primvar`."""
     material = pxr.UsdShade.Material.Define(stage, place)
+    if look.title not in ("", look.name):
+        material.GetPrim().SetDisplayName(look.title)
     surface = _shader(pxr, stage, f"{place}/Surface", "UsdPreviewSurface")
     reader = _shader(pxr, stage, f"{place}/UVs", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", pxr.Sdf.ValueTypeNames.String).Set(primvar)

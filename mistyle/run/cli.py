@@ -281,7 +281,7 @@ def _print_config(options: argparse.Namespace) -> int:
 
 def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
     settings = _settings(options, preset)
-    called = name or asset_name(options, f"{mesh.stem}_{style.stem}")
+    called = name or asset_name(options, mesh.stem, style.stem)
     from mistyle.run.pipeline import stylize
     from mistyle.run.plan import describe_plan, plan
     from mistyle.run.progress import Progress
@@ -326,9 +326,8 @@ def _bake(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import bake_views
 
-    summary = bake_views(
-        options.mesh, options.views, options.out, settings, options.name or options.mesh.stem, Progress()
-    )
+    called = asset_name(options, options.mesh.stem)
+    summary = bake_views(options.mesh, options.views, options.out, settings, called, Progress())
     print(json.dumps(summary) if options.json else f"asset     {summary['asset']}")
     return 0
 

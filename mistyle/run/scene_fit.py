@@ -18,6 +18,7 @@ from jaxtyping import Float
 from mistyle.core import stopping
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import linear_from_srgb
+from mistyle.core.names import asset_name
 from mistyle.files.store import Keeper, atomic_folder, atomic_write, digest
 from mistyle.run import checkpoint
 from mistyle.run.charts import Chart
@@ -77,6 +78,7 @@ def _fit(
     from mistyle.render.scene_fit import fit_scene
     from mistyle.render.scene_xml import write_scene
 
+    name = asset_name(options.name, options.scene.stem)
     read = [read_reference(path) for path in paths]
     iterations = options.iterations or ITERATIONS[options.preset or "standard"]
     seed = options.seed or 0
@@ -96,7 +98,6 @@ def _fit(
             resume=checkpoint.load(folder, progress.say),
             progress=report,
         )
-    name = options.name or options.scene.stem
     written: list[Any] = []
     with progress.stage("scene", "write the scene"):
         atomic_folder(
