@@ -2,7 +2,8 @@
 
 import struct
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +26,16 @@ def library() -> Any:
         return SimpleNamespace(**{name: import_module(f"pxr.{name}") for name in NAMES})
     except ImportError:
         raise EnvironmentMissing("USD needs usd-core: pip install 'mistyle[usd]'") from None
+
+
+@contextmanager
+def heard(pxr: Any) -> Iterator[list[str]]:
+    """Collects what USD would print on stderr: the list is filled at the end of the block."""
+    delegate, said = pxr.UsdUtils.CoalescingDiagnosticDelegate(), []
+    try:
+        yield said
+    finally:
+        said += [" ".join(entry.commentary.split()) for entry in delegate.TakeUncoalescedDiagnostics()]
 
 
 def write_usd(
@@ -50,6 +61,7 @@ def write_usd(
     pxr.UsdGeom.SetStageMetersPerUnit(stage, metres_per_unit)
     root = pxr.UsdGeom.Xform.Define(stage, f"/{name}")
     stage.SetDefaultPrim(root.GetPrim())
+    _titled(root, path.stem)
     pxr.Usd.ModelAPI(root.GetPrim()).SetKind(pxr.Kind.Tokens.component)
     pxr.UsdGeom.Scope.Define(stage, f"/{name}/Materials")
     shape = pxr.UsdGeom.Mesh.Define(stage, f"/{name}/Mesh")
@@ -77,6 +89,7 @@ def write_usd(
         subset = pxr.UsdGeom.Subset.CreateGeomSubset(
             shape, look.name, pxr.UsdGeom.Tokens.face, pxr.Vt.IntArray.FromNumpy(faces), "materialBind"
         )
+        _titled(subset, look.title)
         pxr.UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
     pxr.UsdShade.MaterialBindingAPI(shape).SetMaterialBindSubsetsFamilyType(pxr.UsdGeom.Tokens.partition)
     stage.GetRootLayer().Save()
@@ -85,8 +98,7 @@ def write_usd(
 def define_material(pxr: Any, stage: Any, place: str, look: Look, primvar: str = "st") -> Any:
     """A preview surface with the four textures of a look, looked up at `primvar`."""
     material = pxr.UsdShade.Material.Define(stage, place)
-    if look.title not in ("", look.name):
-        material.GetPrim().SetDisplayName(look.title)
+    _titled(material, look.title)
     surface = _shader(pxr, stage, f"{place}/Surface", "UsdPreviewSurface")
     reader = _shader(pxr, stage, f"{place}/UVs", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", pxr.Sdf.ValueTypeNames.String).Set(primvar)
@@ -118,6 +130,12 @@ def define_material(pxr: Any, stage: Any, place: str, look: Look, primvar: str =
         surface.CreateInput(name, kind).ConnectToSource(output)
     material.CreateSurfaceOutput().ConnectToSource(surface.CreateOutput("surface", pxr.Sdf.ValueTypeNames.Token))
     return material
+
+
+def _titled(schema: Any, title: str) -> None:
+    """Show the user's name where the prim's is another."""
+    if title not in ("", schema.GetPrim().GetName()):
+        schema.GetPrim().SetDisplayName(title)
 
 
 def _shader(pxr: Any, stage: Any, place: str, kind: str) -> Any:

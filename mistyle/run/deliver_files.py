@@ -103,9 +103,9 @@ def _slots(formats: Sequence[str], target: Target, referring: bool) -> list[Any]
 def notes(finished: Finished, chosen: Delivery) -> tuple[str, ...]:
     """What is to be said of the delivered files."""
     turned = [text for text in finished.manifest.get("notes", ()) if TURNED in text]
-    return (
-        (f"{chosen.name}.obj has Y up and does not say so. {turned[0]}",) if turned and "obj" in chosen.formats else ()
-    )
+    if not turned or "obj" not in chosen.formats:
+        return ()
+    return (f"{chosen.name}.obj has Y up, which OBJ cannot state. {turned[0]}",)
 
 
 def _is_down(slot: Any, target: Target) -> bool:
