@@ -4,6 +4,7 @@ import io
 import json
 import re
 import socket
+import zipfile
 from argparse import Namespace
 from dataclasses import replace
 from pathlib import Path
@@ -206,6 +207,9 @@ def test_two_materials_stay_two_in_every_format(tmp_path, parts):
     for shown in found:
         assert len(shown) == 2 and set(shown.values()) == wanted
     assert set(in_materialx(out / f"{name}.mtlx").values()) == {"red", "blue"}
+    with zipfile.ZipFile(out / f"{name}.usdz") as package:
+        named = set(package.namelist())
+    assert {p.relative_to(out).as_posix() for p in files if p.parent.name == "textures"} >= named - {f"{name}.usda"}
     if parts == ("木材", "石头"):
         assert all(set(shown) == set(parts) for shown in (*found, in_materialx(out / f"{name}.mtlx")))
     record = json.loads((out / f"{name}.export.json").read_text())

@@ -17,6 +17,7 @@ from mistyle.core.mesh import Mesh, local_origin
 from mistyle.files.materialx import Look
 
 NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdUtils", "UsdValidation", "Vt")
+UTF8 = 1 << 11  # zip's flag for a name in UTF-8, without which readers take code page 437
 FIRST_DAY = struct.pack("<HH", 0, 1 << 5 | 1)  # DOS time and date of 1980-01-01
 
 
@@ -155,19 +156,26 @@ def write_usdz(path: Path, stage: Path) -> None:
 
 def without_times(archive: Path) -> None:
     """Write zip's first day, 1980-01-01, over the time of every file in an archive, in place: equal content is then
-    equal bytes, whenever it was packed."""
+    equal bytes, whenever it was packed. Names outside ASCII get the flag that says they are UTF-8."""
     with zipfile.ZipFile(archive) as found:
-        local, place, count = [i.header_offset for i in found.infolist()], found.start_dir, len(found.infolist())
+        entries, place = found.infolist(), found.start_dir
     with open(archive, "rb+") as file:
-        for start in local:  # local file header: time and date at byte 10
-            file.seek(start + 10)
+
+        def mark(flags: int, day: int, name: str) -> None:
+            file.seek(day)
             file.write(FIRST_DAY)
-        for _ in range(count):  # central directory header: time and date at byte 12, three lengths at byte 28
+            if not name.isascii():
+                file.seek(flags)
+                (bits,) = struct.unpack("<H", file.read(2))
+                file.seek(flags)
+                file.write(struct.pack("<H", bits | UTF8))
+
+        for entry in entries:  # local file header: flags at byte 6, time and date at byte 10
+            mark(entry.header_offset + 6, entry.header_offset + 10, entry.filename)
+        for entry in entries:  # central directory header: flags at byte 8, time at byte 12, three lengths at byte 28
+            mark(place + 8, place + 12, entry.filename)
             file.seek(place + 28)
-            lengths = struct.unpack("<HHH", file.read(6))
-            file.seek(place + 12)
-            file.write(FIRST_DAY)
-            place += 46 + sum(lengths)
+            place += 46 + sum(struct.unpack("<HHH", file.read(6)))
 
 
 def complaints(path: Path) -> list[str]:
