@@ -40,9 +40,10 @@ def write_obj(
 
 
 def _digits(positions: Float[np.ndarray, "v 3"]) -> int:
-    """Digits that leave nine for the mesh's own size, wherever it lies; 17 are all of a double."""
+    """Digits that leave eight or nine for the mesh's own size, wherever it lies; 17 are all of a double."""
     size, reach = float(np.ptp(positions, axis=0).max()), float(np.abs(positions).max())
-    return min(9 + max(int(np.log10(reach / size)), 0), 17) if size > 0 else 17
+    far = int(np.log10(reach / size)) if reach > size > 0 else 0
+    return min(9 + max(far - 1, 0), 17)
 
 
 def _materials(looks: Sequence[Look]) -> str:
