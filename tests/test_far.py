@@ -11,6 +11,7 @@ from gltf_cases import no_texels, quarters
 
 from mistyle.core.mesh import local_origin
 from mistyle.files.read import read_mesh
+from mistyle.files.usd import library
 from mistyle.run.deliver import export
 from mistyle.stages.export import write_asset
 
@@ -48,15 +49,15 @@ def delivered(folder: Path, points: np.ndarray, up: Any = "y") -> Path:
 
 
 def usd_points(path: Path) -> np.ndarray:
-    from pxr import Gf, Usd, UsdGeom
+    pxr = library()
 
-    stage = Usd.Stage.Open(str(path))
-    (mesh,) = [p for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
-    world = UsdGeom.XformCache().GetLocalToWorldTransform(mesh)
-    points = UsdGeom.Mesh(mesh).GetPointsAttr().Get()
-    low, high = UsdGeom.Mesh(mesh).GetExtentAttr().Get()
+    stage = pxr.Usd.Stage.Open(str(path))
+    (mesh,) = [p for p in stage.Traverse() if p.IsA(pxr.UsdGeom.Mesh)]
+    world = pxr.UsdGeom.XformCache().GetLocalToWorldTransform(mesh)
+    points = pxr.UsdGeom.Mesh(mesh).GetPointsAttr().Get()
+    low, high = pxr.UsdGeom.Mesh(mesh).GetExtentAttr().Get()
     np.testing.assert_array_equal([low, high], [np.min(points, axis=0), np.max(points, axis=0)])
-    return np.array([world.Transform(Gf.Vec3d(*map(float, p))) for p in points])
+    return np.array([world.Transform(pxr.Gf.Vec3d(*map(float, p))) for p in points])
 
 
 def obj_points(path: Path) -> np.ndarray:

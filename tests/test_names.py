@@ -7,6 +7,7 @@ import socket
 import zipfile
 from argparse import Namespace
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from mistyle.core.errors import UsageError
 from mistyle.files import store
 from mistyle.files.packing import TARGETS, TextureSet
 from mistyle.files.textures import part_stems
+from mistyle.files.usd import library
 from mistyle.run import deliver_files
 from mistyle.run.batch_jobs import Job, _names
 from mistyle.run.cli import main
@@ -133,16 +135,16 @@ def hue(picture: Any) -> str:
 
 def in_usd(path: Path) -> dict[str, tuple[str, int]]:
     """Hue of the albedo and number of faces, by the name that is shown."""
-    from pxr import Ar, Usd, UsdGeom, UsdShade
+    pxr = library()
 
-    stage = Usd.Stage.Open(str(path))
-    (mesh,) = [UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(UsdGeom.Mesh)]
+    stage = pxr.Usd.Stage.Open(str(path))
+    (mesh,) = [pxr.UsdGeom.Mesh(p) for p in stage.Traverse() if p.IsA(pxr.UsdGeom.Mesh)]
     found = {}
-    for subset in UsdShade.MaterialBindingAPI(mesh.GetPrim()).GetMaterialBindSubsets():
-        bound = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0].GetPrim()
+    for subset in pxr.UsdShade.MaterialBindingAPI(mesh.GetPrim()).GetMaterialBindSubsets():
+        bound = pxr.UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0].GetPrim()
         texture = stage.GetPrimAtPath(f"{bound.GetPath()}/diffuseColor").GetAttribute("inputs:file").Get()
         shown = bound.GetDisplayName() or bound.GetName()
-        data = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(texture.resolvedPath)).GetBuffer()
+        data = pxr.Ar.GetResolver().OpenAsset(pxr.Ar.ResolvedPath(texture.resolvedPath)).GetBuffer()
         found[shown] = (hue(io.BytesIO(bytes(data))), len(subset.GetIndicesAttr().Get()))
     return found
 
@@ -161,8 +163,7 @@ def in_obj(path: Path) -> dict[str, tuple[str, int]]:
 
 
 def in_materialx(path: Path) -> dict[str, str]:
-    import MaterialX as mx
-
+    mx: Any = import_module("MaterialX")
     document = mx.createDocument()
     mx.readFromXmlFile(document, str(path))
     found = {}

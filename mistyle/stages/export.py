@@ -66,7 +66,7 @@ def write_asset(
     The folder is filled beside its place and swapped in when complete; what an earlier export of the same name wrote
     there goes, all other files stay. Raises UsageError for a name that is no file name.
     """
-    checked(name)
+    name = checked(name)
     result: dict[str, Any] = {}
 
     def fill(new: Path) -> None:
