@@ -26,13 +26,14 @@ def stylize(
     """
     from pathlib import Path
 
+    from mistyle.core.names import asset_name
     from mistyle.run.pipeline import stylize as run
     from mistyle.run.progress import Progress
     from mistyle.run.settings import resolve
     from mistyle.run.stages import Job
 
     mesh, style = Path(mesh), Path(style)
-    job = Job(mesh, style, Path(out), resolve(preset, None, settings), name or f"{mesh.stem}_{style.stem}")
+    job = Job(mesh, style, Path(out), resolve(preset, None, settings), asset_name(name, mesh.stem, style.stem))
     return run(job, Progress(quiet=True))
 
 
@@ -56,6 +57,7 @@ def fit(
     """
     from pathlib import Path
 
+    from mistyle.core.names import asset_name
     from mistyle.run.material import MaterialJob, fit_material
     from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
     from mistyle.run.progress import Progress
@@ -67,7 +69,7 @@ def fit(
         Path(pictures),
         Path(out),
         resolve(preset, None, settings, root=MaterialSettings, presets=MATERIAL_PRESETS),
-        name or mesh.stem,
+        asset_name(name, mesh.stem),
         lights="unknown" if lights == "unknown" else None if lights is None else Path(lights),
         masks=None if masks is None else Path(masks),
     )

@@ -69,6 +69,7 @@ ALLOWED = {
     "run/blender_worker": "the job that mistyle wrote for it",
     "run/settings": "a word of the user's own command line",
     "run/verify_checks": "pictures that mistyle has just written, decoded by others on purpose",
+    "run/verify_surfaces": "models that a list of mistyle's names, opened by others on purpose",
     "stages/mvst": "views that a run kept in its own folder",
 }
 # Names of decoding modules that others may import: records, and what only looks at paths or checked trees.

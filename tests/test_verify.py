@@ -17,6 +17,7 @@ from mistyle.run.blender import blender_command, find_blender
 from mistyle.run.cli import main
 from mistyle.run.deliver import export
 from mistyle.run.verify import Rendering, compared, file_checks, table, verify
+from mistyle.run.verify_surfaces import surface_checks
 from mistyle.stages.export import write_asset
 
 FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
@@ -63,7 +64,10 @@ def test_good_files_pass_every_reader_that_is_there(run, monkeypatch):
     assert told["failed"] == 0, table(told)
     for words in (("ball.json", "sha256"), ("ball.export.json", "sha256"), ("ball.glb", "trimesh"),
                   ("ball.obj", "trimesh"), ("ball.usda", "UsdValidation"), ("ball.usdz", "UsdValidation"),
-                  ("ball.mtlx", "MaterialX"), ("*.png", "Pillow")):  # fmt: skip
+                  ("ball.mtlx", "MaterialX"), ("*.png", "Pillow"), ("ball.glb", "2 materials, 2 maps"),
+                  ("ball.usda", "2 materials, 8 maps"), ("ball.usdz", "2 materials, 8 maps"),
+                  ("ball.obj", "2 materials, 8 maps"), ("ball.mtlx", "2 materials, 8 maps"),
+                  ("asset/ball.json", "2 texture sets"), ("ball.export.json", "2 texture sets")):  # fmt: skip
         assert outcomes(told, *words) == {"passed"}, words
     validator = {"passed"} if isinstance(home, Path) else {"not checked"}
     assert outcomes(told, "ball.glb", "glTF validator") == validator
@@ -126,16 +130,125 @@ def broken_glb(run: Path) -> tuple[str, ...]:
     return "asset/ball.glb", "trimesh"
 
 
+def replaced(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+
+
+def one_obj_material(run: Path) -> tuple[str, ...]:
+    for ending in ("obj", "mtl"):
+        replaced(run / "delivered" / "blender" / f"ball.{ending}", "upper_half\n", "lower_half\n")
+    return "ball.obj", "1 materials on its faces, expected 2"
+
+
+def shared_obj_map(run: Path) -> tuple[str, ...]:
+    replaced(run / "delivered" / "blender" / "ball.mtl", "upper_half_albedo", "Lower_half_albedo")
+    return "ball.obj", "ball_lower_half_albedo.png is several maps of lower_half and upper_half"
+
+
+def one_usd_material(run: Path) -> tuple[str, ...]:
+    replaced(run / "delivered" / "blender" / "ball.usda", "/Materials/upper_half>", "/Materials/lower_half>")
+    return "ball.usda", "1 materials on its faces, expected 2"
+
+
+def shared_usd_map(run: Path) -> tuple[str, ...]:
+    replaced(run / "delivered" / "blender" / "ball.usda", "upper_half_roughness.png", "upper_half_metallic.png")
+    return "ball.usda", "ball_upper_half_metallic.png is several maps of /ball/Materials/upper_half"
+
+
+def one_materialx_surface(run: Path) -> tuple[str, ...]:
+    path = run / "delivered" / "blender" / "ball.mtlx"
+    text = path.read_text()
+    start, end = text.index('<surfacematerial name="upper_half"'), text.rindex("</surfacematerial>")
+    path.write_text(text[:start] + text[end + len("</surfacematerial>") :])
+    return "ball.mtlx", "1 materials on its faces, expected 2"
+
+
+def shared_materialx_map(run: Path) -> tuple[str, ...]:
+    replaced(run / "delivered" / "blender" / "ball.mtlx", "upper_half_normal.png", "lower_half_normal.png")
+    return "ball.mtlx", "ball_lower_half_normal.png is several maps of"
+
+
+def one_glb_material(run: Path) -> tuple[str, ...]:
+    path = run / "asset" / "ball.glb"
+    path.write_bytes(path.read_bytes().replace(b'"material":1', b'"material":0'))
+    return "asset/ball.glb", "1 materials on its faces, expected 2"
+
+
+def shared_glb_map(run: Path) -> tuple[str, ...]:
+    path = run / "asset" / "ball.glb"
+    data = path.read_bytes()
+    assert b'"baseColorTexture":{"index":3}' in data
+    path.write_bytes(data.replace(b'"baseColorTexture":{"index":3}', b'"baseColorTexture":{"index":0}'))
+    return "asset/ball.glb", "1 base colour images, expected 2"
+
+
+def overwritten_map(run: Path) -> tuple[str, ...]:
+    """A delivery of an older version, in which a second set has written over the first one's albedo."""
+    path = run / "delivered" / "blender" / "ball.export.json"
+    record = json.loads(path.read_text())
+    record["files"] = [e for e in record["files"] if not e["file"].endswith("lower_half_albedo.png")]
+    del record["sets"], record["maps"]
+    path.write_text(json.dumps(record))
+    return "ball.export.json", "ball_lower_half has no file for its albedo"
+
+
+def twice_listed_map(run: Path) -> tuple[str, ...]:
+    replaced(run / "asset" / "ball.json", "ball_upper_half_orm.png", "ball_lower_half_orm.png")
+    return "asset/ball.json", "ball_lower_half_orm.png is orm of ball_lower_half and orm of ball_upper_half"
+
+
+def lost_layer(run: Path) -> tuple[str, ...]:
+    replaced(run / "delivered" / "blender" / "ball.usda", "upAxis =", "subLayers = [ @./gone.usda@ ]\n    upAxis =")
+    return "ball.usda", "UsdValidation", "gone.usda"
+
+
 @pytest.mark.parametrize(
     "spoil",
-    [damaged_texture, cut_png, missing_file, lost_usd_texture, wrong_usd, wrong_materialx, cut_list, broken_glb],
+    [
+        damaged_texture,
+        cut_png,
+        missing_file,
+        lost_usd_texture,
+        wrong_usd,
+        wrong_materialx,
+        cut_list,
+        broken_glb,
+        lost_layer,
+    ],
 )
-def test_damage_is_found_and_ends_with_5(run, spoil, capsys):
+def test_damage_is_found_and_ends_with_5(run, spoil, capfd):
     words = spoil(run)
     assert main(["verify", str(run), "--no-render"]) == 5
     told = json.loads((run / "verify" / "verify.json").read_text())
     assert "failed" in outcomes(told, *words), table(told)
-    assert "failed" in capsys.readouterr().err
+    said = capfd.readouterr().err
+    # USD's own words are in the rows only, not on stderr between them.
+    assert "failed" in said and "Warning: in" not in said
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        one_obj_material,
+        shared_obj_map,
+        one_usd_material,
+        shared_usd_map,
+        one_materialx_surface,
+        shared_materialx_map,
+        one_glb_material,
+        shared_glb_map,
+        overwritten_map,
+        twice_listed_map,
+    ],
+)
+def test_lost_materials_and_shared_maps_are_found(run, spoil):
+    path, words = spoil(run)
+    files = sorted(p for p in run.rglob("*") if p.is_file())
+    rows = {r.file: r for r in surface_checks(files, lambda p: p.relative_to(run).as_posix())}
+    (found,) = [r for name, r in rows.items() if name.endswith(path) and r.outcome == "failed"]
+    assert words in found.said
 
 
 def test_the_validator_finds_what_trimesh_lets_pass(run, monkeypatch):

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from mistyle.backends import models
 from mistyle.backends.diffusion_settings import ModelSettings, TrainSettings
 from mistyle.core.errors import UsageError
+from mistyle.core.names import ASSET, cut
 from mistyle.files.store import digest
 
 NETWORKS = ("unet", "vae", "text_encoder", "text_encoder_2")
@@ -57,7 +58,7 @@ def lora_key(
 
 def paths(folder: Path, name: str, key: str) -> Halves:
     """Where a picture's LoRAs are kept: readable, and different for different keys."""
-    stem = f"{re.sub(r'[^A-Za-z0-9._+-]+', '_', name)}-{key[:10]}"
+    stem = f"{cut(re.sub(r'[^A-Za-z0-9._+-]+', '_', name), ASSET)}-{key[:10]}"
     return Halves(folder / f"{stem}.content.safetensors", folder / f"{stem}.style.safetensors")
 
 

@@ -18,6 +18,8 @@ from jaxtyping import Float
 
 from mistyle.core.mesh import Mesh
 
+TURNED = "turned from Z up to Y up"  # stands in a note of every mesh that reading has turned
+
 
 @dataclass(frozen=True)
 class Picture:

@@ -13,16 +13,13 @@ from jaxtyping import Float, Int
 from mistyle import __version__
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps
-from mistyle.core.mesh import weld
+from mistyle.core.mesh import local_origin, weld
 from mistyle.core.rows import corner_rows, distinct
 from mistyle.core.tangents import mikktspace
 from mistyle.files.glb import Builder, Tree, unit_normals
 from mistyle.files.gltf_patch import patch_tree
 from mistyle.files.store import atomic_write
 from mistyle.files.textures import Pictures, add_textures, encode_pictures, part_stems, set_textures
-
-# A mesh further from its own origin than this many radii loses digits in float32; its node then carries the offset.
-FAR = 64.0
 
 
 def write_glb(
@@ -90,10 +87,7 @@ def _node_frame(asset: Asset) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarra
     linear = asset.source.work_from_user[:3, :3]
     # Rounded, since turns between axes are exact and the scale leaves noise in the last digits.
     rotation = np.round(linear / np.cbrt(np.linalg.det(linear)), 12) + 0.0
-    low, high = asset.source.user_positions.min(axis=0), asset.source.user_positions.max(axis=0)
-    radius = float(np.linalg.norm(high - low)) / 2
-    far = np.abs((low + high) / 2).max() > FAR * radius
-    return rotation, np.asarray(np.rint((low + high) / 2) if far else np.zeros(3), float)
+    return rotation, local_origin(asset.source.user_positions)
 
 
 def _quaternion(rotation: Float[np.ndarray, "3 3"]) -> list[float]:

@@ -10,6 +10,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 from xml.etree.ElementTree import Element, SubElement
 
+from mistyle.core.names import distinct
 from mistyle.files.ocio import ColourSpace, materialx_space
 from mistyle.files.store import atomic_write
 
@@ -17,7 +18,7 @@ from mistyle.files.store import atomic_write
 @dataclass(frozen=True)
 class Look:
     """A material and its images: file names as the document names them. The albedo is sRGB, or light in `space` (None:
-    linear Rec.709)."""
+    linear Rec.709). `name` is an identifier (core/names.py); `title` is the user's name for it, or ""."""
 
     name: str
     albedo: str
@@ -26,13 +27,18 @@ class Look:
     metallic: str
     srgb: bool = True
     space: ColourSpace | None = None
+    title: str = ""
 
 
 def write_materialx(path: Path, looks: Sequence[Look]) -> None:
     """Write the document; texture coordinates have v up, as MaterialX has them. Normal maps are tangent space, +Y."""
     root = Element("materialx", version="1.39", colorspace="lin_rec709")
-    for look in looks:
-        graph = SubElement(root, "nodegraph", name=f"NG_{look.name}")
+    names = [look.name for look in looks]
+    # Siblings of one document: a material may itself be called SR_….
+    every = distinct([*names, *(f"NG_{n}" for n in names), *(f"SR_{n}" for n in names)])
+    rows = zip(looks, every[len(names) : 2 * len(names)], every[2 * len(names) :], strict=True)
+    for look, graph_name, surface_name in rows:
+        graph = SubElement(root, "nodegraph", name=graph_name)
         colour = _image(graph, "albedo", "color3", look.albedo)
         colour.set("colorspace", "srgb_texture" if look.srgb else materialx_space(look.space))
         _image(graph, "roughness", "float", look.roughness)
@@ -48,7 +54,7 @@ def write_materialx(path: Path, looks: Sequence[Look]) -> None:
         )
         for name, kind, node in outputs:
             SubElement(graph, "output", name=f"out_{name}", type=kind, nodename=node)
-        surface = SubElement(root, "open_pbr_surface", name=f"SR_{look.name}", type="surfaceshader")
+        surface = SubElement(root, "open_pbr_surface", name=surface_name, type="surfaceshader")
         inputs = (
             ("base_color", "color3", "albedo"),
             ("specular_roughness", "float", "roughness"),
@@ -56,9 +62,11 @@ def write_materialx(path: Path, looks: Sequence[Look]) -> None:
             ("geometry_normal", "vector3", "normal"),
         )
         for name, kind, source in inputs:
-            SubElement(surface, "input", name=name, type=kind, nodegraph=f"NG_{look.name}", output=f"out_{source}")
+            SubElement(surface, "input", name=name, type=kind, nodegraph=graph_name, output=f"out_{source}")
         material = SubElement(root, "surfacematerial", name=look.name, type="material")
-        SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename=f"SR_{look.name}")
+        if look.title not in ("", look.name):
+            material.set("doc", look.title)
+        SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename=surface_name)
     ElementTree.indent(root, "  ")
     text = ElementTree.tostring(root, encoding="unicode")
     atomic_write(path, f'<?xml version="1.0"?>\n{text}\n'.encode())

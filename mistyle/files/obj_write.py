@@ -26,23 +26,31 @@ def write_obj(
     uv, uv_of = _shared(uvs.reshape(-1, 2))
     normal, normal_of = _shared(mesh.corner_normals.reshape(-1, 3).astype(np.float64))
     lines = [f"mtllib {path.with_suffix('.mtl').name}"]
-    lines += [f"v {x:.9g} {y:.9g} {z:.9g}" for x, y, z in positions.tolist()]
+    digits = _digits(positions)
+    lines += [f"v {x:.{digits}g} {y:.{digits}g} {z:.{digits}g}" for x, y, z in positions.tolist()]
     lines += [f"vt {u:.9g} {v:.9g}" for u, v in uv.tolist()]
     lines += [f"vn {x:.7g} {y:.7g} {z:.7g}" for x, y, z in normal.tolist()]
     corners = np.stack([mesh.faces.reshape(-1), uv_of, normal_of], axis=1).reshape(-1, 3, 3) + 1
     for part, look in enumerate(looks):
-        lines.append(f"usemtl {look.name}")
+        lines.append(f"usemtl {look.title or look.name}")
         for face in corners[mesh.part == part].tolist():
             lines.append("f " + " ".join("/".join(map(str, corner)) for corner in face))
     atomic_write(path, ("\n".join(lines) + "\n").encode())
     atomic_write(path.with_suffix(".mtl"), _materials(looks).encode())
 
 
+def _digits(positions: Float[np.ndarray, "v 3"]) -> int:
+    """Digits that leave eight or nine for the mesh's own size, wherever it lies; 17 are all of a double."""
+    size, reach = float(np.ptp(positions, axis=0).max()), float(np.abs(positions).max())
+    far = int(np.log10(reach / size)) if reach > size > 0 else 0
+    return min(9 + max(far - 1, 0), 17)
+
+
 def _materials(looks: Sequence[Look]) -> str:
     lines = []
     for look in looks:
         lines += [
-            f"newmtl {look.name}",
+            f"newmtl {look.title or look.name}",
             "Kd 1 1 1",
             "Pr 1",
             "Pm 1",

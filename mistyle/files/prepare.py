@@ -8,8 +8,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.asset import Asset, Material, Source
+from mistyle.core.asset import TURNED, Asset, Material, Source
 from mistyle.core.mesh import Mesh
+from mistyle.core.names import distinct
 from mistyle.core.normals import area_vectors, crease_normals, same_points, usable_normals
 from mistyle.core.retexture import carry, turn_normals
 from mistyle.core.unwrap import unwrap
@@ -47,7 +48,7 @@ def prepare(
             path, f"{len(area)} faces, all without area", "at least one triangle with an area", "Export the mesh again"
         )
     points = same_points(raw.positions)
-    notes = list(raw.notes)
+    notes = list(raw.notes) + ([f"The mesh was {TURNED}, as asked."] if up == "z" else [])
     normals = _normals(raw, work, points, work_from_user, notes)
     plans = [_plan(raw, m, points, area, uv, path, notes) for m in range(len(raw.materials))]
     progress(0.1)
@@ -192,7 +193,7 @@ def _lay_out(
             owners.append((m, int(n)))
     if raw.twin is not None:
         uvs, part = _copy_to_instances(raw, uvs), part[raw.twin]
-    return uvs, part, _distinct(names), owners
+    return uvs, part, tuple(distinct(names, key=str)), owners
 
 
 def _copy_to_instances(raw: Raw, uvs: Float[np.ndarray, "f 3 2"]) -> Float[np.ndarray, "f 3 2"]:
@@ -206,15 +207,6 @@ def _copy_to_instances(raw: Raw, uvs: Float[np.ndarray, "f 3 2"]) -> Float[np.nd
     copied = uvs[raw.twin]
     copied[turned] = copied[turned][:, [0, 2, 1]]
     return copied
-
-
-def _distinct(names: list[str]) -> tuple[str, ...]:
-    seen: dict[str, int] = {}
-    result = []
-    for name in names:
-        seen[name] = seen.get(name, 0) + 1
-        result.append(name if seen[name] == 1 else f"{name}_{seen[name]}")
-    return tuple(result)
 
 
 def _with_part(primitive, part: Int[np.ndarray, " f"]):

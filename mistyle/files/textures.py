@@ -1,6 +1,5 @@
 """One texture set as the PNG files that glTF wants."""
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -9,6 +8,7 @@ from jaxtyping import Float
 
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps
+from mistyle.core.names import STEM, distinct, safe_name, split_tile
 from mistyle.files.glb import Builder, Tree
 from mistyle.files.images import encode_png
 
@@ -28,25 +28,13 @@ class Pictures:
     has_alpha: bool = False
 
 
-def safe_name(text: str) -> str:
-    """A file name of letters, digits, '-', '_' and '.', at most 80 long, that no system objects to."""
-    name = re.sub(r"[^\w.-]+", "_", text).strip("._ ")[:80].rstrip("._ ")
-    reserved = re.fullmatch(r"(?i)(con|prn|aux|nul|com\d|lpt\d)(\..*)?", name)
-    return f"_{name}" if reserved or not name else name
-
-
 def part_stems(name: str, parts: Sequence[str]) -> list[str]:
-    """How the files of each part begin: `name` for a single part, else `name_part`, all different even without case."""
+    """How the files of each part begin: `name` for a single part, else `name_part`, all different even without case
+    and short enough for every ending (core/names.py)."""
     if len(parts) == 1:
         return [name]
-    stems: list[str] = []
-    for part in parts:
-        stem = base = f"{name}_{safe_name(part)}"
-        number = 2
-        while stem.lower() in (s.lower() for s in stems):
-            stem, number = f"{base}_{number}", number + 1
-        stems.append(stem)
-    return stems
+    split = [split_tile(part) for part in parts]
+    return distinct([f"{name}_{safe_name(base)}{tile}" for base, tile in split], limit=STEM)
 
 
 def srgb_colours(albedo: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "h w c"]:

@@ -2,7 +2,8 @@
 
 import struct
 import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,10 +13,11 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import EnvironmentMissing, MistyleError
-from mistyle.core.mesh import Mesh
+from mistyle.core.mesh import Mesh, local_origin
 from mistyle.files.materialx import Look
 
 NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdUtils", "UsdValidation", "Vt")
+UTF8 = 1 << 11  # zip's flag for a name in UTF-8, without which readers take code page 437
 FIRST_DAY = struct.pack("<HH", 0, 1 << 5 | 1)  # DOS time and date of 1980-01-01
 
 
@@ -25,6 +27,16 @@ def library() -> Any:
         return SimpleNamespace(**{name: import_module(f"pxr.{name}") for name in NAMES})
     except ImportError:
         raise EnvironmentMissing("USD needs usd-core: pip install 'mistyle[usd]'") from None
+
+
+@contextmanager
+def heard(pxr: Any) -> Iterator[list[str]]:
+    """Collects what USD would print on stderr: the list is filled at the end of the block."""
+    delegate, said = pxr.UsdUtils.CoalescingDiagnosticDelegate(), []
+    try:
+        yield said
+    finally:
+        said += [" ".join(entry.commentary.split()) for entry in delegate.TakeUncoalescedDiagnostics()]
 
 
 def write_usd(
@@ -40,7 +52,8 @@ def write_usd(
 
     Normals and `primvars:st` (v up) are per corner, Y up, subdivision off. Textures are 8- or 16-bit files beside the
     stage: albedo sRGB, everything else raw; normals +Y. UDIM tiles are one texture with <UDIM> in its name, which the
-    preview surface reads; the UVs must lie in their tiles already.
+    preview surface reads; the UVs must lie in their tiles already. A mesh far from its origin has points about a local
+    one, which are float32, and a translation in double.
     """
     pxr = library()
     path.unlink(missing_ok=True)
@@ -49,10 +62,14 @@ def write_usd(
     pxr.UsdGeom.SetStageMetersPerUnit(stage, metres_per_unit)
     root = pxr.UsdGeom.Xform.Define(stage, f"/{name}")
     stage.SetDefaultPrim(root.GetPrim())
+    _titled(root, path.stem)
     pxr.Usd.ModelAPI(root.GetPrim()).SetKind(pxr.Kind.Tokens.component)
     pxr.UsdGeom.Scope.Define(stage, f"/{name}/Materials")
     shape = pxr.UsdGeom.Mesh.Define(stage, f"/{name}/Mesh")
-    points = np.ascontiguousarray(positions, np.float32)
+    origin = local_origin(positions)
+    points = np.ascontiguousarray(positions - origin, np.float32)
+    if origin.any():
+        shape.AddTranslateOp(pxr.UsdGeom.XformOp.PrecisionDouble).Set(pxr.Gf.Vec3d(*origin.tolist()))
     shape.CreatePointsAttr(pxr.Vt.Vec3fArray.FromNumpy(points))
     shape.CreateFaceVertexCountsAttr(pxr.Vt.IntArray.FromNumpy(np.full(len(mesh.faces), 3, np.int32)))
     shape.CreateFaceVertexIndicesAttr(pxr.Vt.IntArray.FromNumpy(mesh.faces.reshape(-1).astype(np.int32)))
@@ -73,6 +90,7 @@ def write_usd(
         subset = pxr.UsdGeom.Subset.CreateGeomSubset(
             shape, look.name, pxr.UsdGeom.Tokens.face, pxr.Vt.IntArray.FromNumpy(faces), "materialBind"
         )
+        _titled(subset, look.title)
         pxr.UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
     pxr.UsdShade.MaterialBindingAPI(shape).SetMaterialBindSubsetsFamilyType(pxr.UsdGeom.Tokens.partition)
     stage.GetRootLayer().Save()
@@ -81,6 +99,7 @@ def write_usd(
 def define_material(pxr: Any, stage: Any, place: str, look: Look, primvar: str = "st") -> Any:
     """A preview surface with the four textures of a look, looked up at `primvar`."""
     material = pxr.UsdShade.Material.Define(stage, place)
+    _titled(material, look.title)
     surface = _shader(pxr, stage, f"{place}/Surface", "UsdPreviewSurface")
     reader = _shader(pxr, stage, f"{place}/UVs", "UsdPrimvarReader_float2")
     reader.CreateInput("varname", pxr.Sdf.ValueTypeNames.String).Set(primvar)
@@ -114,6 +133,12 @@ def define_material(pxr: Any, stage: Any, place: str, look: Look, primvar: str =
     return material
 
 
+def _titled(schema: Any, title: str) -> None:
+    """Show the user's name where the prim's is another."""
+    if title not in ("", schema.GetPrim().GetName()):
+        schema.GetPrim().SetDisplayName(title)
+
+
 def _shader(pxr: Any, stage: Any, place: str, kind: str) -> Any:
     shader = pxr.UsdShade.Shader.Define(stage, place)
     shader.CreateIdAttr(kind)
@@ -131,19 +156,26 @@ def write_usdz(path: Path, stage: Path) -> None:
 
 def without_times(archive: Path) -> None:
     """Write zip's first day, 1980-01-01, over the time of every file in an archive, in place: equal content is then
-    equal bytes, whenever it was packed."""
+    equal bytes, whenever it was packed. Names outside ASCII get the flag that says they are UTF-8."""
     with zipfile.ZipFile(archive) as found:
-        local, place, count = [i.header_offset for i in found.infolist()], found.start_dir, len(found.infolist())
+        entries, place = found.infolist(), found.start_dir
     with open(archive, "rb+") as file:
-        for start in local:  # local file header: time and date at byte 10
-            file.seek(start + 10)
+
+        def mark(flags: int, day: int, name: str) -> None:
+            file.seek(day)
             file.write(FIRST_DAY)
-        for _ in range(count):  # central directory header: time and date at byte 12, three lengths at byte 28
+            if not name.isascii():
+                file.seek(flags)
+                (bits,) = struct.unpack("<H", file.read(2))
+                file.seek(flags)
+                file.write(struct.pack("<H", bits | UTF8))
+
+        for entry in entries:  # local file header: flags at byte 6, time and date at byte 10
+            mark(entry.header_offset + 6, entry.header_offset + 10, entry.filename)
+        for entry in entries:  # central directory header: flags at byte 8, time at byte 12, three lengths at byte 28
+            mark(place + 8, place + 12, entry.filename)
             file.seek(place + 28)
-            lengths = struct.unpack("<HHH", file.read(6))
-            file.seek(place + 12)
-            file.write(FIRST_DAY)
-            place += 46 + sum(lengths)
+            place += 46 + sum(struct.unpack("<HHH", file.read(6)))
 
 
 def complaints(path: Path) -> list[str]:

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.asset import Primitive
+from mistyle.core.asset import TURNED, Primitive
 from mistyle.files.bounds import MAX_NODES, refuse
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_indices, check_positions, too_many, triangulate
@@ -148,7 +148,7 @@ def _user_matrix(pxr: Any, stage: Any, notes: list[str]) -> Float[np.ndarray, "4
     unit = unit if np.isfinite(unit) and unit > 0 else 1.0
     z_up = pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z
     if z_up or unit != 1:
-        turned = "turned from Z up to Y up" if z_up else ""
+        turned = TURNED if z_up else ""
         scaled = f"scaled from units of {unit:g} m to metres" if unit != 1 else ""
         notes.append(f"The stage was {' and '.join(x for x in (turned, scaled) if x)}.")
     matrix = np.eye(4)

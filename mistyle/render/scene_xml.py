@@ -4,7 +4,6 @@ Mitsuba's own parser reads the file (includes, defaults and paths are its busine
 text with the fitted elements replaced, not a new file: comments, ids and structure stay.
 """
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -14,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.names import WRITTEN, distinct, safe_name
 from mistyle.render import device, scene_text
 from mistyle.render.scene_keys import Parameter
 
@@ -151,8 +151,10 @@ def write_scene(
     out = Path(path)
     out.parent.mkdir(parents=True, exist_ok=True)
     textures: dict[str, Path] = {}
-    for p in fitted.parameters:
-        textures |= _write_value(out, p, fitted.values[p.key], write_exr)
+    room = max(WRITTEN - len(f"{out.stem}_.exr".encode()), 16)
+    stems = distinct([safe_name(p.name.removesuffix(".data"), room) for p in fitted.parameters], limit=room)
+    for p, stem in zip(fitted.parameters, stems, strict=True):
+        textures |= _write_value(out, stem, p, fitted.values[p.key], write_exr)
     if not isinstance(scene, SceneFile):
         return Written(None, textures, ("The scene does not come from a file: only its textures were written.",))
     source = scene.path.read_bytes()
@@ -176,9 +178,10 @@ def write_scene(
     return Written(out, textures, tuple(notes))
 
 
-def _write_value(out: Path, p: Parameter, values: np.ndarray, write_exr: Callable[..., None]) -> dict[str, Path]:
+def _write_value(
+    out: Path, stem: str, p: Parameter, values: np.ndarray, write_exr: Callable[..., None]
+) -> dict[str, Path]:
     """An image as EXR, a mesh's attribute as .npy, nothing for a number or a colour."""
-    stem = re.sub(r"[^\w.-]+", "_", p.name.removesuffix(".data"))
     if p.kind == "texture" and values.ndim == 3 and values.shape[2] <= 4:
         file = out.with_name(f"{out.stem}_{stem}.exr")
         shown = _without_seam(values) if p.owner == "EnvironmentMapEmitter" else values

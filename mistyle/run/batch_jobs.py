@@ -21,7 +21,6 @@ A folder is a grid of the meshes and the pictures in it (or in its folders `mesh
 """
 
 import itertools
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -29,6 +28,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.core.names import ASSET, distinct, safe_name
 from mistyle.files.read import MESHES
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import merge, validate
@@ -194,15 +194,12 @@ def _globbed(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
 
 def _names(jobs: Sequence[Job]) -> list[str]:
     """A name for each job that no other has and that is safe as the name of a folder; equal ones get -2, -3, …"""
-    taken: set[str] = set()
-    result = []
-    for job in jobs:
+
+    def base(job: Job) -> str:
         second = job.style.stem if job.style is not None else "fit"
-        base = re.sub(r"[^\w.-]+", "-", job.name or f"{job.mesh.stem}_{second}").strip(".-") or "job"
-        name = next(n for n in itertools.chain([base], (f"{base}-{k}" for k in itertools.count(2))) if n not in taken)
-        taken.add(name)
-        result.append(name)
-    return result
+        return safe_name(job.name or f"{job.mesh.stem}_{second}", filler="-")
+
+    return distinct([base(job) for job in jobs], limit=ASSET, joint="-")
 
 
 def _record(job: Job, name: str, file: JobsFile, base: Path, threads: int) -> Record:

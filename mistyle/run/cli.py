@@ -281,7 +281,7 @@ def _print_config(options: argparse.Namespace) -> int:
 
 def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
     settings = _settings(options, preset)
-    called = name or asset_name(options, f"{mesh.stem}_{style.stem}")
+    called = name or asset_name(options, mesh.stem, style.stem)
     from mistyle.run.pipeline import stylize
     from mistyle.run.plan import describe_plan, plan
     from mistyle.run.progress import Progress
@@ -332,7 +332,7 @@ def _bake(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import bake_views
 
-    name, progress = options.name or options.mesh.stem, Progress()
+    name, progress = asset_name(options, options.mesh.stem), Progress()
     summary = bake_views(
         options.mesh, options.views, options.out, settings, name, progress, overwrite=options.overwrite
     )

@@ -50,9 +50,10 @@ def _export(options: argparse.Namespace) -> int:
 
     from mistyle.run.deliver import export
     from mistyle.run.deliver_settings import TEXTURES, ColourSettings, listed
+    from mistyle.run.progress import Progress
 
     colour = ColourSettings(space=options.colorspace, config=os.environ.get("OCIO") or None)
-    targets, files = listed(options.target), []
+    targets, files, progress = listed(options.target), [], Progress()
     for target in targets:
         files += export(
             options.asset,
@@ -65,11 +66,13 @@ def _export(options: argparse.Namespace) -> int:
             colour=colour,
             source=options.source,
             overwrite=options.overwrite,
+            note=progress.note,
         )
     if options.json:
-        print(json.dumps({"files": [str(p) for p in files]}))
+        print(json.dumps({"files": [str(p) for p in files], "notes": progress.notes}))
     else:
         print("\n".join(str(p) for p in files), file=sys.stderr)
+    progress.tell_notes()
     return 0
 
 

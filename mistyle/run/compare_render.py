@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.errors import UsageError
+from mistyle.core.names import safe_name
 from mistyle.files.images import write_exr
 from mistyle.files.output import claim
 from mistyle.files.store import atomic_write
@@ -55,7 +56,7 @@ def _draw(options, chosen: Sequence[Renderer], work: Path, progress: Progress):
     what.folder.mkdir(parents=True, exist_ok=True)
     every = shots(what, lights, options.views, options.size)
     seeds = list(range(options.seeds))
-    folders = [work / f"{k}_{_plain(r.name)}" for k, r in enumerate(chosen)]
+    folders = [work / f"{k}_{safe_name(r.name)}" for k, r in enumerate(chosen)]
     drawn: dict[tuple[str, str], Rendered] = {}
     with progress.stage("render", f"render {len(every)} shot(s) by {len(chosen)} renderers") as report:
         for k, shot in enumerate(every):
@@ -79,10 +80,6 @@ def _draw(options, chosen: Sequence[Renderer], work: Path, progress: Progress):
     if tests:
         context["z-test"] = "; ".join(f"{name}: {said(found)}" for name, found in tests)
     return folders, tests, context
-
-
-def _plain(name: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_." else "_" for c in name)[-60:]
 
 
 def _save(path: Path, found: Rendered) -> None:

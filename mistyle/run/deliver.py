@@ -10,18 +10,18 @@ Deliveries of other names lie in the same folder untouched; the same name again 
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
+from mistyle.core.names import ASSET, FILE_NAME, folded, safe_name, shortened
 from mistyle.files.bounds import USD
 from mistyle.files.output import claim, read_written, replace_files
 from mistyle.files.own import read_own
 from mistyle.files.packing import TARGETS
 from mistyle.files.store import atomic_write, digest, sha256_file
-from mistyle.files.textures import safe_name
 from mistyle.run.colour import key_of, light_space, picture_space
 from mistyle.run.deliver_files import Delivery, fields_for, write_delivery
 from mistyle.run.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
@@ -41,13 +41,14 @@ def export(
     colour: ColourSettings | None = None,
     source: Path | None = None,
     overwrite: bool = False,
+    note: Callable[..., None] = lambda *sentences: None,
 ) -> list[Path]:
     """Deliver the asset found at `place` into the folder `out`; returns the delivery's files.
 
     `name` is the pattern of the delivered name: {asset} {mesh} {style} {target}, and {v}, one more than the highest
     version there; where the latest version is of the same asset, settings and program it is kept and returned. `names`
     is the pattern of texture files: {asset} (the delivered name), {map}, {ext}, and {udim} where the asset has tiles.
-    `source` is where the mesh file of a USD look lies now, if it was moved.
+    `source` is where the mesh file of a USD look lies now, if it was moved. `note` gets sentences about the files.
     """
     wrong = [f for f in formats if f not in FORMATS]
     if wrong or target not in TARGETS:
@@ -73,22 +74,27 @@ def export(
             overwrite=overwrite, lasting=lambda name: name.endswith("_look.usda"),
         )  # fmt: skip
     record = read_own(out / f"{called}.export.json")
+    note(*record.get("notes", ()))
     return sorted([out / f"{called}.export.json", *(out / str(e["file"]) for e in record["files"])])
 
 
 def _called(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tuple[str, int | None]:
     """The name, and its version where the pattern has one: the latest if that is the same delivery, else the next."""
 
+    most = 9999  # a version that takes as much room as any will
+    plain = {field: safe_name(text, FILE_NAME) for field, text in fields.items()}
+    short = shortened(pattern, plain | {"v": most}, ("asset", "mesh", "style"), ASSET)
+
     def filled(v: object) -> str:
-        return safe_name(pattern.format(**fields, v=v))
+        return safe_name(pattern.format(**short | {"v": v}))
 
     if "v" not in fields_of(pattern):
         return filled(0), None
-    if filled(1) == filled(2):
+    if len(pattern.format(**short | {"v": most}).encode()) > ASSET:
         raise UsageError(f"--name {pattern!r}: {filled(1)} is cut off before its version; choose a shorter name")
     # A word that no name has stands for the number while the rest is made safe.
     mark = "0VERSION0"
-    shape = safe_name(re.sub(r"\{v[^}]*\}", mark, pattern).format(**fields))
+    shape = safe_name(re.sub(r"\{v[^}]*\}", mark, pattern).format(**short), FILE_NAME)
     wanted = re.compile(re.escape(shape).replace(mark, r"(\d+)", 1).replace(mark, r"\d+") + r"(?!\d)")
     there = [wanted.match(p.name) for p in out.iterdir()] if out.is_dir() else []
     last = max((int(m[1]) for m in there if m), default=0)
@@ -116,10 +122,12 @@ def _deliver(new: Path, out: Path, finished: Finished, chosen: Delivery, of: str
     path = new / f"{chosen.name}.export.json"
     atomic_write(path, (json.dumps(record, indent=1) + "\n").encode())
     own = {e["file"] for e in record["files"] if not e.get("shared")}
-    others = {file for file, entry in read_written(out).files.items() if entry.by != f"export {chosen.name}"}
-    if own & others:
+    written = read_written(out).files
+    others = {folded(file) for file, entry in written.items() if entry.by != f"export {chosen.name}"}
+    colliding = sorted(file for file in own if folded(file) in others)
+    if colliding:
         raise UsageError(
-            f"{out}: {sorted(own & others)[0]} is another delivery's file; put {{asset}} into --texture-name, or "
+            f"{out}: {colliding[0]} is another delivery's file; put {{asset}} into --texture-name, or "
             "deliver into another folder"
         )
 
@@ -176,6 +184,7 @@ def deliver(job: Any, progress: Any) -> dict[str, dict[str, list[str]]]:
                 colour=job.settings.colour,
                 source=job.mesh if job.mesh.suffix.lower() in USD else None,
                 overwrite=job.overwrite,
+                note=progress.note,
             )
             made[target] = [str(path) for path in files]
             report(len(made) / len(chosen.chosen_targets))

@@ -1,24 +1,36 @@
 """The files of one delivery: textures packed for a program, and the materials that refer to them."""
 
-import re
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from mistyle.core.asset import TURNED
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.names import (
+    IDENTIFIER,
+    STEM,
+    WRITTEN,
+    distinct,
+    folded,
+    identifier,
+    safe_name,
+    split_tile,
+    uses,
+)
 from mistyle.files.bounds import USD
 from mistyle.files.materialx import Look, write_materialx
 from mistyle.files.obj_write import write_obj
 from mistyle.files.ocio import ColourSpace, exr_tags
 from mistyle.files.packing import TARGETS, Target, TextureSet, write_slot
 from mistyle.files.store import sha256_file
-from mistyle.files.textures import safe_name
 from mistyle.run.finished import Finished
 
 # What materials in files refer to: every map by itself, whatever the target packs.
 SINGLE = ("albedo", "normal", "roughness", "metallic")
+LONGEST_MAP = "metallicsmoothness"
+SHORTEST = 24  # bytes of a texture's name that tell one set from another
 
 
 @dataclass(frozen=True)
@@ -48,13 +60,13 @@ def write_delivery(folder: Path, out: Path, finished: Finished, chosen: Delivery
     target = TARGETS[chosen.target]
     referring = any(f in chosen.formats for f in ("usd", "mtlx", "obj"))
     slots = _slots(chosen.formats, target, referring)
+    pattern = _tiled(chosen.textures, finished.sets)
+    labels = set_labels(pattern, chosen.name, finished)
+    files = _texture_files(pattern, labels, finished.sets, slots, target, referring)
     written: list[dict[str, Any]] = []
-    for textures in finished.sets:
-        for slot in slots:
-            # A material in a file wants +Y whatever the target's own normal map is.
-            down = slot.map == "normal" and slot in target.slots and target.normal == "-Y"
-            kind = "normal_dx" if down and referring else slot.map
-            file = texture_name(chosen.textures, chosen.name, finished, textures, kind, slot.ext)
+    for textures, names in zip(finished.sets, files, strict=True):
+        for slot, file in zip(slots, names, strict=True):
+            down = _is_down(slot, target)
             write_slot(folder / "textures" / file, slot, textures, chosen.space)
             about = {"map": slot.map, "colour": slot.colour, "bits": slot.bits, "set": textures.name}
             about |= {"space": exr_tags(chosen.space)["colorInteropID"]} if slot.colour == "linear" else {}
@@ -62,17 +74,19 @@ def write_delivery(folder: Path, out: Path, finished: Finished, chosen: Delivery
             written.append({"file": f"textures/{file}", **about})
     shared = []
     if referring:
-        shared = _materials(folder, out, finished, chosen, {(s.map, s.ext) for s in slots})
+        shared = _materials(folder, out, finished, chosen, _looks(finished, chosen, pattern, labels, slots))
     if "glb" in chosen.formats:
         shutil.copy2(finished.folder / f"{finished.manifest['name']}.glb", folder / f"{chosen.name}.glb")
     told = {e["file"]: e for e in written}
-    files = []
+    listed = []
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         file = path.relative_to(folder).as_posix()
         said = {"shared": True} if file in shared else {"sha256": sha256_file(path), "bytes": path.stat().st_size}
-        files.append(told.get(file, {"file": file}) | said)
+        listed.append(told.get(file, {"file": file}) | said)
     record = {"name": chosen.name, "asset": finished.manifest["name"], "version": chosen.version}
-    record |= {"target": chosen.target, "about": target.about, "formats": list(chosen.formats), "files": files}
+    record |= {"target": chosen.target, "about": target.about, "formats": list(chosen.formats), "files": listed}
+    record |= {"sets": [s.name for s in finished.sets], "maps": sorted({s.map for s in slots})}
+    record |= {"notes": list(notes(finished, chosen))}
     return record | {"provenance": finished.manifest.get("provenance", {})}
 
 
@@ -86,32 +100,87 @@ def _slots(formats: Sequence[str], target: Target, referring: bool) -> list[Any]
     return slots
 
 
-def texture_name(names: str, name: str, finished: Finished, chosen: TextureSet, kind: str, ext: str) -> str:
-    """The file of one map: `<name>[_<set>]_<map>[.<udim>].<ext>` by default."""
-    tiles = {s.tile for s in finished.sets}
-    pattern = names
-    if len(tiles) > 1 and "{udim}" not in pattern:
-        pattern = pattern.replace(".{ext}", ".{udim}.{ext}")
-    return safe_name(pattern.format(asset=_set_name(name, finished, chosen), map=kind, ext=ext, udim=chosen.tile))
+def notes(finished: Finished, chosen: Delivery) -> tuple[str, ...]:
+    """What is to be said of the delivered files."""
+    turned = [text for text in finished.manifest.get("notes", ()) if TURNED in text]
+    if not turned or "obj" not in chosen.formats:
+        return ()
+    return (f"{chosen.name}.obj has Y up, which OBJ cannot state. {turned[0]}",)
 
 
-def _set_name(name: str, finished: Finished, chosen: TextureSet) -> str:
-    """The delivered name, with the material's where several have textures; tiles of one material share it."""
-    base = re.sub(r"\.1\d{3}$", "", chosen.name)
-    others = {re.sub(r"\.1\d{3}$", "", s.name) for s in finished.sets}
-    return name if len(others) == 1 else name + base.removeprefix(str(finished.manifest["name"]))
+def _is_down(slot: Any, target: Target) -> bool:
+    """Whether the slot is the target's own normal map of DirectX: a material in a file wants +Y."""
+    return slot.map == "normal" and slot in target.slots and target.normal == "-Y"
 
 
-def _materials(folder: Path, out: Path, finished: Finished, chosen: Delivery, kinds: set) -> list[str]:
+def _tiled(pattern: str, sets: Sequence[TextureSet]) -> str:
+    """The pattern of texture files, with {udim} before the ending where the asset has tiles."""
+    if len({s.tile for s in sets}) > 1 and "{udim}" not in pattern:
+        return pattern.replace(".{ext}", ".{udim}.{ext}")
+    return pattern
+
+
+def set_labels(pattern: str, name: str, finished: Finished) -> list[str]:
+    """The {asset} of every texture set: the delivered name, with the material's where several have textures.
+
+    Tiles of one material share it; all others differ even without case, and leave room for the rest of the pattern.
+    """
+    split = [split_tile(s.name) for s in finished.sets]
+    groups = list(dict.fromkeys((base, bool(tile)) for base, tile in split))
+    own = str(finished.manifest["name"])
+    wanted = [name if len(groups) == 1 else name + base.removeprefix(own) for base, _ in groups]
+    rest = len(pattern.format(asset="", map=LONGEST_MAP, ext="png", udim=1001).encode())
+    room = (WRITTEN - rest) // max(uses(pattern, "asset"), 1)
+    if room < SHORTEST:
+        raise UsageError(f"--texture-name {pattern[:60]!r}: found {rest} bytes, expected at most {WRITTEN - SHORTEST}")
+    labels = dict(zip(groups, distinct(wanted, limit=min(room, STEM)), strict=True))
+    return [labels[base, bool(tile)] for base, tile in split]
+
+
+def texture_name(pattern: str, label: str, tile: int, kind: str, ext: str) -> str:
+    """The file of one map: `<label>_<map>[.<udim>].<ext>` by default."""
+    return safe_name(pattern.format(asset=label, map=kind, ext=ext, udim=tile), WRITTEN)
+
+
+def _texture_files(
+    pattern: str, labels: Sequence[str], sets: Sequence[TextureSet], slots: Sequence[Any], target: Target, both: bool
+) -> list[list[str]]:
+    """The file of every slot of every set; `both` where both kinds of normal map are written. UsageError where two
+    would be one file."""
+    kinds = ["normal_dx" if both and _is_down(slot, target) else slot.map for slot in slots]
+    files = [
+        [texture_name(pattern, label, s.tile, kind, slot.ext) for kind, slot in zip(kinds, slots, strict=True)]
+        for label, s in zip(labels, sets, strict=True)
+    ]
+    flat = [(folded(file), file) for names in files for file in names]
+    clash = next((file for k, (key, file) in enumerate(flat) if key in {other for other, _ in flat[:k]}), None)
+    if clash is not None:
+        lacking = [f"{{{f}}}" for f in ("asset", "udim") if f"{{{f}}}" not in pattern]
+        raise UsageError(
+            f"--texture-name {pattern!r}: two maps would both be {clash}; "
+            f"put {' and '.join(lacking) or 'something between its fields'} into it"
+        )
+    return files
+
+
+def _looks(
+    finished: Finished, chosen: Delivery, pattern: str, labels: Sequence[str], slots: Sequence[Any]
+) -> list[Look]:
+    """The material of every part, by the files of its single maps."""
+    exr = any((s.map, s.ext) == ("albedo", "exr") for s in slots)
+    parts = finished.asset.mesh.parts
+    names = distinct([identifier(part) for part in parts], limit=IDENTIFIER)
+    titles = distinct([safe_name(part, STEM) for part in parts], limit=STEM)
+    looks = []
+    for name, title, label, textures in zip(names, titles, labels, finished.sets, strict=True):
+        files = [f"textures/{texture_name(pattern, label, textures.tile, m, 'exr' if exr else 'png')}" for m in SINGLE]
+        looks.append(Look(name, *files, srgb=not exr, space=chosen.space, title=title))
+    return looks
+
+
+def _materials(folder: Path, out: Path, finished: Finished, chosen: Delivery, looks: Sequence[Look]) -> list[str]:
     """USD, MaterialX and OBJ, which all refer to the single maps; returns the files that deliveries share."""
-    exr = ("albedo", "exr") in kinds
-    ext = "exr" if exr else "png"
-    looks, tiles = [], []
-    for part, textures in enumerate(finished.sets):
-        named = {m: texture_name(chosen.textures, chosen.name, finished, textures, m, ext) for m in SINGLE}
-        label = identifier(finished.asset.mesh.parts[part])
-        looks.append(Look(label, *(f"textures/{named[m]}" for m in SINGLE), srgb=not exr, space=chosen.space))
-        tiles.append(textures.tile)
+    tiles = [textures.tile for textures in finished.sets]
     mesh, positions = finished.asset.mesh, finished.asset.source.user_positions
     if "obj" in chosen.formats:
         write_obj(folder / f"{chosen.name}.obj", mesh, positions, tiles, looks)
@@ -126,12 +195,6 @@ def _materials(folder: Path, out: Path, finished: Finished, chosen: Delivery, ki
         write_usd(stage, identifier(chosen.name), mesh, positions, looks, metres_per_unit=chosen.unit)
         write_usdz(stage.with_suffix(".usdz"), stage)
     return []
-
-
-def identifier(name: str) -> str:
-    """A name as USD and MaterialX take them: letters, digits and '_', no digit first."""
-    plain = re.sub(r"\W+", "_", name, flags=re.ASCII) or "material"
-    return f"_{plain}" if plain[0].isdigit() else plain
 
 
 def _look_layer(folder: Path, out: Path, finished: Finished, chosen: Delivery, looks: Sequence[Look]) -> list[str]:

@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from mistyle.core import names
+
 PRESET_HELP = "draft: about a minute; standard (default); paper: the paper's own counts"
 
 
@@ -169,10 +171,10 @@ NAME_HELP = (
 )
 
 
-def asset_name(options: argparse.Namespace, default: str) -> str:
-    """The asset's own name: as --name says, unless that is a pattern for what is delivered."""
+def asset_name(options: argparse.Namespace, *parts: str) -> str:
+    """The asset's own name: as --name says, unless that is a pattern for what is delivered; else made of the parts."""
     name = getattr(options, "name", None)
-    return default if not name or "{" in name else name
+    return names.asset_name(None if not name or "{" in name else name, *parts)
 
 
 def add_mesh_options(verb: argparse.ArgumentParser) -> None:

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from mistyle.core import stopping
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import linear_from_srgb
+from mistyle.core.names import asset_name
 from mistyle.files.keeper import Keeper
 from mistyle.files.output import claim
 from mistyle.files.store import atomic_write, digest
@@ -86,6 +87,7 @@ def _fit(
     from mistyle.render.scene_fit import fit_scene
     from mistyle.render.scene_xml import write_scene
 
+    name = asset_name(options.name, options.scene.stem)
     read = [read_reference(path) for path in paths]
     iterations = options.iterations or ITERATIONS[options.preset or "standard"]
     seed = options.seed or 0
@@ -105,7 +107,6 @@ def _fit(
             resume=checkpoint.load(folder, progress.note),
             progress=report,
         )
-    name = options.name or options.scene.stem
     written: list[Any] = []
     with progress.stage("scene", "write the scene"):
         keeper.put(

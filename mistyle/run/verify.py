@@ -21,6 +21,7 @@ from mistyle.files.output import claim, replace_files
 from mistyle.files.store import DONE
 from mistyle.run.blender import BLENDER, find_blender
 from mistyle.run.verify_checks import MODELS, READERS, Check, by_blender, exr, listed_files, png
+from mistyle.run.verify_surfaces import surface_checks
 
 # Two right renderers differ by noise (FLIP 0.05 to 0.09 at 64 samples) and by their pixel filters.
 MOST_FLIP, LEAST_OVERLAP, LEAST_CORRELATION = 0.15, 0.98, 0.95
@@ -120,6 +121,7 @@ def file_checks(place: Path, files: Sequence[Path], blender: str | None) -> Iter
             row = listed_files(path, name(path))
             if row is not None:
                 yield row
+    yield from surface_checks(files, name)
     for path in files:
         for reader in READERS.get(path.suffix.lower(), ()):
             yield from reader(path, name(path))

@@ -40,7 +40,7 @@ class Check:
     said: str
 
 
-def _row(file: str, check: str, complaints: Sequence[str], fine: str) -> Check:
+def row(file: str, check: str, complaints: Sequence[str], fine: str) -> Check:
     if complaints:
         more = f" (and {len(complaints) - 3} more)" if len(complaints) > 3 else ""
         return Check(file, check, "failed", "; ".join(complaints[:3]) + more)
@@ -69,7 +69,7 @@ def listed_files(listing: Path, name: str) -> Check | None:
             wrong.append(f"{file} is missing")
         elif sha256_file(path) != value:
             wrong.append(f"{file} has changed")
-    return _row(name, "sha256 of the files it lists", wrong, f"{len(wanted)} files as they were written")
+    return row(name, "sha256 of the files it lists", wrong, f"{len(wanted)} files as they were written")
 
 
 def validator_home() -> Path | str:
@@ -109,7 +109,7 @@ def gltf(path: Path, name: str) -> Iterator[Check]:
     counts = f"{issues['numErrors']} errors, {issues['numWarnings']} warnings, {issues['numInfos']} notes"
     if issues["numErrors"] and not errors:
         errors = [counts]
-    yield _row(name, f"Khronos glTF validator {told['version']}", errors, counts)
+    yield row(name, f"Khronos glTF validator {told['version']}", errors, counts)
 
 
 def by_trimesh(path: Path, name: str) -> Iterator[Check]:
@@ -128,29 +128,32 @@ def by_trimesh(path: Path, name: str) -> Iterator[Check]:
     wrong += [f"{key} is not finite" for key, g in scene.geometry.items() if not np.isfinite(g.vertices).all()]
     bare = [g for g in parts if getattr(g.visual, "uv", None) is None]
     wrong += [f"{len(bare)} meshes without UVs"] if bare else []
-    yield _row(name, check, wrong, f"{len(parts)} meshes, {faces} triangles, UVs on all")
+    yield row(name, check, wrong, f"{len(parts)} meshes, {faces} triangles, UVs on all")
 
 
 def usd(path: Path, name: str) -> Iterator[Check]:
     """USD's own validators, and whether every texture that it names is there."""
     try:
-        from mistyle.files.usd import complaints, library
+        from mistyle.files.usd import complaints, heard, library
 
         pxr = library()
     except MistyleError as error:
         yield Check(name, "UsdValidation", "not checked", str(error))
         return
-    try:
-        stage = pxr.Usd.Stage.Open(str(path))
-    except pxr.Tf.ErrorException as error:
-        yield Check(name, "UsdValidation", "failed", str(error).strip().splitlines()[-1][:300])
-        return
-    wrong = complaints(path)
+    with heard(pxr) as said:
+        try:
+            stage = pxr.Usd.Stage.Open(str(path))
+            wrong = [str(error).strip().splitlines()[0] for error in stage.GetCompositionErrors()] + complaints(path)
+        except pxr.Tf.ErrorException as error:
+            yield Check(name, "UsdValidation", "failed", str(error).strip().splitlines()[-1][:300])
+            return
     named = [p.GetAttribute("inputs:file").Get() for p in stage.Traverse() if p.HasAttribute("inputs:file")]
     wrong += [f"{asset.path} is not there" for asset in named if asset and not asset.resolvedPath]
     meshes = sum(p.IsA(pxr.UsdGeom.Mesh) for p in stage.Traverse())
     version = ".".join(map(str, pxr.Usd.GetVersion()[1:]))
-    yield _row(name, f"UsdValidation {version}", wrong, f"no errors; {meshes} meshes, {len(named)} textures resolved")
+    warned = [f"USD warns: {text[:300]}" for text in dict.fromkeys(said)]
+    fine = "; ".join([f"no errors; {meshes} meshes, {len(named)} textures resolved", *warned[:3]])
+    yield row(name, f"UsdValidation {version}", wrong, fine)
 
 
 def materialx(path: Path, name: str) -> Iterator[Check]:
@@ -176,7 +179,7 @@ def materialx(path: Path, name: str) -> Iterator[Check]:
     files = [n.getInput("file").getValueString() for n in own if n.getCategory() == "image"]
     wrong += [f"{file} is not there" for file in files if not (path.parent / file).is_file()]
     surfaces = sum(n.getType() == "surfaceshader" for n in own)
-    yield _row(name, check, wrong, f"valid; {surfaces} surfaces, {len(files)} images there")
+    yield row(name, check, wrong, f"valid; {surfaces} surfaces, {len(files)} images there")
 
 
 def png(paths: Sequence[Path], name: str) -> Iterator[Check]:
@@ -191,7 +194,7 @@ def png(paths: Sequence[Path], name: str) -> Iterator[Check]:
                 picture.load()
         except (OSError, SyntaxError, ValueError) as error:
             wrong.append(f"{path.name}: {str(error)[:100]}")
-    yield _row(name, f"Pillow {PIL.__version__}", wrong, f"{len(paths)} PNG decoded")
+    yield row(name, f"Pillow {PIL.__version__}", wrong, f"{len(paths)} PNG decoded")
 
 
 def exr(paths: Sequence[Path], name: str) -> Iterator[Check]:
@@ -209,7 +212,7 @@ def exr(paths: Sequence[Path], name: str) -> Iterator[Check]:
         else:
             spaces.add(str(found.spec().getattribute("colorInteropID") or "no colour space"))
     told = f"{len(paths)} EXR decoded: {', '.join(sorted(spaces))}"
-    yield _row(name, f"OpenImageIO {oiio.VERSION_STRING}", wrong, told)
+    yield row(name, f"OpenImageIO {oiio.VERSION_STRING}", wrong, told)
 
 
 def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None) -> Iterator[Check]:
@@ -232,7 +235,7 @@ def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None)
         wrong += [] if wrong or found["meshes"] and found["triangles"] else ["no mesh was imported"]
         wrong += [f"image {image} is missing" for image in found.get("missing", [])]
         fine = "" if wrong else "{meshes} meshes, {triangles} triangles, {materials} materials, {images} images"
-        yield _row(name, f"Blender {done['blender']}", wrong, fine.format(**found))
+        yield row(name, f"Blender {done['blender']}", wrong, fine.format(**found))
 
 
 # Who reads a model of which kind.

@@ -18,16 +18,16 @@ from jaxtyping import Float
 
 from mistyle import __version__
 from mistyle.core.asset import Asset
-from mistyle.core.errors import UsageError
 from mistyle.core.image import bilinear, nearest_fill
 from mistyle.core.maps import Maps, Texels
+from mistyle.core.names import checked
 from mistyle.files.gltf import patch_glb, write_glb
 from mistyle.files.gltf_alpha import Cutout, cutouts
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.output import put_folder
 from mistyle.files.own import read_own
 from mistyle.files.store import atomic_write, sha256_file
-from mistyle.files.textures import Pictures, encode_pictures, normal_colours, orm_colours, part_stems, safe_name
+from mistyle.files.textures import Pictures, encode_pictures, normal_colours, orm_colours, part_stems
 from mistyle.stages.texels import corner_weights
 
 NORMAL_CONVENTION = {
@@ -68,8 +68,7 @@ def write_asset(
     and nobody edited goes, all other files stay. Raises UsageError for a name that is no file name, and where a file
     that no export wrote has the name of a new one.
     """
-    if not name or safe_name(name) != name:
-        raise UsageError(f"--name {name!r}: found characters that do not suit file names; try {safe_name(name)!r}")
+    name = checked(name)
     result: dict[str, Any] = {}
 
     def fill(new: Path) -> None:

@@ -9,6 +9,7 @@ Mitsuba's `principled` is the material; `normalmap` shades in Mitsuba's own tang
 here must be turned into it (`frames.py`).
 """
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from xml.etree import ElementTree
@@ -30,6 +31,7 @@ from mistyle.core.light import (
 )
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
+from mistyle.core.names import STEM, safe_name
 from mistyle.files.images import write_exr
 from mistyle.render.scene import mitsuba_mesh
 
@@ -56,7 +58,8 @@ def write_scene(
             stem = f"part{p}"
             mitsuba_mesh(mesh, p, name=stem).write_ply(str(folder / f"{stem}.ply"))
             shape = SubElement(root, "shape", type="ply", id=stem)
-            root[-1].append(ElementTree.Comment(f" {part.replace('--', '-')} "))
+            # Two hyphens would end an XML comment.
+            root[-1].append(ElementTree.Comment(f" {re.sub('-{2,}', '-', safe_name(part, STEM))} "))
             SubElement(shape, "string", name="filename", value=f"{stem}.ply")
             shape.append(_bsdf(folder, stem, maps[p]))
     ElementTree.indent(root, "    ")

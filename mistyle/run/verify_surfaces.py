@@ -1,0 +1,183 @@
+"""Whether a model shows every material of its asset with maps of its own, by what the file itself names."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+from mistyle.core.errors import InputRefused, MistyleError
+from mistyle.core.names import folded
+from mistyle.files.bounds import USD
+from mistyle.run.verify_checks import MODELS, Check, row
+
+CHECK = "materials and their maps"
+MAPS = ("map_kd", "map_pr", "map_pm", "norm")
+
+
+@dataclass(frozen=True)
+class List:
+    """What a list of ours (an asset's or a delivery's) says: texture sets, and each map's file as (set, map, file)."""
+
+    path: Path
+    asset: str
+    sets: tuple[str, ...]
+    maps: tuple[tuple[str, str, str], ...]
+    models: tuple[str, ...]
+
+
+def surface_checks(files: Sequence[Path], name: Callable[[Path], str]) -> Iterator[Check]:
+    """A row for every list of ours, and for every model that a list names."""
+    lists = [found for path in files if path.suffix == ".json" and (found := _list(path)) is not None]
+    whole = {found.asset: found.sets for found in lists if found.path.name == f"{found.asset}.json"}
+    wanted: dict[Path, int] = {}
+    for found in lists:
+        # Lists of older versions name only the sets whose files are left; the asset's own list knows them all.
+        sets = max(found.sets, whole.get(found.asset, ()), key=len)
+        if found.maps:
+            said = f"{len(sets)} texture sets, {len(found.maps)} maps"
+            yield row(name(found.path), CHECK, _lost(sets, found.maps), said)
+        for model in found.models if sets else ():
+            path = found.path.parent / model
+            wanted[path] = min(len(sets), wanted.get(path, len(sets)))  # a look layer is on several lists
+    for path in files:
+        if path in wanted:
+            yield _shown(path, name(path), wanted[path])
+
+
+def _list(path: Path) -> List | None:
+    from mistyle.files.read import read_json
+
+    try:
+        content = read_json(path)
+        entries, parts = list(content["files"]), content.get("parts")
+        names = [str(entry["file"]) for entry in entries]
+        if parts is not None:  # an asset's
+            sets = {str(part["name"]): str(part["textures"]) for part in parts}
+            maps = [(sets[e["part"]], e["map"], f) for e, f in zip(entries, names, strict=True) if "map" in e]
+            found = tuple(sets.values())
+        else:
+            maps = [(str(e["set"]), str(e["map"]), f) for e, f in zip(entries, names, strict=True) if "set" in e]
+            found = tuple(content.get("sets") or dict.fromkeys(s for s, *_ in maps))
+        models = tuple(f for f in names if f.endswith((*MODELS, ".mtlx")))
+        return List(path, str(content.get("asset", content["name"])), found, tuple(maps), models)
+    except (InputRefused, KeyError, TypeError, AttributeError):
+        return None  # no list of ours, or a damaged one, which verify_checks.listed_files reports
+
+
+def _lost(sets: Sequence[str], maps: Sequence[tuple[str, str, str]]) -> list[str]:
+    """Maps that a set does not have although others do, and files that are listed as two maps."""
+    kinds, there = sorted({kind for _, kind, _ in maps}), {(s, kind) for s, kind, _ in maps}
+    wrong = [f"{s} has no file for its {kind}" for s in sets for kind in kinds if (s, kind) not in there]
+    owners: dict[str, tuple[str, str]] = {}
+    for s, kind, file in maps:
+        first = owners.setdefault(folded(file), (s, kind))
+        if first != (s, kind):
+            wrong.append(f"{file} is {first[1]} of {first[0]} and {kind} of {s}")
+    return wrong
+
+
+def _shown(path: Path, name: str, wanted: int) -> Check:
+    """Whether a model has `wanted` materials on its faces, with files that no two maps share."""
+    reader = _usd if path.suffix.lower() in USD else SURFACES[path.suffix.lower()]
+    try:
+        materials = reader(path)
+    except MistyleError as error:
+        return Check(name, CHECK, "not checked", str(error))
+    except (OSError, ValueError, LookupError, TypeError, ElementTree.ParseError) as error:
+        return Check(name, CHECK, "failed", f"{type(error).__name__}: {str(error)[:200]}")
+    wrong = [] if len(materials) >= wanted else [f"{len(materials)} materials on its faces, expected {wanted}"]
+    wrong += [f"{material} names no map" for material, maps in materials.items() if not maps]
+    owners: dict[str, list[str]] = {}
+    for material, maps in materials.items():
+        for file in maps:
+            owners.setdefault(folded(file), []).append(material)
+    if reader is not _gltf:
+        shared = {file: " and ".join(dict.fromkeys(of)) for file, of in owners.items() if len(of) > 1}
+        wrong += [f"{file} is several maps of {of}" for file, of in shared.items()]
+    elif len(owners) < wanted:  # other scenes of the user's own file may share what they like
+        wrong.append(f"{len(owners)} base colour images, expected {wanted}")
+    return row(name, CHECK, wrong, f"{len(materials)} materials, {len(owners)} maps of their own")
+
+
+def _gltf(path: Path) -> dict[str, list[str]]:
+    """The base colour images of the materials that triangles wear; one image may hold several other maps."""
+    data = path.read_bytes()
+    text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data[:4] == b"glTF" else data
+    tree: dict[str, Any] = json.loads(text)
+    used = {p["material"] for m in tree["meshes"] for p in m["primitives"] if "material" in p and p.get("mode", 4) > 3}
+    result = {}
+    for k in sorted(used):
+        shown = tree["materials"][k].get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        if shown is not None:
+            texture = tree["textures"][shown["index"]]
+            result[f"material {k}"] = [f"image {texture.get('source', texture)}"]
+    return result
+
+
+def _obj(path: Path) -> dict[str, list[str]]:
+    """The materials that faces use, with what the library says of them."""
+    used, current, libraries = set(), "", []
+    with open(path, encoding="utf-8") as file:
+        for line in file:
+            if line.startswith("f "):
+                used.add(current)
+            elif line.startswith(("usemtl ", "mtllib ")):
+                word, rest = line.split(None, 1)
+                current, libraries = (rest.strip(), libraries) if word == "usemtl" else (current, [*libraries, rest])
+    known: dict[str, list[str]] = {}
+    for library in libraries:
+        name = ""
+        for line in (path.parent / library.strip()).read_text(encoding="utf-8").splitlines():
+            word, _, rest = line.strip().partition(" ")
+            if word == "newmtl":
+                name = rest.strip()
+            elif word.lower() in MAPS:
+                known.setdefault(name, []).append(rest.strip())
+    return {name: known.get(name, []) for name in sorted(used)}
+
+
+def _materialx(path: Path) -> dict[str, list[str]]:
+    """The images of every material's surface, which lie in its node graph."""
+    root, place = ElementTree.parse(path).getroot(), "image/input[@name='file']"
+    graphs = {g.get("name"): [i.get("value", "") for i in g.iterfind(place)] for g in root.iterfind("nodegraph")}
+    shaders = root.iterfind("open_pbr_surface")
+    surfaces = {s.get("name"): [i.get("nodegraph") for i in s if i.get("nodegraph")] for s in shaders}
+    result = {}
+    for material in root.iterfind("surfacematerial"):
+        names = [g for i in material for g in surfaces[i.get("nodename")]]
+        result[str(material.get("name"))] = [file for g in dict.fromkeys(names) for file in graphs[g]]
+    return result
+
+
+def _usd(path: Path) -> dict[str, list[str]]:
+    """The textures of every material that is bound to faces."""
+    from mistyle.files.usd import heard, library
+
+    pxr = library()
+    api, found = pxr.UsdShade.MaterialBindingAPI, {}
+    with heard(pxr):
+        try:
+            stage = pxr.Usd.Stage.Open(str(path))
+        except pxr.Tf.ErrorException as error:
+            raise ValueError(str(error).strip().splitlines()[-1]) from None
+        for prim in stage.Traverse():
+            if not prim.IsA(pxr.UsdGeom.Mesh):
+                continue
+            subsets = [s for s in api(prim).GetMaterialBindSubsets() if s.GetIndicesAttr().Get()]
+            for bound in [s.GetPrim() for s in subsets] or [prim]:
+                material = api(bound).ComputeBoundMaterial()[0]
+                if material:
+                    below = pxr.Usd.PrimRange(material.GetPrim())
+                    named = [p.GetAttribute("inputs:file").Get() for p in below if p.HasAttribute("inputs:file")]
+                    found[str(material.GetPath())] = [asset.path for asset in named if asset]
+    return found
+
+
+SURFACES: Mapping[str, Callable[[Path], dict[str, list[str]]]] = {
+    ".glb": _gltf,
+    ".gltf": _gltf,
+    ".obj": _obj,
+    ".mtlx": _materialx,
+}
