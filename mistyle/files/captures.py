@@ -174,6 +174,9 @@ def reading_notes(path: Path, shots: Sequence[Shot]) -> tuple[str, ...]:
             else "they were turned upright, as camera.json describes what one sees."
         )
         notes.append(f"EXIF orientation of {found} (of {len(shots)} views): {done}")
+    unused = _home(Path(path)) / "masks"
+    if unused.is_dir() and not any(shot.mask for shot in shots):
+        notes.append(f"The folder {unused} was not used; --masks {unused} hands it in.")
     kind, file = _source(Path(path))
     if kind == "transforms":
         applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]

@@ -163,7 +163,7 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
     if image.width * image.height > MAX_PIXELS:
         raise _too_large(where, f"{image.width} x {image.height} pixels")
     taken = {"MPO": "pictures in the MPO file only the first", "TIFF": "pages only the first"}
-    notes = [f"Of the {taken.get(image.format, 'animation only the first frame')} was taken."] if several else []
+    notes = [f"Of the {taken.get(str(image.format), 'animation only the first frame')} was taken."] if several else []
     return image, notes
 
 

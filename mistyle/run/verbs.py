@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.run.inputs import input_files
+from mistyle.run.material_outlines import tell_views
 from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
 from mistyle.run.progress import Progress
@@ -38,7 +39,9 @@ def bake_views(mesh: Path, views: Path, out: Path, settings: Settings, name: str
     with progress.stage("mesh", "read the mesh") as report:
         asset = read(mesh, settings.read, settings.atlas.size, report)
         atlas = lay_out(asset, settings, lambda done: None)
-    seen_by = with_geometry(asset, read_views(views))
+    pictures = read_views(views)
+    tell_views(asset.mesh, pictures, progress)
+    seen_by = with_geometry(asset, pictures)
     maps = []
     with progress.stage("bake", "bake the texture") as report:
         for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
