@@ -94,8 +94,9 @@ def inside(folder: Path, name: str, where: Path, fix: str) -> Path:
         target = (root / plain).resolve()
     except (OSError, RuntimeError) as error:  # a loop of links
         raise refuse(where, found, "a file name", fix) from error
-    if re.match(r"[A-Za-z]:", plain) or not target.is_relative_to(root):
-        leads = "" if re.match(r"[A-Za-z]:", plain) else f", which is {target}"
+    drive = re.match(r"[A-Za-z]:/", plain)
+    if drive or not target.is_relative_to(root):
+        leads = "" if drive else f", which is {target}"
         raise refuse(where, f"{found}{leads}", f"a file inside the folder {root}", fix)
     return target
 

@@ -297,7 +297,7 @@ def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -
         }
         entry = entry.model_copy(update=files)
     exr = folder / f"{camera.name}.exr" if entry.exr is None else inside(folder, entry.exr, file, HAND_IN)
-    picture = standing_picture(folder, camera, entry, exr if exr.is_file() else None)
+    picture = standing_picture(folder, camera, entry, exr if exr.is_file() else None, HAND_IN)
     lens = Lens((camera.focal, camera.focal), camera.centre, camera.size)
     alpha_of = exr if picture is not None and exr.is_file() else None
     return Shot(camera, lens, picture or exr, PIXELS, alpha_of=alpha_of)

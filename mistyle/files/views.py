@@ -155,11 +155,14 @@ def _read_view(folder: Path, camera: Camera, entry: ViewEntry | None) -> View:
     return _view(camera, linear if alpha is None else linear * alpha[..., None], alpha, planes, picture)
 
 
-def standing_picture(folder: Path, camera: Camera, entry: ViewEntry | None, exr: Path | None) -> Path | None:
-    """The picture that stands for the view instead of its EXR, or None when the EXR does."""
+def standing_picture(
+    folder: Path, camera: Camera, entry: ViewEntry | None, exr: Path | None, fix: str = COPY
+) -> Path | None:
+    """The picture that stands for the view instead of its EXR, or None when the EXR does. `fix` is what helps where the
+    entry names a picture outside the folder."""
     there = [path for ending in PICTURES if (path := folder / f"{camera.name}{ending}").is_file()]
     if entry is not None and entry.png is not None:
-        named = inside(folder, entry.png, folder / "camera.json", COPY)
+        named = inside(folder, entry.png, folder / "camera.json", fix)
         if named.is_file() and named not in [path.resolve() for path in there]:
             there.append(named)
     written = entry.png_sha256 if entry is not None else None
