@@ -9,6 +9,7 @@ import zlib
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from scipy.spatial.transform import Rotation
 from test_colmap import Model, write_bin, write_txt
 from test_read_pictures import png16
 
+from mistyle.core.asset import Pixels
 from mistyle.core.camera import Camera, orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
@@ -154,7 +156,7 @@ def test_pictures_are_read_stored_or_upright(tmp_path, ending):
         path, turned = tmp_path / f"a.{ending}", upright(quadrants(), orientation)
         assert read_stored_size(path) == (TALL, WIDE, orientation)
         assert read_size(path) == turned.shape[:2] and read_size(path, "stored") == (TALL, WIDE)
-        for pixels, expected in (("stored", quadrants()), ("upright", turned)):
+        for pixels, expected in zip(get_args(Pixels), (quadrants(), turned), strict=True):
             found = read_picture(path, pixels)
             assert np.abs(found.rgb * 255 - expected).max() < (12 if ending == "jpg" else 1e-2)
             assert any("EXIF" in note for note in found.notes) == (orientation > 1 and pixels == "upright")

@@ -16,7 +16,7 @@ def fix_of(chosen: ReferenceSettings) -> str:
     options = [f"--{name.replace('_', '-')}" for name in ("align", "refine_poses") if not getattr(chosen, name)]
     start = f"Try {' and '.join(options)}; check" if options else "Check"
     return (
-        f"{start} the cameras' axes and units (--up z), and that pictures and masks are those that the cameras were "
+        f"{start} the cameras' axes and units, and that pictures and masks are those that the cameras were "
         "made for. Masks that leave out parts of the object lower the overlap too."
     )
 
