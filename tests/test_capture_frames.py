@@ -30,7 +30,7 @@ from mistyle.files.images import write_exr
 from mistyle.files.read import read_picture, read_size, read_stored_size
 from mistyle.files.views import read_views
 from mistyle.render.draw import gbuffer, tracer
-from mistyle.stages.outline_check import outline_overlaps, overlap_line, overlap_notes
+from mistyle.stages.outline_check import Outlines, check_outlines, overlap_line, overlap_notes
 
 TALL, WIDE = 32, 48  # of the stored pixels
 FOCAL = 60.0
@@ -485,32 +485,48 @@ def wedge() -> Mesh:
 
 def test_outlines_tell_right_frames_from_wrong_ones():
     mesh = wedge()
-    seen = [orbit(60.0 * k, 25, distance=4.0, fov=30.0, size=(240, 300)) for k in range(6)]
+    seen = [orbit(100.0 * k, 25, distance=4.0, fov=30.0, size=(240, 300)) for k in range(3)]
     traced = tracer(mesh)
     masks = [gbuffer(traced, camera).mask for camera in seen]
-    names = [f"v{k}" for k in range(6)]
+    names = ["v0", "v1", "v2"]
 
-    def overlaps(matrix: np.ndarray) -> list[float]:
-        return list(outline_overlaps(mesh, [replace(c, world_from_cam=matrix @ c.world_from_cam) for c in seen], masks))
+    def moved(matrix: np.ndarray) -> Outlines:
+        return check_outlines(mesh, [replace(c, world_from_cam=matrix @ c.world_from_cam) for c in seen], masks)
 
-    right = overlaps(np.eye(4))
-    assert min(right) > 0.97 and overlap_notes(names, right, 0.8, "fix") == ()
+    right = moved(np.eye(4))
+    assert min(right.overlap) > 0.97 and overlap_notes(names, right, 0.8, "fix") == ()
+    assert "v0 1.00, v1 " in overlap_line(names, right.overlap)
     shifted = np.eye(4)
     shifted[:3, 3] = (0.5, 0.2, 0)
-    wrong = {"shifted": overlaps(shifted), "Z up": overlaps(TURN), "upside down": overlaps(np.diag([1.0, -1, -1, 1]))}
-    wrong["mirrored"] = list(outline_overlaps(mesh, seen, [mask[:, ::-1] for mask in masks]))
-    wrong["turned by 180"] = list(outline_overlaps(mesh, seen, [mask[::-1, ::-1] for mask in masks]))
-    for name, found in wrong.items():
-        assert min(found) < 0.75, name
+    wrong = {
+        "shifted": (moved(shifted), None),
+        "Z up": (moved(TURN), "turned by 90 degrees about X"),
+        "upside down": (moved(np.diag([1.0, -1, -1, 1])), "turned by 180 degrees about X"),
+        "mirrored": (check_outlines(mesh, seen, [mask[:, ::-1] for mask in masks]), None),
+        "turned in the picture": (check_outlines(mesh, seen, [mask[::-1, ::-1] for mask in masks]), None),
+    }
+    for name, (found, hint) in wrong.items():
+        assert min(found.overlap) < 0.75, name
         (note,) = overlap_notes(names, found, 0.8, "Try --align")
         assert note.startswith("Warning: the cameras do not fit the mesh") and "Try --align" in note, name
-    assert "v0 1.00" in overlap_line(names, right) and "v5 " in overlap_line(names, right)
+        assert (hint or "") in note and (hint is not None) == ("With the cameras turned" in note), name
+
+
+def test_outlines_that_do_not_show_a_turn_are_said():
+    """A cube looks the same under the turns that take one convention for another."""
+    cube = wedge()
+    cube = replace(cube, positions=np.sign(cube.positions) * np.float32(0.5))
+    seen = [orbit(60.0 * k, 25, distance=4.0, fov=30.0, size=(90, 90)) for k in range(3)]
+    masks = [gbuffer(tracer(cube), camera).mask for camera in seen]
+    found = check_outlines(cube, seen, masks)
+    (note,) = overlap_notes(["a", "b", "c"], found, 0.8, "")
+    assert "do not show whether the frame is the right one" in note and note.count("degrees") == 3
 
 
 def test_pictures_without_an_outline_are_not_judged():
     mesh, camera = wedge(), orbit(0, 25, distance=4.0, fov=30.0, size=(60, 60))
     everything = np.ones((60, 60), bool)
-    found = list(outline_overlaps(mesh, [camera] * 3, [None, everything, ~everything]))
-    assert np.isnan(found).all()
+    found = check_outlines(mesh, [camera] * 3, [None, everything, ~everything])
+    assert np.isnan(found.overlap).all()
     (note,) = overlap_notes(["a", "b", "c"], found, 0.8, "")
     assert "neither alpha nor masks" in note and "not checked" in note

@@ -195,7 +195,7 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     from mistyle.core.align import moved
     from mistyle.files.captures import camera_space, outline_of, silhouette, sparse_points
     from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
-    from mistyle.stages.outline_check import outline_overlaps, overlap_notes
+    from mistyle.stages.outline_check import check_outlines, overlap_notes
 
     chosen = job.settings.references
     figures: dict[str, float] = {}
@@ -228,14 +228,12 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
         captures = replace(captures, cameras=refined.cameras)
         before, after = (float(np.nanmean(each)) for each in (refined.before, refined.after))
         figures |= {"pose_px_before": before, "pose_px_after": after}
-    overlaps = []
-    for overlap in outline_overlaps(asset.mesh, captures.cameras, outlines):
-        overlaps.append(overlap)
-        report(0.8 + 0.2 * len(overlaps) / len(shots))
-    said = overlap_notes([c.name for c in captures.cameras], overlaps, chosen.overlap, fix_of(chosen))
-    if np.isfinite(overlaps).any():
-        figures |= {"outline_overlap": float(np.nanmean(overlaps)), "outline_overlap_least": float(np.nanmin(overlaps))}
-    return Placed(captures.cameras, captures.lights, (*notes, *said), figures, tuple(overlaps))
+    found = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done))
+    said = overlap_notes([c.name for c in captures.cameras], found, chosen.overlap, fix_of(chosen))
+    if np.isfinite(found.overlap).any():
+        mean, least = float(np.nanmean(found.overlap)), float(np.nanmin(found.overlap))
+        figures |= {"outline_overlap": mean, "outline_overlap_least": least}
+    return Placed(captures.cameras, captures.lights, (*notes, *said), figures, found.overlap)
 
 
 def no_finer(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:

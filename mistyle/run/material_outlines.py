@@ -35,11 +35,11 @@ def tell_placed(placed: Any, progress: Progress) -> None:
 
 def tell_views(mesh: Mesh, views: Sequence[View], progress: Progress) -> None:
     """The same for the pictures of `mistyle bake`, whose alpha is their coverage."""
-    from mistyle.stages.outline_check import outline_overlaps, overlap_line, overlap_notes
+    from mistyle.stages.outline_check import check_outlines, overlap_line, overlap_notes
 
     names = [view.camera.name for view in views]
-    found = list(outline_overlaps(mesh, [view.camera for view in views], (view.coverage > 0.5 for view in views)))
-    if np.isfinite(found).any():
-        progress.say(overlap_line(names, found))
+    found = check_outlines(mesh, [view.camera for view in views], (view.coverage > 0.5 for view in views))
+    if np.isfinite(found.overlap).any():
+        progress.say(overlap_line(names, found.overlap))
     fix = "Check the cameras' axes, and that they are in working units (camera.json of `mistyle render`)."
     progress.note(*overlap_notes(names, found, LEAST_OVERLAP, fix))
