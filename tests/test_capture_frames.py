@@ -138,7 +138,7 @@ def test_a_camera_describes_stored_or_upright_pixels(tmp_path, kind, ending):
         assert found is not None and np.array_equal(found, inside > 0)
         assert shot.pixels == pixels and shot.orientation == (orientation, orientation)
         notes = " ".join(reading_notes(home, [shot]))
-        assert ("EXIF orientation of 1 pictures and 1 masks" in notes) == (orientation > 1)
+        assert ("EXIF orientation: 1 pictures, 1 masks" in notes) == (orientation > 1)
         assert orientation == 1 or ("ignored" if pixels == "stored" else "turned upright") in notes
 
 
@@ -485,7 +485,7 @@ def wedge() -> Mesh:
 
 def test_outlines_tell_right_frames_from_wrong_ones():
     mesh = wedge()
-    seen = [orbit(100.0 * k, 25, distance=4.0, fov=30.0, size=(240, 300)) for k in range(3)]
+    seen = [orbit(100.0 * k, 25, distance=4.0, fov=30.0, size=(96, 120)) for k in range(3)]
     traced = tracer(mesh)
     masks = [gbuffer(traced, camera).mask for camera in seen]
     names = ["v0", "v1", "v2"]

@@ -243,9 +243,9 @@ def _matrix(rows: Any, where: str, path: Path) -> Float[np.ndarray, "4 4"]:
     except (TypeError, ValueError):
         matrix = np.zeros(0)
     if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
-        shape = f"a matrix of {' x '.join(map(str, matrix.shape))}" if matrix.ndim == 2 else "no matrix"
-        found = f"{shape} or with other things than finite numbers in {where}"
-        raise refuse(path, found, "3 or 4 rows of 4 finite numbers", "Correct the file")
+        sides = " x ".join(map(str, matrix.shape))
+        found = f"a matrix of {sides} numbers" if matrix.ndim == 2 else "something else than a matrix of numbers"
+        raise refuse(path, f"{found} in {where}", "3 or 4 rows of 4 finite numbers", "Correct the file")
     whole = np.vstack([matrix[:3], [0.0, 0, 0, 1]])
     if len(matrix) == 4 and not np.allclose(matrix[3], whole[3], atol=1e-9):
         raise refuse(path, f"a projective matrix in {where}", "a last row 0 0 0 1", "Write rigid matrices")
@@ -319,7 +319,7 @@ def _check_square(fx: float, fy: float, where: str, path: Path) -> None:
 
 
 def check_rotation(rotation: Float[np.ndarray, "3 3"], where: str, path: Path) -> None:
-    """Refuse a matrix that is no rotation within RIGID."""
+    """Refuse a matrix that is not a rotation within RIGID."""
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
         fix = "Take scale and mirroring out of the matrix"
         raise refuse(path, f"a matrix that is no rotation in {where}", "an orthonormal right-handed one", fix)

@@ -167,13 +167,14 @@ def reading_notes(path: Path, shots: Sequence[Shot]) -> tuple[str, ...]:
     notes = []
     tagged = [sum(shot.orientation[k] > 1 for shot in shots) for k in (0, 1)]
     if any(tagged):
-        found = " and ".join(f"{n} {what}" for n, what in zip(tagged, ("pictures", "masks"), strict=True) if n)
         done = (
-            "it was ignored, as COLMAP and transforms.json describe the pixels as they are stored."
+            "It was ignored: COLMAP models and transforms.json describe the pixels as they are stored."
             if shots[0].pixels == "stored"
-            else "they were turned upright, as camera.json describes what one sees."
+            else "They were turned upright: camera.json describes upright pictures."
         )
-        notes.append(f"EXIF orientation of {found} (of {len(shots)} views): {done}")
+        notes.append(
+            f"Files with an EXIF orientation: {tagged[0]} pictures, {tagged[1]} masks (of {len(shots)} views). {done}"
+        )
     unused = _home(Path(path)) / "masks"
     if unused.is_dir() and not any(shot.mask for shot in shots):
         notes.append(f"The folder {unused} was not used; --masks {unused} hands it in.")
@@ -182,8 +183,8 @@ def reading_notes(path: Path, shots: Sequence[Shot]) -> tuple[str, ...]:
         applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
         if applied:
             notes.append(
-                f"{' and '.join(applied)} of {file.name}: undone; the cameras stand in the space that nerfstudio took "
-                "them from. A mesh in nerfstudio's own space needs --align."
+                f"{' and '.join(applied)} of {file.name} were undone: the cameras stand in the space of the "
+                "reconstruction. A mesh in nerfstudio's own space needs --align."
             )
     return tuple(notes)
 
