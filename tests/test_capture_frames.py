@@ -521,6 +521,7 @@ def test_outlines_that_do_not_show_a_turn_are_said():
     found = check_outlines(cube, seen, masks)
     (note,) = overlap_notes(["a", "b", "c"], found, 0.8, "")
     assert "do not show whether the frame is the right one" in note and note.count("degrees") == 3
+    assert overlap_notes(["a", "b", "c"], found, 0.8, "", trusted=True) == ()
 
 
 def test_pictures_without_an_outline_are_not_judged():

@@ -229,7 +229,9 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
         before, after = (float(np.nanmean(each)) for each in (refined.before, refined.after))
         figures |= {"pose_px_before": before, "pose_px_after": after}
     found = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done))
-    said = overlap_notes([c.name for c in captures.cameras], found, chosen.overlap, fix_of(chosen))
+    ours = camera_space(job.references) == "working" and not chosen.align
+    names = [camera.name for camera in captures.cameras]
+    said = overlap_notes(names, found, chosen.overlap, fix_of(chosen), trusted=ours)
     if np.isfinite(found.overlap).any():
         mean, least = float(np.nanmean(found.overlap)), float(np.nanmin(found.overlap))
         figures |= {"outline_overlap": mean, "outline_overlap_least": least}

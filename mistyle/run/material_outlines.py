@@ -42,4 +42,4 @@ def tell_views(mesh: Mesh, views: Sequence[View], progress: Progress) -> None:
     if np.isfinite(found.overlap).any():
         progress.say(overlap_line(names, found.overlap))
     fix = "Check the cameras' axes, and that they are in working units (camera.json of `mistyle render`)."
-    progress.note(*overlap_notes(names, found, LEAST_OVERLAP, fix))
+    progress.note(*overlap_notes(names, found, LEAST_OVERLAP, fix, trusted=True))
