@@ -195,7 +195,7 @@ def test_pictures_are_loaded_one_at_a_time(tmp_path, monkeypatch):
     nerf(tmp_path, [grey(0.1), grey(0.2), grey(0.3)])
     read: list[str] = []
     real = module.read_picture
-    monkeypatch.setattr(module, "read_picture", lambda path: read.append(path.name) or real(path))
+    monkeypatch.setattr(module, "read_picture", lambda path, pixels: read.append(path.name) or real(path, pixels))
     captures = read_captures(tmp_path)
     assert read == []
     captures.load(1), captures.load(1), captures.load(2)

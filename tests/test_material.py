@@ -18,14 +18,17 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.files.images import write_png
 from mistyle.files.read import read_mesh
-from mistyle.files.views import write_views
+from mistyle.files.views import read_views, write_views
 from mistyle.render import draw, shade
 from mistyle.run.charts import Chart, svg
 from mistyle.run.cli import main
-from mistyle.run.material import hold_out, lights_in_order
-from mistyle.run.material_settings import ReferenceSettings
+from mistyle.run.material import MaterialJob, hold_out, lights_in_order, place, references_of
+from mistyle.run.material_outlines import tell_placed, tell_views
+from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
+from mistyle.run.progress import Progress
 from mistyle.run.stages import MATERIAL_STAGES
 from mistyle.stages import unknown_light
+from mistyle.stages.align import Alignment
 
 SIZE, SIDE = 64, 112
 KEYS = [
@@ -119,8 +122,10 @@ def fitted(shots):
 def test_the_material_explains_pictures_that_were_held_out(fitted):
     out, summary = fitted
     assert summary["figures"]["psnr_held_out"] > 40
+    assert 0.95 < summary["figures"]["outline_overlap_least"] <= summary["figures"]["outline_overlap"] <= 1
     record = json.loads((out / "run.json").read_text())
     assert sum(p["held_out"] for p in record["pictures"]) == 2 and len(record["pictures"]) == 24
+    assert min(p["outline_overlap"] for p in record["pictures"]) == summary["figures"]["outline_overlap_least"]
     assert {"c00_0", "c11_1"} <= {p["name"] for p in record["pictures"]}
     page = (out / "report" / "index.html").read_text()
     assert "fitted to" in page and "<svg" in page and "held out" in page
@@ -144,6 +149,51 @@ def test_the_mitsuba_scene_shows_what_the_reference_shows(fitted, shots):
     inside = planes["A"] > 0.999
     error = srgb_from_linear(picture)[inside] - srgb_from_linear(reference)[inside]
     assert 10 * np.log10(1 / np.mean(error**2)) > 34
+
+
+@pytest.mark.parametrize("align", [False, True])
+def test_cameras_that_do_not_fit_the_mesh_are_said(shots, tmp_path, capsys, monkeypatch, align):
+    """Turned by 90 degrees about X, as if Z were up."""
+    from mistyle.files.captures import read_shots
+
+    asset = read_mesh(shots / "bowl.obj", size=SIZE)
+    job = MaterialJob(shots / "bowl.obj", shots / "shots", tmp_path, MaterialSettings(), "bowl")
+    captures, read = references_of(job), read_shots(shots / "shots")
+    right = place(job, asset, captures, read, lambda done: None)
+    assert min(right.overlap) > 0.95 and right.notes == ()
+    turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
+    turned = tuple(replace(c, world_from_cam=turn @ c.world_from_cam) for c in captures.cameras)
+    if align:  # what was asked for already is not advised again
+        monkeypatch.setattr("mistyle.stages.align.align_by_masks", lambda *_: Alignment(turn, (), ()))
+        job = replace(job, settings=MaterialSettings(references=ReferenceSettings(align=True)))
+    else:
+        captures = replace(captures, cameras=turned)
+    wrong, progress = place(job, asset, captures, read, lambda done: None), Progress()
+    tell_placed(wrong, progress)
+    (note,) = progress.notes
+    assert note.startswith("Warning: the cameras do not fit the mesh in ") and "less than 0.8" in note
+    assert ("--align" in note) == (not align) and "--refine-poses" in note
+    assert wrong.figures["outline_overlap_least"] == min(wrong.overlap) < 0.8
+    printed = capsys.readouterr().err
+    assert note in printed and f"c00_0 {wrong.overlap[0]:.2f}, " in printed
+    blind = [replace(shot, picture=shot.picture.with_suffix(".png"), alpha_of=None) for shot in read]
+    monkeypatch.setattr("mistyle.files.captures.outline_of", lambda shot: None)
+    if not align:
+        (note,) = place(job, asset, captures, blind, lambda done: None).notes
+        assert "not checked whether the cameras fit" in note
+
+
+def test_views_that_do_not_fit_are_said_before_they_are_baked(shots):
+    asset, views = read_mesh(shots / "bowl.obj", size=SIZE), read_views(shots / "shots")[:4]
+    progress = Progress(quiet=True)
+    tell_views(asset.mesh, views, progress)
+    assert progress.notes == []
+    swapped = [
+        replace(view, camera=replace(other.camera, name=f"s{k}"))
+        for k, (view, other) in enumerate(zip(views, views[::-1], strict=True))
+    ]
+    tell_views(asset.mesh, swapped, progress)
+    assert "do not fit the mesh" in progress.notes[0] and "--align" not in progress.notes[0]
 
 
 def test_a_second_run_takes_everything_over(fitted, shots):

@@ -12,6 +12,7 @@ Faces may share texels (stacked or mirrored shells, instances of one glTF mesh):
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -19,11 +20,13 @@ from jaxtyping import Float
 from mistyle.core.mesh import Mesh
 
 TURNED = "turned from Z up to Y up"  # stands in a note of every mesh that reading has turned
+# Rows and columns as the file stores them, or as a viewer shows the picture (EXIF orientation).
+Pixels = Literal["stored", "upright"]
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An image file, decoded: sRGB-encoded Rec.709, 0..1, upright (row 0 is the top).
+    """An image file, decoded: sRGB-encoded Rec.709, 0..1, upright (row 0 is the top) unless asked for otherwise.
 
     `alpha` is linear coverage 0..1, or None when the file is opaque; rgb is not premultiplied. `notes` are sentences
     about what was converted on the way in.

@@ -77,11 +77,35 @@ def _unreadable(path: Path, error: OSError) -> InputRefused:
     return refuse(path, f"a file that cannot be read ({error.strerror})", "a readable file", "Check its permissions")
 
 
+def inside(folder: Path, name: str, where: Path, fix: str) -> Path:
+    """The file of that name in `folder` or below, which need not exist; links are resolved before the check.
+
+    Every character of the name is a letter (a percent sign too), but backslashes separate folders. Raises InputRefused
+    for network addresses and everything that leads out of the folder; `where` is the file that names it.
+    """
+    found = f"the file name {name[:120]!r}"
+    plain = name.replace("\\", "/")
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+://", plain) or plain.startswith("//"):
+        raise refuse(where, found, "a relative file name (nothing is fetched)", fix)
+    if "\0" in plain or not plain:
+        raise refuse(where, found, "a file name", fix)
+    root = folder.resolve()
+    try:
+        target = (root / plain).resolve()
+    except (OSError, RuntimeError) as error:  # a loop of links
+        raise refuse(where, found, "a file name", fix) from error
+    drive = re.match(r"[A-Za-z]:/", plain)
+    if drive or not target.is_relative_to(root):
+        leads = "" if drive else f", which is {target}"
+        raise refuse(where, f"{found}{leads}", f"a file inside the folder {root}", fix)
+    return target
+
+
 def beside(path: Path, reference: str) -> Path:
     """The file that `path` names, if it lies in the folder of `path` or below; links are resolved before the check.
 
-    Percent escapes are decoded as URIs have them. Raises InputRefused for network addresses, absolute paths and
-    everything that leads out of the folder.
+    Percent escapes are decoded as URIs have them (`inside` does not). Raises InputRefused for network addresses,
+    absolute paths and everything that leads out of the folder.
     """
     name = unquote(reference).replace("\\", "/")
     fix = "Copy the file into the mesh's folder and name it relative to the mesh"

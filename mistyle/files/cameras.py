@@ -12,7 +12,12 @@ z_min and z_max are null where nothing is seen. On reading, R and t of one of th
 is the working space: the mesh in a bounding sphere of radius 1 about the origin, Y up.
 
 `transforms.json` is the NeRF/Blender convention: `transform_matrix` is world from camera with OpenGL axes. Ours says
-with "space" that it is in the working space; another's is in whatever space its maker chose.
+with "space" that it is in the working space; another's is in whatever space its maker chose. nerfstudio turns and
+scales the world of its reconstruction: stored = applied_scale * (applied_transform @ original). That is undone here.
+
+Every camera describes either the pixels that a picture file stores or those of the upright picture, which a viewer
+shows (EXIF orientation): `Frame.pixels` says which. COLMAP and the readers of transforms.json (nerfstudio, instant-ngp)
+ignore the orientation, so their cameras describe stored pixels. A camera.json describes what one sees: upright pixels.
 """
 
 import math
@@ -26,6 +31,8 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from mistyle.core.align import moved_camera, similarity
+from mistyle.core.asset import Pixels
 from mistyle.core.camera import OPENGL_FROM_OPENCV, Camera
 from mistyle.core.distortion import Lens, is_distorted
 from mistyle.core.errors import InputRefused
@@ -33,6 +40,7 @@ from mistyle.files.bounds import refuse
 from mistyle.files.read import read_json
 
 SPACE = "working space: bounding sphere of radius 1 about the origin, right-handed, Y up"
+PIXELS: Pixels = "upright"  # that a camera.json describes
 MAX_SIDE = 16384
 # How far a stored rotation may be from a rotation: files with five digits pass.
 RIGID = 1e-4
@@ -41,7 +49,6 @@ ENDINGS = (".exr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff")
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Side = Annotated[int, Field(ge=1, le=MAX_SIDE)]
 Row3 = Annotated[list[Number], Field(min_length=3, max_length=3)]
-Row4 = Annotated[list[Number], Field(min_length=4, max_length=4)]
 
 
 class _Pose(BaseModel):
@@ -81,7 +88,7 @@ class _Frame(BaseModel):
 
     file_path: str = Field("", max_length=1000)
     mask_path: str | None = Field(None, max_length=1000)
-    transform_matrix: Annotated[list[Row4], Field(min_length=4, max_length=4)]
+    transform_matrix: Any = None
 
 
 class _Transforms(BaseModel):
@@ -90,13 +97,15 @@ class _Transforms(BaseModel):
 
 @dataclass(frozen=True)
 class Frame:
-    """One photograph of a model of cameras: its name (unique), its files as the model names them, its pose and lens."""
+    """One photograph of a model of cameras: its name (unique), its files as the model names them, its pose, its lens,
+    and which pixels of the files these two describe (the module's text)."""
 
     name: str
     picture: str
     mask: str | None
     world_from_cam: Float[np.ndarray, "4 4"]
     lens: Lens
+    pixels: Pixels
 
 
 def camera_entry(camera: Camera, depth: Float[np.ndarray, "h w"] | None = None) -> dict[str, Any]:
@@ -166,17 +175,20 @@ def read_cameras(path: Path, size: tuple[int, int] = (1024, 1024)) -> list[Camer
 
 
 def read_frames(path: Path, size_of: Callable[[str], tuple[int, int]]) -> list[Frame]:
-    """The frames of a `transforms.json` with their lenses (k1 k2 k3 p1 p2), in the file's order and space.
+    """The frames of a `transforms.json` with their lenses (k1 k2 k3 p1 p2), in the file's order and the space before
+    nerfstudio's `applied_transform` and `applied_scale`.
 
-    `size_of` gives (height, width) of the picture that a frame names, where the file does not say (w, h). Refused:
-    fisheye and other camera models, matrices that are no rigid motion.
+    `size_of` gives (height, width) of the picture that a frame names, where the file does not say (w, h). A frame's own
+    intrinsics go before those above all frames. Refused: fisheye and other camera models, matrices (3 x 4 or 4 x 4)
+    that are no rigid motion.
     """
     tree = read_json(path)
+    original = np.linalg.inv(_applied(tree, path))
     try:
         known = [_Frame.model_validate(frame) for frame in _Transforms.model_validate(tree).frames]
         names = unique_names([frame.file_path or f"view_{k:03d}" for k, frame in enumerate(known)])
         return [
-            _frame(frame, {**tree, **raw}, name, size_of, path)
+            _frame(frame, _fields(tree, raw), name, size_of, original, path)
             for frame, raw, name in zip(known, tree["frames"], names, strict=True)
         ]
     except ValidationError as error:
@@ -199,8 +211,54 @@ def stem(name: str) -> str:
     return name[: -len(ending)] if (ending := PurePosixPath(name).suffix).lower() in ENDINGS else name
 
 
+def _fields(tree: Mapping[str, Any], frame: Mapping[str, Any]) -> dict[str, Any]:
+    """A frame's fields, and those above all frames that it does not have itself. The focal lengths are one of them: a
+    field of view of the frame's own is not overruled by a focal length of the whole file."""
+    kinds = ("fl_x", "fl_y", "camera_angle_x")
+    own = any(frame.get(key) is not None for key in kinds)
+    return {**{key: value for key, value in tree.items() if not (own and key in kinds)}, **frame}
+
+
+def _applied(tree: Mapping[str, Any], path: Path) -> Float[np.ndarray, "4 4"]:
+    """What nerfstudio did to the space of the reconstruction: a similarity, the identity where nothing is said."""
+    matrix = tree.get("applied_transform")
+    scale = tree.get("applied_scale", 1.0)
+    if isinstance(scale, bool) or not isinstance(scale, int | float) or not (0 < scale < math.inf):
+        raise refuse(path, f"applied_scale = {scale!r}", "a finite number > 0", "Correct the file")
+    if matrix is None:
+        return similarity(float(scale), np.eye(3), np.zeros(3))
+    known = _matrix(matrix, "applied_transform", path)
+    own = np.cbrt(np.linalg.det(known[:3, :3]))
+    if not own > 0:
+        raise refuse(path, "an applied_transform that mirrors", "a rotation, shift and scale", "Export it again")
+    check_rotation(known[:3, :3] / own, "applied_transform", path)
+    left, _, right = np.linalg.svd(known[:3, :3])  # the nearest rotation: files may have five digits
+    return similarity(float(scale), np.eye(3), np.zeros(3)) @ similarity(float(own), left @ right, known[:3, 3])
+
+
+def _matrix(rows: Any, where: str, path: Path) -> Float[np.ndarray, "4 4"]:
+    """A matrix of 3 or 4 rows of 4 finite numbers, its last row 0 0 0 1."""
+    try:
+        matrix = np.asarray(rows, float)
+    except (TypeError, ValueError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((3, 4), (4, 4)) or not np.isfinite(matrix).all():
+        sides = " x ".join(map(str, matrix.shape))
+        found = f"a matrix of {sides} numbers" if matrix.ndim == 2 else "something else than a matrix of numbers"
+        raise refuse(path, f"{found} in {where}", "3 or 4 rows of 4 finite numbers", "Correct the file")
+    whole = np.vstack([matrix[:3], [0.0, 0, 0, 1]])
+    if len(matrix) == 4 and not np.allclose(matrix[3], whole[3], atol=1e-9):
+        raise refuse(path, f"a projective matrix in {where}", "a last row 0 0 0 1", "Write rigid matrices")
+    return whole
+
+
 def _frame(
-    known: _Frame, fields: Mapping[str, Any], name: str, size_of: Callable[[str], tuple[int, int]], path: Path
+    known: _Frame,
+    fields: Mapping[str, Any],
+    name: str,
+    size_of: Callable[[str], tuple[int, int]],
+    original: Float[np.ndarray, "4 4"],
+    path: Path,
 ) -> Frame:
     where = f"view '{name}'"
 
@@ -226,14 +284,13 @@ def _frame(
     if fx is None or fy is None or fx <= 0 or fy <= 0:
         raise refuse(path, f"no focal length in {where}", "fl_x or camera_angle_x", "Add one of them")
     cx, cy = number("cx"), number("cy")
-    matrix = np.asarray(known.transform_matrix) @ OPENGL_FROM_OPENCV
+    matrix = _matrix(known.transform_matrix, where, path) @ OPENGL_FROM_OPENCV
     check_rotation(matrix[:3, :3], where, path)
-    if not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
-        raise refuse(path, f"a projective matrix in {where}", "a last row 0 0 0 1", "Write rigid matrices")
     k1, k2, k3, p1, p2 = (float(number(key) or 0.0) for key in ("k1", "k2", "k3", "p1", "p2"))
     centre = (width / 2 if cx is None else float(cx), height / 2 if cy is None else float(cy))
     lens = Lens((float(fx), float(fy)), centre, (height, width), (k1, k2, k3), (p1, p2))
-    return Frame(name, known.file_path, known.mask_path, matrix, lens)
+    there = moved_camera(Camera(matrix, float(fx), centre, (height, width), name), original).world_from_cam
+    return Frame(name, known.file_path, known.mask_path, there, lens, "stored")
 
 
 def _camera(entry: ViewEntry, path: Path) -> Camera:
@@ -262,7 +319,7 @@ def _check_square(fx: float, fy: float, where: str, path: Path) -> None:
 
 
 def check_rotation(rotation: Float[np.ndarray, "3 3"], where: str, path: Path) -> None:
-    """Refuse a matrix that is no rotation within RIGID."""
+    """Refuse a matrix that is not a rotation within RIGID."""
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
         fix = "Take scale and mirroring out of the matrix"
         raise refuse(path, f"a matrix that is no rotation in {where}", "an orthonormal right-handed one", fix)

@@ -6,6 +6,9 @@ sRGB-encoded with straight alpha, 8 or 16 bits. Every picture becomes linear Rec
 with square pixels: encoded values go through the exact sRGB curve, a lens's distortion and unequal focal lengths are
 resampled away.
 
+A camera describes either stored pixels or upright ones (EXIF orientation, see files/cameras.py): the picture and the
+mask of a view are both read so, `Shot.pixels`.
+
 Which pixels count: finite, not saturated (an encoded channel at its maximum), wholly inside the alpha (a pixel that the
 object covers in part shows the background too) and inside the user's mask.
 
@@ -14,23 +17,35 @@ The exposures' file is `{"ev": {picture: stops, ...}}` (the picture is 2^stops t
 """
 
 import math
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.core.asset import Picture, Pixels
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, Loaded
 from mistyle.core.distortion import Lens, pinhole, resample
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Lights, lights_of_views
-from mistyle.files.bounds import beside, refuse
-from mistyle.files.cameras import ENDINGS, SPACE, Frame, read_entries, read_frames, stem
+from mistyle.files.bounds import inside, refuse
+from mistyle.files.cameras import PIXELS, SPACE, Frame, ViewEntry, read_entries, read_frames
+from mistyle.files.capture_files import (
+    COPY,
+    HAND_IN,
+    check_different,
+    find,
+    find_elsewhere,
+    images_folder,
+    mask_of_view,
+    named_mask,
+    picture_folder,
+)
 from mistyle.files.colmap import SparsePoints, find_model
 from mistyle.files.read import (
     read_colmap,
@@ -40,6 +55,7 @@ from mistyle.files.read import (
     read_picture,
     read_radiance,
     read_size,
+    read_stored_size,
 )
 from mistyle.files.views import standing_picture
 
@@ -50,15 +66,24 @@ TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 @dataclass(frozen=True)
 class Shot:
-    """One picture on disk: the pinhole camera that it is resampled to, its lens, its files, and what its radiance was
-    multiplied by. `alpha_of` is an EXR whose A is the alpha of a picture that has none of its own."""
+    """One picture on disk.
+
+    camera       the pinhole camera that it is resampled to
+    lens         what it was taken with
+    pixels       which pixels of the picture and the mask these two describe (files/cameras.py)
+    factor       what its radiance was multiplied by
+    alpha_of     an EXR whose A is the alpha of a picture that has none of its own
+    orientation  the EXIF orientations 1..8 of picture and mask (1: none)
+    """
 
     camera: Camera
     lens: Lens
     picture: Path
+    pixels: Pixels
     mask: Path | None = None
     factor: float = 1.0
     alpha_of: Path | None = None
+    orientation: tuple[int, int] = (1, 1)
 
 
 def read_captures(
@@ -78,7 +103,8 @@ def read_captures(
                 every view an empty list
     masks       a folder with a picture per view, by the view's name or its picture's: what is brighter than half counts
     exposure    a file as the module says, or stops by view
-    pictures    the folder of a COLMAP model's or a transforms.json's pictures, where they are elsewhere
+    pictures    the folder of the pictures, where they are elsewhere; of the folders that a camera file names before a
+                picture, those that are not there are left out
     saturation  encoded value 0..1 from which a channel is taken as saturated (JPEGs often stop short of 1)
     coverage    least alpha 0..1 of a pixel that counts; its colour is freed of the premultiplication
 
@@ -108,23 +134,59 @@ def read_shots(
 ) -> tuple[Shot, ...]:
     """The pictures of a folder with cameras, masks and exposures; sizes are checked, see `read_captures`."""
     kind, file = _source(Path(path))
+    elsewhere = None if pictures is None else picture_folder(Path(pictures))
     if kind == "camera.json":
-        shots = [_own(file, camera, entry) for camera, entry in read_entries(file)]
-    elif kind == "colmap":
-        folder = _images(Path(path), file, pictures)
-        shots = [_shot(frame, folder) for frame in read_colmap(file)]
+        shots = [_own(file, camera, entry, elsewhere) for camera, entry in read_entries(file)]
     else:
-        folder = Path(pictures) if pictures is not None else file.parent
-        frames = read_frames(file, lambda name: read_size(_find(folder, name)))
-        shots = [_shot(frame, folder) for frame in frames]
+        folder = images_folder(Path(path), file) if kind == "colmap" and elsewhere is None else file.parent
+
+        def place(name: str) -> Path:
+            return find(folder, name, file) if elsewhere is None else find_elsewhere(elsewhere, name)
+
+        def size(name: str) -> tuple[int, int]:
+            return read_size(place(name), "stored")
+
+        frames = read_colmap(file) if kind == "colmap" else read_frames(file, size)
+        # Masks that the user hands in take the place of those that frames name.
+        homes = [file.parent] if elsewhere is None else [elsewhere, file.parent]
+        named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
+        shots = [_shot(frame, place(frame.picture), mask) for frame, mask in zip(frames, named, strict=True)]
+    if elsewhere is not None:
+        check_different({shot.camera.name: shot.picture for shot in shots}, elsewhere)
     factors = _factors(exposure, [shot.camera.name for shot in shots])
     result = []
     for shot, factor in zip(shots, factors, strict=True):
-        mask = shot.mask if masks is None else _mask(Path(masks), shot)
-        result.append(Shot(shot.camera, shot.lens, shot.picture, mask, factor, shot.alpha_of))
-        for picture in (shot.picture, mask):
-            _check_size(picture, shot)
+        mask = shot.mask if masks is None else mask_of_view(Path(masks), shot.camera.name, shot.picture)
+        tags = _checked(shot.picture, shot), 1 if mask is None else _checked(mask, shot)
+        result.append(replace(shot, mask=mask, factor=factor, orientation=tags))
     return tuple(result)
+
+
+def reading_notes(path: Path, shots: Sequence[Shot]) -> tuple[str, ...]:
+    """Sentences about how the pictures and cameras of `read_shots` were understood."""
+    notes = []
+    tagged = [sum(shot.orientation[k] > 1 for shot in shots) for k in (0, 1)]
+    if any(tagged):
+        done = (
+            "It was ignored: COLMAP models and transforms.json describe the pixels as they are stored."
+            if shots[0].pixels == "stored"
+            else "They were turned upright: camera.json describes upright pictures."
+        )
+        notes.append(
+            f"Files with an EXIF orientation: {tagged[0]} pictures, {tagged[1]} masks (of {len(shots)} views). {done}"
+        )
+    unused = _home(Path(path)) / "masks"
+    if unused.is_dir() and not any(shot.mask for shot in shots):
+        notes.append(f"The folder {unused} was not used; --masks {unused} hands it in.")
+    kind, file = _source(Path(path))
+    if kind == "transforms":
+        applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
+        if applied:
+            notes.append(
+                f"{' and '.join(applied)} of {file.name} were undone: the cameras stand in the space of the "
+                "reconstruction. A mesh in nerfstudio's own space needs --align."
+            )
+    return tuple(notes)
 
 
 def camera_space(path: Path) -> Literal["working", "own"]:
@@ -149,7 +211,7 @@ def load_shot(shot: Shot, saturation: float = 1.0, coverage: float = 0.999) -> L
         if shot.picture.suffix.lower() == ".exr":
             rgb = rgb / np.maximum(alpha, 1e-6)[..., None]
     if shot.mask is not None:
-        usable = usable & _inside(shot.mask)
+        usable = usable & _inside(shot.mask, shot.pixels)
     rgb = np.where(usable[..., None], rgb / np.float32(shot.factor), 0).astype(np.float32)
     return resample(shot.lens, rgb, usable)
 
@@ -159,16 +221,24 @@ def silhouette(shot: Shot) -> Bool[np.ndarray, "h w"]:
 
     Refused: a picture without either.
     """
+    found = outline_of(shot)
+    if found is None:
+        fix = "Hand in masks (a folder with a picture of the same name per view)"
+        raise refuse(shot.picture, "neither an alpha channel nor a mask", "to know where the object is", fix)
+    return found
+
+
+def outline_of(shot: Shot) -> Bool[np.ndarray, "h w"] | None:
+    """As `silhouette`; None for a picture that has neither alpha nor mask."""
     if shot.mask is not None:
-        inside = _inside(shot.mask)
+        covered = _inside(shot.mask, shot.pixels)
     else:
-        alpha = _decoded(shot, 1.0)[1]
+        alpha = _alpha(shot)
         if alpha is None:
-            fix = "Hand in masks (a folder with a picture of the same name per view)"
-            raise refuse(shot.picture, "neither an alpha channel nor a mask", "to know where the object is", fix)
-        inside = alpha >= 0.5
-    everywhere = np.ones_like(inside)
-    return resample(shot.lens, inside[..., None].astype(np.float32), everywhere)[0][..., 0] >= 0.5
+            return None
+        covered = alpha >= 0.5
+    everywhere = np.ones_like(covered)
+    return resample(shot.lens, covered[..., None].astype(np.float32), everywhere)[0][..., 0] >= 0.5
 
 
 def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda done: None) -> tuple[str, ...]:
@@ -218,65 +288,43 @@ def _home(path: Path) -> Path:
     return Path(path) if Path(path).is_dir() else Path(path).parent
 
 
-def _own(file: Path, camera: Camera, entry) -> Shot:
+def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -> Shot:
     """A view of our camera.json: its EXR, or the picture that was edited or added (as files/views.py has it)."""
-    exr = beside(file, entry.exr) if entry.exr is not None else file.parent / f"{camera.name}.exr"
-    picture = standing_picture(file.parent, camera, entry, exr if exr.is_file() else None)
+    folder = file.parent
+    if elsewhere is not None:
+        folder = elsewhere
+        files = {
+            key: name and PurePosixPath(name.replace("\\", "/")).name for key, name in entry if key in ("exr", "png")
+        }
+        entry = entry.model_copy(update=files)
+    exr = folder / f"{camera.name}.exr" if entry.exr is None else inside(folder, entry.exr, file, HAND_IN)
+    picture = standing_picture(folder, camera, entry, exr if exr.is_file() else None, HAND_IN)
     lens = Lens((camera.focal, camera.focal), camera.centre, camera.size)
-    return Shot(camera, lens, picture or exr, alpha_of=exr if picture is not None and exr.is_file() else None)
+    alpha_of = exr if picture is not None and exr.is_file() else None
+    return Shot(camera, lens, picture or exr, PIXELS, alpha_of=alpha_of)
 
 
-def _shot(frame: Frame, folder: Path) -> Shot:
+def _shot(frame: Frame, picture: Path, mask: Path | None) -> Shot:
     focal, centre, size = pinhole(frame.lens)
     camera = Camera(frame.world_from_cam, focal, centre, size, frame.name)
-    mask = None if frame.mask is None else _find(folder, frame.mask)
-    return Shot(camera, frame.lens, _find(folder, frame.picture), mask)
+    return Shot(camera, frame.lens, picture, frame.pixels, mask)
 
 
-def _images(path: Path, model: Path, pictures: Path | None) -> Path:
-    """The folder of a COLMAP model's pictures."""
-    places = [Path(pictures)] if pictures is not None else [p / "images" for p in (path, *path.resolve().parents[:2])]
-    found = next((place for place in places if place.is_dir()), None)
-    if found is None:
-        raise refuse(model, "no folder 'images' beside the model", "the pictures' folder", "Copy the pictures there")
-    return found
-
-
-def _find(folder: Path, name: str) -> Path:
-    """The picture that a camera file names, with or without its ending; in the folder or below."""
-    exact = beside(folder / "cameras", name)
-    if exact.is_file():
-        return exact
-    there = _with_endings(exact.parent, [exact.name])
-    if not there:
-        found, fix = f"no picture {name!r}", "Add it, or take the view out of the camera file"
-        raise refuse(folder, found, "one for every camera", fix)
-    return there[0]
-
-
-def _with_endings(folder: Path, names: Iterable[str]) -> list[Path]:
-    endings = [e for ending in ENDINGS for e in (ending, ending.upper())]
-    return [file for name in dict.fromkeys(names) for e in endings if (file := folder / f"{name}{e}").is_file()]
-
-
-def _mask(folder: Path, shot: Shot) -> Path:
-    name, picture = shot.camera.name, shot.picture.name
-    names = [name, picture, stem(picture)]
-    there = _with_endings(folder, names) or _with_endings(folder / shot.picture.parent.name, names)
-    if not there:
-        found = f"no mask for the view '{name}'"
-        raise refuse(folder, found, f"{name}.png or {picture}.png", "Add it; white where the picture counts")
-    return there[0]
-
-
-def _check_size(picture: Path | None, shot: Shot) -> None:
-    if picture is None:
-        return
-    height, width = read_size(picture)
+def _checked(picture: Path, shot: Shot) -> int:
+    """The EXIF orientation of a picture or mask that has the size of its view's camera; refused where it has not."""
+    height, width, orientation = read_stored_size(picture)
+    if shot.pixels == "upright" and orientation > 4:
+        height, width = width, height
     if (height, width) != shot.lens.size:
         expected = f"{shot.lens.size[1]} x {shot.lens.size[0]}, as its camera says (view '{shot.camera.name}')"
         fix = "Hand in the pictures that the cameras were made for, neither scaled nor cropped"
+        if (width, height) == shot.lens.size:
+            fix = (
+                "The sides are swapped, as an EXIF rotation does that was applied to some files only: the cameras "
+                f"describe {shot.pixels} pixels, this file's orientation is {orientation} (1: none). {fix} nor turned"
+            )
         raise refuse(picture, f"{width} x {height} pixels", expected, fix)
+    return orientation
 
 
 def _lights(home: Path, file: Path | None, names: list[str]) -> tuple[Lights, ...]:
@@ -291,7 +339,7 @@ def _lights(home: Path, file: Path | None, names: list[str]) -> tuple[Lights, ..
 
     def load(name: str) -> Float[np.ndarray, "h w 3"]:
         if name not in maps:
-            maps[name] = read_radiance(beside(found, name))
+            maps[name] = read_radiance(inside(found.parent, name, found, COPY))
         return maps[name]
 
     return lights_of_views(read_json(found), names, str(found), load)
@@ -329,17 +377,25 @@ def _decoded(
             raise refuse(shot.picture, found, "R, G and B", "Write the colours as R, G, B")
         rgb = np.stack([planes[c] for c in "RGB"], axis=-1)
         return rgb, planes.get("A"), np.asarray(np.isfinite(rgb).all(axis=-1))
-    picture = read_picture(shot.picture)
-    alpha = picture.alpha
-    if alpha is None and shot.alpha_of is not None:
-        alpha = read_exr(shot.alpha_of).get("A")
+    picture = read_picture(shot.picture, shot.pixels)
+    alpha = _alpha(shot, picture)
     return linear_from_srgb(picture.rgb), alpha, np.asarray((picture.rgb < saturation).all(axis=-1))
 
 
-def _inside(mask: Path) -> Bool[np.ndarray, "h w"]:
+def _alpha(shot: Shot, decoded: Picture | None = None) -> Float[np.ndarray, "h w"] | None:
+    """The alpha of the picture (`decoded`, where it is at hand), or of the EXR that it took the place of."""
+    if shot.picture.suffix.lower() == ".exr":
+        return read_exr(shot.picture).get("A")
+    picture = read_picture(shot.picture, shot.pixels) if decoded is None else decoded
+    if picture.alpha is not None or shot.alpha_of is None:
+        return picture.alpha
+    return read_exr(shot.alpha_of).get("A")
+
+
+def _inside(mask: Path, pixels: Pixels) -> Bool[np.ndarray, "h w"]:
     if mask.suffix.lower() == ".exr":
         planes = read_exr(mask)
         return next((planes[c] for c in ("A", "Y", "R") if c in planes), np.zeros(read_size(mask), np.float32)) > 0.5
-    picture = read_picture(mask)
+    picture = read_picture(mask, pixels)
     bright = picture.rgb.mean(axis=-1) > 0.5
     return bright if picture.alpha is None else bright & (picture.alpha > 0.5)

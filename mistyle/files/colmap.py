@@ -64,7 +64,8 @@ def read_model(folder: Path) -> list[Frame]:
     for (pose, camera, picture), name in zip(rows, unique_names([row[2] for row in rows]), strict=True):
         if camera not in lenses:
             raise refuse(path, f"camera {camera} of the image {picture!r}", "one of cameras' numbers", AGAIN)
-        frames.append(Frame(name, picture, None, _world_from_cam(pose, picture, path), lenses[camera]))
+        # COLMAP reads the pixels as they are stored, whatever EXIF says of the orientation.
+        frames.append(Frame(name, picture, None, _world_from_cam(pose, picture, path), lenses[camera], "stored"))
     return frames
 
 
@@ -189,8 +190,8 @@ def _points_bin(path: Path) -> list[tuple[float, ...]]:
 
 
 def _lines(path: Path) -> Iterator[str]:
-    """The lines that are no comments; empty ones stay, since an image may have no observations."""
-    for line in read_bytes(path).decode().splitlines():
+    """The lines that are no comments, whatever ends them; a byte-order mark is passed over."""
+    for line in re.split(r"\r\n|\r|\n", read_bytes(path).decode("utf-8-sig")):
         if not line.lstrip().startswith("#"):
             yield line
 
@@ -205,17 +206,30 @@ def _cameras_txt(path: Path) -> dict[int, Lens]:
 
 
 def _images_txt(path: Path) -> list[tuple[tuple[float, ...], int, str]]:
+    """An image's line and the line of its observations, which is left out by some writers where there are none."""
     rows = []
-    lines = _lines(path)
-    for line in lines:
-        if not line.strip():
+    after_image = False  # whether observations may come
+    for line in _lines(path):
+        if not line.strip() or (after_image and _is_observations(line)):
+            after_image = False
             continue
         fields = re.split(r"\s+", line.strip(), maxsplit=9)
         if len(fields) != 10:
             raise ValueError(f"an image of {len(fields)} fields: {line[:60]!r}")
         rows.append((tuple(float(v) for v in fields[1:8]), int(fields[8]), fields[9]))
-        next(lines, None)
+        after_image = True
     return rows
+
+
+def _is_observations(line: str) -> bool:
+    """Whether a line of images.txt holds triples of X, Y and POINT3D_ID, and so no image with its name."""
+    fields = line.split()
+    try:
+        [float(v) for v in fields]
+        [int(v) for v in fields[2::3]]
+    except ValueError:
+        return False
+    return len(fields) % 3 == 0
 
 
 def _points_txt(path: Path) -> list[tuple[float, ...]]:

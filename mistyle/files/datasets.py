@@ -38,7 +38,7 @@ from mistyle.core.capture import Captures
 from mistyle.core.distortion import Lens
 from mistyle.core.image import bilinear, linear_from_srgb
 from mistyle.core.light import Environment, Lights
-from mistyle.files.bounds import beside, refuse
+from mistyle.files.bounds import inside, refuse
 from mistyle.files.cameras import MAX_SIDE, Frame, check_rotation, read_frames
 from mistyle.files.captures import Shot, load_shot
 from mistyle.files.read import read_json, read_npy, read_picture, read_radiance, read_size
@@ -98,7 +98,7 @@ def read_stanford_orb(
 
     # A novel transforms.json names pictures of other folders, so that a name alone does not say whose size is asked.
     first = place(0)[0]
-    frames = read_frames(file, lambda name: read_size(beside(first / "x", name + ending)))
+    frames = read_frames(file, lambda name: read_size(_inside(first, name + ending), "stored"))
     shots = [_orb_shot(frame, place(k)[0], ending) for k, frame in enumerate(frames)]
     if scenes is not None:
         shots = [
@@ -137,10 +137,14 @@ def read_tensoir(
 def _captures(shots: list[Shot], rigs: list[Lights]) -> Captures:
     for shot in shots:
         for picture in (shot.picture, shot.mask):
-            if picture is not None and (size := read_size(picture)) != shot.lens.size:
+            if picture is not None and (size := read_size(picture, shot.pixels)) != shot.lens.size:
                 expected = f"{shot.lens.size[1]} x {shot.lens.size[0]}"
                 raise refuse(picture, f"{size[1]} x {size[0]} pixels", expected, "Unpack the data set again")
     return Captures(tuple(shot.camera for shot in shots), tuple(rigs), lambda k: load_shot(shots[k]))
+
+
+def _inside(folder: Path, name: str) -> Path:
+    return inside(folder, name, folder, "Unpack the data set again")
 
 
 def _novel_scenes(file: Path) -> list[str]:
@@ -155,10 +159,10 @@ def _novel_scenes(file: Path) -> list[str]:
 
 
 def _orb_shot(frame: Frame, home: Path, ending: str) -> Shot:
-    picture = beside(home / "x", frame.picture + ending)
-    mask = beside(home / "x", f"{Path(frame.picture).parent.as_posix()}_mask/{Path(frame.picture).name}.png")
+    picture = _inside(home, frame.picture + ending)
+    mask = _inside(home, f"{Path(frame.picture).parent.as_posix()}_mask/{Path(frame.picture).name}.png")
     camera = Camera(frame.world_from_cam, frame.lens.focal[0], frame.lens.centre, frame.lens.size, frame.name)
-    return Shot(camera, frame.lens, picture, mask)
+    return Shot(camera, frame.lens, picture, frame.pixels, mask)
 
 
 def _orb_light(camera: Camera, truth: Path, name: str) -> Lights:
@@ -175,7 +179,7 @@ def _orb_common_light(root: Path, kind: str, scene: str, number: int, ending: st
     file = home / "transforms_test.json"
     if not file.is_file():
         return ()
-    frames = read_frames(file, lambda name: read_size(beside(home / "x", name + ending)))
+    frames = read_frames(file, lambda name: read_size(_inside(home, name + ending), "stored"))
     if not 0 <= number < len(frames):
         raise refuse(file, f"{len(frames)} test pictures", f"more than {number}", "Choose another for the light")
     shot = _orb_shot(frames[number], home, ending)
@@ -239,11 +243,11 @@ def _tensoir_shot(place: Path, light: str) -> Shot:
     size = (known.imh, known.imw)
     lens = Lens((float(focal), float(focal)), (known.imw / 2, known.imh / 2), size)
     camera = Camera(pose, lens.focal[0], lens.centre, size, place.name)
-    return Shot(camera, lens, beside(file, f"rgba_{light}.png"))
+    return Shot(camera, lens, _inside(place, f"rgba_{light}.png"), "stored")
 
 
 def _tensoir_light(maps: Path, light: str) -> Environment:
-    there = [file for ending in (".hdr", ".exr") if (file := beside(maps / "x", light + ending)).is_file()]
+    there = [file for ending in (".hdr", ".exr") if (file := _inside(maps, light + ending)).is_file()]
     if not there:
         raise refuse(maps, f"no {light}.hdr", "the environment map of that light", "Copy TensoIR's maps there")
     radiance = read_radiance(there[0])

@@ -29,7 +29,7 @@ def read_exr(path: Path) -> dict[str, Shaped[np.ndarray, "h w"]]:
 
 
 def size_of_exr(path: Path) -> tuple[int, int]:
-    """See `read_size` in files/read.py."""
+    """See `read_stored_size` in files/read.py."""
     width, height = window_of(headers_of_exr(path)[0], "displayWindow")[2:]
     return height, width
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from mistyle.core.asset import Picture
+from mistyle.core.asset import Picture, Pixels
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import MAX_PIXELS, MAX_TEXTURE_PIXELS, WORK_TEXTURE, read_bytes, refuse
 from mistyle.files.texels import Kind, finished, fractions
@@ -18,6 +18,8 @@ FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "AVIF", "TGA")
 EXPECTED = "a PNG, JPEG, WebP, TIFF, BMP, GIF or TGA picture"
 CONVERT = "Save it as PNG or JPEG and try again"
 MAX_PICTURE_BYTES = 512 << 20
+ORIENTATION = 0x0112  # the tag of EXIF and TIFF: 1 upright, 2 mirrored, 3 turned by 180 degrees, ... 8
+UNDONE_BY = {6: 8, 8: 6}  # the other orientations undo themselves
 
 
 @dataclass
@@ -38,21 +40,27 @@ class Budget:
             raise refuse(self.path, found + " in its textures", most, "Scale its textures down")
 
 
-def read_pixels(path: Path) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    """A style or any other picture file as sRGB-encoded 8- or 16-bit rgb (h w 3) and alpha (h w), upright, and notes.
+def read_pixels(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    """A style or any other picture file as sRGB-encoded 8- or 16-bit rgb (h w 3) and alpha (h w), and notes.
 
     Size is checked in the header before anything is decoded (at most MAX_PIXELS). Embedded colour profiles are
-    converted to sRGB, EXIF orientation is applied, CMYK, palettes, grey and 16-bit files are converted, of an animation
-    the first frame is taken; `notes` says so. Refused with a sentence: files that are no picture of a known format
-    (SVG and PDF among them), cut-off or damaged ones, ones of no or too many pixels.
+    converted to sRGB, EXIF orientation is applied (with `pixels` "stored" it is not), CMYK, palettes, grey and 16-bit
+    files are converted, of several pictures the first is taken; `notes` says so. Refused with a sentence: files that
+    are no picture of a known format (SVG and PDF among them), cut-off or damaged ones, ones of no or too many pixels.
     """
     path = Path(path)
     data = read_bytes(path, MAX_PICTURE_BYTES)
     image, notes = _open(data, str(path))
-    image, turned = _upright(image, str(path))
-    if turned:
+    if image.format != "TIFF":  # Pillow drops a TIFF's tag when it decodes; a PNG's tag may follow the pixels
+        _load(image, str(path))
+    orientation = _orientation(image)
+    if orientation > 1 and pixels == "upright":
         notes.append("The picture was turned upright as its EXIF orientation says.")
     rgb, alpha = _pixels(image, data, str(path), notes)
+    rgb, alpha = (
+        None if part is None else _as_wanted(part, orientation, image.format == "TIFF", pixels) for part in (rgb, alpha)
+    )
+    assert rgb is not None
     return rgb, alpha, tuple(notes)
 
 
@@ -62,14 +70,13 @@ def picture_of(path: Path, pixels: tuple[np.ndarray, np.ndarray | None, tuple[st
     return Picture(fractions(rgb), None if alpha is None else fractions(alpha), path, notes)
 
 
-def size_of_picture(path: Path) -> tuple[int, int]:
-    """See `read_size` in files/read.py."""
+def size_of_picture(path: Path) -> tuple[int, int, int]:
+    """See `read_stored_size` in files/read.py."""
     image, _ = _open(read_bytes(path, MAX_PICTURE_BYTES), str(path))
-    try:
-        turned = image.getexif().get(0x0112, 1) in range(5, 9)
-    except (OSError, ValueError, SyntaxError, KeyError, TypeError):
-        turned = False  # as in `_upright`
-    return (image.width, image.height) if turned else (image.height, image.width)
+    # Pillow gives the upright size of a TIFF with this tag (but not with an orientation in XMP).
+    swapped = image.format == "TIFF" and image.tag_v2.get(ORIENTATION) in range(5, 9)
+    height, width = (image.width, image.height) if swapped else (image.height, image.width)
+    return height, width, _orientation(image)
 
 
 def texture(data: bytes, where: str, budget: Budget) -> Shaped[np.ndarray, "h w 3"]:
@@ -155,7 +162,8 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         raise refuse(where, f"{image.width} x {image.height} pixels", "at least one pixel", CONVERT)
     if image.width * image.height > MAX_PIXELS:
         raise _too_large(where, f"{image.width} x {image.height} pixels")
-    notes = ["Of the animation only the first frame was taken."] if several else []
+    taken = {"MPO": "pictures in the MPO file only the first", "TIFF": "pages only the first"}
+    notes = [f"Of the {taken.get(str(image.format), 'animation only the first frame')} was taken."] if several else []
     return image, notes
 
 
@@ -179,16 +187,31 @@ def _first(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:120]
 
 
-def _upright(image: Any, where: str) -> tuple[Any, bool]:
-    from PIL import ImageOps
-
-    _load(image, where)
+def _orientation(image: Any) -> int:
+    """The orientation 1..8 of an opened picture; 1 where it has none or its EXIF data cannot be read."""
     try:
-        orientation = image.getexif().get(0x0112, 1)
-        turned = ImageOps.exif_transpose(image) if orientation in range(2, 9) else image
+        found = image.getexif().get(ORIENTATION, 1)
     except (OSError, ValueError, SyntaxError, KeyError, TypeError):
-        return image, False  # EXIF data that cannot be read: the pixels are all the same fine
-    return turned, turned is not image
+        return 1
+    return found if isinstance(found, int) and found in range(1, 9) else 1
+
+
+def _as_wanted(
+    pixels: Shaped[np.ndarray, "h w *c"], orientation: int, upright: bool, wanted: Pixels
+) -> Shaped[np.ndarray, "h2 w2 *c"]:
+    """Decoded pixels, which are `upright` already or as stored, as they are `wanted`."""
+    if upright == (wanted == "upright"):
+        return pixels
+    return np.ascontiguousarray(_turned(pixels, UNDONE_BY.get(orientation, orientation) if upright else orientation))
+
+
+def _turned(stored: Shaped[np.ndarray, "h w *c"], orientation: int) -> Shaped[np.ndarray, "h2 w2 *c"]:
+    """The upright picture of stored pixels (EXIF 2.3, tag 0x0112: where row 0 and column 0 are)."""
+    rows, columns = {1: (1, 1), 2: (1, -1), 3: (-1, -1), 4: (-1, 1), 5: (1, 1), 6: (-1, 1), 7: (-1, -1), 8: (1, -1)}[
+        orientation
+    ]
+    mirrored = stored[::rows, ::columns]
+    return mirrored if orientation < 5 else mirrored.swapaxes(0, 1)
 
 
 def _pixels(

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.asset import Asset, Picture
+from mistyle.core.asset import Asset, Picture, Pixels
 from mistyle.files.bounds import refuse
 from mistyle.files.layers import Frame, frame_of
 from mistyle.files.pictures import picture_of
@@ -41,6 +41,7 @@ __all__ = [
     "read_radiance",
     "read_references",
     "read_size",
+    "read_stored_size",
     "read_toml",
     "read_usd_files",
     "read_yaml",
@@ -175,9 +176,9 @@ def read_npy(path: Path) -> np.ndarray:
     return ask("npy", Path(path))
 
 
-def read_picture(path: Path) -> Picture:
-    """A style or any other picture file as sRGB-encoded float32 0..1, upright; see files/pictures.py."""
-    return picture_of(Path(path), ask("picture", Path(path)))
+def read_picture(path: Path, pixels: Pixels = "upright") -> Picture:
+    """A style or any other picture file as sRGB-encoded float32 0..1; see files/pictures.py."""
+    return picture_of(Path(path), ask("picture", Path(path), pixels))
 
 
 def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
@@ -185,9 +186,17 @@ def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
     return ask("radiance", Path(path))
 
 
-def read_size(path: Path) -> tuple[int, int]:
-    """Height and width of a picture (EXIF orientation applied) or an .exr (display window), from its header alone."""
-    return ask("size", Path(path))
+def read_size(path: Path, pixels: Pixels = "upright") -> tuple[int, int]:
+    """Height and width of a picture (EXIF orientation applied unless "stored") or an .exr (display window), from its
+    header alone."""
+    height, width, orientation = read_stored_size(path)
+    return (width, height) if pixels == "upright" and orientation > 4 else (height, width)
+
+
+def read_stored_size(path: Path) -> tuple[int, int, int]:
+    """Height and width of the pixels that a picture file stores, and its EXIF orientation 1..8 (1: none)."""
+    height, width, orientation = ask("size", Path(path))
+    return height, width, orientation
 
 
 def read_colmap(folder: Path) -> list[Any]:

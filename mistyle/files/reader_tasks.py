@@ -17,6 +17,7 @@ from zipfile import BadZipFile
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core.asset import Pixels
 from mistyle.core.errors import InputRefused
 from mistyle.files import hdr, pictures
 from mistyle.files.bounds import MAX_DEPTH, MAX_SETTINGS_BYTES, MAX_VALUES, read_bytes, refuse
@@ -106,14 +107,14 @@ def radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
     return values
 
 
-def picture(path: Path) -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
-    return pictures.read_pixels(path)
+def picture(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.ndarray | None, tuple[str, ...]]:
+    return pictures.read_pixels(path, pixels)
 
 
-def size(path: Path) -> tuple[int, int]:
+def size(path: Path) -> tuple[int, int, int]:
     if not path.is_file():
         raise refuse(path, "nothing", "a picture", "Check the path")
-    return (hdr.size_of_exr if path.suffix.lower() == ".exr" else pictures.size_of_picture)(path)
+    return (*hdr.size_of_exr(path), 1) if path.suffix.lower() == ".exr" else pictures.size_of_picture(path)
 
 
 def npy(path: Path) -> np.ndarray:

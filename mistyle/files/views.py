@@ -28,8 +28,9 @@ from mistyle.core.camera import Camera, resized
 from mistyle.core.image import canny, linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Lights, from_json, to_json
 from mistyle.core.view import View
-from mistyle.files.bounds import beside, refuse
-from mistyle.files.cameras import SPACE, ViewEntry, camera_entry, read_cameras, read_entries, transforms
+from mistyle.files.bounds import inside, refuse
+from mistyle.files.cameras import PIXELS, SPACE, ViewEntry, camera_entry, read_cameras, read_entries, transforms
+from mistyle.files.capture_files import COPY
 from mistyle.files.images import encode_png, write_exr, write_png
 from mistyle.files.read import read_exr, read_json, read_picture, read_radiance
 from mistyle.files.store import atomic_write, sha256_file
@@ -113,7 +114,7 @@ def read_lights(path: Path) -> Lights:
     """A `lights.json`, or the one in a folder of views."""
     path = Path(path)
     found = path / "lights.json" if path.is_dir() else path
-    return from_json(read_json(found), str(found), lambda name: read_radiance(beside(found, name)))
+    return from_json(read_json(found), str(found), lambda name: read_radiance(inside(found.parent, name, found, COPY)))
 
 
 def read_views(folder: Path) -> list[View]:
@@ -143,14 +144,15 @@ def _entries(folder: Path) -> list[tuple[Camera, ViewEntry | None]]:
 def _read_view(folder: Path, camera: Camera, entry: ViewEntry | None) -> View:
     exr = folder / f"{camera.name}.exr"
     if entry is not None and entry.exr is not None:
-        exr = beside(folder / "camera.json", entry.exr)
+        exr = inside(folder, entry.exr, folder / "camera.json", COPY)
     planes = read_exr(exr) if exr.is_file() else {}
     if planes and not {"R", "G", "B"} <= set(planes):
         raise refuse(exr, f"channels {', '.join(sorted(planes))[:200]}", "R, G and B", "Write the colours as R, G, B")
     picture = standing_picture(folder, camera, entry, exr if planes else None)
     if picture is None:
         return _view(camera, _stack(planes, "R", "G", "B"), planes.get("A"), planes, exr)
-    found = read_picture(picture)
+    # Without an entry the camera is of a transforms.json, which describes stored pixels (files/cameras.py).
+    found = read_picture(picture, PIXELS if entry is not None else "stored")
     linear = linear_from_srgb(found.rgb)
     shape = found.rgb.shape[:2]
     if shape != camera.size:
@@ -159,11 +161,14 @@ def _read_view(folder: Path, camera: Camera, entry: ViewEntry | None) -> View:
     return _view(camera, linear if alpha is None else linear * alpha[..., None], alpha, planes, picture)
 
 
-def standing_picture(folder: Path, camera: Camera, entry: ViewEntry | None, exr: Path | None) -> Path | None:
-    """The picture that stands for the view instead of its EXR, or None when the EXR does."""
+def standing_picture(
+    folder: Path, camera: Camera, entry: ViewEntry | None, exr: Path | None, fix: str = COPY
+) -> Path | None:
+    """The picture that stands for the view instead of its EXR, or None when the EXR does. `fix` is what helps where the
+    entry names a picture outside the folder."""
     there = [path for ending in PICTURES if (path := folder / f"{camera.name}{ending}").is_file()]
     if entry is not None and entry.png is not None:
-        named = beside(folder / "camera.json", entry.png)
+        named = inside(folder, entry.png, folder / "camera.json", fix)
         if named.is_file() and named not in [path.resolve() for path in there]:
             there.append(named)
     written = entry.png_sha256 if entry is not None else None

@@ -84,7 +84,9 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
     given.add_argument("--light", choices=["known", "unknown"], default="known", help="unknown: solve for it too")
     given.add_argument("--masks", type=Path, metavar="DIR", help="a mask per picture, by name; white counts")
     given.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")
-    given.add_argument("--pictures", type=Path, metavar="DIR", help="where a COLMAP model's pictures are, if elsewhere")
+    given.add_argument(
+        "--pictures", type=Path, metavar="DIR", help="where the pictures are, if not where the cameras' file says"
+    )
     given.add_argument(
         "--align", action="store_true", default=None, help="find the similarity from the mesh to the cameras' space"
     )

@@ -24,6 +24,7 @@ from mistyle.run.budget import check_material, with_setting
 from mistyle.run.edits import asset_stage, tell_edits
 from mistyle.run.inputs import input_files
 from mistyle.run.material_files import scene, write
+from mistyle.run.material_outlines import fix_of, tell_placed
 from mistyle.run.material_pictures import look_through, looked
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 from mistyle.run.progress import Progress, Report
@@ -51,12 +52,14 @@ class MaterialJob:
 
 @dataclass(frozen=True)
 class Placed:
-    """The cameras in working space, the lights there, and what was done to bring them there."""
+    """The cameras in working space, the lights there, and what was done to bring them there. `overlap` is that of the
+    mesh's outline with each picture's alpha or mask (stages/outline_check.py), NaN where it has none."""
 
     cameras: tuple[Camera, ...]
     lights: tuple[Lights, ...]
     notes: tuple[str, ...]
     figures: dict[str, float]
+    overlap: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
 
     Raises a MistyleError for everything that a user can mend; what was finished before stays.
     """
-    from mistyle.files.captures import read_shots
+    from mistyle.files.captures import read_shots, reading_notes
     from mistyle.run.colour import in_working_space, key_of
     from mistyle.run.deliver import check, deliver
     from mistyle.run.material_report import material_report, write_summary
@@ -115,8 +118,12 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
             "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(job.mesh, s.read, s.atlas.size, r)
         )
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
-        given = [pictures, [vars(c) for c in captures.cameras], captures.lights, s.references, s.seed, key_of(s.colour)]
-        placed = run.record("cameras", ["mesh"], given, lambda r: place(job, asset, captures, r))
+        read_as = [shot.pixels for shot in shots]
+        given = [pictures, read_as, [vars(c) for c in captures.cameras], captures.lights]
+        given += [s.references, s.seed, key_of(s.colour)]
+        placed = run.record("cameras", ["mesh"], given, lambda r: place(job, asset, captures, shots, r))
+        placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
+        tell_placed(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
         captures, said = no_finer(run, texels, whole)
         placed = replace(placed, notes=(*placed.notes, *said))
@@ -191,18 +198,19 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
     return tuple(result)
 
 
-def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) -> Placed:
-    """The cameras in working space: as they are, through the mesh's own units, or aligned and refined on request."""
+def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Placed:
+    """The cameras in working space: as they are, through the mesh's own units, or aligned and refined on request; and
+    whether the mesh's outlines are where the pictures have them."""
     from mistyle.core.align import moved
-    from mistyle.files.captures import camera_space, read_shots, silhouette, sparse_points
+    from mistyle.files.captures import camera_space, outline_of, silhouette, sparse_points
     from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
+    from mistyle.stages.outline_check import check_outlines, overlap_notes
 
     chosen = job.settings.references
     figures: dict[str, float] = {}
     notes: list[str] = []
     masks, sparse = None, sparse_points(job.references) if chosen.align else None
     if chosen.align or chosen.refine_poses:
-        shots = read_shots(job.references, masks=job.masks, exposure=job.exposure, pictures=job.pictures)
         try:
             masks = [silhouette(shot) for shot in shots]
         except InputRefused:
@@ -221,14 +229,22 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, report: Report) ->
     elif camera_space(job.references) == "own":
         captures = moved(captures, asset.source.work_from_user)
     report(0.3)
+    outlines = (outline_of(shot) for shot in shots) if masks is None else masks
     if chosen.refine_poses:
         refined = refine_poses(
-            asset.mesh, captures.cameras, masks or (), progress=lambda done: report(0.3 + 0.7 * done)
+            asset.mesh, captures.cameras, masks or (), progress=lambda done: report(0.3 + 0.5 * done)
         )
         captures = replace(captures, cameras=refined.cameras)
         before, after = (float(np.nanmean(each)) for each in (refined.before, refined.after))
         figures |= {"pose_px_before": before, "pose_px_after": after}
-    return Placed(captures.cameras, captures.lights, tuple(notes), figures)
+    found = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done))
+    ours = camera_space(job.references) == "working" and not chosen.align
+    names = [camera.name for camera in captures.cameras]
+    said = overlap_notes(names, found, chosen.overlap, fix_of(chosen), trusted=ours)
+    if np.isfinite(found.overlap).any():
+        mean, least = float(np.nanmean(found.overlap)), float(np.nanmin(found.overlap))
+        figures |= {"outline_overlap": mean, "outline_overlap_least": least}
+    return Placed(captures.cameras, captures.lights, (*notes, *said), figures, found.overlap)
 
 
 def no_finer(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:

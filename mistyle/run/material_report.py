@@ -27,6 +27,8 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
         "mean relative difference of the same maps under the other material model: what a viewer of that model adds",
         "lower",
     ),
+    "outline_overlap": ("mean overlap of the mesh's outline with alpha or masks, intersection over union", "higher"),
+    "outline_overlap_least": ("the least such overlap of a picture", "higher"),
     "align_px": ("distance of the mesh's outline from the masks' after alignment, pixels", "lower"),
     "pose_px_before": ("how far cameras were from the mesh's outline, pixels, before they were refined", "lower"),
     "pose_px_after": ("how far cameras are from the mesh's outline, pixels, after they were refined", "lower"),
@@ -182,6 +184,10 @@ def figures(made: Any) -> dict[str, float]:
     return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
+def _or_null(value: float) -> float | None:
+    return value if np.isfinite(value) else None
+
+
 def write_summary(made: Any, run: Run) -> dict[str, Any]:
     """Write `run.json`; returns what the caller wants to know."""
     job = made.job
@@ -202,8 +208,10 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
     record = summary | {
         "inputs": {"mesh": job.mesh.name, "references": job.references.name},
         "pictures": [
-            {"name": n, "held_out": h, "psnr": p if np.isfinite(p) else None}
-            for n, h, p in zip(made.measured.names, made.measured.held, made.measured.psnr, strict=True)
+            {"name": n, "held_out": h, "psnr": _or_null(p), "outline_overlap": _or_null(o)}
+            for n, h, p, o in zip(
+                made.measured.names, made.measured.held, made.measured.psnr, made.placed.overlap, strict=True
+            )
         ],
         "seed": job.settings.seed,
         "settings": job.settings.model_dump(mode="json"),

@@ -9,6 +9,8 @@ from mistyle.run.settings import ReadSettings, ReportSettings
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import AtlasSettings
 
+LEAST_OVERLAP = 0.8  # of the mesh's outline with alpha or masks
+
 
 class ReferenceSettings(BaseModel):
     """How the pictures that a material is fitted to are read and placed."""
@@ -20,6 +22,13 @@ class ReferenceSettings(BaseModel):
     )
     align: bool = Field(default=False, description="find the similarity that brings the mesh into the cameras' space")
     refine_poses: bool = Field(default=False, description="improve every camera against the mesh before fitting")
+    overlap: float = Field(
+        default=LEAST_OVERLAP,
+        ge=0,
+        le=1,
+        description="overlap of the mesh's outline with alpha or mask (intersection over union) below which a warning "
+        "says that the picture's camera does not fit the mesh",
+    )
     average: int = Field(
         default=0,
         ge=0,

@@ -6,6 +6,7 @@ from typing import Any
 
 from mistyle.files.output import claim, read_written, replace_files
 from mistyle.run.inputs import input_files
+from mistyle.run.material_outlines import tell_views
 from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
 from mistyle.run.progress import Progress
@@ -64,7 +65,9 @@ def bake_views(
         start_engines(settings)
         atlas = lay_out(asset, settings, lambda done: None)
     progress.note(*asset.source.notes)
-    seen_by = with_geometry(asset, read_views(views))
+    pictures = read_views(views)
+    tell_views(asset.mesh, pictures, progress)
+    seen_by = with_geometry(asset, pictures)
     maps = []
     with progress.stage("bake", "bake the texture") as report:
         for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):

@@ -105,14 +105,14 @@ def align_by_masks(
     if not any(mask.any() for mask in masks):
         raise InputRefused("--align: found only empty masks; expected the object's. Check that white is the object.")
     traced = tracer(mesh)
-    coarse = [_shrunk(camera, mask, levels[0]) for camera, mask in zip(cameras, masks, strict=True)]
+    coarse = [shrunk(camera, mask, levels[0]) for camera, mask in zip(cameras, masks, strict=True)]
     if start is None:
         start = _from_hull(mesh, traced, cameras, masks, coarse, rng)
     matrix = _descend(traced, coarse, start)
     for side in levels[1:]:
-        small = [_shrunk(camera, mask, side) for camera, mask in zip(cameras, masks, strict=True)]
+        small = [shrunk(camera, mask, side) for camera, mask in zip(cameras, masks, strict=True)]
         matrix = _descend(traced, small, matrix)
-    finest = [_shrunk(camera, mask, levels[-1]) for camera, mask in zip(cameras, masks, strict=True)]
+    finest = [shrunk(camera, mask, levels[-1]) for camera, mask in zip(cameras, masks, strict=True)]
     return Alignment(matrix, _distances(traced, finest, start), _distances(traced, finest, matrix))
 
 
@@ -173,8 +173,8 @@ def refine_poses(
         for side in levels:
             pose = _settle(traced, pose, mask, side, shading)
         finest = levels[-1]
-        old, new = (_distance(traced, *_shrunk(which, mask, finest)[:2]) for which in (camera, pose))
-        times = _shrunk(camera, mask, finest)[2]
+        old, new = (_distance(traced, *shrunk(which, mask, finest)[:2]) for which in (camera, pose))
+        times = shrunk(camera, mask, finest)[2]
         kept = not np.isfinite(new) or (shading is None and new > old)
         refined.append(camera if kept else pose)
         before.append(old * times)
@@ -192,7 +192,7 @@ class _Shading:
     predict: Callable[[Camera], Float[np.ndarray, "h w 3"]]
 
 
-def _shrunk(camera: Camera, mask: np.ndarray, side: int) -> tuple[Camera, np.ndarray, int]:
+def shrunk(camera: Camera, mask: np.ndarray, side: int) -> tuple[Camera, np.ndarray, int]:
     """Camera and mask with about `side` pixels along the longer side, and how much smaller: by an odd number, so that
     no pixel is half in and half out, which would move all contours outwards or all inwards."""
     if mask.shape != camera.size:
@@ -282,7 +282,7 @@ def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.n
 
 def _settle(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading: _Shading | None) -> Camera:
     """Gauss-Newton on one camera's pose at one size."""
-    small, seen, times = _shrunk(camera, mask, side)
+    small, seen, times = shrunk(camera, mask, side)
     depth = max(float(np.linalg.norm(camera.position)), 1e-6)
     prior = np.diag(1 / np.array([TURN] * 3 + [SHIFT * depth] * 3) ** 2)
     total = np.zeros(6)

@@ -1,0 +1,109 @@
+"""Whether cameras fit the mesh: its outline as they see it, against alpha or masks.
+
+The overlap is the intersection over union of the two silhouettes. A frame that is turned, mirrored or in another space
+shows in it, unless the mesh looks the same from there: the overlaps with the mesh turned as other conventions have it
+tell whether it does, and which of them fits where the cameras' own does not.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool
+from scipy.spatial.transform import Rotation
+
+from mistyle.core.align import moved_camera, similarity
+from mistyle.core.camera import Camera
+from mistyle.core.image import overlap
+from mistyle.core.mesh import Mesh
+from mistyle.render.draw import gbuffer, tracer
+from mistyle.stages.align import shrunk
+
+SIDE = 160  # pixels of the longer side that is looked at: some 1 % of the overlap
+FEW = 6  # pictures that the mesh is turned for
+ALIKE = 0.02  # difference of mean overlaps that tells nothing
+# Frames that one convention takes for another's, as turns of the cameras about X, degrees.
+TURNS = {"by 90 degrees about X": 90.0, "by -90 degrees about X": -90.0, "by 180 degrees about X": 180.0}
+
+
+@dataclass(frozen=True)
+class Outlines:
+    """How well outlines fit.
+
+    overlap  0..1 of each picture; NaN where it has no outline
+    base     the mean over the few pictures that the cameras were turned for; NaN where there is none
+    turned   the same with all cameras turned about the mesh, by the names of TURNS
+    """
+
+    overlap: tuple[float, ...]
+    base: float
+    turned: dict[str, float]
+
+
+def check_outlines(
+    mesh: Mesh,
+    cameras: Sequence[Camera],
+    outlines: Iterable[Bool[np.ndarray, "h w"] | None],
+    progress: Callable[[float], None] = lambda done: None,
+) -> Outlines:
+    """The overlaps of the mesh (working space) with the outlines, which have their cameras' size and are asked for one
+    at a time. None, everything and nothing inside are no outline."""
+    traced = tracer(mesh)
+
+    def drawn(camera: Camera) -> np.ndarray:
+        return gbuffer(traced, camera).mask
+
+    overlaps, seen = [], []
+    for camera, outline in zip(cameras, outlines, strict=True):
+        if outline is None or outline.all() or not outline.any():
+            overlaps.append(float("nan"))
+        else:
+            seen.append(shrunk(camera, outline, SIDE)[:2])
+            overlaps.append(overlap(drawn(seen[-1][0]), seen[-1][1]))
+        progress(len(overlaps) / len(cameras))
+    few = [seen[k] for k in np.unique(np.linspace(0, len(seen) - 1, min(FEW, len(seen))).round().astype(int))]
+
+    def mean(degrees: float) -> float:
+        turn = similarity(1.0, Rotation.from_euler("x", degrees, degrees=True).as_matrix(), np.zeros(3))
+        return float(np.mean([overlap(drawn(moved_camera(camera, turn)), mask) for camera, mask in few]))
+
+    if not few:
+        return Outlines(tuple(overlaps), float("nan"), {})
+    return Outlines(tuple(overlaps), mean(0.0), {name: mean(degrees) for name, degrees in TURNS.items()})
+
+
+def overlap_line(names: Sequence[str], overlaps: Sequence[float]) -> str:
+    """Every picture's overlap in one line."""
+    shown = ", ".join(f"{n} {o:.2f}" for n, o in zip(names, overlaps, strict=True) if np.isfinite(o))
+    return f"outlines  overlap of the mesh with alpha or masks: {shown}"
+
+
+def overlap_notes(
+    names: Sequence[str], found: Outlines, least: float, fix: str, *, trusted: bool = False
+) -> tuple[str, ...]:
+    """What there is to say: overlaps below `least`, cameras that could not be checked, turns that do not show (unless
+    the cameras' frame is `trusted`, as that of our own files is)."""
+    known = [(o, n) for n, o in zip(names, found.overlap, strict=True) if np.isfinite(o)]
+    if not known:
+        return (
+            "The pictures have neither alpha nor masks with an outline: it was not checked whether the cameras fit the "
+            "mesh.",
+        )
+    bad = sorted(pair for pair in known if pair[0] < least)
+    if bad:
+        mean = float(np.mean([o for o, _ in known]))
+        worst = ", ".join(f"{n} {o:.2f}" for o, n in bad[:3])
+        best = max(found.turned, key=lambda name: found.turned[name])
+        better = f"With the cameras turned {best} it would be {found.turned[best]:.2f} on average. "
+        hint = better if found.turned[best] >= max(least, found.base + ALIKE) else ""
+        return (
+            f"Warning: the cameras do not fit the mesh in {len(bad)} of {len(known)} pictures: its outline overlaps "
+            f"alpha or masks by less than {least:g} there (worst: {worst}; mean of all {mean:.2f}). {hint}{fix}",
+        )
+    alike = [name for name, value in found.turned.items() if value >= found.base - ALIKE]
+    if trusted or not alike:
+        return ()
+    return (
+        f"The mesh's outlines fit, but as well with the cameras turned {' or '.join(alike)}: they do not show whether "
+        "the frame is the right one.",
+    )
