@@ -42,7 +42,8 @@ meshes = ["{mesh}"]
 styles = ["{style}"]
 variants = [{{ seed = 0 }}, {{ seed = 1 }}]
 """
-SKIPPED = ("report", "run.json", "batch.json", "batch.html", "plan.json", "shards")  # these hold times or places
+# These hold times or places, or hashes of files that do.
+SKIPPED = ("report", "run.json", "batch.json", "batch.html", "plan.json", "shards", ".mistyle.written")
 HIDDEN = (".tmp-", ".old-", ".mistyle.lock", "checkpoint-")
 
 

@@ -255,6 +255,13 @@ def _retried(whole: Whole, out: Path) -> Row:
     return row("the crash is gone", "the same batch again", f"exit {code}; {found or 'the same bytes'}", done=not found)
 
 
+def folders(wholes: Mapping[str, Whole], folder: Path) -> Iterator[Row]:
+    """A stranger's files in the output folder of every verb (benchmarks/faults_folders.py)."""
+    from benchmarks.faults_folders import strangers
+
+    return strangers(wholes, folder)
+
+
 def run(wholes: Mapping[str, Whole], quick: Mapping[str, tuple[Job, Job]], folder: Path) -> list[Row]:
     """Every row, said on stderr as it comes; what cannot be tried here is said too.
 
@@ -266,6 +273,7 @@ def run(wholes: Mapping[str, Whole], quick: Mapping[str, tuple[Job, Job]], folde
         "vanished": lambda: vanished(wholes, folder),
         "native": lambda: native(wholes, folder),
         "plain": lambda: plain(wholes, folder),
+        "folders": lambda: folders(wholes, folder),
     }
     rows = []
     for name, kind in kinds.items():
