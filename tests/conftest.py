@@ -1,6 +1,7 @@
 """What holds for every test: the LLVM that the set-up found, a seeded generator, and no silent skips in CI."""
 
 import os
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -29,6 +30,16 @@ settings.load_profile("mistyle")
 def rng() -> np.random.Generator:
     """The same random numbers in every test and every run."""
     return np.random.default_rng(0)
+
+
+@pytest.fixture(scope="session")
+def verb_inputs(tmp_path_factory) -> Path:
+    """A folder with what every verb that writes can be given (tests/verbs.py); not to be changed."""
+    from verbs import write_inputs
+
+    folder = tmp_path_factory.mktemp("verbs") / "inputs"
+    write_inputs(folder)
+    return folder
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
