@@ -48,6 +48,14 @@ def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:
     return Atlas(tuple(texels), tuple(start))
 
 
+def own_maps(asset: Asset, settings: Settings) -> list[Maps]:
+    """The asset's own material as its file has it, for pictures that need no atlas: each map at its own resolution."""
+    from mistyle.render.lookdev import material_maps
+
+    metallic = "zero" if settings.fit.metallic == "zero" else "keep"
+    return [material_maps(material, metallic) for material in asset.materials]
+
+
 def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> list[Camera]:
     """The rig in visiting order, from the settings, from a file, or made for the mesh (then it says what it sees)."""
     if settings.rig.kind == "nbv":

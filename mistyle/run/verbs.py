@@ -10,7 +10,7 @@ from mistyle.run.pipeline import write_asset
 from mistyle.run.progress import Progress
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Job
-from mistyle.run.start import draw, lay_out, read, start_engines
+from mistyle.run.start import draw, lay_out, own_maps, read, start_engines
 
 
 def render_views(mesh: Path, out: Path, settings: Settings, progress: Progress) -> list[Path]:
@@ -21,9 +21,9 @@ def render_views(mesh: Path, out: Path, settings: Settings, progress: Progress) 
     start_engines(settings)
     with progress.stage("mesh", "read the mesh") as report:
         asset = read(mesh, settings.read, settings.atlas.size, report)
-        atlas = lay_out(asset, settings, lambda done: None)
+    maps = own_maps(asset, settings)
     with progress.stage("views", "render the views") as report:
-        atomic_folder(out, lambda folder: draw(folder, asset, atlas.start, settings, report, progress.say))
+        atomic_folder(out, lambda folder: draw(folder, asset, maps, settings, report, progress.say))
     return sorted(out.iterdir())
 
 
