@@ -17,6 +17,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.render import device
 from mistyle.render import scene as scenery
+from mistyle.render.pages import paged_shapes
 
 
 @dataclass(frozen=True)
@@ -201,7 +202,10 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
 
     device.use()
     chosen = None if maps is None else [as_fine_as(m, max(max(c.size) for c in cameras)) for m in maps]
-    shapes = scenery.object_shapes(mesh, chosen, flip_invalid=True, frame="mikkt")
+    if chosen is not None and len(chosen) > 1:
+        shapes = paged_shapes(mesh, chosen, flip_invalid=True)
+    else:
+        shapes = scenery.object_shapes(mesh, chosen, flip_invalid=True, frame="mikkt")
     del chosen
     memory.let_go()
 
