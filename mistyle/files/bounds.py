@@ -95,7 +95,7 @@ def beside(path: Path, reference: str) -> Path:
         targets = [(root / name).resolve() for root in roots]
     except (OSError, RuntimeError) as error:  # a loop of links
         raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix) from error
-    inside = [t for t in targets if not re.match(r"[A-Za-z]:", name) and any(t.is_relative_to(r) for r in roots)]
-    if not inside:
+    usable = [t for t in targets if not re.match(r"[A-Za-z]:", name) and any(t.is_relative_to(r) for r in roots)]
+    if not usable:
         raise refuse(path, f"a reference to {reference[:120]!r}", "a file inside the mesh's own folder", fix)
-    return next((target for target in inside if target.exists()), inside[0])
+    return next((target for target in usable if target.exists()), usable[0])

@@ -107,7 +107,11 @@ def _pages_class(mi: Any) -> type:
 
         def _lookup(self, si, active):
             page = mi.UInt32(si.shape.eval_attribute_1(PAGE, si, active))
-            start, height, width = (dr.gather(mi.UInt32, n, page, active) for n in (self.start, self.height, self.width))
+            start = dr.gather(mi.UInt32, self.start, page, active)
+            height, width = (
+                dr.gather(mi.UInt32, self.height, page, active),
+                dr.gather(mi.UInt32, self.width, page, active),
+            )
             left, right, tx = _neighbours(si.uv.x, width)
             above, below, ty = _neighbours(si.uv.y, height)
             kind = mi.Float if self.channels == 1 else mi.Color3f

@@ -4,7 +4,7 @@ Each stage is kept in the run folder under a key made of its inputs, its setting
 so that a killed run goes on from the last finished stage and a changed setting redoes only what depends on it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset, Picture
-from mistyle.core.maps import Maps
+from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.files.textures import part_stems
 from mistyle.run import asset_files
@@ -102,7 +102,8 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Callabl
     )
 
     def write(folder: Path, edited: Edited, report: Report) -> None:
-        write_asset(folder, run.job, asset, atlas, repaired.maps, report, edited)
+        sets = zip(atlas.texels, repaired.maps, strict=True)
+        write_asset(folder, run.job, asset, sets, report, edited)
 
     folder, edited = asset_stage(run, ["repair"], write)
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
@@ -248,11 +249,10 @@ def write_asset(
     folder: Path,
     job: Job,
     asset: Asset,
-    atlas: Atlas,
-    maps: Sequence[Maps],
+    sets: Iterable[tuple[Texels, Maps]],
     report: Report,
     edited: Edited = UNEDITED,
 ) -> None:
-    """The files that other programs open; `edited` holds textures that a person painted over."""
+    """The files that other programs open, set after set; `edited` holds textures that a person painted over."""
     provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed}
-    asset_files.write(folder, job, asset, atlas.texels, maps, provenance, report, edited)
+    asset_files.write(folder, job, asset, sets, provenance, report, edited)

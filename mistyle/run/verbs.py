@@ -1,16 +1,20 @@
 """The verbs `render` and `bake`: single stages for people who draw or paint the views themselves."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from mistyle.core.asset import Asset
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.view import View
 from mistyle.run.inputs import input_files
 from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
 from mistyle.run.progress import Progress
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Job
-from mistyle.run.start import draw, lay_out, own_maps, read, start_engines
+from mistyle.run.start import draw, lay_out_one, own_maps, read, start_engines
 
 
 def render_views(mesh: Path, out: Path, settings: Settings, progress: Progress) -> list[Path]:
@@ -31,22 +35,29 @@ def bake_views(mesh: Path, views: Path, out: Path, settings: Settings, name: str
     """`mistyle bake`: anyone's pictures of known cameras projected onto the texture (section 4.1.4)."""
     from mistyle.files.store import atomic_folder
     from mistyle.files.views import read_views
-    from mistyle.stages.backproject import backproject, fill
 
     input_files(mesh)
     start_engines(settings)
     with progress.stage("mesh", "read the mesh") as report:
         asset = read(mesh, settings.read, settings.atlas.size, report)
-        atlas = lay_out(asset, settings, lambda done: None)
     seen_by = with_geometry(asset, read_views(views))
-    maps = []
-    with progress.stage("bake", "bake the texture") as report:
-        for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
-            baked = backproject(seen_by, texels, settings.bake, mesh=asset.mesh)
-            maps.append(replace(start, albedo=fill(baked, texels), known=baked.known))
-            report((part + 1) / len(atlas.texels))
+    shares: list[float] = []
     job = Job(mesh, views, out, settings, name)
-    with progress.stage("asset", "write the asset") as report:
-        atomic_folder(out, lambda folder: write_asset(folder, job, asset, atlas, maps, report))
-    shares = [float(m.known.sum() / max(t.covered.sum(), 1)) for m, t in zip(maps, atlas.texels, strict=True)]
+    with progress.stage("asset", "bake and write the texture") as report:
+        sets = baked_sets(asset, seen_by, settings, shares)
+        atomic_folder(out, lambda folder: write_asset(folder, job, asset, sets, report))
     return {"asset": str(out / f"{name}.glb"), "painted": dict(zip(asset.mesh.parts, shares, strict=True))}
+
+
+def baked_sets(
+    asset: Asset, views: Sequence[View], settings: Settings, shares: list[float]
+) -> Iterator[tuple[Texels, Maps]]:
+    """Texture set after texture set, made when it is asked for: its texels, and its own material with what the views
+    show in place of the albedo. `shares` receives how much of each set some view saw."""
+    from mistyle.stages.backproject import backproject, fill
+
+    for part in range(len(asset.mesh.parts)):
+        texels, start = lay_out_one(asset, part, settings)
+        baked = backproject(views, texels, settings.bake, mesh=asset.mesh)
+        shares.append(float(baked.known.sum() / max(texels.covered.sum(), 1)))
+        yield texels, replace(start, albedo=fill(baked, texels), known=baked.known)

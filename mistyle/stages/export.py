@@ -9,7 +9,7 @@ With several parts (texture sets) the textures are called <name>_<part>_<map>.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -57,11 +57,24 @@ def write_asset(
     *,
     provenance: dict[str, Any],
 ) -> dict[str, Any]:
+    """`write_sets` of maps, occlusions and texels that are there already, one entry per part of the mesh each."""
+    return write_sets(folder, name, asset, zip(maps, occlusion, texels, strict=True), provenance=provenance)
+
+
+def write_sets(
+    folder: Path,
+    name: str,
+    asset: Asset,
+    sets: Iterable[tuple[Maps, Float[np.ndarray, "h w"], Texels]],
+    *,
+    provenance: dict[str, Any],
+) -> dict[str, Any]:
     """Write GLB, textures and the list of files into `folder`; returns the list (the content of <name>.json).
 
-    `maps`, `occlusion` (1 is open) and `texels` have one entry per part of the mesh; the maps arrive padded around
-    their islands. glTF sources are patched, all others written anew. `provenance` must hold JSON values and nothing
-    that differs from run to run (no times): it goes into the GLB and the list, and equal inputs give equal bytes.
+    `sets` gives maps, occlusion (1 is open) and texels of every part of the mesh in turn; one set is written before the
+    next is taken, and only its PNG files are kept. The maps arrive padded around their islands. glTF sources are
+    patched, all others written anew. `provenance` must hold JSON values and nothing that differs from run to run (no
+    times): it goes into the GLB and the list, and equal inputs give equal bytes.
 
     The folder is filled beside its place and swapped in when complete; what an earlier export of the same name wrote
     there goes, all other files stay. Raises UsageError for a name that is no file name.
@@ -71,7 +84,7 @@ def write_asset(
     result: dict[str, Any] = {}
 
     def fill(new: Path) -> None:
-        result.update(_write(new, name, asset, maps, occlusion, texels, provenance))
+        result.update(_write(new, name, asset, sets, provenance))
         if folder.exists():
             carry_over(folder, new, without=_earlier(folder, name))
 
@@ -79,18 +92,19 @@ def write_asset(
     return result
 
 
-def _write(new: Path, name: str, asset: Asset, maps, occlusion, texels, provenance: dict[str, Any]) -> dict[str, Any]:
+def _write(new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any]) -> dict[str, Any]:
     stems = part_stems(name, asset.mesh.parts)
-    alphas = _alphas(asset, texels)
+    found = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
     pictures: list[Pictures] = []
     files: list[dict[str, Any]] = []
-    for part, stem in enumerate(stems):
-        pictures.append(encode_pictures(maps[part], occlusion[part], alphas[part]))
-        written = _write_textures(new / "textures", stem, maps[part], occlusion[part], alphas[part], pictures[part])
+    for part, (stem, (maps, occlusion, texels)) in enumerate(zip(stems, sets, strict=True)):
+        alpha = _carried(asset, found[part], texels) if part in found else None
+        pictures.append(encode_pictures(maps, occlusion, alpha))
+        written = _write_textures(new / "textures", stem, maps, occlusion, alpha, pictures[part])
         files += [_entry(new, path, part=asset.mesh.parts[part], **about) for path, about in written]
     write = patch_glb if asset.source.kind in ("glb", "gltf") else write_glb
     glb = new / f"{name}.glb"
-    write(glb, asset, maps, occlusion, name=name, provenance=provenance, pictures=pictures)
+    write(glb, asset, (), (), name=name, provenance=provenance, pictures=pictures)
     manifest = {
         "generator": f"mistyle {__version__}",
         "name": name,
@@ -156,12 +170,6 @@ def _earlier(folder: Path, name: str) -> set[str]:
         return {own, *(str(entry["file"]) for entry in listed)}
     except (OSError, ValueError, LookupError, TypeError):
         return {own}
-
-
-def _alphas(asset: Asset, texels: Sequence[Texels]) -> list[Float[np.ndarray, "h w"] | None]:
-    """The opacity of cut-out and blended glTF materials, carried over to the texels; None for opaque parts."""
-    found = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
-    return [_carried(asset, found[p], texels[p]) if p in found else None for p in range(len(texels))]
 
 
 def _carried(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, "h w"]:
