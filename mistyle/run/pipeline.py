@@ -4,7 +4,7 @@ Each stage is kept in the run folder under a key made of its inputs, its setting
 so that a killed run goes on from the last finished stage and a changed setting redoes only what depends on it.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.files.textures import part_stems
 from mistyle.run import asset_files
-from mistyle.run.budget import kept
+from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import inpainter_inputs, texture_inpainter
@@ -79,12 +79,12 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
         return deliver(job, progress) | write_summary(made, run)
 
 
-def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Callable[[int, int], None]) -> Made:
+def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> Made:
     s, seed = run.job.settings, run.job.settings.seed
     asset = run.record(
         "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)
     )
-    look_again(len(asset.mesh.faces), len(asset.mesh.parts))
+    look_again(*size_of(asset))
     atlas = run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
     views = views_stage(run, asset, atlas)
     baked, stylized = painted_stages(run, asset, style, atlas, views)
