@@ -24,7 +24,7 @@ from mistyle.core.light import (
     environment_radiance,
     spherical_gaussian,
 )
-from mistyle.core.maps import Maps
+from mistyle.core.maps import OwnMaps
 from mistyle.core.paths import scenes
 from mistyle.render import device
 from mistyle.render.emitters import emitters
@@ -53,7 +53,7 @@ def light_rig(name: str, read: Any) -> Lights:
     return (Environment(read(Path(name)), file=Path(name).name),)
 
 
-def material_maps(material: Material, metallic: Literal["keep", "zero"] = "keep") -> Maps:
+def material_maps(material: Material, metallic: Literal["keep", "zero"] = "keep") -> OwnMaps:
     """The maps of a material as a renderer wants them: each at the file's resolution with its factor applied, and 2 x 2
     texels (the renderer's least) where the file has no texture. "zero" leaves the file's metalness out."""
 
@@ -69,15 +69,13 @@ def material_maps(material: Material, metallic: Literal["keep", "zero"] = "keep"
     flat = np.zeros((2, 2, 3), np.float32) + np.array([0, 0, 1], np.float32)
     albedo = full(material.albedo, material.albedo_factor, 3)
     metal = (material.metallic, material.metallic_factor) if metallic == "keep" else (None, 0.0)
-    # Maps may differ in size here: each becomes a texture of its own.
-    with_any_size: dict[str, Any] = dict(
+    return OwnMaps(
         albedo=albedo,
         normal=flat if material.normal is None else material.normal,
         roughness=full(material.roughness, material.roughness_factor, 0),
         metallic=full(*metal, 0),
         known=np.ones(albedo.shape[:2], bool),
     )
-    return Maps(**with_any_size)
 
 
 def asset_shapes(asset: Asset) -> dict[str, Any]:

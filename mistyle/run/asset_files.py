@@ -36,12 +36,18 @@ def _finished(
     job: Any, asset: Asset, sets: Iterable[tuple[Texels, Maps]], report: Report, edited: Edited, own: int
 ) -> Iterator[tuple[Maps, np.ndarray, Texels]]:
     """Each set with its occlusion, its islands continued outwards and a person's edits in it."""
+    stems, given = part_stems(job.name, asset.mesh.parts), iter(sets)
+    for part, stem in enumerate(stems):
+        # No name here holds a set: it can go before the next one is made.
+        yield _finish(job, asset, part, stem, next(given), report, (edited, own))
+
+
+def _finish(
+    job: Any, asset: Asset, part: int, stem: str, given: tuple[Texels, Maps], report: Report, how: tuple[Edited, int]
+) -> tuple[Maps, np.ndarray, Texels]:
     from mistyle.stages.texels import pad_maps
 
-    s = job.settings
-    stems = part_stems(job.name, asset.mesh.parts)
-    for part, (texels, maps) in enumerate(sets):
-        occlusion = ambient(asset, part, s.atlas.size, s.seed, report)
-        padded = pad_maps(maps, texels, s.atlas.padding, own)
-        (padded,), (occlusion,) = edited([stems[part]], [padded], [occlusion])
-        yield padded, occlusion, texels
+    (texels, maps), (edited, own), s = given, how, job.settings
+    occlusion = ambient(asset, part, s.atlas.size, s.seed, report)
+    (padded,), (occlusion,) = edited([stem], [pad_maps(maps, texels, s.atlas.padding, own)], [occlusion])
+    return padded, occlusion, texels

@@ -9,7 +9,7 @@ import numpy as np
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera, rig
 from mistyle.core.cores import use_threads
-from mistyle.core.maps import Maps, Texels
+from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.run.made import Atlas
 from mistyle.run.progress import Report
@@ -55,7 +55,7 @@ def lay_out_one(asset: Asset, part: int, settings: Settings) -> tuple[Texels, Ma
     return texels, start_maps(asset.materials[part], texels, settings.atlas.size, metallic)
 
 
-def own_maps(asset: Asset, settings: Settings) -> list[Maps]:
+def own_maps(asset: Asset, settings: Settings) -> list[OwnMaps]:
     """The asset's own material as its file has it, for pictures that need no atlas: each map at its own resolution."""
     from mistyle.render.lookdev import material_maps
 

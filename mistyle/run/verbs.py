@@ -73,10 +73,18 @@ def baked_sets(
 ) -> Iterator[tuple[Texels, Maps]]:
     """Texture set after texture set, made when it is asked for: its texels, and its own material with what the views
     show in place of the albedo. `shares` receives how much of each set some view saw."""
+    for part in range(len(asset.mesh.parts)):
+        # No name here holds a set: it can go before the next one is made.
+        yield baked_set(asset, part, views, settings, shares)
+
+
+def baked_set(
+    asset: Asset, part: int, views: Sequence[View], settings: Settings, shares: list[float]
+) -> tuple[Texels, Maps]:
+    """One texture set of `baked_sets`."""
     from mistyle.stages.backproject import backproject, fill
 
-    for part in range(len(asset.mesh.parts)):
-        texels, start = lay_out_one(asset, part, settings)
-        baked = backproject(views, texels, settings.bake, mesh=asset.mesh)
-        shares.append(float(baked.known.sum() / max(texels.covered.sum(), 1)))
-        yield texels, replace(start, albedo=fill(baked, texels), known=baked.known)
+    texels, start = lay_out_one(asset, part, settings)
+    baked = backproject(views, texels, settings.bake, mesh=asset.mesh)
+    shares.append(float(baked.known.sum() / max(texels.covered.sum(), 1)))
+    return texels, replace(start, albedo=fill(baked, texels), known=baked.known)

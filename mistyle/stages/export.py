@@ -97,10 +97,11 @@ def _write(new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any])
     found = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
     pictures: list[Pictures] = []
     files: list[dict[str, Any]] = []
-    for part, (stem, (maps, occlusion, texels)) in enumerate(zip(stems, sets, strict=True)):
-        alpha = _carried(asset, found[part], texels) if part in found else None
-        pictures.append(encode_pictures(maps, occlusion, alpha))
-        written = _write_textures(new / "textures", stem, maps, occlusion, alpha, pictures[part])
+    given = iter(sets)
+    for part, stem in enumerate(stems):
+        # No name here holds a set: it can go before the next one is made.
+        made, written = _write_set(new, stem, asset, found.get(part), next(given))
+        pictures.append(made)
         files += [_entry(new, path, part=asset.mesh.parts[part], **about) for path, about in written]
     write = patch_glb if asset.source.kind in ("glb", "gltf") else write_glb
     glb = new / f"{name}.glb"
@@ -121,6 +122,16 @@ def _write(new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any])
     }
     atomic_write(new / f"{name}.json", (json.dumps(manifest, indent=1, ensure_ascii=False) + "\n").encode())
     return manifest
+
+
+def _write_set(
+    new: Path, stem: str, asset: Asset, cutout: Cutout | None, given: tuple[Maps, np.ndarray, Texels]
+) -> tuple[Pictures, list[tuple[Path, dict[str, Any]]]]:
+    """The PNG files of one part for the GLB, and its texture files with what to say about each."""
+    maps, occlusion, texels = given
+    alpha = None if cutout is None else _carried(asset, cutout, texels)
+    pictures = encode_pictures(maps, occlusion, alpha)
+    return pictures, _write_textures(new / "textures", stem, maps, occlusion, alpha, pictures)
 
 
 def _write_textures(
