@@ -4,6 +4,7 @@ import json
 import weakref
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -190,7 +191,8 @@ def test_own_maps_count_as_they_are_read(tmp_path):
     mesh = squares(tmp_path, 2)
     library = tmp_path / "squares.mtl"
     library.write_text(library.read_text() + "\nmap_Kd t.png\nmap_Pr t.png\n")
-    for uv, size in (("keep", 2048), ("new", 4)):
+    choices: tuple[tuple[Literal["keep", "new"], int], ...] = (("keep", 2048), ("new", 4))
+    for uv, size in choices:
         own = budget.size_of(read_mesh(mesh, uv=uv, size=size))[2]
         assert own > 0 and read_extent(mesh, uv=uv, size=size).own == own
 
