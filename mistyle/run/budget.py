@@ -4,8 +4,9 @@ A stage's peak is what the program itself takes, plus bytes a texel of all textu
 a pixel of a step's crops, a surface sample, a face, a texel of the textures as they are drawn, and a pixel of the
 turntable's frames. Those of PLAIN were solved from the peaks that `run.json` notes for every stage (`peaks_gb`) of five
 jobs: `draft_spot`, `views_64` and `atlas_4096` of `python -m benchmarks.memory --stages`, and the draft on spot with an
-atlas of 3072², four views and 20,000 samples, and of 2048². Those of TILED come from stages run alone at 1024² and
-2048², the report's from 2048² and 4096². They hold on the processor, with two threads and the embedded filter bank:
+atlas of 3072², four views and 20,000 samples, and of 2048². What only one texture set takes at a time
+(`one`) comes from a job with 20 sets of 512². Those of TILED come from stages run alone at 1024² and 2048², the
+report's from 2048² and 4096²; they count all sets alike. They hold on the processor, with two threads and the embedded filter bank:
 VGG-19 and the stylizers that need models count their own (run/generative.py).
 """
 
@@ -26,7 +27,8 @@ class Need(NamedTuple):
     """A stage's peak: GB of the program, then bytes a texel, view pixel, crop pixel, surface sample, face, texel of the
     textures as the views draw them (kept by the renderer) and as the report's close-ups do, pixel of the turntable's
     frames, texel times picture where texels are solved one by one, pixel of the largest picture, as the fit looks at it
-    and as it was taken, and sample of a pass of it; byte of the file's own maps; and texel whose PNG file is kept."""
+    and as it was taken, and sample of a pass of it; byte of the file's own maps; texel whose PNG file is kept; and
+    texel of one texture set, for what only one set takes at a time."""
 
     program: float
     texel: float = 0
@@ -43,22 +45,24 @@ class Need(NamedTuple):
     lane: float = 0
     own: float = 0
     packed: float = 0
+    one: float = 0
 
 
 # With every array in memory.
 PLAIN = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.38, texel=71),
-    "views": Need(0.46, texel=67, viewed=64, view=46.5),
-    "surface": Need(0.49, texel=67, viewed=68, view=45.5, sample=1200),
-    "bake": Need(0.59, texel=102, viewed=82, view=58.5),
-    "stylized": Need(0.53, texel=95, viewed=64, view=63.5),
-    "fit": Need(0.75, texel=184, viewed=51, view=107, crop=2000),
-    "masks": Need(0.77, texel=158, viewed=56, view=107),
-    "repair": Need(0.69, texel=200, viewed=55, view=121.5, crop=2000),
-    "asset": Need(0.75, texel=225, viewed=60, view=114),
-    "report": Need(0.71, texel=163, viewed=60, view=114, drawn=72, frame=24),
+    "views": Need(0.46, texel=39, one=28, viewed=64, view=46.5),
+    "surface": Need(0.49, texel=31, one=36, viewed=68, view=45.5, sample=1200),
+    "bake": Need(0.59, texel=20, one=82, viewed=82, view=58.5),
+    "stylized": Need(0.53, texel=56, one=39, viewed=64, view=63.5),
+    "fit": Need(0.75, texel=86, one=98, viewed=51, view=107, crop=2000),
+    "masks": Need(0.77, texel=49, one=109, viewed=56, view=107),
+    "repair": Need(0.69, texel=40, one=160, viewed=55, view=121.5, crop=2000),
+    "asset": Need(0.75, texel=53, one=172, viewed=60, view=114),
+    "report": Need(0.71, texel=39, one=124, viewed=60, view=114, drawn=72, frame=24),
 }
+PLAIN = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in PLAIN.items()}
 # With large arrays in files: what has to be in memory all the same.
 TILED = {
     "mesh": Need(0.39, face=5000),
@@ -73,6 +77,7 @@ TILED = {
     "asset": Need(0.70, texel=30, view=4),
     "report": Need(0.65, texel=5, view=4, drawn=78, frame=24),
 }
+TILED = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in TILED.items()}
 # A fit to pictures, without what is kept of the pictures' samples, up to `recover.memory`; the system does not get all
 # of that back after the stage. Read off `fit_512` and `fit_200`, the report off `fit_256`, what hangs on large pictures
 # off `large` of `python -m benchmarks.photographs`.
@@ -90,7 +95,7 @@ MATERIAL = {
 # with and without textures, at atlases of 512² to 2048² and views of 128² to 1024².
 RENDER = {
     "mesh": Need(0.38, face=5000, own=2),
-    "views": Need(0.40, view=46.5, lane=25, own=3),
+    "views": Need(0.44, view=46.5, lane=25, own=3),
 }
 RENDER_TILED = {
     "mesh": Need(0.38, face=5000, own=2),
@@ -98,12 +103,13 @@ RENDER_TILED = {
 }
 BAKE = {
     "mesh": Need(0.38, face=5000, own=2),
-    "asset": Need(0.50, texel=225, view=58.5, own=1, packed=6),
+    "asset": Need(0.50, texel=150, view=58.5, own=1, packed=12),
 }
 BAKE_TILED = {
     "mesh": Need(0.38, face=5000, own=2),
-    "asset": Need(0.60, texel=60, view=10, own=1, packed=6),
+    "asset": Need(0.60, texel=60, view=10, own=1, packed=12),
 }
+MATERIAL = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in MATERIAL.items()}
 KEEPING = ("recover", "measure", "asset", "scene", "report")
 # Shares of a picture that show the object, of the atlas that is covered, and of that what one picture sees.
 SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
@@ -160,6 +166,7 @@ class Counts(NamedTuple):
     lane: int = 0
     own: int = 0
     packed: int = 0
+    one: int = 0
 
 
 def view_pixels(settings: Settings) -> int:
@@ -181,6 +188,7 @@ def counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> C
         sets * as_drawn(settings.atlas.size, settings.rig.resolution),
         *shown(settings, sets),
         own=own,
+        one=settings.atlas.size**2,
     )
 
 
