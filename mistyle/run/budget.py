@@ -4,10 +4,10 @@ A stage's peak is what the program itself takes, plus bytes a texel of all textu
 a pixel of a step's crops, a surface sample, a face, a texel of the textures as they are drawn, and a pixel of the
 turntable's frames. Those of PLAIN were solved from the peaks that `run.json` notes for every stage (`peaks_gb`) of five
 jobs: `draft_spot`, `views_64` and `atlas_4096` of `python -m benchmarks.memory --stages`, and the draft on spot with an
-atlas of 3072², four views and 20,000 samples, and of 2048². What only one texture set takes at a time
-(`one`) comes from a job with 20 sets of 512². Those of TILED come from stages run alone at 1024² and 2048², the
-report's from 2048² and 4096²; they count all sets alike. They hold on the processor, with two threads and the embedded filter bank:
-VGG-19 and the stylizers that need models count their own (run/generative.py).
+atlas of 3072², four views and 20,000 samples, and of 2048². What only one texture set takes at a time (`one`) comes
+from a job with 20 sets of 512². Those of TILED come from stages run alone at 1024² and 2048², the report's from 2048²
+and 4096²; they count all sets alike. They hold on the processor, with two threads and the embedded filter bank: VGG-19
+and the stylizers that need models count their own (run/generative.py).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
