@@ -156,8 +156,8 @@ def test_a_budget_changes_no_picture_and_no_texture(tmp_path, monkeypatch):
     free = made(tmp_path / "free")
     assert tight == [False] * 4
     # As if every array in memory were far too much for this machine, and arrays in files were not.
-    plain = (budget.RENDER, budget.BAKE)
-    monkeypatch.setattr(budget, "peaks", lambda needs, count: {"views": 1e6 if needs in plain else 0.1})
+    tiled = (*budget.RENDER_TILED.values(), *budget.BAKE_TILED.values())
+    monkeypatch.setattr(budget, "peaks", lambda needs, count: {k: 0.1 if n in tiled else 1e6 for k, n in needs.items()})
     assert made(tmp_path / "kept") == free and len(free) > 10
     assert tight[4:] == [True] * 4
     assert sorted(p.name for p in (tmp_path / "kept").iterdir()) == ["baked", "views"], "no scratch files are left"

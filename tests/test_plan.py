@@ -90,6 +90,14 @@ def test_a_fit_to_pictures_keeps_less_of_their_samples_or_is_refused():
         budget.check_material(settings.model_copy(update={"memory": 0.5}), pixels)
 
 
+def test_a_large_mesh_is_refused_by_a_budget_in_words_only(monkeypatch):
+    """What reading and unwrapping take is not known well enough to refuse a job that nobody bounded."""
+    monkeypatch.setattr(memory, "limit", lambda: int(8e9))
+    assert not budget.tiles(job(), faces=5_000_000)
+    with pytest.raises(UsageError, match="in its stage 'mesh'"):
+        budget.tiles(job(memory=8.0), faces=5_000_000)
+
+
 def test_the_machines_memory_cuts_nothing_of_a_fit(monkeypatch):
     """A fit that keeps fewer samples may leave out steps: only who gives a budget may ask for that."""
     settings = resolve("draft", None, {}, {}, MaterialSettings, MATERIAL_PRESETS)

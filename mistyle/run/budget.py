@@ -308,9 +308,13 @@ def must_tile(
 ) -> bool:
     """Whether a job's large arrays must lie in files for its budget; `count` gives its counts for any settings.
 
-    Raises UsageError where even that is not enough, with the need, the limit, and which of the settings `keys` helps.
+    Raises UsageError where even that is not enough, with the need, the limit, and which of the settings `keys` helps. A
+    budget that nobody gave leaves out the stage 'mesh': what reading takes is bounded in files/bounds.py, and its need
+    here is that of unwrapping.
     """
     budget = allowed(settings)
+    if not budget.given:
+        plain, tiled = ({k: need for k, need in needs.items() if k != "mesh"} for needs in (plain, tiled))
     whole = max(peaks(plain, count(settings)).values())
     if whole <= budget.gb:
         return False
