@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from benchmarks.faults_jobs import Job, begin, differences, finish, left_over, until
+from benchmarks.faults_jobs import SMALL, Job, begin, differences, finish, left_over, until
 from benchmarks.faults_kills import Whole
+from mistyle.core.paths import scenes
 
 # What each job says when it is in the middle.
 MIDDLE = {
@@ -238,6 +239,66 @@ def native(wholes: Mapping[str, Whole], folder: Path) -> Iterator[Row]:
             yield row(how, "one shard of a batch", told, done=code == 0 and not found, in_its_log=noted)
 
 
+# A command line, and one on a machine (or in a control group) that says it has so much memory.
+PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main(sys.argv[1:]))"
+POOR = f"from mistyle.core import memory; memory.limit = lambda: MOST; {PROGRAM}"
+MATERIALS, MOST = 200, 1.5  # of the mesh; GB
+
+
+def out_of_memory(folder: Path) -> Iterator[Row]:
+    """A mesh of many materials where there is little memory: done within it, or refused in words before it begins."""
+    mesh, views = squares(folder / "materials", MATERIALS), folder / "materials" / "views"
+    small = ["--preset", "draft", "--threads", "1", *(f"--set={k}={SMALL[k]}" for k in ("rig.kind", "rig.views"))]
+    jobs = {
+        "render": (["render", str(mesh), *small], True),
+        "render, views of 8192²": (["render", str(mesh), *small, "--resolution=8192"], False),
+        "bake": (["bake", str(mesh), str(views), *small, "--atlas=64"], True),
+        "bake, an atlas of 8192²": (["bake", str(mesh), str(views), *small, "--atlas=8192"], False),
+        "stylize": (["stylize", str(mesh), str(scenes() / "demo_style.png"), *small], False),
+    }
+    asked, poor = f"--memory {MOST:g}G", f"a machine of {MOST:g} GB"
+    for name, (words, fits) in jobs.items():
+        for kind in (asked, poor):
+            line = [sys.executable, "-c", PROGRAM, *words, "--memory", f"{MOST}G"]
+            if kind == poor:
+                line = [sys.executable, "-c", POOR.replace("MOST", f"{1e9 * MOST:.0f}"), *words]
+            out = views if name == "render" and kind == asked else folder / f"poor{len(name)}{kind == poor:d}"
+            code, words_said, peak = measured([*line, "-o", str(out)], folder / "poor.log")
+            if fits:
+                told = f"exit {code}, {peak:.2f} GB at most"
+                yield row(f"{kind}, {MATERIALS} materials", name, told, done=code == 0, kept=peak < MOST)
+            else:
+                said = "the job needs" in words_said and "give it --memory" in words_said
+                told = f"exit {code}, {sentence(words_said)}"
+                yield row(
+                    f"{kind}, {MATERIALS} materials", name, told, refused=code == 2 and said, clean=clean(words_said),
+                    nothing_made=not out.exists(),
+                )  # fmt: skip
+
+
+def squares(folder: Path, count: int) -> Path:
+    """An OBJ of so many squares side by side, each with a material of its own."""
+    lines, library = ["mtllib squares.mtl"], []
+    for k in range(count):
+        x, y = k % 16, k // 16
+        lines += [f"v {x + a} {y + b} 0" for a, b in ((0, 0), (0.9, 0), (0.9, 0.9), (0, 0.9))]
+        lines += ["vt 0.1 0.1", "vt 0.9 0.1", "vt 0.9 0.9", "vt 0.1 0.9", f"usemtl m{k}"]
+        lines.append("f " + " ".join(f"{4 * k + c}/{4 * k + c}" for c in range(1, 5)))
+        library.append(f"newmtl m{k}\nKd {k / count:.4f} 0.5 {1 - k / count:.4f}")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "squares.mtl").write_text("\n".join(library))
+    (folder / "squares.obj").write_text("\n".join(lines) + "\n")
+    return folder / "squares.obj"
+
+
+def measured(line: list[str], log: Path) -> tuple[int, str, float]:
+    """Run to the end: exit code, words, and the most GB of main memory that the process held."""
+    child = begin(line, log)
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    return child.returncode, log.read_text(errors="replace"), used.ru_maxrss * 1024 / 1e9
+
+
 def plain(wholes: Mapping[str, Whole], folder: Path) -> Iterator[Row]:
     """What a second try runs on: nothing recorded, an empty kernel cache. It must make the same files."""
     for name in ("stylize", "fit"):
@@ -274,6 +335,7 @@ def run(wholes: Mapping[str, Whole], quick: Mapping[str, tuple[Job, Job]], folde
         "native": lambda: native(wholes, folder),
         "plain": lambda: plain(wholes, folder),
         "folders": lambda: folders(wholes, folder),
+        "memory": lambda: out_of_memory(folder),
     }
     rows = []
     for name, kind in kinds.items():

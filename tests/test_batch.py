@@ -52,6 +52,67 @@ def test_a_folder_is_a_grid_of_what_lies_in_it(props):
     assert all(r.settings["threads"] == 2 for r in records)
 
 
+LIST = """[[job]]
+mesh = "meshes/cube.obj"
+style = "styles/wave.png"
+[[job]]
+mesh = "meshes/box.obj"
+style = "styles/ink.jpg"
+"""
+GRID = '[[grid]]\nmeshes = ["meshes/cube.obj", "meshes/b*.obj"]\nstyles = ["styles/*"]\n'
+EVERY = {"list": ["cube_wave", "box_ink"], "grid": ["cube_ink", "cube_wave", "box_ink", "box_wave"]}
+EVERY["folder"] = ["box_ink", "box_wave", "cube_ink", "cube_wave"]
+
+
+@pytest.mark.parametrize("kind", ["list", "grid", "folder"])
+@pytest.mark.parametrize("where", ["beside", "elsewhere", "inside", "absolute"])
+def test_paths_are_those_of_the_jobs_file_or_folder_wherever_one_stands(props, kind, where, monkeypatch, capsys):
+    from mistyle.run.cli import main
+
+    jobs = props if kind == "folder" else jobs_file(props, {"list": LIST, "grid": GRID}[kind])
+    (props.parent / "elsewhere").mkdir()
+    stand = {"beside": props.parent, "elsewhere": props.parent / "elsewhere", "inside": props}.get(where, Path("/"))
+    monkeypatch.chdir(stand)
+    named = str(jobs) if where == "absolute" else os.path.relpath(jobs, stand)
+    out = str(props.parent / "out") if where == "absolute" else os.path.relpath(props.parent / "out", stand)
+    assert main(["batch", named, "-o", out, "--dry-run", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert [row["name"] for row in told["jobs"]] == EVERY[kind]
+    assert not any(row["refused"] for row in told["jobs"]) and all(row["memory_gb"] > 0 for row in told["jobs"])
+    assert main(["farm", "export", named, "-o", out, "--as", "openjd"]) == 0
+    # Read where a worker stands, from the plan alone.
+    monkeypatch.chdir("/")
+    records = read_plan(props.parent / "out").jobs
+    assert [r.name for r in records] == EVERY[kind]
+    meshes = {
+        f"{name}_{style}": props / "meshes" / f"{name}.obj" for name in ("cube", "box") for style in ("wave", "ink")
+    }
+    for record in records:
+        assert record.style is not None and record.mesh.is_absolute() and record.style.is_absolute()
+        assert record.mesh.samefile(meshes[record.name]) and record.style.stem == record.name.partition("_")[2]
+    listed = json.loads((props.parent / "out" / "farm" / "asset_references.yaml").read_text())["assetReferences"]
+    assert all(Path(name).is_file() for name in listed["inputs"]["filenames"])
+
+
+def test_files_in_settings_are_placed_like_the_others(props, monkeypatch):
+    for name in ("mask.png", "weights.pth", "gold.png"):
+        (props / name).write_bytes(b"")
+    settings = """
+        { "coat.protect" = "mask.png", fit = { features = "/abs/w.pth" }, "rig.file" = "../cameras.json",
+          "coat.slots" = ["wood=gold.png", "mask.png=gold.png"], "colour.config" = "ocio://default" }
+    """
+    jobs_file(props, LIST + f"settings = {' '.join(settings.split())}\n")
+    monkeypatch.chdir(props.parent)
+    monkeypatch.setenv("MISTYLE_VGG", "here.pth")
+    first, second = (r.settings for r in read_jobs(Path("props/jobs.toml"), 1))
+    # The environment speaks of where one stands.
+    assert first["fit"]["features"] == str(props.parent / "here.pth") and first["coat"]["protect"] is None
+    assert second["coat"]["protect"] == str(props / "mask.png") and second["fit"]["features"] == "/abs/w.pth"
+    assert second["rig"]["file"] == str(props / "../cameras.json")
+    assert second["coat"]["slots"] == [f"wood={props}/gold.png", f"{props}/mask.png={props}/gold.png"]
+    assert second["colour"]["config"] == "ocio://default"
+
+
 def test_a_list_a_grid_and_what_holds_for_all(props):
     path = jobs_file(
         props,

@@ -71,3 +71,18 @@ def test_unknown_verbs_are_refused():
     with pytest.raises(SystemExit) as stopped:
         parser().parse_args(["stylise"])
     assert stopped.value.code == 2
+
+
+@pytest.mark.parametrize("verb", ["stylize", "demo", "render", "bake", "fit"])
+def test_print_config_needs_nothing_else(verb, capsys):
+    assert main([verb, "--print-config", "--memory", "3G"]) == 0
+    assert "memory = 3.0" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "wanted"),
+    [(["render"], "MESH, -o OUT"), (["render", "a.obj"], "-o OUT"), (["bake", "a.obj"], "VIEWS, -o OUT")],
+)
+def test_without_it_what_is_missing_is_named(words, wanted, capsys):
+    assert main(words) == 2
+    assert f"{words[0]} needs {wanted}" in capsys.readouterr().err

@@ -3,6 +3,7 @@
 import ctypes
 import errno
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -100,3 +101,54 @@ def test_a_full_disk_is_an_error_and_no_signal(tmp_path, monkeypatch):
     monkeypatch.setattr("os.posix_fallocate", full)
     with memory.within(1e9, tmp_path), pytest.raises(OSError, match="no space"):
         memory.zeros(10_000_000)
+
+
+def kernel(folder: Path, files: dict[str, str], groups: str) -> int | None:
+    """`memory.limit` of a machine with 8 GiB whose control groups say what `files` do."""
+    for name, text in {"proc/meminfo": "MemTotal:  8388608 kB\nMemFree: 1 kB\n", **files}.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(text)
+    (folder / "proc/self").mkdir(exist_ok=True)
+    (folder / "proc/self/cgroup").write_text(groups)
+    return memory.limit(folder / "proc", folder / "groups")
+
+
+UNLIMITED = "9223372036854771712\n"  # as v1 says it
+
+
+@pytest.mark.parametrize(
+    ("groups", "files", "gib"),
+    [
+        ("0::/\n", {}, 8),
+        ("0::/job/step\n", {"groups/job/step/memory.max": "max\n", "groups/job/memory.max": "max\n"}, 8),
+        ("0::/job/step\n", {"groups/job/step/memory.max": f"{2 << 30}\n", "groups/job/memory.max": "max\n"}, 2),
+        # The group around it allows less than its own.
+        ("0::/job/step\n", {"groups/job/step/memory.max": f"{4 << 30}\n", "groups/job/memory.max": f"{3 << 30}\n"}, 3),
+        # A container sees its own group at the root, and the host's path leads nowhere.
+        ("0::/docker/abc\n", {"groups/memory.max": f"{1 << 30}\n"}, 1),
+        ("5:cpu,memory:/job\n0::/\n", {"groups/memory/job/memory.limit_in_bytes": f"{2 << 30}\n"}, 2),
+        ("5:memory:/job\n", {"groups/memory/job/memory.limit_in_bytes": UNLIMITED}, 8),
+        ("5:memory:/docker/abc\n", {"groups/memory/memory.limit_in_bytes": f"{3 << 30}\n"}, 3),
+        ("5:memory:/job\n", {"groups/memory/job/memory.limit_in_bytes": f"{64 << 30}\n"}, 8),
+        # Both at once, as systemd mounts them; groups of another kind, and what is no list of groups, count nothing.
+        (
+            "5:cpu:/job\n0::/job\n",
+            {"groups/unified/job/memory.max": f"{2 << 30}\n", "groups/cpu/job/memory.max": "1"},
+            2,
+        ),
+        ("nonsense\n::\n", {"groups/memory.max": "nonsense"}, 8),
+    ],
+)
+def test_the_limit_is_the_machines_or_that_of_the_smallest_group(tmp_path, groups, files, gib):
+    assert kernel(tmp_path, files, groups) == gib << 30
+
+
+def test_the_limit_where_the_kernel_shows_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr("os.sysconf", lambda name: {"SC_PHYS_PAGES": 1 << 20, "SC_PAGE_SIZE": 4096}[name])
+    assert memory.limit(tmp_path, tmp_path) == 4 << 30
+
+    def unknown(name: str) -> int:
+        raise ValueError("unrecognized configuration name")
+
+    monkeypatch.setattr("os.sysconf", unknown)
+    assert memory.limit(tmp_path, tmp_path) is None

@@ -5,6 +5,7 @@ import json
 
 import pytest
 
+from mistyle.core import memory
 from mistyle.core.errors import UsageError
 from mistyle.run import budget
 from mistyle.run.cli import main
@@ -87,6 +88,30 @@ def test_a_fit_to_pictures_keeps_less_of_their_samples_or_is_refused():
     assert budget.material_gb(kept, pixels) <= free - 0.9
     with pytest.raises(UsageError, match=r"--memory 0\.5G: the fit needs .* even if it keeps nothing"):
         budget.check_material(settings.model_copy(update={"memory": 0.5}), pixels)
+
+
+def test_a_large_mesh_is_refused_by_a_budget_in_words_only(monkeypatch):
+    """What reading and unwrapping take is not known well enough to refuse a job that nobody bounded."""
+    monkeypatch.setattr(memory, "limit", lambda: int(8e9))
+    assert not budget.tiles(job(), faces=5_000_000)
+    with pytest.raises(UsageError, match="in its stage 'mesh'"):
+        budget.tiles(job(memory=8.0), faces=5_000_000)
+
+
+def test_the_machines_memory_cuts_nothing_of_a_fit(monkeypatch):
+    """A fit that keeps fewer samples may leave out steps: only who gives a budget may ask for that."""
+    settings = resolve("draft", None, {}, {}, MaterialSettings, MATERIAL_PRESETS)
+    pixels = [1024**2] * 48
+    whole = budget.material_gb(settings, pixels)
+    monkeypatch.setattr(memory, "limit", lambda: int((whole + 0.1) / budget.SHARE * 1e9))
+    assert budget.check_material(settings, pixels) is settings
+    monkeypatch.setattr(memory, "limit", lambda: int((whole - 1) / budget.SHARE * 1e9))
+    with pytest.raises(UsageError, match=r"the fit needs .* GB; give it --memory .* fewer of the pictures' samples"):
+        budget.check_material(settings, pixels)
+    assert budget.check_material(settings.model_copy(update={"memory": whole - 1}), pixels).recover.memory < 4
+    monkeypatch.setattr(memory, "limit", lambda: int(0.6e9))
+    with pytest.raises(UsageError, match="even if it keeps nothing"):
+        budget.check_material(settings, pixels)
 
 
 def test_the_command_line_plans_and_refuses(tmp_path, capsys):

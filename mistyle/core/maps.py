@@ -42,6 +42,17 @@ class Maps:
     known: Bool[np.ndarray, "h w"]
 
 
+@dataclass(frozen=True)
+class OwnMaps(Maps):
+    """Maps as a file has them, each of its own size: for renderers, to which each is a texture of its own."""
+
+    albedo: Float[np.ndarray, "h w 3"]
+    normal: Float[np.ndarray, "hn wn 3"]
+    roughness: Float[np.ndarray, "hr wr"]
+    metallic: Float[np.ndarray, "hm wm"]
+    known: Bool[np.ndarray, "hk wk"]
+
+
 FINER = 4  # texels along a side of the atlas per pixel along a side of the picture, beyond which nothing is gained
 
 

@@ -17,7 +17,7 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -60,6 +60,49 @@ def kept() -> Iterator[None]:
         library.mallopt(M_MMAP_THRESHOLD, DEFAULT)
         library.mallopt(M_TRIM_THRESHOLD, DEFAULT)
         library.malloc_trim(0)
+
+
+def limit(proc: Path = Path("/proc"), groups: Path = Path("/sys/fs/cgroup")) -> int | None:
+    """Bytes of main memory that this process can get: the machine's, or what a control group (v1 or v2) or one of the
+    groups around it leaves of them; None where nothing tells. `proc` and `groups` are where the kernel shows them."""
+    found = [_total(proc), *_group_limits(proc, groups)]
+    return min((n for n in found if n is not None), default=None)
+
+
+def _total(proc: Path) -> int | None:
+    """The machine's main memory."""
+    try:
+        lines = (proc / "meminfo").read_text(encoding="ascii", errors="replace").splitlines()
+        return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemTotal:"))
+    except (OSError, ValueError, IndexError, StopIteration):
+        pass
+    try:  # not Linux
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _group_limits(proc: Path, groups: Path) -> Iterator[int]:
+    """What the groups that this process is in allow, from its own up to the root.
+
+    In a container the path may be the host's, of which nothing is to be seen; the root is the container's own then.
+    """
+    try:
+        lines = (proc / "self/cgroup").read_text(encoding="utf-8", errors="replace").splitlines()
+    except OSError:
+        return
+    for line in lines:
+        _, kinds, path = (line.split(":", 2) + ["", ""])[:3]
+        if kinds and "memory" not in kinds.split(","):
+            continue
+        roots = [groups / "memory"] if kinds else [groups, groups / "unified"]
+        own = PurePosixPath(path.lstrip("/"))
+        name = "memory.limit_in_bytes" if kinds else "memory.max"
+        for folder in [root / group for root in roots for group in (own, *own.parents)]:
+            try:
+                yield int((folder / name).read_text(encoding="ascii", errors="replace"))
+            except (OSError, ValueError):  # no such group here, or "max"
+                continue
 
 
 _seen = [0]  # bytes: the highest that was told; the kernel's own mark is reset, and lacks some pages of each core

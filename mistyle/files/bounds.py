@@ -104,8 +104,9 @@ def inside(folder: Path, name: str, where: Path, fix: str) -> Path:
 def beside(path: Path, reference: str) -> Path:
     """The file that `path` names, if it lies in the folder of `path` or below; links are resolved before the check.
 
+    A `path` that is a link has two folders, its own and that of the file it leads to; they are searched in this order.
     Percent escapes are decoded as URIs have them (`inside` does not). Raises InputRefused for network addresses,
-    absolute paths and everything that leads out of the folder.
+    absolute paths and everything that leads out of the folder (of both).
     """
     name = unquote(reference).replace("\\", "/")
     fix = "Copy the file into the mesh's folder and name it relative to the mesh"
@@ -113,11 +114,12 @@ def beside(path: Path, reference: str) -> Path:
         raise refuse(path, f"a reference to {reference[:120]!r}", "a relative file name (nothing is fetched)", fix)
     if "\0" in name or not name:
         raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix)
-    root = path.parent.resolve()
     try:
-        target = (root / name).resolve()
+        roots = list(dict.fromkeys((path.parent.resolve(), path.resolve().parent)))
+        targets = [(root / name).resolve() for root in roots]
     except (OSError, RuntimeError) as error:  # a loop of links
         raise refuse(path, f"a reference to {reference[:120]!r}", "a file name", fix) from error
-    if re.match(r"[A-Za-z]:", name) or not target.is_relative_to(root):
+    usable = [t for t in targets if not re.match(r"[A-Za-z]:", name) and any(t.is_relative_to(r) for r in roots)]
+    if not usable:
         raise refuse(path, f"a reference to {reference[:120]!r}", "a file inside the mesh's own folder", fix)
-    return target
+    return next((target for target in usable if target.exists()), usable[0])

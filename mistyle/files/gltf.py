@@ -38,7 +38,8 @@ def write_glb(
     Positions are the user's: file units, file axes, corners in the order of the source's vertices. Where reading
     turned the mesh upright (Z-up files) the node carries that rotation, since glTF's scene is Y-up; the position of a
     mesh very far from its origin is split between node and vertices, which are float32. TANGENT is MikkTSpace.
-    `maps` and `occlusion` (1 is open) have one entry per part; `pictures` are their PNG files where already encoded.
+    `maps` and `occlusion` (1 is open) have one entry per part; `pictures` are their PNG files where already encoded,
+    and then nothing else of them is needed.
     The same input gives the same bytes. The result is a still mesh: other formats have nothing else to keep.
     """
     pictures = pictures or [encode_pictures(m, o) for m, o in zip(maps, occlusion, strict=True)]

@@ -111,7 +111,7 @@ def keeps(root: Path, name: str, written: Written | None = None) -> bool:
     folder = root / name
     if not os.path.lexists(folder):
         return True
-    known = name in (written or read_written(root)).folders or (folder / RECORD).is_file()
+    known = name in (written or read_written(root)).folders
     return folder.is_dir() and (known or not any(files_of(folder)))
 
 
@@ -337,6 +337,16 @@ def keep_folder(root: Path, name: str) -> None:
     written = read_written(root)
     if name not in written.folders:
         _write_record(root, Written(written.files, written.folders | {name}))
+
+
+def forget_folder(root: Path, name: str) -> None:
+    """Take back `keep_folder` of a subfolder that is gone; a record that then holds nothing goes too."""
+    written = read_written(root)
+    left = Written(written.files, written.folders - {name})
+    if left == NOTHING:
+        (root / RECORD).unlink(missing_ok=True)
+    elif left != written:
+        _write_record(root, left)
 
 
 def move_aside(folder: Path, label: str, names: Iterable[str]) -> Path:

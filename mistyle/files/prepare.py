@@ -1,5 +1,6 @@
 """From what a file says to an asset: working space, normals, one usable set of UVs for every material."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,7 @@ from mistyle.core.unwrap import unwrap
 from mistyle.core.uvs import Layout, Verdict, arrange
 from mistyle.files.bounds import refuse
 from mistyle.files.polygons import check_positions
-from mistyle.files.raw import Raw, RawMap
+from mistyle.files.raw import Extent, Raw, RawMap
 
 # Faces below this area in the unit sphere have none that anything could be computed from (float32 positions).
 NO_AREA = 1e-13
@@ -32,6 +33,24 @@ class _Plan:
     rows: Int[np.ndarray, " n"]
     layout: Layout | None
     reason: str
+
+
+def extent(raw: Raw, path: Path, uv: UnwrapMode, size: int) -> Extent:
+    """What `prepare` would make of a file, without unwrapping it; refuses what that refuses on the way."""
+    check_positions(raw.positions, path)
+    area = np.linalg.norm(area_vectors(raw.positions, raw.faces), axis=1)
+    points, unwrapped, sets, own = same_points(raw.positions), 0, 0, 0
+    for m, material in enumerate(raw.materials):
+        plan = _plan(raw, m, points, area, uv, path, [])
+        unwrapped += 0 if plan.layout is not None else len(_own(raw, plan.rows))
+        tiles = [1001] if plan.layout is None else np.unique(plan.layout.tile).tolist()
+        sets += len(tiles)
+        for entry in (entry for tile in tiles for entry in material.load(tile)[0].values()):
+            height, width, *channels = entry.values.shape
+            if plan.layout is None or entry.uvs is not None or entry.transform is not None:  # as in `_placed`
+                height = width = min(size, max(height, width))
+            own += 4 * height * width * math.prod(channels)
+    return Extent(len(raw.faces), unwrapped, sets, own)
 
 
 def prepare(

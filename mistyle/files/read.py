@@ -20,7 +20,7 @@ from mistyle.core.asset import Asset, Picture, Pixels
 from mistyle.files.bounds import refuse
 from mistyle.files.layers import Frame, frame_of
 from mistyle.files.pictures import picture_of
-from mistyle.files.raw import spelled
+from mistyle.files.raw import Extent, Raw, spelled
 from mistyle.files.reader_process import ask
 
 __all__ = [
@@ -31,6 +31,7 @@ __all__ = [
     "read_colmap",
     "read_colmap_points",
     "read_exr",
+    "read_extent",
     "read_frame",
     "read_gltf_alpha",
     "read_hdr",
@@ -91,17 +92,33 @@ def read_mesh(
     (glTF: flat, as it demands). One part per material and UDIM tile. Not read: vertex colours, morph targets (the base
     shape is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression (refused).
     """
+    from mistyle.files.prepare import prepare
+
     path = Path(path)
+    return prepare(_raw(path, max_faces), path, uv, up, size, progress)
+
+
+def _raw(path: Path, max_faces: int) -> Raw:
+    """What the file says, checked."""
     kind = path.suffix.lower()
     if kind not in MESHES:
         found = f"a file ending in '{kind}'" if kind else "a file without an ending"
         raise refuse(path, found, f"one of {' '.join(MESHES)}", "Export the mesh as .glb or .obj")
     from mistyle.files.polygons import check_indices
-    from mistyle.files.prepare import prepare
 
     raw = spelled(ask("mesh", path, MESHES[kind], max_faces))
     check_indices(raw.faces, len(raw.positions), path, "vertex")
-    return prepare(raw, path, uv, up, size, progress)
+    return raw
+
+
+def read_extent(
+    path: Path, *, uv: Literal["keep", "new", "auto"] = "auto", max_faces: int = 5_000_000, size: int = 2048
+) -> Extent:
+    """How large the asset of `read_mesh` will be: its faces, texture sets and own maps; nothing is unwrapped."""
+    from mistyle.files.prepare import extent
+
+    path = Path(path)
+    return extent(_raw(path, max_faces), path, uv, size)
 
 
 def read_usd_files(path: Path) -> list[Path]:

@@ -69,7 +69,7 @@ def check_layers(pxr: Any, path: Path) -> list[Path]:
     Returns the files. Refused: names that lead out of the folder or to a network, layers of other formats, packages
     that are compressed or nested, value clips (which would be opened later), too many or too large files.
     """
-    root, start = path.parent.resolve(), Place(path.resolve())
+    root, start = path.resolve().parent, Place(path.resolve())
     waiting, seen = [start], {str(start)}
     files: dict[Path, int] = {}
     while waiting:

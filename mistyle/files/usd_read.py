@@ -73,7 +73,7 @@ def files_of(path: Path) -> list[Path]:
     """The layers, packages and textures that a file stands on, itself among them."""
     pxr = library()
     files = check_layers(pxr, path)
-    return [*files, *textures_named(pxr, files, path.parent.resolve())]
+    return [*files, *textures_named(pxr, files, path.resolve().parent)]
 
 
 def read_usd(path: Path, max_faces: int) -> Raw:
@@ -83,7 +83,7 @@ def read_usd(path: Path, max_faces: int) -> Raw:
     time, notes = pxr.Usd.TimeCode.EarliestTime(), []
     found: dict[str, int] = {}
     materials: list[Found] = []
-    budget, root = Budget(path), path.parent.resolve()
+    budget, root = Budget(path), path.resolve().parent
 
     def number(material: Any, colour: Any) -> int:
         key = str(material.GetPath()) if material else f"displayColor {colour}"

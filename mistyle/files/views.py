@@ -132,6 +132,11 @@ def read_views(folder: Path) -> list[View]:
     return [memory.away(_read_view(folder, camera, entry)) for camera, entry in cameras]
 
 
+def view_cameras(folder: Path) -> list[Camera]:
+    """The cameras of the views that `read_views` would read."""
+    return [camera for camera, _ in _entries(folder)]
+
+
 def _entries(folder: Path) -> list[tuple[Camera, ViewEntry | None]]:
     if (folder / "camera.json").is_file():
         return list(read_entries(folder / "camera.json"))

@@ -17,6 +17,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.render import device
 from mistyle.render import scene as scenery
+from mistyle.render.pages import paged_shapes
 
 
 @dataclass(frozen=True)
@@ -140,19 +141,23 @@ def draw_views(
 
 
 def as_fine_as(maps: Maps, pixels: int) -> Maps:
-    """Maps for pictures of so many pixels a side: where they are finer than that shows (`coarser`), a coarser mip
-    level (means over squares of texels; normals unit length again), so that textures do not take more memory and
-    time than they show."""
-    by = coarser(min(maps.roughness.shape), pixels)
-    if by == 1:
-        return maps
-    shape = (maps.roughness.shape[0] // by, maps.roughness.shape[1] // by)
-    small = {name: resize(getattr(maps, name), shape) for name in ("albedo", "normal", "roughness", "metallic")}
-    length = np.linalg.norm(small["normal"], axis=-1, keepdims=True)
-    small["normal"] = np.where(
-        length > 1e-6, small["normal"] / np.maximum(length, 1e-6), np.array([0, 0, 1], np.float32)
-    )
+    """Maps for pictures of so many pixels a side: where one is finer than that shows (`coarser`), a coarser mip level
+    (means over squares of texels; normals unit length again), so that textures do not take more memory and time than
+    they show. Each map counts by its own size."""
+    small = {name: _coarse(getattr(maps, name), pixels) for name in ("albedo", "normal", "roughness", "metallic")}
+    if small["normal"] is not maps.normal:
+        length = np.linalg.norm(small["normal"], axis=-1, keepdims=True)
+        small["normal"] = np.where(
+            length > 1e-6, small["normal"] / np.maximum(length, 1e-6), np.array([0, 0, 1], np.float32)
+        )
+    by = coarser(min(maps.known.shape), pixels)
     return replace(maps, **small, known=maps.known[::by, ::by])
+
+
+def _coarse(values: np.ndarray, pixels: int) -> np.ndarray:
+    """The mip level of a map (h w *c) that pictures of so many pixels a side show; itself where that is the finest."""
+    by = coarser(min(values.shape[:2]), pixels)
+    return values if by == 1 else resize(values, (values.shape[0] // by, values.shape[1] // by))
 
 
 def picture(
@@ -197,7 +202,10 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
 
     device.use()
     chosen = None if maps is None else [as_fine_as(m, max(max(c.size) for c in cameras)) for m in maps]
-    shapes = scenery.object_shapes(mesh, chosen, flip_invalid=True, frame="mikkt")
+    if chosen is not None and len(chosen) > 1:
+        shapes = paged_shapes(mesh, chosen, flip_invalid=True)
+    else:
+        shapes = scenery.object_shapes(mesh, chosen, flip_invalid=True, frame="mikkt")
     del chosen
     memory.let_go()
 

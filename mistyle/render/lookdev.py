@@ -6,7 +6,7 @@ of no size and everything soft as one latitude-longitude picture in its own layo
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float
@@ -24,7 +24,7 @@ from mistyle.core.light import (
     environment_radiance,
     spherical_gaussian,
 )
-from mistyle.core.maps import Maps
+from mistyle.core.maps import OwnMaps
 from mistyle.core.paths import scenes
 from mistyle.render import device
 from mistyle.render.emitters import emitters
@@ -53,25 +53,29 @@ def light_rig(name: str, read: Any) -> Lights:
     return (Environment(read(Path(name)), file=Path(name).name),)
 
 
-def material_maps(material: Material) -> Maps:
-    """The maps of a material as a renderer wants them: factors applied, constants where the file has no texture."""
+def material_maps(material: Material, metallic: Literal["keep", "zero"] = "keep") -> OwnMaps:
+    """The maps of a material as a renderer wants them: each at the file's resolution with its factor applied, and 2 x 2
+    texels (the renderer's least) where the file has no texture. "zero" leaves the file's metalness out."""
 
     def full(texture: np.ndarray | None, factor: float | np.ndarray, channels: int) -> np.ndarray:
-        if texture is not None:
-            return (texture * factor).astype(np.float32)
-        return np.broadcast_to(np.asarray(factor, np.float32), (2, 2, channels) if channels else (2, 2)).copy()
+        if texture is None:
+            constant = np.clip(np.asarray(factor, np.float32), 0, 1)
+            return np.broadcast_to(constant, (2, 2, channels) if channels else (2, 2)).copy()
+        if np.all(np.asarray(factor) == 1):
+            return texture
+        scaled = np.multiply(texture, np.asarray(factor, np.float32), dtype=np.float32)
+        return np.clip(scaled, 0, 1, out=scaled)
 
     flat = np.zeros((2, 2, 3), np.float32) + np.array([0, 0, 1], np.float32)
     albedo = full(material.albedo, material.albedo_factor, 3)
-    # Maps may differ in size here: each becomes a texture of its own.
-    with_any_size: dict[str, Any] = dict(
+    metal = (material.metallic, material.metallic_factor) if metallic == "keep" else (None, 0.0)
+    return OwnMaps(
         albedo=albedo,
         normal=flat if material.normal is None else material.normal,
         roughness=full(material.roughness, material.roughness_factor, 0),
-        metallic=full(material.metallic, material.metallic_factor, 0),
+        metallic=full(*metal, 0),
         known=np.ones(albedo.shape[:2], bool),
     )
-    return Maps(**with_any_size)
 
 
 def asset_shapes(asset: Asset) -> dict[str, Any]:

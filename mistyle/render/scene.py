@@ -111,7 +111,12 @@ def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
 
 def encoded(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """A normal map as textures hold it: (n + 1) / 2."""
-    result = np.multiply(normal, np.float32(0.5), out=memory.empty(normal.shape))
+    return encoded_into(memory.empty(normal.shape), normal)
+
+
+def encoded_into(result: Float[np.ndarray, "h w 3"], normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
+    """`encoded`, written into `result`."""
+    np.multiply(normal, np.float32(0.5), out=result)
     return np.add(result, np.float32(0.5), out=result)
 
 

@@ -1,8 +1,10 @@
 """The asset that other programs open, as every kind of job writes it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps, Texels
@@ -16,21 +18,36 @@ def write(
     folder: Path,
     job: Any,
     asset: Asset,
-    texels: Sequence[Texels],
-    maps: Sequence[Maps],
+    sets: Iterable[tuple[Texels, Maps]],
     provenance: Mapping[str, Any],
     report: Report,
     edited: Edited,
     own: int = 0,
 ) -> None:
-    """The files of `maps`, one per texture set; `edited` holds textures that a person painted over, `own` is as in
-    `pad_maps`."""
-    from mistyle.stages.export import write_asset
+    """The files of the texture sets, each finished and written before the next is taken; `edited` holds textures that
+    a person painted over, `own` is as in `pad_maps`."""
+    from mistyle.stages.export import write_sets
+
+    told = {**provenance, **edited.provenance}
+    write_sets(folder, job.name, asset, _finished(job, asset, sets, report, edited, own), provenance=told)
+
+
+def _finished(
+    job: Any, asset: Asset, sets: Iterable[tuple[Texels, Maps]], report: Report, edited: Edited, own: int
+) -> Iterator[tuple[Maps, np.ndarray, Texels]]:
+    """Each set with its occlusion, its islands continued outwards and a person's edits in it."""
+    stems, given = part_stems(job.name, asset.mesh.parts), iter(sets)
+    for part, stem in enumerate(stems):
+        # No name here holds a set: it can go before the next one is made.
+        yield _finish(job, asset, part, stem, next(given), report, (edited, own))
+
+
+def _finish(
+    job: Any, asset: Asset, part: int, stem: str, given: tuple[Texels, Maps], report: Report, how: tuple[Edited, int]
+) -> tuple[Maps, np.ndarray, Texels]:
     from mistyle.stages.texels import pad_maps
 
-    s = job.settings
-    occlusion = [ambient(asset, part, s.atlas.size, s.seed, report) for part in range(len(asset.mesh.parts))]
-    padded = [pad_maps(m, t, s.atlas.padding, own) for m, t in zip(maps, texels, strict=True)]
-    padded, occlusion = edited(part_stems(job.name, asset.mesh.parts), padded, occlusion)
-    told = {**provenance, **edited.provenance}
-    write_asset(folder, job.name, asset, padded, occlusion, texels, provenance=told)
+    (texels, maps), (edited, own), s = given, how, job.settings
+    occlusion = ambient(asset, part, s.atlas.size, s.seed, report)
+    (padded,), (occlusion,) = edited([stem], [pad_maps(maps, texels, s.atlas.padding, own)], [occlusion])
+    return padded, occlusion, texels

@@ -1,6 +1,6 @@
 """What a batch is to do: a list, a grid or a folder, as records that are checked before anything runs.
 
-    # jobs.toml (or .yaml with the same keys); paths are relative to the file
+    # jobs.toml (or .yaml with the same keys); paths are relative to the file, those in settings too
     preset = "draft"                       # of every job that says nothing else
     settings = { "report.frames" = 12 }
 
@@ -23,7 +23,7 @@ A folder is a grid of the meshes and the pictures in it (or in its folders `mesh
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -100,7 +100,8 @@ def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
 
     `threads` is what each job may use where its settings say nothing. Raises UsageError or InputRefused.
     """
-    base = path if path.is_dir() else path.parent
+    # Made absolute here, once: whatever is placed under it is absolute, and placing it again changes nothing.
+    base = (path if path.is_dir() else path.parent).absolute()
     file = _of_folder(path) if path.is_dir() else _of_file(path)
     jobs = [*file.job, *itertools.chain.from_iterable(_spread(grid, base, str(path)) for grid in file.grid)]
     if not jobs:
@@ -209,7 +210,7 @@ def _record(job: Job, name: str, file: JobsFile, base: Path, threads: int) -> Re
         raise UsageError("lights, masks and exposure belong to a fit to references; this job has a style")
 
     def placed(path: Path | None) -> Path | None:
-        return None if path is None else (base / path).absolute()
+        return None if path is None else base / path
 
     mesh, style, references = placed(job.mesh), placed(job.style), placed(job.references)
     assert mesh is not None
@@ -232,7 +233,7 @@ def _record(job: Job, name: str, file: JobsFile, base: Path, threads: int) -> Re
         lights=lights,
         masks=placed(job.masks),
         exposure=placed(job.exposure),
-        settings=resolved(kind, job.preset or file.preset, said, threads),
+        settings=resolved(kind, job.preset or file.preset, said, threads, base),
     )
 
 
@@ -251,15 +252,47 @@ def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int) -> dict[str, Any]:
-    """All settings of a job, as JSON has them; with `threads` where they say nothing."""
+def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int, base: Path) -> dict[str, Any]:
+    """All settings of a job, as JSON has them; with `threads` where they say nothing.
+
+    Files that `said` names are relative to `base`, those of the environment to the working folder; all end absolute.
+    """
     from mistyle.run.settings import resolve
 
+    root: type[BaseModel]
     if kind == "fit":
         from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
 
-        settings: BaseModel = resolve(preset, None, said, root=MaterialSettings, presets=MATERIAL_PRESETS)
+        root, presets = MaterialSettings, MATERIAL_PRESETS
     else:
-        settings = resolve(preset, None, said)
-    values = settings.model_dump(mode="json")
+        from mistyle.run.settings import PRESETS, Settings
+
+        root, presets = Settings, PRESETS
+    settings = resolve(preset, None, placed_files(said, root, base), root=root, presets=presets)
+    values = placed_files(settings.model_dump(mode="json"), root, Path.cwd())
     return values | {"threads": values["threads"] or threads}
+
+
+def placed_files(values: Mapping[str, Any], model: type[BaseModel], base: Path) -> dict[str, Any]:
+    """Settings of `model` with the files that they name relative to `base`; absolute ones stay.
+
+    Of a style slot (SLOT=PICTURE) the picture is a file, and SLOT where `base` has a file of that name.
+    """
+    result = dict(values)
+    for name, field in model.model_fields.items():
+        value, kind = result.get(name), field.annotation
+        if isinstance(value, Mapping) and isinstance(kind, type) and issubclass(kind, BaseModel):
+            result[name] = placed_files(value, kind, base)
+        elif isinstance(value, str) and (Path in (kind, *get_args(kind)) or name == "config" and "://" not in value):
+            result[name] = str(base / value)  # colour.config is a file or a config's ocio:// name
+        elif name == "slots" and isinstance(value, (list, tuple)):
+            result[name] = [_placed_slot(slot, base) for slot in value]
+    return result
+
+
+def _placed_slot(slot: Any, base: Path) -> Any:
+    where, equals, picture = str(slot).rpartition("=")
+    if not equals or not where or not picture:
+        return slot  # refused with the job's other settings
+    mask = base / where
+    return f"{mask if mask.is_file() else where}={base / picture}"

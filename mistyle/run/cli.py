@@ -127,11 +127,15 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--variations", type=int, metavar="N", help="only try N seeds and stroke sizes, quickly, on one contact sheet"
     )
+    _add_dry_run(verb)
+    add_memory_option(verb)
+    add_delivery_options(verb)
+
+
+def _add_dry_run(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--dry-run", action="store_true", help="print the plan with estimated time, memory and disk, and stop"
     )
-    add_memory_option(verb)
-    add_delivery_options(verb)
 
 
 def _add_stylize(verbs: Any) -> None:
@@ -185,11 +189,13 @@ def _add_render(verbs: Any) -> None:
             """
         ),
     )
-    verb.add_argument("mesh", type=Path, metavar="MESH")
-    verb.add_argument("-o", "--out", type=Path, required=True, metavar="DIR")
+    verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH")
+    verb.add_argument("-o", "--out", type=Path, metavar="DIR")
     add_job_options(verb)
     add_mesh_options(verb)
     _add_view_options(verb)
+    _add_dry_run(verb)
+    add_memory_option(verb)
     verb.set_defaults(command=_render)
 
 
@@ -204,13 +210,15 @@ def _add_bake(verbs: Any) -> None:
             """
         ),
     )
-    verb.add_argument("mesh", type=Path, metavar="MESH")
-    verb.add_argument("views", type=Path, metavar="VIEWS_DIR", help="camera.json and one picture per view")
-    verb.add_argument("-o", "--out", type=Path, required=True, metavar="OUT")
+    verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH")
+    verb.add_argument("views", type=Path, nargs="?", metavar="VIEWS_DIR", help="camera.json and one picture per view")
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT")
     verb.add_argument("--atlas", type=int, metavar="N", help="texture size")
     verb.add_argument("--name", help="name of the asset (default: the mesh's)")
     add_job_options(verb)
     add_mesh_options(verb)
+    _add_dry_run(verb)
+    add_memory_option(verb)
     verb.set_defaults(command=_bake)
 
 
@@ -257,11 +265,23 @@ def _rig(options: argparse.Namespace) -> dict[str, Any]:
 def _stylize(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
-    missing = [name for name in ("mesh", "style", "out") if getattr(options, name) is None]
+    _need(options, "mesh", "style", "out")
+    return _run_job(options, options.mesh, options.style, None)
+
+
+def _need(options: argparse.Namespace, *names: str) -> None:
+    """UsageError for arguments that only --print-config does without."""
+    missing = [name for name in names if getattr(options, name) is None]
     if missing:
         wanted = ", ".join("-o OUT" if m == "out" else m.upper() for m in missing)
-        raise UsageError(f"stylize needs {wanted}; see mistyle stylize --help")
-    return _run_job(options, options.mesh, options.style, None)
+        raise UsageError(f"{options.verb} needs {wanted}; see mistyle {options.verb} --help")
+
+
+def _tell_plan(options: argparse.Namespace, estimate: dict[str, Any]) -> int:
+    from mistyle.run.plan import describe_plan
+
+    print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
+    return 0
 
 
 def _demo(options: argparse.Namespace) -> int:
@@ -283,15 +303,13 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     settings = _settings(options, preset)
     called = name or asset_name(options, mesh.stem, style.stem)
     from mistyle.run.pipeline import stylize
-    from mistyle.run.plan import describe_plan, plan
+    from mistyle.run.plan import plan
     from mistyle.run.progress import Progress
     from mistyle.run.stages import Job
 
     job = Job(mesh, style, options.out, settings, called, options.redo_from, options.overwrite)
     if options.dry_run:
-        estimate = plan(job)
-        print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
-        return 0
+        return _tell_plan(options, plan(job))
     progress = Progress()
     if options.variations:
         from mistyle.run.variations import sheet
@@ -313,7 +331,12 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
 def _render(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
+    _need(options, "mesh", "out")
     settings = _settings(options)
+    if options.dry_run:
+        from mistyle.run.plan import plan_render
+
+        return _tell_plan(options, plan_render(options.mesh, options.out, settings))
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import render_views
 
@@ -328,13 +351,18 @@ def _render(options: argparse.Namespace) -> int:
 def _bake(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
-    settings = _settings(options)
+    _need(options, "mesh", "views", "out")
+    settings, called = _settings(options), asset_name(options, options.mesh.stem)
+    if options.dry_run:
+        from mistyle.run.plan import plan_bake
+
+        return _tell_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import bake_views
 
-    name, progress = asset_name(options, options.mesh.stem), Progress()
+    progress = Progress()
     summary = bake_views(
-        options.mesh, options.views, options.out, settings, name, progress, overwrite=options.overwrite
+        options.mesh, options.views, options.out, settings, called, progress, overwrite=options.overwrite
     )
     print(json.dumps(summary) if options.json else f"asset     {summary['asset']}")
     progress.tell_notes()

@@ -18,7 +18,7 @@ from typing import Any
 from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, FILE_NAME, folded, safe_name, shortened
 from mistyle.files.bounds import USD
-from mistyle.files.output import claim, read_written, replace_files
+from mistyle.files.output import claim, keep_folder, read_written, replace_files
 from mistyle.files.own import read_own
 from mistyle.files.packing import TARGETS
 from mistyle.files.store import atomic_write, digest, sha256_file
@@ -173,6 +173,7 @@ def deliver(job: Any, progress: Any) -> dict[str, dict[str, list[str]]]:
     made: dict[str, list[str]] = {}
     with progress.stage("deliver", "write the files for " + ", ".join(chosen.chosen_targets)) as report:
         for target in chosen.chosen_targets:
+            keep_folder(job.out, f"delivered/{target}")
             files = export(
                 job.out,
                 job.out / "delivered" / target,

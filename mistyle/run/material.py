@@ -20,7 +20,7 @@ from mistyle.core.light import Lights, SceneLights
 from mistyle.core.maps import Maps, Texels
 from mistyle.files.textures import part_stems
 from mistyle.run import checkpoint
-from mistyle.run.budget import check_material, with_setting
+from mistyle.run.budget import check_material, size_of, with_setting
 from mistyle.run.edits import asset_stage, tell_edits
 from mistyle.run.inputs import input_files
 from mistyle.run.material_files import scene, write
@@ -117,6 +117,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         asset = run.record(
             "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(job.mesh, s.read, s.atlas.size, r)
         )
+        check_material(s, pixels_of(captures), *size_of(asset))
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
         read_as = [shot.pixels for shot in shots]
         given = [pictures, read_as, [vars(c) for c in captures.cameras], captures.lights]
@@ -308,7 +309,7 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
     folder = checkpoint.place(run.job.out, run.keys["recover"])
     # What is kept of the pictures' samples changes how long the fit takes and nothing else.
     looked_at = with_setting(s, "references.average", 1)  # they are averaged already
-    within = check_material(looked_at, pixels_of(captures), len(asset.mesh.faces), len(texels))
+    within = check_material(looked_at, pixels_of(captures), *size_of(asset))
     return recover(
         asset.mesh,
         texels,

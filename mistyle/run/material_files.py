@@ -26,7 +26,8 @@ def write(
 ) -> None:
     """The asset as `stylize` writes it; `edited` holds textures that a person painted over."""
     provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
-    asset_files.write(folder, job, asset, texels, recovered.maps, provenance, report, edited, own=BORDER)
+    sets = zip(texels, recovered.maps, strict=True)
+    asset_files.write(folder, job, asset, sets, provenance, report, edited, own=BORDER)
 
 
 def scene(folder: Path, job: Any, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures) -> None:

@@ -59,8 +59,8 @@ class MaterialSettings(BaseModel):
         default=0,
         ge=0,
         le=100_000,
-        description="GB of main memory that the job may take; a job that cannot keep it is refused; 0: as much as it "
-        "takes, of that recover.memory for the pictures' samples",
+        description="GB of main memory that the job may take; a job that cannot keep it is refused; 0: nine tenths of "
+        "what there is, of that recover.memory for the pictures' samples",
     )
     threads: int = Field(default=0, ge=0, le=1024, description="threads of the renderer; 0 takes all cores")
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"

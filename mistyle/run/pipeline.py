@@ -4,7 +4,7 @@ Each stage is kept in the run folder under a key made of its inputs, its setting
 so that a killed run goes on from the last finished stage and a changed setting redoes only what depends on it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset, Picture
-from mistyle.core.maps import Maps
+from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.files.textures import part_stems
 from mistyle.run import asset_files
-from mistyle.run.budget import kept
+from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import inpainter_inputs, texture_inpainter
@@ -65,7 +65,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
         from mistyle.run.sweep import refuse_what_is_not_kept
 
         refuse_what_is_not_kept(job.settings)
-    with kept(job.settings, job.out / "work") as look_again, Run(job, progress) as run:
+    with Run(job, progress) as run, kept(job.settings, run.hidden.root) as look_again:
         start_engines(job.settings)
         made = _stages(run, files, style, look_again)
         progress.note(*made.asset.source.notes, *style.notes, *made.fit.notes)
@@ -86,12 +86,12 @@ def inputs_of(job: Job) -> list[Path]:
     return [*input_files(job.mesh), job.style, *coat_files(s.coat), *filter(None, (s.rig.file, s.draw.scene))]
 
 
-def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Callable[[int, int], None]) -> Made:
+def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> Made:
     s, seed = run.job.settings, run.job.settings.seed
     asset = run.record(
         "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)
     )
-    look_again(len(asset.mesh.faces), len(asset.mesh.parts))
+    look_again(*size_of(asset))
     atlas = run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
     views = views_stage(run, asset, atlas)
     baked, stylized = painted_stages(run, asset, style, atlas, views)
@@ -109,7 +109,8 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Callabl
     )
 
     def write(folder: Path, edited: Edited, report: Report) -> None:
-        write_asset(folder, run.job, asset, atlas, repaired.maps, report, edited)
+        sets = zip(atlas.texels, repaired.maps, strict=True)
+        write_asset(folder, run.job, asset, sets, report, edited)
 
     folder, edited = asset_stage(run, ["repair"], write)
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
@@ -255,11 +256,10 @@ def write_asset(
     folder: Path,
     job: Job,
     asset: Asset,
-    atlas: Atlas,
-    maps: Sequence[Maps],
+    sets: Iterable[tuple[Texels, Maps]],
     report: Report,
     edited: Edited = UNEDITED,
 ) -> None:
-    """The files that other programs open; `edited` holds textures that a person painted over."""
+    """The files that other programs open, set after set; `edited` holds textures that a person painted over."""
     provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed}
-    asset_files.write(folder, job, asset, atlas.texels, maps, provenance, report, edited)
+    asset_files.write(folder, job, asset, sets, provenance, report, edited)

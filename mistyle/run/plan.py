@@ -6,30 +6,43 @@ The times are products of counts and constants that were read off `python -m ben
 """
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from mistyle.core.errors import InputRefused
+from mistyle.files.raw import Extent
 from mistyle.run.budget import (
+    BAKE,
+    BAKE_TILED,
+    BAKED,
     COVERED,
+    DRAWN,
     MATERIAL,
     PLAIN,
+    RENDER,
+    RENDER_TILED,
     SEEN,
     SHOWN,
+    STYLED,
     TILED,
+    Counts,
+    Need,
+    bake_counts,
     check_material,
     counts,
     looked_at,
     material_counts,
     material_gb,
-    memory_gb,
+    must_tile,
     peaks,
-    tiles,
+    render_counts,
     view_pixels,
+    within_gb,
 )
 from mistyle.run.inputs import input_files
-from mistyle.run.settings import thread_count
+from mistyle.run.settings import Settings, thread_count
 from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
 from mistyle.stages.recover_settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
@@ -49,8 +62,7 @@ PER_BOUNCED_PATH = 1e-7
 PER_SMOOTHED = 1.5e-5
 PER_JOINT = 1.5e-5  # of a pixel that shows the object, for each joint step
 
-# Bytes of a face in a file of each kind, roughly; only the time of unwrapping hangs on it.
-BYTES_PER_FACE = {".obj": 60, ".ply": 35, ".stl": 50, ".off": 50, ".glb": 40, ".gltf": 40}
+PER_TABLE_PIXEL = 4e-8  # of all views, for each texture set that is baked
 
 BYTES_PER_TEXEL = 190
 BYTES_PER_VIEW_PIXEL = 60
@@ -58,18 +70,17 @@ BYTES_PER_VIEW_PIXEL = 60
 
 def plan(job: Job) -> dict[str, Any]:
     """Stages with estimated seconds, and the disk they take; refuses a missing mesh or picture as the job would."""
-    files = input_files(job.mesh)
+    extent = extent_of(job.mesh, job.settings)
     if not job.style.is_file():
         raise InputRefused(f"{job.style}: found nothing, expected a picture; check the path")
     s = job.settings
     pixels = view_pixels(s)
-    texels = s.atlas.size**2
-    faces = _faces(files)
+    texels = extent.sets * s.atlas.size**2
     crops = (s.fit.iterations1 + (s.fit.iterations2 if s.fit.refine == "all" else 0)) * s.fit.crops
     crops *= s.fit.refine != "off"
     frames = s.report.frames * s.report.resolution**2 * s.report.spp
     seconds = {
-        "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),
+        "mesh": _reading(extent),
         "texels": texels * PER_TEXEL,
         "views": pixels * (s.draw.spp * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
         "surface": s.surface.samples * PER_SURFACE_SAMPLE,
@@ -84,11 +95,57 @@ def plan(job: Job) -> dict[str, Any]:
     return {
         "mesh": str(job.mesh),
         "style": str(job.style),
-        **_costs(job, STAGES, seconds),
-        "memory_gb": memory_gb(s, faces),
-        "in_files": tiles(s, faces),
-        "peaks_gb": peaks(TILED if tiles(s, faces) else PLAIN, counts(s, faces)),
+        **_costs(job, STAGES, seconds, extent.sets),
+        **_memory(s, lambda c: counts(c, extent.faces, extent.sets, extent.own), PLAIN, TILED, STYLED),
         "disk_gb": round((texels * BYTES_PER_TEXEL + 2 * pixels * BYTES_PER_VIEW_PIXEL) / 1e9, 2),
+    }
+
+
+def plan_render(mesh: Path, out: Path, settings: Settings) -> dict[str, Any]:
+    """The same for `mistyle render`."""
+    extent = extent_of(mesh, settings)
+
+    def count(chosen: Settings) -> Counts:
+        return render_counts(chosen, extent.faces, extent.sets, extent.own)
+
+    pixels = count(settings).view
+    seconds = {
+        "mesh": _reading(extent),
+        "views": 2 + pixels * (settings.draw.spp * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
+    }
+    job = Job(mesh, mesh, out, settings, mesh.stem)
+    return {
+        "mesh": str(mesh),
+        "views": f"{pixels / 1e6:.1f} megapixels of views",
+        **_costs(job, STAGES, seconds, extent.sets),
+        **_memory(settings, count, RENDER, RENDER_TILED, DRAWN),
+        "disk_gb": round(pixels * BYTES_PER_VIEW_PIXEL / 1e9, 2),
+    }
+
+
+def plan_bake(mesh: Path, views: Path, out: Path, settings: Settings, name: str) -> dict[str, Any]:
+    """The same for `mistyle bake`, whose views' cameras are read."""
+    from mistyle.files.views import view_cameras
+
+    extent = extent_of(mesh, settings)
+    sizes = [camera.size[0] * camera.size[1] for camera in view_cameras(views)]
+    texels = extent.sets * settings.atlas.size**2
+
+    def count(chosen: Settings) -> Counts:
+        return bake_counts(sizes, chosen, extent.faces, extent.sets, extent.own)
+
+    seconds = {
+        "mesh": _reading(extent),
+        "asset": 4 * texels * PER_TEXEL + extent.sets * sum(sizes) * PER_TABLE_PIXEL,
+    }
+    return {
+        "mesh": str(mesh),
+        "pictures": len(sizes),
+        "megapixels": round(sum(sizes) / 1e6, 1),
+        "references": str(views),
+        **_costs(Job(mesh, views, out, settings, name), STAGES, seconds, extent.sets),
+        **_memory(settings, count, BAKE, BAKE_TILED, BAKED),
+        "disk_gb": round(texels * BYTES_PER_TEXEL / 1e9, 2),
     }
 
 
@@ -101,10 +158,11 @@ def plan_material(job: Any) -> dict[str, Any]:
     from mistyle.run.material import pixels_of, references_of
     from mistyle.stages.recover_solve import STARTS
 
-    s, files = job.settings, input_files(job.mesh)
+    s, extent = job.settings, extent_of(job.mesh, job.settings)
+    size = extent.faces, extent.sets, extent.own
     sizes = pixels_of(references_of(job))
-    faces, texels = _faces(files), s.atlas.size**2
-    check_material(s, sizes, faces)
+    texels = extent.sets * s.atlas.size**2
+    chosen = check_material(s, sizes, *size)
     averaged = looked_at(s, sizes)
     looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
@@ -117,7 +175,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     paths = samples * sum(min(n, MOST**2) for n in averaged)
     words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
-        "mesh": 1 + (0 if s.read.uv == "keep" else faces * PER_UNWRAPPED_FACE),
+        "mesh": _reading(extent),
         "texels": texels * PER_TEXEL,
         "cameras": 1,
         "pictures": sum(sizes) * PER_READ_PIXEL,
@@ -137,47 +195,81 @@ def plan_material(job: Any) -> dict[str, Any]:
         "references": str(job.references),
         "pictures": len(sizes),
         "megapixels": round(sum(sizes) / 1e6, 1),
-        **_costs(job, MATERIAL_STAGES, seconds),
-        "memory_gb": material_gb(s, sizes, faces),
+        **_costs(job, MATERIAL_STAGES, seconds, extent.sets),
+        "memory_gb": material_gb(chosen, sizes, *size),
         "in_files": False,
-        "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, faces)),
+        "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, *size)),
         "disk_gb": round((texels * BYTES_PER_TEXEL + kept) / 1e9, 2),
     }
 
 
-def _faces(files: Sequence[Path]) -> int:
-    """Of a mesh in these files, by their size."""
-    size = sum(f.stat().st_size for f in files if f.suffix.lower() in (*BYTES_PER_FACE, ".bin"))
-    return size // BYTES_PER_FACE.get(files[0].suffix.lower(), 50)
+def extent_of(mesh: Path, settings: Any) -> Extent:
+    """How large the asset of a mesh file will be; the file is read, but nothing is unwrapped."""
+    files = input_files(mesh)
+    stamps = tuple((str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files)
+    return _extent(mesh, settings.read.uv, settings.read.max_faces, settings.atlas.size, stamps)
 
 
-def _costs(job: Any, stages: Mapping[str, str], seconds: Mapping[str, float]) -> dict[str, Any]:
+@lru_cache(maxsize=64)  # a batch names few meshes many times
+def _extent(mesh: Path, uv: Literal["keep", "new", "auto"], max_faces: int, size: int, stamps: object) -> Extent:
+    """`stamps` tells a file that was changed from what it was."""
+    from mistyle.files.read import read_extent
+
+    return read_extent(mesh, uv=uv, max_faces=max_faces, size=size)
+
+
+def _reading(extent: Extent) -> float:
+    """Seconds of the stage 'mesh'."""
+    return 1 + extent.unwrapped * PER_UNWRAPPED_FACE
+
+
+def _memory(
+    settings: Any,
+    count: Callable[[Any], Counts],
+    plain: Mapping[str, Need],
+    tiled: Mapping[str, Need],
+    keys: Sequence[str],
+) -> dict[str, Any]:
+    """GB at most and of each stage, and whether large arrays will lie in files; refuses what the job would refuse."""
+    tile = must_tile(settings, count, plain, tiled, keys)
+    return {
+        "memory_gb": within_gb(settings, count(settings), plain, tiled),
+        "in_files": tile,
+        "peaks_gb": peaks(tiled if tile else plain, count(settings)),
+    }
+
+
+def _costs(job: Any, stages: Mapping[str, str], seconds: Mapping[str, float], sets: int) -> dict[str, Any]:
     scale = 2 / thread_count(job.settings)
     return {
         "out": str(job.out),
         "name": job.name,
+        "texture_sets": sets,
         "stages": [{"stage": k, "what": stages[k], "seconds": round(v * scale, 1)} for k, v in seconds.items()],
         "seconds": round(sum(seconds.values()) * scale),
-        "free_gb": round(shutil.disk_usage(_existing(job.out)).free / 1e9, 1),
+        "free_gb": round(shutil.disk_usage(existing(job.out)).free / 1e9, 1),
     }
 
 
-def _existing(folder: Path) -> Path:
+def existing(folder: Path) -> Path:
     """The folder, or the nearest one above it that is there."""
     folder = folder.absolute()
-    return folder if folder.exists() else _existing(folder.parent)
+    return folder if folder.exists() else existing(folder.parent)
 
 
 def describe_plan(estimate: dict[str, Any]) -> str:
     """The plan as a person reads it."""
     if "style" in estimate:
         relation = f"in the style of {estimate['style']}"
+    elif "views" in estimate:
+        relation = f"in {estimate['views']}"
     else:
         told = f"{estimate['pictures']} pictures, {estimate['megapixels']} megapixels"
         relation = f"from {told} of {estimate['references']}"
     lines = [f"{estimate['mesh']} {relation} -> {estimate['out']}"]
     lines += [f"  {row['what']:<36} about {row['seconds']:7.1f} s" for row in estimate["stages"]]
-    lines.append(f"  in all about {estimate['seconds']} s, if one texture set is made and nothing is taken over")
+    sets = "1 texture set" if estimate["texture_sets"] == 1 else f"{estimate['texture_sets']} texture sets"
+    lines.append(f"  in all about {estimate['seconds']} s for {sets}, if nothing is taken over")
     files = ", large arrays in files" if estimate["in_files"] else ""
     lines.append(f"  memory at most about {estimate['memory_gb']} GB{files}")
     lines.append(f"  disk about {estimate['disk_gb']} GB; free there: {estimate['free_gb']} GB")

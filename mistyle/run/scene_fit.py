@@ -20,7 +20,7 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.names import asset_name
 from mistyle.files.keeper import Keeper
-from mistyle.files.output import claim
+from mistyle.files.output import claim, keep_folder
 from mistyle.files.store import atomic_write, digest
 from mistyle.run import checkpoint
 from mistyle.run.charts import Chart
@@ -63,6 +63,7 @@ def run_scene(options: argparse.Namespace) -> int:
     paths = reference_files(options.shots, [every[k].id() for k in numbers], len(every), numbers)
     progress = Progress()
     with Keeper(options.out, progress.note, overwrite=options.overwrite) as keeper, Keeper(options.out / "work"):
+        keep_folder(options.out, "work")
         summary = _fit(options, keeper, file, [p.key for p in chosen], numbers, paths, progress)
     if options.json:
         print(json.dumps(summary))

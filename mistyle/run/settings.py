@@ -76,7 +76,7 @@ class Settings(BaseModel):
         ge=0,
         le=100_000,
         description="GB of main memory that the job may take (then large arrays lie in files of its work folder where "
-        "they must, with the same result; a job that cannot keep it is refused); 0: as much as it takes",
+        "they must, with the same result; a job that cannot keep it is refused); 0: nine tenths of what there is",
     )
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     stylizer: Literal["embedded", "embedded-view", "diffusion"] = Field(

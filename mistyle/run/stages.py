@@ -115,6 +115,7 @@ class Run(Generic[Work]):
         self.base = digest([program(), thread_count(job.settings), job.settings.variant])
         self.visible = Keeper(job.out, progress.note, overwrite=job.overwrite)
         try:
+            output.keep_folder(job.out, "work")
             self.hidden = Keeper(job.out / "work", progress.note, overwrite=job.overwrite)
         except BaseException:
             self.visible.close()
@@ -126,10 +127,11 @@ class Run(Generic[Work]):
     def __exit__(self, *_: object) -> None:
         self.visible.close()
         self.hidden.close()
-        for folder in (self.job.out / "work", self.job.out):
-            # A job that was refused before its first stage leaves no empty folders behind.
-            with contextlib.suppress(OSError):  # not empty; or where a disk is mounted
-                folder.rmdir()
+        # A job that was refused before its first stage leaves no empty folders behind.
+        with contextlib.suppress(OSError):  # not empty; or where a disk is mounted
+            (self.job.out / "work").rmdir()
+            output.forget_folder(self.job.out, "work")
+            self.job.out.rmdir()
 
     def stage(self, name: str, after: Sequence[str], inputs: Any, write: Callable[[Path, Report], object]) -> Path:
         """The folder of stage `name`, taken over or made; it depends on `inputs` and on the stages `after`."""

@@ -9,7 +9,7 @@ import numpy as np
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera, rig
 from mistyle.core.cores import use_threads
-from mistyle.core.maps import Maps
+from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.run.made import Atlas
 from mistyle.run.progress import Report
@@ -37,15 +37,30 @@ def read(path: Path, chosen: ReadSettings, size: int, report: Report) -> Asset:
 
 def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:
     """Rasterise every texture set and lay the asset's own material into it."""
-    from mistyle.stages.texels import rasterise, start_maps
-
     texels, start = [], []
     for part in range(len(asset.mesh.parts)):
-        texels.append(rasterise(asset.mesh, part, settings.atlas.size))
-        metallic = "zero" if settings.fit.metallic == "zero" else "keep"
-        start.append(start_maps(asset.materials[part], texels[-1], settings.atlas.size, metallic))
+        where, maps = lay_out_one(asset, part, settings)
+        texels.append(where)
+        start.append(maps)
         report((part + 1) / len(asset.mesh.parts))
     return Atlas(tuple(texels), tuple(start))
+
+
+def lay_out_one(asset: Asset, part: int, settings: Settings) -> tuple[Texels, Maps]:
+    """One texture set of `lay_out`."""
+    from mistyle.stages.texels import rasterise, start_maps
+
+    texels = rasterise(asset.mesh, part, settings.atlas.size)
+    metallic = "zero" if settings.fit.metallic == "zero" else "keep"
+    return texels, start_maps(asset.materials[part], texels, settings.atlas.size, metallic)
+
+
+def own_maps(asset: Asset, settings: Settings) -> list[OwnMaps]:
+    """The asset's own material as its file has it, for pictures that need no atlas: each map at its own resolution."""
+    from mistyle.render.lookdev import material_maps
+
+    metallic = "zero" if settings.fit.metallic == "zero" else "keep"
+    return [material_maps(material, metallic) for material in asset.materials]
 
 
 def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> list[Camera]:

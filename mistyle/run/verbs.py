@@ -1,18 +1,36 @@
 """The verbs `render` and `bake`: single stages for people who draw or paint the views themselves."""
 
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mistyle.core.asset import Asset
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.view import View
 from mistyle.files.output import claim, read_written, replace_files
+from mistyle.run.budget import (
+    BAKE,
+    BAKE_TILED,
+    BAKED,
+    DRAWN,
+    RENDER,
+    RENDER_TILED,
+    bake_counts,
+    kept,
+    render_counts,
+    size_of,
+)
 from mistyle.run.inputs import input_files
 from mistyle.run.material_outlines import tell_views
 from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
+from mistyle.run.plan import existing
 from mistyle.run.progress import Progress
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Job
-from mistyle.run.start import draw, lay_out, read, start_engines
+from mistyle.run.start import draw, lay_out_one, own_maps, read, start_engines
 
 
 def render_views(
@@ -21,16 +39,18 @@ def render_views(
     """`mistyle render`: the views of section 4.1.1 for any mesh."""
     inputs = [*input_files(mesh), *filter(None, (settings.rig.file, settings.draw.scene))]
     claim(out, files_of_views(settings), inputs=inputs, overwrite=overwrite)
-    start_engines(settings)
-    with progress.stage("mesh", "read the mesh") as report:
-        asset = read(mesh, settings.read, settings.atlas.size, report)
-        atlas = lay_out(asset, settings, lambda done: None)
-    progress.note(*asset.source.notes)
-    with progress.stage("views", "render the views") as report:
-        replace_files(
-            out, "render", lambda folder: draw(folder, asset, atlas.start, settings, report, progress.note),
-            inputs=inputs, overwrite=overwrite,
-        )  # fmt: skip
+    with kept(settings, existing(out), render_counts, RENDER, RENDER_TILED, DRAWN) as look_again:
+        start_engines(settings)
+        with progress.stage("mesh", "read the mesh") as report:
+            asset = read(mesh, settings.read, settings.atlas.size, report)
+        progress.note(*asset.source.notes)
+        look_again(*size_of(asset))
+        maps = own_maps(asset, settings)
+        with progress.stage("views", "render the views") as report:
+            replace_files(
+                out, "render", lambda folder: draw(folder, asset, maps, settings, report, progress.note),
+                inputs=inputs, overwrite=overwrite,
+            )  # fmt: skip
     return sorted(out / name for name, entry in read_written(out).files.items() if entry.by == "render")
 
 
@@ -53,33 +73,51 @@ def bake_views(
     mesh: Path, views: Path, out: Path, settings: Settings, name: str, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
     """`mistyle bake`: anyone's pictures of known cameras projected onto the texture (section 4.1.4)."""
-    from mistyle.files.views import read_views
-    from mistyle.stages.backproject import backproject, fill
+    from mistyle.files.views import read_views, view_cameras
     from mistyle.stages.export import asset_names
 
     inputs = [*input_files(mesh), views]
     claim(out, [f"{name}.glb", f"{name}.json"], inputs=inputs, overwrite=overwrite)
-    with progress.stage("mesh", "read the mesh") as report:
-        asset = read(mesh, settings.read, settings.atlas.size, report)
+    sizes = [camera.size[0] * camera.size[1] for camera in view_cameras(views)]
+    with kept(settings, existing(out), partial(bake_counts, sizes), BAKE, BAKE_TILED, BAKED) as look_again:
+        with progress.stage("mesh", "read the mesh") as report:
+            asset = read(mesh, settings.read, settings.atlas.size, report)
         claim(out, asset_names(name, asset.mesh.parts), inputs=inputs, overwrite=overwrite)
         start_engines(settings)
-        atlas = lay_out(asset, settings, lambda done: None)
-    progress.note(*asset.source.notes)
-    pictures = read_views(views)
-    tell_views(asset.mesh, pictures, progress)
-    seen_by = with_geometry(asset, pictures)
-    maps = []
-    with progress.stage("bake", "bake the texture") as report:
-        for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
-            baked = backproject(seen_by, texels, settings.bake, mesh=asset.mesh)
-            maps.append(replace(start, albedo=fill(baked, texels), known=baked.known))
-            report((part + 1) / len(atlas.texels))
-    job = Job(mesh, views, out, settings, name)
-    with progress.stage("asset", "write the asset") as report:
-        replace_files(
-            out, "bake", lambda folder: write_asset(folder, job, asset, atlas, maps, report), inputs=inputs,
-            overwrite=overwrite,
-        )  # fmt: skip
-    shares = [float(m.known.sum() / max(t.covered.sum(), 1)) for m, t in zip(maps, atlas.texels, strict=True)]
+        progress.note(*asset.source.notes)
+        look_again(*size_of(asset))
+        pictures = read_views(views)
+        tell_views(asset.mesh, pictures, progress)
+        seen_by = with_geometry(asset, pictures)
+        shares: list[float] = []
+        job = Job(mesh, views, out, settings, name)
+        with progress.stage("asset", "bake and write the texture") as report:
+            sets = baked_sets(asset, seen_by, settings, shares)
+            replace_files(
+                out, "bake", lambda folder: write_asset(folder, job, asset, sets, report), inputs=inputs,
+                overwrite=overwrite,
+            )  # fmt: skip
     painted = dict(zip(asset.mesh.parts, shares, strict=True))
     return {"asset": str(out / f"{name}.glb"), "painted": painted, "notes": list(progress.notes)}
+
+
+def baked_sets(
+    asset: Asset, views: Sequence[View], settings: Settings, shares: list[float]
+) -> Iterator[tuple[Texels, Maps]]:
+    """Texture set after texture set, made when it is asked for: its texels, and its own material with what the views
+    show in place of the albedo. `shares` receives how much of each set some view saw."""
+    for part in range(len(asset.mesh.parts)):
+        # No name here holds a set: it can go before the next one is made.
+        yield baked_set(asset, part, views, settings, shares)
+
+
+def baked_set(
+    asset: Asset, part: int, views: Sequence[View], settings: Settings, shares: list[float]
+) -> tuple[Texels, Maps]:
+    """One texture set of `baked_sets`."""
+    from mistyle.stages.backproject import backproject, fill
+
+    texels, start = lay_out_one(asset, part, settings)
+    baked = backproject(views, texels, settings.bake, mesh=asset.mesh)
+    shares.append(float(baked.known.sum() / max(texels.covered.sum(), 1)))
+    return texels, replace(start, albedo=fill(baked, texels), known=baked.known)

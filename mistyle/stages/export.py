@@ -9,7 +9,7 @@ With several parts (texture sets) the textures are called <name>_<part>_<map>.
 """
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,11 +58,24 @@ def write_asset(
     *,
     provenance: dict[str, Any],
 ) -> dict[str, Any]:
+    """`write_sets` of maps, occlusions and texels that are there already, one entry per part of the mesh each."""
+    return write_sets(folder, name, asset, zip(maps, occlusion, texels, strict=True), provenance=provenance)
+
+
+def write_sets(
+    folder: Path,
+    name: str,
+    asset: Asset,
+    sets: Iterable[tuple[Maps, Float[np.ndarray, "h w"], Texels]],
+    *,
+    provenance: dict[str, Any],
+) -> dict[str, Any]:
     """Write GLB, textures and the list of files into `folder`; returns the list (the content of <name>.json).
 
-    `maps`, `occlusion` (1 is open) and `texels` have one entry per part of the mesh; the maps arrive padded around
-    their islands. glTF sources are patched, all others written anew. `provenance` must hold JSON values and nothing
-    that differs from run to run (no times): it goes into the GLB and the list, and equal inputs give equal bytes.
+    `sets` gives maps, occlusion (1 is open) and texels of every part of the mesh in turn; one set is written before the
+    next is taken, and only its PNG files are kept. The maps arrive padded around their islands. glTF sources are
+    patched, all others written anew. `provenance` must hold JSON values and nothing that differs from run to run (no
+    times): it goes into the GLB and the list, and equal inputs give equal bytes.
 
     The folder is filled beside its place and put there when complete; what an earlier export of the same name wrote
     and nobody edited goes, all other files stay. Raises UsageError for a name that is no file name, and where a file
@@ -72,24 +85,26 @@ def write_asset(
     result: dict[str, Any] = {}
 
     def fill(new: Path) -> None:
-        result.update(_write(new, name, asset, maps, occlusion, texels, provenance))
+        result.update(_write(new, name, asset, sets, provenance))
 
     put_folder(folder, fill, lambda target: _earlier(target, name))
     return result
 
 
-def _write(new: Path, name: str, asset: Asset, maps, occlusion, texels, provenance: dict[str, Any]) -> dict[str, Any]:
+def _write(new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any]) -> dict[str, Any]:
     stems = part_stems(name, asset.mesh.parts)
-    alphas = _alphas(asset, texels)
+    found = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
     pictures: list[Pictures] = []
     files: list[dict[str, Any]] = []
+    given = iter(sets)
     for part, stem in enumerate(stems):
-        pictures.append(encode_pictures(maps[part], occlusion[part], alphas[part]))
-        written = _write_textures(new / "textures", stem, maps[part], occlusion[part], alphas[part], pictures[part])
+        # No name here holds a set: it can go before the next one is made.
+        made, written = _write_set(new, stem, asset, found.get(part), next(given))
+        pictures.append(made)
         files += [_entry(new, path, part=asset.mesh.parts[part], **about) for path, about in written]
     write = patch_glb if asset.source.kind in ("glb", "gltf") else write_glb
     glb = new / f"{name}.glb"
-    write(glb, asset, maps, occlusion, name=name, provenance=provenance, pictures=pictures)
+    write(glb, asset, (), (), name=name, provenance=provenance, pictures=pictures)
     manifest = {
         "generator": f"mistyle {__version__}",
         "name": name,
@@ -113,6 +128,16 @@ def asset_names(name: str, parts: Sequence[str]) -> list[str]:
     stems = part_stems(name, parts)
     maps = [f"textures/{stem}_{kind}.{ext}" for stem in stems for kind in CHANNELS for ext in ("png", "exr")]
     return [f"{name}.glb", f"{name}.json", *maps]
+
+
+def _write_set(
+    new: Path, stem: str, asset: Asset, cutout: Cutout | None, given: tuple[Maps, np.ndarray, Texels]
+) -> tuple[Pictures, list[tuple[Path, dict[str, Any]]]]:
+    """The PNG files of one part for the GLB, and its texture files with what to say about each."""
+    maps, occlusion, texels = given
+    alpha = None if cutout is None else _carried(asset, cutout, texels)
+    pictures = encode_pictures(maps, occlusion, alpha)
+    return pictures, _write_textures(new / "textures", stem, maps, occlusion, alpha, pictures)
 
 
 def _write_textures(
@@ -165,12 +190,6 @@ def _earlier(folder: Path, name: str) -> set[str]:
     except (OSError, ValueError, LookupError, TypeError):
         return set()
     return {own, *(f for f, value in listed.items() if (folder / f).is_file() and sha256_file(folder / f) == value)}
-
-
-def _alphas(asset: Asset, texels: Sequence[Texels]) -> list[Float[np.ndarray, "h w"] | None]:
-    """The opacity of cut-out and blended glTF materials, carried over to the texels; None for opaque parts."""
-    found = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
-    return [_carried(asset, found[p], texels[p]) if p in found else None for p in range(len(texels))]
 
 
 def _carried(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, "h w"]:
