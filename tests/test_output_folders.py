@@ -95,6 +95,15 @@ def test_what_is_not_ours_is_refused_before_any_work(verb_inputs, tmp_path, monk
     assert not left or verb == "shard" and left == {output.RECORD, "shards", "shards/one.failed.json"}
 
 
+@pytest.mark.parametrize("verb", ["render", "bake", "stylize", "demo", "fit"])
+def test_a_dry_run_refuses_what_the_run_would(verb_inputs, tmp_path, capsys, verb):
+    out = tmp_path / "out"
+    plant(out, VERBS[verb].covers[0])
+    before = everything(out)
+    assert main([*VERBS[verb].words(verb_inputs, out), "--dry-run"]) == 2
+    assert "mistyle did not" in capsys.readouterr().err and everything(out) == before
+
+
 @pytest.mark.parametrize("verb", [v for v in VERBS if VERBS[v].older])
 def test_a_folder_of_an_older_version_is_refused_with_that_reason(verb_inputs, tmp_path, capsys, verb):
     out = tmp_path / "out"

@@ -335,7 +335,9 @@ def _render(options: argparse.Namespace) -> int:
     settings = _settings(options)
     if options.dry_run:
         from mistyle.run.plan import plan_render
+        from mistyle.run.verbs import claim_views
 
+        claim_views(options.mesh, options.out, settings, options.overwrite)
         return _tell_plan(options, plan_render(options.mesh, options.out, settings))
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import render_views
@@ -355,7 +357,9 @@ def _bake(options: argparse.Namespace) -> int:
     settings, called = _settings(options), asset_name(options, options.mesh.stem)
     if options.dry_run:
         from mistyle.run.plan import plan_bake
+        from mistyle.run.verbs import claim_baked
 
+        claim_baked(options.mesh, options.views, options.out, called, options.overwrite)
         return _tell_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import bake_views

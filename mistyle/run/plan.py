@@ -43,7 +43,7 @@ from mistyle.run.budget import (
 )
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import Settings, thread_count
-from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job
+from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job, claim_run
 from mistyle.stages.recover_settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
 # Seconds on two cores, per unit named.
@@ -69,8 +69,12 @@ BYTES_PER_VIEW_PIXEL = 60
 
 
 def plan(job: Job) -> dict[str, Any]:
-    """Stages with estimated seconds, and the disk they take; refuses a missing mesh or picture as the job would."""
+    """Stages with estimated seconds, and the disk they take; refuses a missing mesh or picture, and a folder with the
+    user's files in the way, as the job would."""
+    from mistyle.run.pipeline import inputs_of
+
     extent = extent_of(job.mesh, job.settings)
+    claim_run(job, STAGES, inputs_of(job))
     if not job.style.is_file():
         raise InputRefused(f"{job.style}: found nothing, expected a picture; check the path")
     s = job.settings
@@ -155,10 +159,11 @@ def plan_material(job: Any) -> dict[str, Any]:
     How much of the pictures shows the object is not known yet: run/budget.py's shares are taken.
     """
     from mistyle.render.indirect import MOST
-    from mistyle.run.material import pixels_of, references_of
+    from mistyle.run.material import inputs_of, pixels_of, references_of
     from mistyle.stages.recover_solve import STARTS
 
     s, extent = job.settings, extent_of(job.mesh, job.settings)
+    claim_run(job, MATERIAL_STAGES, inputs_of(job))
     size = extent.faces, extent.sets, extent.own
     sizes = pixels_of(references_of(job))
     texels = extent.sets * s.atlas.size**2

@@ -37,8 +37,7 @@ def render_views(
     mesh: Path, out: Path, settings: Settings, progress: Progress, *, overwrite: bool = False
 ) -> list[Path]:
     """`mistyle render`: the views of section 4.1.1 for any mesh."""
-    inputs = [*input_files(mesh), *filter(None, (settings.rig.file, settings.draw.scene))]
-    claim(out, files_of_views(settings), inputs=inputs, overwrite=overwrite)
+    inputs = claim_views(mesh, out, settings, overwrite)
     with kept(settings, existing(out), render_counts, RENDER, RENDER_TILED, DRAWN) as look_again:
         start_engines(settings)
         with progress.stage("mesh", "read the mesh") as report:
@@ -52,6 +51,20 @@ def render_views(
                 inputs=inputs, overwrite=overwrite,
             )  # fmt: skip
     return sorted(out / name for name, entry in read_written(out).files.items() if entry.by == "render")
+
+
+def claim_views(mesh: Path, out: Path, settings: Settings, overwrite: bool) -> list[Path]:
+    """The inputs of `mistyle render`; UsageError where it would cover one of them or a file that is not mistyle's."""
+    inputs = [*input_files(mesh), *filter(None, (settings.rig.file, settings.draw.scene))]
+    claim(out, files_of_views(settings), inputs=inputs, overwrite=overwrite)
+    return inputs
+
+
+def claim_baked(mesh: Path, views: Path, out: Path, name: str, overwrite: bool) -> list[Path]:
+    """The same of `mistyle bake`, as far as it is known before the mesh is read."""
+    inputs = [*input_files(mesh), views]
+    claim(out, [f"{name}.glb", f"{name}.json"], inputs=inputs, overwrite=overwrite)
+    return inputs
 
 
 def files_of_views(settings: Settings) -> list[str]:
@@ -76,8 +89,7 @@ def bake_views(
     from mistyle.files.views import read_views, view_cameras
     from mistyle.stages.export import asset_names
 
-    inputs = [*input_files(mesh), views]
-    claim(out, [f"{name}.glb", f"{name}.json"], inputs=inputs, overwrite=overwrite)
+    inputs = claim_baked(mesh, views, out, name, overwrite)
     sizes = [camera.size[0] * camera.size[1] for camera in view_cameras(views)]
     with kept(settings, existing(out), partial(bake_counts, sizes), BAKE, BAKE_TILED, BAKED) as look_again:
         with progress.stage("mesh", "read the mesh") as report:
