@@ -51,7 +51,8 @@ def lora_key(
     """Everything that decides a LoRA's bits, but for the machine."""
     # How often a checkpoint is written decides nothing.
     numbers = training.model_dump(exclude={"save_every"})
-    return digest([kind, np.float32(rgb), word, numbers, identity(settings), settings.precision, seed])
+    own = settings.model_dump(include={"precision", "prediction"})
+    return digest([kind, np.float32(rgb), word, numbers, identity(settings), own, seed])
 
 
 def paths(folder: Path, name: str, key: str) -> Halves:

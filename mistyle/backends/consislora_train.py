@@ -90,7 +90,7 @@ def lesson(pipeline: Any, rgb: Float[np.ndarray, "h w 3"], prompt: str, resoluti
     vae = pipeline.vae
     generator = torch.Generator("cpu").manual_seed(seed)
     with torch.no_grad():
-        posterior = vae.encode(tensor.to(vae.device, vae.dtype)).latent_dist
+        posterior = vae.encode(tensor).latent_dist
         noise = torch.randn(posterior.mean.shape, generator=generator).to(posterior.mean)
         z0 = (posterior.mean + posterior.std * noise) * vae.config.scaling_factor
         text, _, pooled, _ = pipeline.encode_prompt(prompt, do_classifier_free_guidance=False)
@@ -174,7 +174,8 @@ def run_phase(
                 group["lr"] = phase.rate if step < phase.switch else phase.later_rate
             scaler.scale(loss).backward()
             scaler.unscale_(optimiser)
-            torch.nn.utils.clip_grad_norm_(named.values(), settings.clip)
+            if settings.clip:
+                torch.nn.utils.clip_grad_norm_(named.values(), settings.clip)
             scaler.step(optimiser)
             scaler.update()
             optimiser.zero_grad(set_to_none=True)

@@ -118,7 +118,7 @@ def key(job: Job, views: Sequence[View]) -> str:
         ip = models.find("ip-adapter", job.models.folder, [LOOSE_NEEDED["sdxl"]])
         files += [ip / LOOSE_NEEDED["sdxl"], *models.weights(ip / ENCODER)]
     networks = [identity(job.models), models.fingerprint(files)]
-    own = job.models.model_dump(include={"device", "precision", "offload"})
+    own = job.models.model_dump(include={"precision", "prediction"})
     pictures = [view.rgb for view in views]
     return digest([loras, networks, own, job.models.style_lora, job.diffusion, job.style, pictures])
 

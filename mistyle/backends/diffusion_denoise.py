@@ -78,15 +78,14 @@ def tensor_of(rgb: Float[np.ndarray, "h w c"]) -> Float[torch.Tensor, "1 c h w"]
 
 def encode(vae: Any, encoded: Float[np.ndarray, "h w 3"]) -> Float[torch.Tensor, "1 c h2 w2"]:
     """The latent of an sRGB picture: the posterior's mode, scaled, float32."""
-    picture = (tensor_of(encoded) * 2 - 1).to(vae.device, vae.dtype)
     with torch.no_grad():
-        return vae.encode(picture).latent_dist.mode().float() * vae.config.scaling_factor
+        return vae.encode(tensor_of(encoded) * 2 - 1).latent_dist.mode().float() * vae.config.scaling_factor
 
 
 def decode(vae: Any, latent: Float[torch.Tensor, "1 c h w"]) -> Float[np.ndarray, "h2 w2 3"]:
     """The sRGB picture of a latent, 0..1."""
     with torch.no_grad():
-        picture = vae.decode((latent / vae.config.scaling_factor).to(vae.dtype)).sample
+        picture = vae.decode(latent / vae.config.scaling_factor).sample
     return (picture[0].permute(1, 2, 0).float().cpu().numpy() / 2 + 0.5).clip(0, 1).astype(np.float32)
 
 

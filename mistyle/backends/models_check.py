@@ -131,7 +131,10 @@ def need(
 
 
 def room(device: str) -> float:
-    """GB that are free on a device."""
+    """GB that are free on a device, networks that nobody holds any more counted as gone."""
+    from mistyle.backends.models_load import empty
+
+    empty(device)
     if device == "cuda":
         import torch
 

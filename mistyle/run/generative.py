@@ -100,9 +100,8 @@ def inpainter_inputs(settings: Settings, style: Picture) -> list[Any]:
         return []
     from mistyle.backends.paint3d import identity
 
-    own = settings.models.model_dump(include={"device", "precision", "offload"})
-    networks = identity(settings.models, settings.paint3d)
-    return [settings.inpainter, settings.paint3d, own, networks, style.rgb, style.alpha]
+    chosen = settings.paint3d.model_dump(exclude={"precision"})
+    return [settings.inpainter, chosen, identity(settings.models, settings.paint3d), style.rgb, style.alpha]
 
 
 def texture_inpainter(settings: Settings, asset: Asset, style: Picture) -> Inpainter:
