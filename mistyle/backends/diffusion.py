@@ -181,7 +181,7 @@ def _pipeline(job: Job) -> tuple[Any, list[Any]]:
     device = device_of(job.models)
     dtype = precision_of(job.models, device)
     place, controls = _places(job.models, job.diffusion)
-    parts = base_parts(place, "sdxl", dtype, job.models.checkpoint)
+    parts = base_parts(place, "sdxl", dtype, job.models.checkpoint, job.models.prediction)
     pipeline = StableDiffusionXLControlNetPipeline(
         **parts, controlnet=controlnets(controls, dtype), add_watermarker=False
     )

@@ -136,7 +136,7 @@ def denoiser(
             )
             if asked.picture:
                 more = more | {"image_embeds": list(asked.picture)}
-            eps = unet(
+            said = unet(
                 both,
                 time,
                 encoder_hidden_states=asked.text,
@@ -145,14 +145,21 @@ def denoiser(
                 mid_block_additional_residual=middle,
                 return_dict=False,
             )[0].float()
-            nothing, something = eps.chunk(2)
+            nothing, something = said.chunk(2)
             guided = nothing + asked.guidance * (something - nothing)
             if terms:
                 residuals = [d[1:] for d in down], middle[1:]
                 guided = guided + _terms(pipeline, terms, prompts or {}, scaled, time, asked, residuals)
-        return x - sigma * guided
+        return clean(pipeline.scheduler.config.prediction_type, guided, x, sigma)
 
     return denoise
+
+
+def clean(prediction: str, said: torch.Tensor, x: torch.Tensor, sigma: float) -> torch.Tensor:
+    """The clean latent that follows from what the network says of `x`: its noise, or its velocity."""
+    if prediction == "v_prediction":
+        return x / (sigma**2 + 1) - said * (sigma / (sigma**2 + 1) ** 0.5)
+    return x - sigma * said
 
 
 def activate(pipeline: Any, adapters: Mapping[str, float]) -> None:

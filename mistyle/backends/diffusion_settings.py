@@ -24,8 +24,8 @@ class ModelSettings(BaseModel):
     )
     precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
         default="auto",
-        description="of frozen networks; auto: bfloat16 on a GPU that computes it, float16 on others, float32 on a CPU. "
-        "VAEs stay float32",
+        description="of frozen networks; auto: bfloat16 on a GPU that computes it, float16 on others, float32 on a "
+        "CPU. VAEs stay float32",
     )
     prediction: Literal["auto", "epsilon", "v_prediction"] = Field(
         default="auto", description="what an SDXL checkpoint predicts; auto: as its scheduler or its file says"
@@ -56,8 +56,8 @@ class TrainSettings(BaseModel):
     clip: float = Field(
         default=0,
         ge=0,
-        description="largest norm of a step's gradient; 0: unlimited, as in ConsisLoRA's script, whose clipping is handed "
-        "a list that is used up",
+        description="largest norm of a step's gradient; 0: unlimited, as ConsisLoRA's script in effect has it, whose "
+        "clipping is handed a list that is used up",
     )
     resolution: int = Field(default=1024, ge=16, le=4096, description="pixels of the picture's short side")
     save_every: int = Field(default=100, ge=1, description="steps between checkpoints")

@@ -1,7 +1,5 @@
 """From folders to networks: every weight is a safetensors file on disk, no code of a model's author is run."""
 
-import gc
-import sys
 import warnings
 from collections.abc import Mapping
 from contextlib import contextmanager
@@ -12,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mistyle.backends import models
+from mistyle.backends import models, models_check
 from mistyle.backends.diffusion_settings import ModelSettings
 from mistyle.backends.models_list import ENCODER
 from mistyle.core.errors import EnvironmentMissing
@@ -49,18 +47,6 @@ def computes_bfloat16(device: str) -> bool:
     return device != "mps"
 
 
-def empty(device: str) -> None:
-    """Give back what networks left on a device: those that nobody holds any more, and memory kept for later ones."""
-    gc.collect()
-    if "drjit" in sys.modules:
-        from mistyle.render.device import give_back
-
-        give_back()
-    kept = getattr(torch, torch.device(device).type, None)
-    if device != "cpu" and hasattr(kept, "empty_cache"):
-        kept.empty_cache()
-
-
 @contextmanager
 def quiet():
     """diffusers and transformers without their bars and remarks."""
@@ -87,20 +73,17 @@ def network(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
     return made.requires_grad_(False).eval()
 
 
-def base_parts(place: Path, kind: str, dtype: torch.dtype, checkpoint: Path | None = None) -> dict[str, Any]:
-    """The parts of a base model ('sdxl' or 'sd15'), as diffusers' pipelines take them; the VAE is float32 (vae.py).
-
-    Sampling is Euler's with trailing spacing for SDXL (ConsisLoRA's choice; the paper's equations (1)-(3) need its
-    unscaled noise levels).
-    """
+def base_parts(
+    place: Path, kind: str, dtype: torch.dtype, checkpoint: Path | None = None, prediction: str = "auto"
+) -> dict[str, Any]:
+    """The parts of a base model ('sdxl' or 'sd15'), as diffusers' pipelines take them; the VAE is float32 (vae.py)."""
     from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
-    from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
     from transformers import CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
 
     from mistyle.backends.vae import ExactVae
 
     if checkpoint is not None:
-        return _from_checkpoint(place, dtype, checkpoint)
+        return _from_checkpoint(place, dtype, checkpoint) | {"scheduler": schedule(place, checkpoint, prediction)}
     parts = {
         "tokenizer": CLIPTokenizer.from_pretrained(place / "tokenizer", local_files_only=True),
         "text_encoder": network(CLIPTextModel, place / "text_encoder", dtype),
@@ -110,13 +93,23 @@ def base_parts(place: Path, kind: str, dtype: torch.dtype, checkpoint: Path | No
     if kind == "sdxl":
         parts["tokenizer_2"] = CLIPTokenizer.from_pretrained(place / "tokenizer_2", local_files_only=True)
         parts["text_encoder_2"] = network(CLIPTextModelWithProjection, place / "text_encoder_2", dtype)
-        parts["scheduler"] = EulerDiscreteScheduler.from_pretrained(place / "scheduler", timestep_spacing="trailing")
+        parts["scheduler"] = schedule(place, None, prediction)
     return parts
+
+
+def schedule(place: Path, checkpoint: Path | None, prediction: str) -> Any:
+    """SDXL's noise levels, Euler's with trailing spacing (ConsisLoRA's choice; the paper's equations (1)-(3) need its
+    unscaled levels), and what the network predicts: as set, else as a single file's marks or the configuration say."""
+    from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
+
+    more: dict[str, Any] = {} if checkpoint is None else models_check.marks(checkpoint)
+    if prediction != "auto":
+        more["prediction_type"] = prediction
+    return EulerDiscreteScheduler.from_pretrained(place / "scheduler", timestep_spacing="trailing", **more)
 
 
 def _from_checkpoint(place: Path, dtype: torch.dtype, checkpoint: Path) -> dict[str, Any]:
     from diffusers.pipelines.stable_diffusion_xl.pipeline_stable_diffusion_xl import StableDiffusionXLPipeline
-    from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
 
     from mistyle.backends.vae import ExactVae
 
@@ -132,7 +125,6 @@ def _from_checkpoint(place: Path, dtype: torch.dtype, checkpoint: Path) -> dict[
     parts["vae"] = vae
     for name in ("text_encoder", "text_encoder_2", "unet", "vae"):
         parts[name].requires_grad_(False).eval()
-    parts["scheduler"] = EulerDiscreteScheduler.from_pretrained(place / "scheduler", timestep_spacing="trailing")
     return parts
 
 

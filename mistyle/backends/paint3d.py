@@ -40,9 +40,7 @@ class Recipe:
 
 RECIPES = {
     # Latents go far beyond the -1..1 that DDIM clips its pictures to unless its configuration says otherwise.
-    "inpaint": Recipe(
-        "inpaint", 9, ("position",), (1.0,), 30, 4.0, 0.6, "DDIMScheduler", {"clip_sample": False}
-    ),
+    "inpaint": Recipe("inpaint", 9, ("position",), (1.0,), 30, 4.0, 0.6, "DDIMScheduler", {"clip_sample": False}),
     "paint3d": Recipe(
         "sd15", 4, ("position", "inpaint-control"), (1.0, 0.5), 20, 3.0, 1.0, "EulerAncestralDiscreteScheduler"
     ),

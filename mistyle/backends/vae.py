@@ -28,6 +28,6 @@ class ExactVae(AutoencoderKL):
         """Pictures of latents (n, 4, h, w), the scale of training taken off."""
         return super().decode(self._brought(z), return_dict=return_dict, generator=generator)
 
-    def _brought(self, x: torch.Tensor) -> torch.Tensor:
+    def _brought(self, x: torch.Tensor) -> Any:
         device = getattr(getattr(self, "_hf_hook", None), "execution_device", None)
         return x.to(self.device if device is None else device, self.dtype)

@@ -104,6 +104,14 @@ def inpainter_inputs(settings: Settings, style: Picture) -> list[Any]:
     return [settings.inpainter, chosen, identity(settings.models, settings.paint3d), style.rgb, style.alpha]
 
 
+def release(settings: Settings) -> None:
+    """Free the device of networks whose stage is over: the next one asks how much is free."""
+    from mistyle.backends.models_check import empty
+    from mistyle.backends.models_load import device_of
+
+    empty(device_of(settings.models))
+
+
 def texture_inpainter(settings: Settings, asset: Asset, style: Picture) -> Inpainter:
     """Paint3D's inpainter, loaded."""
     from mistyle.backends.paint3d import inpainter

@@ -19,7 +19,7 @@ from mistyle.run import asset_files
 from mistyle.run.budget import kept
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.run.generative import check as check_generative
-from mistyle.run.generative import inpainter_inputs, texture_inpainter
+from mistyle.run.generative import inpainter_inputs, release, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
 from mistyle.run.painting import bake, check_coat, coat, coat_files, stylized_stage, unlit_views
@@ -207,6 +207,9 @@ def repair(
         again = network or from_paint(baked.maps[part].albedo)
         maps.append(repair_part(fitted.maps[part], mask, texels, again, settings.repair, rng))
         report(0.3 * (part + 1) / len(atlas.texels))
+    if network is not None:
+        del network, again
+        release(settings)
     maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
     if settings.coat.protect is not None:
         own = [painted_mask(settings.coat.protect, texels) for texels in atlas.texels]

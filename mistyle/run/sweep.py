@@ -82,7 +82,7 @@ def swept(
     s = run.job.settings
     network = s.stylizer == "diffusion"
     if network:
-        from mistyle.run.generative import view_stylizer
+        from mistyle.run.generative import release, view_stylizer
 
         paint = view_stylizer(run, style, views, lambda done: report(0.1 * done))
     else:
@@ -100,6 +100,9 @@ def swept(
         key=key,
     )
     run.progress.say(sentence(result))
+    del paint
+    if network:
+        release(s)
     return result.painted
 
 
