@@ -1,6 +1,7 @@
 """Networks on a device, by a stand-in for it: what lies where, offloading, and what is left between the stages."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -9,10 +10,20 @@ import test_diffusion as views_of
 import test_paint3d as atlas_of
 import tiny_models
 import torch
+from test_surface_paint import asset_of
 
 from mistyle.backends import consislora_make, diffusion, models_check, models_load, paint3d
 from mistyle.backends.diffusion_settings import ModelSettings
+from mistyle.core.asset import Picture
 from mistyle.core.errors import EnvironmentMissing
+from mistyle.core.maps import flat_maps
+from mistyle.run.generative import inpainter_inputs
+from mistyle.run.made import Atlas, Baked
+from mistyle.run.progress import Progress
+from mistyle.run.settings import resolve
+from mistyle.run.stages import Job, Run
+from mistyle.stages.fit import Fit
+from mistyle.stages.texels import rasterise
 
 torch.set_num_threads(1)
 
@@ -90,15 +101,35 @@ def test_offloading_keeps_less_on_the_device(tmp_path, monkeypatch):
 
 
 def test_nothing_is_left_on_the_device_when_a_stage_asks_what_is_free(tmp_path, monkeypatch):
-    """The whole job: every question is asked of an empty device."""
-    from test_generative import SETTINGS, stylize
+    """Sweep with its training, then repair, as a job runs them: every question is asked of an empty device."""
+    from mistyle.run import pipeline
+    from mistyle.run.sweep import swept
 
-    few = {"rig.views": 2, "train.steps": 2, "train.style_steps": 1, "train.switch": 1, "diffusion.steps": 2}
-    few |= {"fit.iterations1": 1, "fit.iterations2": 1, "paint3d.steps": 1, "models.device": "auto"}
-    assert set(few) <= set(SETTINGS)
-    with standin.device(monkeypatch) as found:
-        assert stylize(tmp_path / "out", **few) == 0
-    assert len(found) >= 5, "stylizer and inpainter before the job, stylizer, training, inpainter in it"
+    chosen = {"steps": 1, "repeats": 1, "refinement": 0.0, "content": "shared"}
+    training = {"rank": 4, "steps": 1, "style_steps": 1, "switch": 0, "resolution": 16}
+    texture = {"size": 32, "overlap": 8, "steps": 1}
+    place = {"folder": str(tiny_models.folder()), "precision": "float32"}
+    said = {"stylizer": "diffusion", "inpainter": "paint3d", "models": place, "diffusion": chosen, "train": training}
+    settings = resolve("standard", None, said | {"paint3d": texture, "fit": {"refine": "off"}}, {})
+    job = Job(Path("mesh.obj"), Path("wave.png"), tmp_path, settings, "x")
+    style = Picture(views_of.picture(), None, Path("wave.png"))
+    asset, maps = asset_of(atlas_of.mesh()), (flat_maps(32, albedo=0.3),)
+    texels = rasterise(asset.mesh, 0, 32)
+    atlas, baked, nothing = Atlas((texels,), maps), Baked(maps, (np.ones((32, 32), int),)), (np.zeros((32, 32)),)
+    fitted = Fit(maps, nothing, nothing, {}, {}, {}, ())
+    masks = [atlas_of.middle() & texels.covered]
+    held: list[int] = []
+
+    def report(done: float) -> None:
+        held.append(standin.bytes_alive())
+
+    with standin.device(monkeypatch) as found, Run(job, Progress(quiet=True)) as run:
+        run.keys["surface"] = "k"
+        swept(run, asset, style, atlas, [views_of.view()], report)
+        assert len(found) == 2 and max(held) > 0 == standin.bytes_alive(), "stylizer and training asked"
+        monkeypatch.setattr(pipeline, "settle_relief", lambda *a: held.append(standin.bytes_alive()) or a[2])
+        pipeline.repair(asset, style, atlas, baked, [], fitted, masks, settings, report)
+        assert len(found) == 3 and held[-2] > held[-1] == 0 == standin.bytes_alive()
     assert not any(found)
 
 
@@ -124,11 +155,7 @@ def test_bfloat16_only_where_the_card_has_it(monkeypatch, device, card, chosen):
 
 
 def test_what_decides_nothing_is_in_no_key(tmp_path):
-    from mistyle.core.asset import Picture
-    from mistyle.run.generative import inpainter_inputs
-    from mistyle.run.settings import resolve
-
-    style, seen = Picture(views_of.picture(), None), [views_of.view()]
+    style, seen = Picture(views_of.picture(), None, Path("wave.png")), [views_of.view()]
     plain = {"folder": str(tiny_models.folder()), "device": "cpu"}
 
     def keys(paint: dict, **more) -> tuple:
