@@ -25,6 +25,8 @@ def fetch(name: str, folder: Path, allowed: bool) -> Path:
     proxies are huggingface_hub's. Raises UsageError unless downloading was allowed.
     """
     model = models.get(name)
+    if model.url:
+        raise UsageError(f"'{name}' does not lie on the hub: {models.how_to_get(model, folder)}")
     if not allowed:
         raise UsageError(
             f"fetching '{name}' downloads about {model.gigabytes} GB from {model.repo} under its licence "
@@ -75,7 +77,8 @@ def adopt(name: str, folder: Path) -> Path:
     if lost:
         raise EnvironmentMissing(f"{lost[0]} is not there; {name} needs {', '.join(model.folders + model.loose)}")
     lock = models.read_lock(folder)
-    entries = {path: _checked(place / path, None) for path in _files(place) if path.endswith(".safetensors")}
+    weights = [path for path in _files(place) if path.endswith(".safetensors") or path in model.loose]
+    entries = {path: _checked(place / path, None) for path in weights}
     lock[name] = {"repo": model.repo, "revision": "adopted", "files": entries}
     models.write_lock(folder, lock)
     return place
@@ -167,7 +170,7 @@ def listing(folder: Path | None) -> list[dict[str, Any]]:
     lock = models.read_lock(folder) if folder else {}
     for model in models.MODELS.values():
         there = next((p for p in models.places(model, folder) if p.is_dir()), None)
-        lost = models.lacking(model, there, ()) if there else []
+        lost = models.lacking(model, there, model.loose if model.url else ()) if there else []
         locked = lock.get(model.name, {}).get("files", {})
         hashes = {k: v["sha256"] for k, v in locked.items() if k.endswith(".safetensors")}
         rows.append(
@@ -179,6 +182,7 @@ def listing(folder: Path | None) -> list[dict[str, Any]]:
                 "gigabytes": model.gigabytes,
                 "licence": model.licence,
                 "purpose": model.purpose,
+                "url": model.url,
                 "folders": [f or "." for f in model.folders] + list(model.loose),
                 "found": str(there) if there and not lost else None,
             }
