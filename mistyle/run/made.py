@@ -22,14 +22,14 @@ class Baked:
 
     `begin` are the same maps with the painting's relief, where the fit starts at them (else empty); `gains` are the
     factors, per stylized view, that took the painted light out of it, where the stylizer paints lit objects, and
-    `shares` how much of the shading that was.
+    `taken` the share of the known shading that this was.
     """
 
     maps: tuple[Maps, ...]
     seen: tuple[np.ndarray, ...]
     begin: tuple[Maps, ...] = ()
     gains: tuple[np.ndarray, ...] = ()
-    shares: tuple[float, ...] = ()
+    taken: float | None = None
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,8 @@ def swept_stages(
     baked = run.record(
         "bake", ["surface"], [s.bake, *light], lambda r: bake(asset, stylized, painted, atlas, s, r, lit)
     )
-    if baked.shares:
-        run.progress.note(said_of_light(baked.shares))
+    if baked.taken is not None:
+        run.progress.note(said_of_light(baked.taken))
     shown = run.stage("stylized", ["bake"], [], lambda folder, r: write_views(folder, stylized, (), progress=r))
     return baked, read_views(shown)
 
@@ -142,11 +142,11 @@ def bake(
     from mistyle.stages.unlight import gain, share, unlit
 
     views = [replace(view, mask=view.mask & one.mask) for view, one in zip(stylized, painted, strict=True)]
-    shares, gains = [], []
+    taken, gains = None, []
     if lit:
         shading = bare_shape(asset, views, settings)
-        shares = [share(view, bare, settings.fit.unlight) for view, bare in zip(views, shading, strict=True)]
-        gains = [gain(*each) for each in zip(stylized, shading, shares, strict=True)]
+        taken = share(views, shading, settings.fit.unlight)
+        gains = [gain(view, bare, taken) for view, bare in zip(stylized, shading, strict=True)]
         views = unlit(views, gains)
     maps, seen = [], []
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
@@ -157,7 +157,7 @@ def bake(
         maps.append(coated)
         seen.append(found.seen)
         report((part + 1) / len(atlas.texels))
-    return Baked(tuple(maps), tuple(seen), (), tuple(gains), tuple(shares))
+    return Baked(tuple(maps), tuple(seen), (), tuple(gains), taken)
 
 
 def bare_shape(asset: Asset, views: Sequence[View], settings: Settings) -> list[np.ndarray]:
@@ -173,10 +173,11 @@ def bare_shape(asset: Asset, views: Sequence[View], settings: Settings) -> list[
     return [luminance(view.rgb) for view in drawn]
 
 
-def said_of_light(shares: Sequence[float]) -> str:
+def said_of_light(taken: float) -> str:
     """What a person should know of light that was taken out of the views."""
-    least, most = 100 * min(shares), 100 * max(shares)
+    if taken == 0:
+        return "no light was found in the stylized views that the lights of the rendered ones explain (fit.unlight)."
     return (
-        f"{least:.0f} to {most:.0f} % of the shading under the views' lights was found in the stylized views and "
+        f"{100 * taken:.0f} % of the shading under the rendered views' lights was found in the stylized views and "
         "divided out before the texture took their colours (fit.unlight)."
     )

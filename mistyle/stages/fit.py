@@ -89,9 +89,9 @@ def two_phase(
     `phase1_lights` replaces those of `scenes/phase1_directional.xml`; `only` names the texels that may change, all
     others keep their bytes. Phase 1 starts at the normal and roughness of `begin`, where given; what counts as unfitted
     is `maps` all the same, and they are what stays where the phase is undone. With `style` (sRGB) its gradient lowers
-    the albedo's total variation, not the targets'. `unlit` are the targets of phase 2 where light was taken out of them.
-    The same inputs, settings, seed and thread count give the same bytes. A gradient that is not a number ends its phase
-    at the last good state, and a note says where.
+    the albedo's total variation, not the targets'. `unlit` are the targets of phase 2, where light was taken out of
+    them. The same inputs, settings, seed and thread count give the same bytes. A gradient that is not a number ends its
+    phase at the last good state, and a note says where.
     """
     if settings.metallic == "zero":
         maps = [replace(m, metallic=np.zeros_like(m.metallic)) for m in maps]
