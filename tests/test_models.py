@@ -191,6 +191,9 @@ def test_a_published_pickle_becomes_safetensors_on_the_way(hub, tmp_path):
     }
     done = fetch(hub, tmp_path / "models", "position")
     assert done.returncode == 0, done.stderr
+    lock = models.read_lock(tmp_path / "models")["position"]
+    assert lock["revision"] == "c" * 40, "no commit was published: the one that was fetched is noted"
+    assert models_fetch._commit(models.MODELS["position"], "d" * 40) == "d" * 40
     found = load_file(models.find("position", tmp_path / "models") / "diffusion_pytorch_model.safetensors")
     assert set(found) == set(state) and all(torch.equal(found[k], state[k]) for k in state)
 

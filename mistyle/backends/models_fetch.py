@@ -39,7 +39,8 @@ def fetch(name: str, folder: Path, allowed: bool) -> Path:
     transport: Any = next(base for base in HfHubHTTPError.__mro__ if base.__name__ == "HTTPError")
     place = folder / name
     try:
-        wanted = _download(model, place) | dict(model.sha256)
+        revision = _commit(model, models.read_lock(folder).get(name, {}).get("revision", ""))
+        wanted = _download(model, revision, place) | dict(model.sha256)
     except (transport, OSError) as error:
         if isinstance(error, OSError) and error.errno in (*faults.FULL, errno.EFBIG, *faults.NOT_TO_BE_WRITTEN):
             raise MistyleError(
@@ -59,7 +60,7 @@ def fetch(name: str, folder: Path, allowed: bool) -> Path:
         convert(place / "diffusion_pytorch_model.bin", place)
         entries = {path: entries.get(path) or _checked(place / path, None) for path in _files(place)}
     lock = models.read_lock(folder)
-    lock[name] = {"repo": model.repo, "revision": model.revision, "files": entries}
+    lock[name] = {"repo": model.repo, "revision": revision, "files": entries}
     models.write_lock(folder, lock)
     lost = models.lacking(model, place, model.loose)
     if lost:
@@ -89,7 +90,17 @@ def _files(place: Path) -> list[str]:
     return [p.as_posix() for p in every if p.parts[0] != PARTIAL]
 
 
-def _download(model: models.Model, place: Path) -> dict[str, str]:
+def _commit(model: models.Model, noted: str) -> str:
+    """The commit to fetch. Where nobody is known to have published one, that of the first fetching stays: what the hub
+    calls `main` may change meanwhile."""
+    from huggingface_hub import HfApi
+
+    if model.revision != "main":
+        return model.revision
+    return noted if re.fullmatch("[0-9a-f]{40}", noted) else str(HfApi().model_info(model.repo).sha)
+
+
+def _download(model: models.Model, revision: str, place: Path) -> dict[str, str]:
     """Fetch what is not there; returns the sha256 that the hub states for its large files.
 
     Parts of files stay in `place/.partial` when the connection breaks (huggingface_hub's own downloads begin anew in
@@ -99,11 +110,11 @@ def _download(model: models.Model, place: Path) -> dict[str, str]:
     from huggingface_hub.file_download import http_get
     from huggingface_hub.utils import build_hf_headers, filter_repo_objects
 
-    every = HfApi().list_repo_files(model.repo, revision=model.revision)
+    every = HfApi().list_repo_files(model.repo, revision=revision)
     stated, partial = {}, place / PARTIAL
     for path in filter_repo_objects(every, allow_patterns=list(model.patterns)):
         target = _inside(place, path)
-        url = hf_hub_url(model.repo, path, revision=model.revision)
+        url = hf_hub_url(model.repo, path, revision=revision)
         found = get_hf_file_metadata(url)
         tag = found.etag or ""
         if re.fullmatch("[0-9a-f]{64}", tag):
