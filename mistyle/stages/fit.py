@@ -102,8 +102,7 @@ def two_phase(
     shrink = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
     table = fit_table.build(maps, texels, shrink, only)
     begun = {} if begin is None else fit_table.build(begin, texels, shrink, only).values
-    variation = _albedo_variation(settings, targets, style)
-    phases = _phases(settings, phase1_lights or lights("phase1"), variation, unlit is not None)
+    phases = _phases(settings, phase1_lights or lights("phase1"), targets, style, unlit is not None)
     judge = fit_judge.bench(world.traced, world.tangents, targets) if settings.judge else None
     total, done = max(sum(phase.iterations for phase in phases), 1), 0
     fit = Fit(tuple(maps), nothing, nothing, {}, {}, {}, ())
@@ -202,7 +201,13 @@ def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
     )
 
 
-def _phases(settings: FitSettings, directional: Lights, variation: float, unlit: bool) -> list[Phase]:
+def _phases(
+    settings: FitSettings,
+    directional: Lights,
+    targets: Sequence[View],
+    style: Float[np.ndarray, "h w 3"] | None = None,
+    unlit: bool = False,
+) -> list[Phase]:
     """Phase 1, and with refine = all phase 2; `unlit` where the latter's targets show no light."""
     flat = settings.painted != "with-light"
     moving = {"tilt": settings.rate_normal, "roughness": settings.rate_roughness}
@@ -226,7 +231,7 @@ def _phases(settings: FitSettings, directional: Lights, variation: float, unlit:
         clay=False,
         gloss=not (flat or unlit),
         rates={"albedo": settings.rate_albedo} | {name: rate * settings.reduced for name, rate in moving.items()},
-        variation={"albedo": variation},
+        variation={"albedo": _albedo_variation(settings, targets, style)},
         iterations=settings.iterations2,
         loss=_colour_loss(settings),
     )
