@@ -1,19 +1,28 @@
-"""What the generative stages cost: `python -m benchmarks.generative [--quick] [--json FILE]`
+"""What the generative stages cost, and that all of their paths run: `python -m benchmarks.generative [--device cuda]
+[--tiny] [--precision bfloat16] [--quick] [--json FILE]`
 
 The networks have their full size and random weights, made from their configurations: nothing is downloaded and the
 pictures are noise, but time and memory are the real ones. On a GPU, in bfloat16: one training step of ConsisLoRA, one
 denoising step of SDXL with two ControlNets and guidance, both at 1024², and one 1024² crop of the texture inpainter of
-two steps. Figures: seconds of a second call each, and the peak memory of the device in GB. --quick, or no GPU: the same
-calls on tiny networks on the CPU, only to see that they work.
+two steps. Figures: seconds of a second call each, and the peak memory of the device in GB. --tiny (--quick, or no GPU):
+the same calls on tiny networks, only to see that they work, and then every path from models on disk to a texture:
+stylizer x inpainter x offloaded or not x resumed or not, in the precision asked for. Figures: `paths`, how many there
+are, `paths_run`, how many gave finite pictures, and the seconds of each.
 """
 
+import tempfile
+from argparse import ArgumentParser
 from collections.abc import Callable
+from contextlib import suppress
+from itertools import product
+from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
+import numpy as np
 import torch
 
-from benchmarks.common import arguments, finish, timed
+from benchmarks.common import finish, timed
 
 FULL: dict[str, Any] = {
     "xl": {
@@ -142,17 +151,16 @@ def denoise_step(pipeline: Any, shape: dict[str, Any], device: str, dtype: torch
 
 def crop_step(shape: dict[str, Any], device: str, dtype: torch.dtype) -> Callable[[], object]:
     """One crop of the texture, two sampling steps, without the IP-Adapter's few numbers."""
-    import numpy as np
-    from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
     from diffusers.pipelines.controlnet.pipeline_controlnet_inpaint import StableDiffusionControlNetInpaintPipeline
     from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
     from mistyle.backends.diffusion_settings import Paint3dSettings
     from mistyle.backends.paint3d import RECIPES, Brush, inpaint
+    from mistyle.backends.vae import ExactVae
 
     channels = shape["vae"]
     with torch.device(device):
-        vae = AutoencoderKL(
+        vae = ExactVae(
             block_out_channels=channels,
             down_block_types=("DownEncoderBlock2D",) * len(channels),
             up_block_types=("UpDecoderBlock2D",) * len(channels),
@@ -190,16 +198,125 @@ def measured(figures: dict[str, float], name: str, device: str, work: Callable[[
         figures[f"{name}.peak_gb"] = torch.cuda.max_memory_allocated() / 1e9
 
 
+SIDE = 32  # pixels of the paths' views and atlas
+
+
+def ball(azimuth: float) -> Any:
+    """A view of a striped ball, by formula."""
+    from mistyle.core.camera import orbit
+    from mistyle.core.view import View
+
+    y, x = (np.mgrid[:SIDE, :SIDE] + 0.5) / SIDE * 2 - 1
+    mask = x**2 + y**2 < 0.8
+    height = np.sqrt(np.maximum(0.8 - x**2 - y**2, 0))
+    depth = np.where(mask, 4 - height, np.inf).astype(np.float32)
+    normal = np.where(mask[..., None], np.stack([x, -y, height], axis=-1), 0).astype(np.float32)
+    rgb = np.where(mask[..., None], (np.sin(12 * x) > 0)[..., None] * [0.8, 0.5, 0.3] + 0.1, 0).astype(np.float32)
+    camera, uv = orbit(azimuth, 0, distance=4, fov=30, size=(SIDE, SIDE)), np.zeros((SIDE, SIDE, 2), np.float32)
+    return View(camera, rgb, depth, normal, uv, np.where(mask, 0, -1), mask, mask.astype(np.float32))
+
+
+def painted_views(job: Any, views: list[Any], kept: Path, resumed: bool) -> list[np.ndarray]:
+    """The sweep over the views; resumed: stopped in the last one and begun again with networks loaded anew."""
+    from mistyle.backends import diffusion
+    from mistyle.core.errors import Stopped
+    from mistyle.stages.mvst import SweepSettings, sweep
+
+    key = diffusion.key(job, views)
+
+    def stops(view: Any, prior: Any, rng: np.random.Generator) -> np.ndarray:
+        if prior is not None:
+            raise Stopped("on request")
+        return paint(view, prior, rng)
+
+    paint = diffusion.stylizer(job, views)
+    if resumed:
+        with suppress(Stopped):
+            sweep(views, stops, SweepSettings(), 0, kept=kept, key=key)
+        paint = diffusion.stylizer(job, views)
+    return [one.rgb for one in sweep(views, paint, SweepSettings(), 0, kept=kept, key=key).painted]
+
+
+def painted(made: Any, stylizer: str, resumed: bool, work: Path) -> bool:
+    """Two views, from models on disk: LoRAs trained where the stylizer takes some; whether all colours are finite."""
+    from mistyle.backends.diffusion import Job
+    from mistyle.backends.diffusion_settings import DiffusionSettings, TrainSettings
+
+    sampling = DiffusionSettings(adapter=cast(Any, stylizer), steps=2, block=1, repeats=2, refinement=0.5)
+    training = TrainSettings(rank=4, steps=2, style_steps=1, switch=1, resolution=16)
+    job = Job(made, training, sampling, noise(), "style", work / "loras", 0)
+    with tempfile.TemporaryDirectory() as kept:
+        views = painted_views(job, [ball(0.0), ball(30.0)], Path(kept), resumed)
+    return all(bool(np.isfinite(one).all()) for one in views)
+
+
+def filled(made: Any, recipe: str) -> bool:
+    """A hole in the texture of a triangle, from models on disk; whether all colours are finite."""
+    from mistyle.backends import paint3d
+    from mistyle.backends.diffusion_settings import Paint3dSettings
+    from mistyle.core.mesh import Mesh
+    from mistyle.stages.texels import rasterise
+
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32)
+    flat = np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1))
+    uvs = np.array([[[0.05, 0.05], [0.95, 0.05], [0.5, 0.95]]], np.float32)
+    mesh = Mesh(corners, np.array([[0, 1, 2]]), flat, uvs, np.zeros(1, np.int64), ("a",))
+    chosen = Paint3dSettings(recipe=cast(Any, recipe), size=SIDE, overlap=8, steps=2)
+    paint = paint3d.inpainter(mesh, noise(), made, chosen)
+    hole = np.zeros((SIDE, SIDE), bool)
+    hole[SIDE // 2 :] = True
+    albedo = np.full((SIDE, SIDE, 3), 0.3, np.float32)
+    return bool(np.isfinite(paint(albedo, hole, rasterise(mesh, 0, SIDE), np.random.default_rng(0))).all())
+
+
+def noise() -> np.ndarray:
+    return np.random.default_rng(0).random((24, 20, 3)).astype(np.float32)
+
+
+def paths(figures: dict[str, float], device: str, precision: str) -> None:
+    """Every path on tiny random models, as users have models on disk; what paths share is run once."""
+    from mistyle.backends.diffusion_settings import ModelSettings
+    from mistyle.backends.paint3d import RECIPES
+    from tests import tiny_models
+
+    made: Any = {"folder": tiny_models.folder(), "device": device, "precision": precision}
+    places = {word: ModelSettings(**made, offload=word == "offloaded") for word in ("whole", "offloaded")}
+    stylizers, times, good = ("lora", "ip"), ("fresh", "resumed"), {}
+    with tempfile.TemporaryDirectory() as work:
+        for place, stylizer, when in product(places, stylizers, times):
+            given = places[place], stylizer, when == "resumed", Path(work)
+            name = f"{stylizer}.{precision}.{place}.{when}"
+            good[place, stylizer, when] = timed(figures, name, lambda given=given: painted(*given))
+    for place, recipe in product(places, RECIPES):
+        name = f"inpainter.{recipe}.{precision}.{place}"
+        good[place, recipe] = timed(figures, name, lambda at=(places[place], recipe): filled(*at))
+    every = list(product(places, stylizers, times, RECIPES))
+    figures |= {"paths": len(every), "paths_run": sum(good[p, s, t] and good[p, r] for p, s, t, r in every)}
+
+
 def main() -> None:
-    chosen = arguments(__doc__ or "")
-    device = "cpu" if chosen.quick or not torch.cuda.is_available() else "cuda"
-    shape, dtype = (TINY, torch.float32) if device == "cpu" else (FULL, torch.bfloat16)
+    parser = ArgumentParser(description=__doc__)
+    there = "cuda" if torch.cuda.is_available() else "cpu"
+    parser.add_argument("--device", choices=["cpu", "cuda"], default=there)
+    parser.add_argument("--tiny", action="store_true", help="tiny networks, and every path on them")
+    parser.add_argument("--precision", choices=["float32", "bfloat16", "float16"], help="else bfloat16 in full size")
+    parser.add_argument("--quick", action="store_true", help="--tiny on the CPU")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="also write the figures as JSON ('-': stdout only)")
+    chosen = parser.parse_args()
+    device = "cpu" if chosen.quick else chosen.device
+    tiny = chosen.tiny or device == "cpu"
+    precision = chosen.precision or ("float32" if tiny else "bfloat16")
+    shape, dtype = TINY if tiny else FULL, getattr(torch, precision)
     figures: dict[str, float] = {"full_size": float(shape is FULL)}
+    if tiny:
+        torch.set_num_threads(1)  # threads that wait for each other would take most of the time
     pipeline = sdxl(shape, device, dtype)
     measured(figures, "train_step", device, train_step(pipeline, shape, device, dtype))
     measured(figures, "denoise_step", device, denoise_step(pipeline, shape, device, dtype))
     del pipeline
     measured(figures, "crop_two_steps", device, crop_step(shape, device, dtype))
+    if tiny:
+        paths(figures, device, precision)
     finish(figures, chosen.json)
 
 

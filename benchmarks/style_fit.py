@@ -4,7 +4,7 @@ standard.seconds          the whole fit of the standard preset (2048 atlas, 16 v
                           the bunny; .cpu its processor time, .phase1_step and .phase2_step the seconds of one step
 split.<phase>.<part>      seconds per step: surface (rays, lights, texel weights), picture (fetch and shading),
                           features, backward (of which pull is Dr.Jit's), texels (total variation and Adam), other
-bridge.<phase>.<way>      seconds per step by the frozen split and by dr.wrap, turn about in one run; .speedup of the
+bridge.<phase>.<way>      least seconds of a step by the frozen split and by dr.wrap, in turns, one run; .speedup of the
                           whole step, bridge.<phase>.shading_speedup of picture and gradient alone
 vgg.<phase>_step          seconds per step with the VGG-19 of data/weights, at crops of the size vgg.crop_size, and
                           vgg.<phase>_fall, by which share the style loss of a fixed set of crops fell
@@ -176,8 +176,8 @@ def bridges(where: Problem, figures: dict[str, float], count: int) -> None:
                 shading[way].append(_shading(run))
         name = pair["frozen"][0]
         for way in ways:
-            figures[f"bridge.{name}.{way}"] = float(np.median(took[way][3:]))
-            figures[f"bridge.{name}.{way}_shading"] = float(np.median(shading[way][3:]))
+            figures[f"bridge.{name}.{way}"] = float(np.min(took[way][3:]))
+            figures[f"bridge.{name}.{way}_shading"] = float(np.min(shading[way][3:]))
         figures[f"bridge.{name}.speedup"] = figures[f"bridge.{name}.wrap"] / figures[f"bridge.{name}.frozen"]
         figures[f"bridge.{name}.shading_speedup"] = (
             figures[f"bridge.{name}.wrap_shading"] / figures[f"bridge.{name}.frozen_shading"]

@@ -86,6 +86,47 @@ def test_a_view_is_painted_and_the_seed_decides(pipeline):
     assert np.array_equal(one, same) and differs(one, other)
 
 
+@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+def test_half_precision_paints_what_float32_paints(pipeline, loras, tmp_path, precision):
+    made, _ = diffusion._pipeline(job(tmp_path, precision=precision))
+    assert made.vae.dtype == torch.float32 and made.unet.dtype == getattr(torch, precision)
+    short = QUICK.model_copy(update={"steps": 2, "repeats": 1})
+    for prior in (None, half_prior()):
+        seen, exact = paint(made, short, prior=prior), paint(pipeline, short, prior=prior)
+        assert np.isfinite(seen).all() and np.abs(seen - exact).mean() < 0.05
+    consislora.load_half(made, loras["style1"], "style", "style")
+    assert np.isfinite(paint(made, short)).all()
+
+
+def velocity_scheduler(**more):
+    from diffusers import EulerDiscreteScheduler
+
+    place = tiny_models.folder() / "sdxl" / "scheduler"
+    return EulerDiscreteScheduler.from_pretrained(
+        place, timestep_spacing="trailing", prediction_type="v_prediction", **more
+    )
+
+
+@pytest.mark.parametrize("zero_snr", [False, True])
+def test_velocity_checkpoints_walk_diffusers_own_path(pipeline, monkeypatch, zero_snr):
+    monkeypatch.setattr(pipeline, "scheduler", velocity_scheduler(rescale_betas_zero_snr=zero_snr))
+    walks_as_diffusers(pipeline)
+    assert pipeline.scheduler.sigmas[0] > (4000 if zero_snr else 14)
+
+
+def test_single_files_say_that_they_predict_velocities(tmp_path):
+    from safetensors.torch import save_file
+
+    from mistyle.backends import models_load
+
+    place = tiny_models.folder() / "sdxl"
+    for names, kind, zero in (((), "epsilon", False), (("v_pred", "ztsnr"), "v_prediction", True)):
+        save_file({n: torch.zeros(1) for n in ("x", *names)}, tmp_path / "x.safetensors")
+        found = models_load.schedule(place, tmp_path / "x.safetensors", "auto").config
+        assert (found.prediction_type, found.rescale_betas_zero_snr) == (kind, zero)
+    assert models_load.schedule(place, None, "v_prediction").config.prediction_type == "v_prediction"
+
+
 def test_sizes_that_the_network_cannot_take_are_enlarged(pipeline):
     assert paint(pipeline, seen=view(size=(30, 30))).shape == (30, 30, 3)
     assert diffusion_denoise.fitting_size((1000, 1024), 32) == (1024, 1024)
@@ -227,6 +268,10 @@ def test_time_steps_belong_to_their_levels(pipeline):
 
 
 def test_the_denoiser_agrees_with_diffusers_own_pipeline(pipeline):
+    walks_as_diffusers(pipeline)
+
+
+def walks_as_diffusers(pipeline) -> None:
     """The plain twin: diffusers' pipeline with the same latents, conditions and prompts walks the same path."""
     from mistyle.stages.repaint import sample
 
@@ -393,13 +438,15 @@ def test_missing_files_are_named(tmp_path):
         ("sdxl/unet", {"addition_embed_type": None}, "addition_embed_type is None.*not an SDXL base model"),
         ("sdxl/unet", {"in_channels": 9}, "in_channels is 9, expected 4"),
         ("sdxl/text_encoder", {"hidden_size": 48}, "the folders come from different models"),
+        ("sdxl/scheduler", {"prediction_type": "sample"}, "prediction_type is 'sample', expected epsilon or v_pred"),
         ("depth", {"cross_attention_dim": 32}, "cross_attention_dim is 32, expected 64.*a ControlNet for SDXL"),
         ("canny", {"_class_name": "ControlNetUnionModel"}, "unions of several conditions are not supported"),
     ],
 )
 def test_wrong_architectures_are_refused(tmp_path, file, change, match):
     folder = tiny_models.copy_without(tmp_path / "models")
-    tiny_models.edit_json(folder / file / "config.json", **change)
+    name = "scheduler_config.json" if file.endswith("scheduler") else "config.json"
+    tiny_models.edit_json(folder / file / name, **change)
     refused(tmp_path, match, folder=folder)
 
 
@@ -426,11 +473,3 @@ def test_a_checkpoint_of_another_kind_is_refused(tmp_path, loras):
     refused(tmp_path, "not an SDXL checkpoint", checkpoint=loras["style1"])
     (tmp_path / "x.safetensors").write_bytes(b"\x80\x04pickle")
     refused(tmp_path, "expected a .safetensors file", error=InputRefused, checkpoint=tmp_path / "x.safetensors")
-
-
-def test_the_low_memory_recipe_paints_the_same_kind_of_picture(tmp_path, loras):
-    low = diffusion.stylizer(job(tmp_path, style_lora=loras["style1"], offload=True), [view()])
-    usual = diffusion.stylizer(job(tmp_path, style_lora=loras["style1"]), [view()])
-    a, b = (painter(view(), None, np.random.default_rng(0)) for painter in (low, usual))
-    # Small pictures are one tile, so decoding in tiles gives the same.
-    np.testing.assert_allclose(a, b, atol=1e-5)

@@ -110,7 +110,7 @@ def test_all_lights_together_shade_like_one_from_their_mean_direction(rng):
 
 
 def test_the_papers_preset_lights_all_together():
-    assert PRESETS["paper"]["fit"]["lights"] == "together"
+    assert PRESETS["fine"]["fit"]["lights"] == PRESETS["paper"]["fit"]["lights"] == "together"
 
 
 def test_both_phases_run_with_the_real_vgg(scene):

@@ -10,6 +10,7 @@ import trimesh
 from PIL import Image
 
 from mistyle.backends import consislora
+from mistyle.core.camera import rig
 from mistyle.core.paths import scenes
 from mistyle.files.records import load_record
 from mistyle.files.views import read_views
@@ -76,7 +77,7 @@ def test_the_papers_cost_is_said_before_it_starts():
     from mistyle.backends.diffusion import announcement
     from mistyle.run.settings import resolve
 
-    paper = resolve("paper", None, {"stylizer": "diffusion"}, {})
+    paper = resolve("paper", None, {}, {})
     text = announcement(paper.models, paper.train, paper.diffusion, 16)
     assert "26,500 training steps" in text and "hours" in text and f"{30 + 15 * 303:,} denoising steps" in text
     ip = resolve("standard", None, {"diffusion": {"adapter": "ip"}}, {})
@@ -171,6 +172,20 @@ def test_settings_and_help_name_the_generative_stages(capsys):
     assert main(["stylize", "--preset", "paper", "--print-config"]) == 0
     text = capsys.readouterr().out
     assert 'content = "per-view"' in text and "[paint3d]" in text and "[train]" in text
+
+
+def test_the_paper_preset_is_the_paper():
+    from mistyle.run.settings import resolve
+
+    paper, fine = (resolve(name, None, {}, {}) for name in ("paper", "fine"))
+    assert (paper.stylizer, paper.inpainter) == ("diffusion", "paint3d")
+    assert (paper.atlas.size, paper.rig.resolution, len(rig(paper.rig))) == (4096, 1024, 16)
+    assert (paper.sweep.order, paper.sweep.histogram, str(paper.sweep.segmenter)) == ("paper", 1.0, "birefnet")
+    assert (str(paper.fit.features), paper.fit.bridge, paper.fit.lights) == ("vgg19", "wrap", "together")
+    assert (paper.fit.painted, paper.fit.unlight, paper.fit.tv_from) == ("with-light", 0, "style")
+    assert (paper.train.steps, paper.train.style_steps, paper.train.rank, paper.train.switch) == (1500, 1000, 64, 500)
+    assert (paper.diffusion.steps, paper.diffusion.block, paper.diffusion.repeats) == (30, 10, 10)
+    assert (fine.stylizer, fine.inpainter, fine.atlas.size) == ("embedded", "fill", 4096)
 
 
 def test_losses_are_spoken_of_now_and_then():

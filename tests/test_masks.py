@@ -132,3 +132,15 @@ def test_a_real_onnx_file_is_opened_and_run(tmp_path, side):
     (tmp_path / "broken.onnx").write_bytes((tmp_path / "net.onnx").read_bytes()[:20])
     with pytest.raises(InputRefused, match="cannot open"):
         masks.segmenter(tmp_path / "broken.onnx")
+
+
+@pytest.mark.skipif(importlib.util.find_spec("onnxruntime") is None, reason="onnxruntime is not installed")
+@pytest.mark.parametrize("half", [False, True])
+def test_a_network_of_birefnets_signature_runs_in_both_precisions(tmp_path, half):
+    """What is brighter than ImageNet's mean in all channels is foreground; the last of several answers counts."""
+    import tiny_models
+
+    tiny_models.birefnet(tmp_path / "birefnet", half)
+    (file,) = (tmp_path / "birefnet").glob("*.onnx")
+    view = see(at(0, size=128), [BALL], paint=lambda points, which: np.full((len(points), 3), 0.8, np.float32))
+    assert overlap(masks.segmenter(file)(view), view.mask) > 0.97

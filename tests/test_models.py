@@ -191,6 +191,9 @@ def test_a_published_pickle_becomes_safetensors_on_the_way(hub, tmp_path):
     }
     done = fetch(hub, tmp_path / "models", "position")
     assert done.returncode == 0, done.stderr
+    lock = models.read_lock(tmp_path / "models")["position"]
+    assert lock["revision"] == "c" * 40, "no commit was published: the one that was fetched is noted"
+    assert models_fetch._commit(models.MODELS["position"], "d" * 40) == "d" * 40
     found = load_file(models.find("position", tmp_path / "models") / "diffusion_pytorch_model.safetensors")
     assert set(found) == set(state) and all(torch.equal(found[k], state[k]) for k in state)
 
@@ -353,6 +356,49 @@ def test_pictures_reach_clip_whole(rng):
         theirs = encoder(processor(square, return_tensors="pt").pixel_values).image_embeds
     ours = models_load.image_embedding(encoder, (square / 255).astype(np.float32))
     torch.testing.assert_close(ours, theirs, atol=1e-4, rtol=1e-4)
+
+
+def test_single_files_are_found_by_their_models_names(tmp_path, monkeypatch, capsys):
+    from mistyle.measure.features import load_features
+    from mistyle.run.generative import fit_settings, named
+    from mistyle.run.settings import resolve
+
+    folder = tiny_models.folder()
+    for name, file in (("vgg19", "vgg19-dcbb9e9d.pth"), ("birefnet", "BiRefNet-general-epoch_244.onnx")):
+        assert models.file(name, folder) == folder / name / file
+    said = {"models": {"folder": str(folder)}, "fit": {"features": "vgg19"}, "sweep": {"segmenter": "birefnet"}}
+    settings = resolve("standard", None, said, {})
+    found = fit_settings(settings)
+    assert len(load_features(found.features)(torch.rand(1, 3, 32, 32))) == 3
+    assert len(load_features(models.file("vgg19-normalised", folder))(torch.rand(1, 3, 32, 32))) == 3
+    assert named(settings, settings.sweep.segmenter) == folder / "birefnet" / "BiRefNet-general-epoch_244.onnx"
+    assert found.painted == "without-light"
+    assert fit_settings(resolve("standard", None, said | {"stylizer": "diffusion"}, {})).painted == "with-light"
+    # Torchvision's own file is known by eight digits of its hash, BiRefNet's by all of them.
+    (tmp_path / "vgg19").mkdir()
+    shutil.copy(folder / "vgg19" / "vgg19-dcbb9e9d.pth", tmp_path / "vgg19")
+    with pytest.raises(EnvironmentMissing, match=r"expected dcbb9e9d, which is the file.*models adopt vgg19"):
+        models.file("vgg19", tmp_path)
+    digits = hashlib.sha256((tmp_path / "vgg19" / "vgg19-dcbb9e9d.pth").read_bytes()).hexdigest()[:8]
+    known = replace(models.MODELS["vgg19"], sha256={"vgg19-dcbb9e9d.pth": digits})
+    monkeypatch.setitem(models.MODELS, "vgg19", known)
+    assert models.file("vgg19", tmp_path).parent == tmp_path / "vgg19"
+    with pytest.raises(EnvironmentMissing, match=r"download https://.*epoch_244.onnx and put it at .*birefnet"):
+        models.file("birefnet", tmp_path)
+    with pytest.raises(EnvironmentMissing, match=r"no --models DIR was given; download https"):
+        models.file("birefnet", None)
+    assert main(["models", "fetch", "birefnet", "--models", str(tmp_path), "--allow-download"]) == 2
+    assert "does not lie on the hub: download https" in capsys.readouterr().err
+
+
+def test_the_paper_preset_names_what_it_lacks_and_what_needs_nothing(tmp_path, monkeypatch):
+    from mistyle.run.generative import check
+    from mistyle.run.settings import resolve
+
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
+    with pytest.raises(EnvironmentMissing, match=r"vgg19.* --preset fine"):
+        check(resolve("paper", None, {}, {}), print)
+    check(resolve("fine", None, {}, {}), print)
 
 
 def test_names_that_are_not_models_are_refused():

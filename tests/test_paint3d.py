@@ -64,6 +64,24 @@ def brushes() -> dict[str, paint3d.Brush]:
     }
 
 
+@pytest.mark.parametrize("recipe", list(paint3d.RECIPES))
+@pytest.mark.parametrize("precision", ["bfloat16", "float16"])
+def test_half_precision_paints_what_float32_paints(brushes, recipe, precision):
+    """The VAE stays float32 while the pipeline hands it the network's type."""
+    chosen = SETTINGS.model_copy(update={"recipe": recipe, "precision": precision})
+    half = paint3d.load(settings(), chosen, picture())
+    assert half.pipeline.vae.dtype == torch.float32 and half.pipeline.unet.dtype == getattr(torch, precision)
+    seen = answer(half)
+    assert np.isfinite(seen).all() and np.abs(seen - answer(brushes[recipe])).mean() < 0.05
+
+
+def test_ddim_never_clips_latents(brushes, tmp_path):
+    folder = tiny_models.copy_without(tmp_path / "models")
+    tiny_models.edit_json(folder / "inpaint" / "scheduler" / "scheduler_config.json", clip_sample=True)
+    made = paint3d.load(settings(folder=folder), SETTINGS, picture())
+    assert made.pipeline.scheduler.config.clip_sample is False
+
+
 def test_position_map_is_paint3ds():
     m = mesh()
     centre, radius = plan.centre_and_radius(m)

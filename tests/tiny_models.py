@@ -47,6 +47,50 @@ def folder() -> Path:
     return place
 
 
+def vgg(place: Path) -> None:
+    """VGG-19's layers up to relu3_1 in torchvision's order, with four channels, as a pickle."""
+    place.mkdir(parents=True)
+    layers, before = {}, 3
+    for n in (0, 2, 5, 7, 10):
+        layers |= {f"features.{n}.weight": torch.randn(4, before, 3, 3) * 0.3, f"features.{n}.bias": torch.zeros(4)}
+        before = 4
+    torch.save(layers, place / MODELS["vgg19"].loose[0])
+
+
+def normalised_vgg(place: Path) -> None:
+    """The same in the layout of Li et al., whose first layer changes the colours."""
+    place.mkdir(parents=True)
+    layers, before = {"0.weight": torch.eye(3)[..., None, None] * 255, "0.bias": torch.full((3,), -110.0)}, 3
+    for n in (2, 5, 9, 12, 16):
+        layers |= {f"{n}.weight": torch.randn(4, before, 3, 3) * 0.3, f"{n}.bias": torch.zeros(4)}
+        before = 4
+    torch.save(layers, place / MODELS["vgg19-normalised"].loose[0])
+
+
+def birefnet(place: Path, half: bool = False, side: int = 64) -> None:
+    """A network of BiRefNet's signature, one picture in and several logits out, the last at full size; it calls what is
+    brighter than grey foreground."""
+    import onnx
+    from onnx import TensorProto, helper
+
+    place.mkdir(parents=True)
+    kind = TensorProto.FLOAT16 if half else TensorProto.FLOAT
+    shape = [1, 3, side, side]
+    given = helper.make_tensor_value_info("input_image", kind, shape)
+    answers = [helper.make_tensor_value_info(n, kind, None) for n in ("coarse", "fine")]
+    weights = [
+        helper.make_tensor("w", kind, [1, 3, 1, 1], [1.0, 1.0, 1.0]),
+        helper.make_tensor("b", kind, [1], [0.0]),
+    ]
+    nodes = [
+        helper.make_node("Conv", ["input_image", "w", "b"], ["fine"]),
+        helper.make_node("AveragePool", ["fine"], ["coarse"], kernel_shape=[4, 4], strides=[4, 4]),
+    ]
+    graph = helper.make_graph(nodes, "tiny", [given], answers, weights)
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    onnx.save(made, str(place / MODELS["birefnet"].loose[0]))
+
+
 def build(place: Path, seed: int = 0) -> None:
     """sdxl, depth, canny, inpaint, sd15, position, inpaint-control and ip-adapter."""
     torch.manual_seed(seed)
@@ -69,6 +113,9 @@ def build(place: Path, seed: int = 0) -> None:
             place / name
         )
     ip_adapter(place / "ip-adapter")
+    vgg(place / "vgg19")
+    normalised_vgg(place / "vgg19-normalised")
+    birefnet(place / "birefnet")
 
 
 def _common(more: dict) -> dict:

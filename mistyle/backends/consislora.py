@@ -88,14 +88,26 @@ def epsilon_loss(eps: Float[torch.Tensor, "b c h w"], noise: Float[torch.Tensor,
 
 
 def x0_loss(
-    eps: Float[torch.Tensor, "b c h w"],
+    said: Float[torch.Tensor, "b c h w"],
     z0: Float[torch.Tensor, "b c h w"],
     zt: Float[torch.Tensor, "b c h w"],
     alpha_bar: Float[torch.Tensor, ""],
+    prediction: str = "epsilon",
 ) -> Float[torch.Tensor, ""]:
-    """Mean squared error of the predicted picture, unweighted; equals the noise's error times `weight`."""
-    predicted = (zt - (1 - alpha_bar).sqrt() * eps.float()) / alpha_bar.sqrt()
+    """Mean squared error of the picture that follows from what the network said, unweighted; equals the noise's error
+    times `weight`."""
+    if prediction == "v_prediction":
+        predicted = alpha_bar.sqrt() * zt - (1 - alpha_bar).sqrt() * said.float()
+    else:
+        predicted = (zt - (1 - alpha_bar).sqrt() * said.float()) / alpha_bar.sqrt()
     return torch.mean((predicted - z0) ** 2)
+
+
+def velocity(
+    z0: Float[torch.Tensor, "b c h w"], noise: Float[torch.Tensor, "b c h w"], alpha_bar: Float[torch.Tensor, ""]
+) -> Float[torch.Tensor, "b c h w"]:
+    """What networks of `v_prediction` say: sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z0."""
+    return alpha_bar.sqrt() * noise - (1 - alpha_bar).sqrt() * z0
 
 
 def weight(alpha_bar: Float[torch.Tensor, ""]) -> Float[torch.Tensor, ""]:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.backends import models
+from mistyle.backends import models, models_check
 from mistyle.backends.diffusion_settings import ModelSettings, TrainSettings
 from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, cut
@@ -53,7 +53,8 @@ def lora_key(
     """Everything that decides a LoRA's bits, but for the machine."""
     # How often a checkpoint is written decides nothing.
     numbers = training.model_dump(exclude={"save_every"})
-    return digest([kind, np.float32(rgb), word, numbers, identity(settings), settings.precision, seed])
+    own = settings.model_dump(include={"precision", "prediction"})
+    return digest([kind, np.float32(rgb), word, numbers, identity(settings), own, seed])
 
 
 def paths(folder: Path, name: str, key: str) -> Halves:
@@ -94,7 +95,6 @@ def forecast(steps: int, resolution: int) -> str:
 def check(settings: ModelSettings, training: TrainSettings) -> None:
     """Refuse, before anything is loaded, a training that could not run: packages, files, architecture, memory."""
     models.need_extra()
-    from mistyle.backends import models_check
     from mistyle.backends.models_load import device_of, precision_of
 
     place = models.find("sdxl", settings.folder, weightless=NETWORKS if settings.checkpoint else ())
@@ -117,7 +117,7 @@ def trainer(settings: ModelSettings) -> Any:
     device = device_of(settings)
     weightless = NETWORKS if settings.checkpoint else ()
     place = models.find("sdxl", settings.folder, weightless=weightless)
-    parts = base_parts(place, "sdxl", precision_of(settings, device), settings.checkpoint)
+    parts = base_parts(place, "sdxl", precision_of(settings, device), settings.checkpoint, settings.prediction)
     pipeline = StableDiffusionXLPipeline(**parts, add_watermarker=False)
     pipeline.set_progress_bar_config(disable=True)
     return pipeline.to(device)
@@ -197,6 +197,7 @@ def make_all(
     say(f"LoRAs: {forecast(sum(left), training.resolution)}")
     if not any(left):
         return made
+    check(settings, training)
     pipeline = trainer(settings)
     done = 0
     for (kind, _, rgb, word), halves, key, steps in zip(wanted, made, keys, left, strict=True):
@@ -207,4 +208,7 @@ def make_all(
 
             make(pipeline, kind, rgb, word, halves, key, training, seed, note)
             done += steps
+    device = pipeline.device.type
+    del pipeline
+    models_check.empty(device)
     return made

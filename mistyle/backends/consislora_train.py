@@ -44,12 +44,13 @@ class Phase:
 
 @dataclass(frozen=True)
 class Lesson:
-    """What the network is shown, computed once: latent, text, pooled text and SDXL's sizes."""
+    """What the network is shown, computed once: latent, text, pooled text and SDXL's sizes; and what it predicts."""
 
     z0: Float[torch.Tensor, "1 c h w"]
     text: Float[torch.Tensor, "1 n d"]
     pooled: Float[torch.Tensor, "1 p"]
     sizes: Float[torch.Tensor, "1 6"]
+    prediction: str = "epsilon"
 
 
 def joint_phase(word: str, settings: TrainSettings) -> Phase:
@@ -90,12 +91,12 @@ def lesson(pipeline: Any, rgb: Float[np.ndarray, "h w 3"], prompt: str, resoluti
     vae = pipeline.vae
     generator = torch.Generator("cpu").manual_seed(seed)
     with torch.no_grad():
-        posterior = vae.encode(tensor.to(vae.device, vae.dtype)).latent_dist
+        posterior = vae.encode(tensor).latent_dist
         noise = torch.randn(posterior.mean.shape, generator=generator).to(posterior.mean)
         z0 = (posterior.mean + posterior.std * noise) * vae.config.scaling_factor
         text, _, pooled, _ = pipeline.encode_prompt(prompt, do_classifier_free_guidance=False)
     sizes = torch.tensor([[height, width, 0, 0, *size]], dtype=torch.float32)
-    return Lesson(z0.float(), text, pooled, sizes.to(z0.device))
+    return Lesson(z0.float(), text, pooled, sizes.to(z0.device), pipeline.scheduler.config.prediction_type)
 
 
 def step_noise(
@@ -122,20 +123,22 @@ def step_loss(
     noise: Float[torch.Tensor, "b c h w"],
     alpha_bar: Float[torch.Tensor, ""],
 ) -> tuple[torch.Tensor, float]:
-    """The loss of one step, and the noise's error alone: the loss over its weight, which can be compared over steps."""
+    """The loss of one step, and the error of what the network predicts alone: the loss over its weight, which can be
+    compared over steps."""
     zt = consislora.noisy(shown.z0, noise, alpha_bar)
     with consislora.below_without_gradients(unet):
-        eps = unet(
+        said = unet(
             zt.to(unet.dtype),
             torch.tensor([level], device=zt.device),
             encoder_hidden_states=shown.text,
             added_cond_kwargs={"text_embeds": shown.pooled, "time_ids": shown.sizes.to(shown.text.dtype)},
             return_dict=False,
         )[0]
-    error = consislora.epsilon_loss(eps, noise)
+    wanted = consislora.velocity(shown.z0, noise, alpha_bar) if shown.prediction == "v_prediction" else noise
+    error = consislora.epsilon_loss(said, wanted)
     if step < phase.switch:
         return error, float(error.detach())
-    picture = consislora.x0_loss(eps, shown.z0, zt, alpha_bar)
+    picture = consislora.x0_loss(said, shown.z0, zt, alpha_bar, shown.prediction)
     return (picture + error if mode == "sum" else picture), float(error.detach())
 
 
@@ -174,7 +177,8 @@ def run_phase(
                 group["lr"] = phase.rate if step < phase.switch else phase.later_rate
             scaler.scale(loss).backward()
             scaler.unscale_(optimiser)
-            torch.nn.utils.clip_grad_norm_(named.values(), settings.clip)
+            if settings.clip:
+                torch.nn.utils.clip_grad_norm_(named.values(), settings.clip)
             scaler.step(optimiser)
             scaler.update()
             optimiser.zero_grad(set_to_none=True)

@@ -118,7 +118,7 @@ def key(job: Job, views: Sequence[View]) -> str:
         ip = models.find("ip-adapter", job.models.folder, [LOOSE_NEEDED["sdxl"]])
         files += [ip / LOOSE_NEEDED["sdxl"], *models.weights(ip / ENCODER)]
     networks = [identity(job.models), models.fingerprint(files)]
-    own = job.models.model_dump(include={"device", "precision", "offload"})
+    own = job.models.model_dump(include={"precision", "prediction"})
     pictures = [view.rgb for view in views]
     return digest([loras, networks, own, job.models.style_lora, job.diffusion, job.style, pictures])
 
@@ -181,7 +181,7 @@ def _pipeline(job: Job) -> tuple[Any, list[Any]]:
     device = device_of(job.models)
     dtype = precision_of(job.models, device)
     place, controls = _places(job.models, job.diffusion)
-    parts = base_parts(place, "sdxl", dtype, job.models.checkpoint)
+    parts = base_parts(place, "sdxl", dtype, job.models.checkpoint, job.models.prediction)
     pipeline = StableDiffusionXLControlNetPipeline(
         **parts, controlnet=controlnets(controls, dtype), add_watermarker=False
     )

@@ -78,15 +78,14 @@ def tensor_of(rgb: Float[np.ndarray, "h w c"]) -> Float[torch.Tensor, "1 c h w"]
 
 def encode(vae: Any, encoded: Float[np.ndarray, "h w 3"]) -> Float[torch.Tensor, "1 c h2 w2"]:
     """The latent of an sRGB picture: the posterior's mode, scaled, float32."""
-    picture = (tensor_of(encoded) * 2 - 1).to(vae.device, vae.dtype)
     with torch.no_grad():
-        return vae.encode(picture).latent_dist.mode().float() * vae.config.scaling_factor
+        return vae.encode(tensor_of(encoded) * 2 - 1).latent_dist.mode().float() * vae.config.scaling_factor
 
 
 def decode(vae: Any, latent: Float[torch.Tensor, "1 c h w"]) -> Float[np.ndarray, "h2 w2 3"]:
     """The sRGB picture of a latent, 0..1."""
     with torch.no_grad():
-        picture = vae.decode((latent / vae.config.scaling_factor).to(vae.dtype)).sample
+        picture = vae.decode(latent / vae.config.scaling_factor).sample
     return (picture[0].permute(1, 2, 0).float().cpu().numpy() / 2 + 0.5).clip(0, 1).astype(np.float32)
 
 
@@ -137,7 +136,7 @@ def denoiser(
             )
             if asked.picture:
                 more = more | {"image_embeds": list(asked.picture)}
-            eps = unet(
+            said = unet(
                 both,
                 time,
                 encoder_hidden_states=asked.text,
@@ -146,14 +145,21 @@ def denoiser(
                 mid_block_additional_residual=middle,
                 return_dict=False,
             )[0].float()
-            nothing, something = eps.chunk(2)
+            nothing, something = said.chunk(2)
             guided = nothing + asked.guidance * (something - nothing)
             if terms:
                 residuals = [d[1:] for d in down], middle[1:]
                 guided = guided + _terms(pipeline, terms, prompts or {}, scaled, time, asked, residuals)
-        return x - sigma * guided
+        return clean(pipeline.scheduler.config.prediction_type, guided, x, sigma)
 
     return denoise
+
+
+def clean(prediction: str, said: torch.Tensor, x: torch.Tensor, sigma: float) -> torch.Tensor:
+    """The clean latent that follows from what the network says of `x`: its noise, or its velocity."""
+    if prediction == "v_prediction":
+        return x / (sigma**2 + 1) - said * (sigma / (sigma**2 + 1) ** 0.5)
+    return x - sigma * said
 
 
 def activate(pipeline: Any, adapters: Mapping[str, float]) -> None:

@@ -24,11 +24,15 @@ class ModelSettings(BaseModel):
     )
     precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
         default="auto",
-        description="of frozen networks; auto: bfloat16 on a GPU, else float32. VAEs stay float32",
+        description="of frozen networks; auto: bfloat16 on a GPU that computes it, float16 on others, float32 on a "
+        "CPU. VAEs stay float32",
+    )
+    prediction: Literal["auto", "epsilon", "v_prediction"] = Field(
+        default="auto", description="what an SDXL checkpoint predicts; auto: as its scheduler or its file says"
     )
     offload: bool = Field(
         default=False,
-        description="keep on the GPU only the network that runs, and decode in tiles: slower",
+        description="keep on the GPU only the network that runs: slower, the same pictures",
     )
     memory: float = Field(default=0, ge=0, description="GB that may be used; 0 asks the device")
 
@@ -49,7 +53,12 @@ class TrainSettings(BaseModel):
     later_rate: float = Field(default=1e-4, gt=0, description="learning rate from `switch` on, and of style stage 2")
     noise_offset: float = Field(default=0.03, ge=0, description="noise shared by a channel's pixels, style stage 2")
     weight_decay: float = Field(default=1e-4, ge=0, description="of AdamW")
-    clip: float = Field(default=1.0, gt=0, description="largest norm of a step's gradient")
+    clip: float = Field(
+        default=0,
+        ge=0,
+        description="largest norm of a step's gradient; 0: unlimited, as ConsisLoRA's script in effect has it, whose "
+        "clipping is handed a list that is used up",
+    )
     resolution: int = Field(default=1024, ge=16, le=4096, description="pixels of the picture's short side")
     save_every: int = Field(default=100, ge=1, description="steps between checkpoints")
 
@@ -104,6 +113,9 @@ class Paint3dSettings(BaseModel):
     )
     steps: int = Field(default=0, ge=0, le=1000, description="sampling steps; 0 takes the recipe's (30, Paint3D 20)")
     guidance: float = Field(default=0, ge=0, description="classifier-free; 0 takes the recipe's (4, Paint3D 3)")
+    precision: Literal["same", "float32", "bfloat16", "float16"] = Field(
+        default="same", description="of its frozen networks; same: models.precision"
+    )
     position: float = Field(default=1.0, ge=0, le=2, description="scale of the UV-position ControlNet")
     style: float = Field(default=-1, ge=-1, le=2, description="IP-Adapter; -1 takes the recipe's (0.6, Paint3D 1)")
     shape_scale: float = Field(default=0.6, gt=0, le=1, description="radius of the mesh in the position map")

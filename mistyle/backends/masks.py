@@ -39,10 +39,11 @@ def segmenter(path: Path) -> Masker:
             f"{path}: found inputs of shape {shapes}, expected one picture (1, 3, height, width);"
             " give the ONNX file of BiRefNet or of a segmenter like it"
         )
+    half = getattr(given[0], "type", "") == "tensor(float16)"
     height, width = (n if isinstance(n, int) and n > 0 else SIDE for n in given[0].shape[2:])
 
     def mask(view: View) -> np.ndarray:
-        ready = prepared(srgb_from_linear(view.rgb), (height, width))
+        ready = prepared(srgb_from_linear(view.rgb), (height, width)).astype(np.float16 if half else np.float32)
         return foreground(session.run(None, {given[0].name: ready})[-1], view.camera.size, path)
 
     return mask

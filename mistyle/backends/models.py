@@ -50,6 +50,8 @@ def cache() -> Path:
 def places(model: Model, folder: Path | None) -> list[Path]:
     """Where a model is looked for: the models' folder, then the cache (the pinned revision, then `main`)."""
     found = [folder / model.name] if folder else []
+    if model.url:
+        return found
     cached = cache() / f"models--{model.repo.replace('/', '--')}"
     main = cached / "refs" / "main"
     revisions = [model.revision, *([main.read_text().strip()] if main.is_file() else [])]
@@ -81,15 +83,25 @@ def find(name: str, folder: Path | None, loose: Iterable[str] = (), weightless: 
         if place == looked[0] and folder:
             raise EnvironmentMissing(f"{place} lacks {_relative(lost, place)}; {how_to_get(model, folder)}")
     where = f"neither in {folder / name} nor in {cache()}" if folder else f"not in {cache()}"
+    if model.url:
+        where = f"not in {folder / name}" if folder else "nowhere, since no --models DIR was given"
     raise EnvironmentMissing(
         f"the model '{name}' ({model.repo}, {model.gigabytes} GB, {model.licence}) was found {where}; "
         f"{how_to_get(model, folder)}"
     )
 
 
+def file(name: str, folder: Path | None) -> Path:
+    """The one file of a model that is one (VGG-19, BiRefNet)."""
+    loose = get(name).loose
+    return find(name, folder, loose) / loose[0]
+
+
 def how_to_get(model: Model, folder: Path | None) -> str:
     """The sentence that fixes a missing model."""
     into = folder or Path("models")
+    if model.url:
+        return f"download {model.url} and put it at {into / model.name / model.loose[0]} (--models {into})"
     return f"run: mistyle models fetch {model.name} --models {into} --allow-download (or copy it there yourself)"
 
 
@@ -200,7 +212,7 @@ def verify(name: str, place: Path, folder: Path | None) -> None:
                 f"{path}: sha256 is {found}, expected {entry['sha256']} as it was when it was taken in; the file "
                 f"changed or broke. Remove it and {how_to_get(model, folder)}"
             )
-        if entry is None and found != model.sha256[relative]:
+        if entry is None and not found.startswith(model.sha256[relative]):
             raise EnvironmentMissing(
                 f"{path}: sha256 is {found}, expected {model.sha256[relative]}, which is the file of {model.repo}. "
                 f"Remove it and {how_to_get(model, folder)}; if these weights are meant, put them into a folder of "

@@ -1,8 +1,10 @@
 """Whether found models fit together and fit into memory, from their configurations and headers alone: before any
 rendering, and before torch is loaded."""
 
+import gc
 import math
 import os
+import sys
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,9 @@ from mistyle.core.errors import EnvironmentMissing, InputRefused
 
 # Layers' working memory per megapixel of picture, GB at 2 bytes a number; an estimate, not measured here.
 WORKING = {"sdxl": 4.0, "sd15": 3.0}
+PREDICTIONS = ("epsilon", "v_prediction")
+# Tensors by whose names finetunes in one file say that they predict velocities, and that their last level is all noise.
+MARKS = {"v_pred": ("prediction_type", "v_prediction"), "ztsnr": ("rescale_betas_zero_snr", True)}
 STYLE_BLOCK, CONTENT_BLOCK = "up_blocks.0.attentions.1", "up_blocks.0.attentions.0"
 
 
@@ -38,6 +43,12 @@ def base(place: Path, kind: str, channels: int) -> dict[str, Any]:
     wanted["addition_embed_type"] = "text_time" if kind == "sdxl" else None
     config = expect(place / "unet" / "config.json", what, fix, **wanted)
     text = models.read_json(place / "text_encoder" / "config.json")["hidden_size"]
+    schedule = place / "scheduler" / "scheduler_config.json"
+    found = models.read_json(schedule).get("prediction_type", "epsilon")
+    if found not in PREDICTIONS:
+        raise EnvironmentMissing(
+            f"{schedule}: prediction_type is {found!r}, expected {' or '.join(PREDICTIONS)}; {fix}"
+        )
     if kind == "sdxl":
         text += models.read_json(place / "text_encoder_2" / "config.json")["hidden_size"]
     if config["cross_attention_dim"] != text:
@@ -112,6 +123,12 @@ def checkpoint(path: Path, place: Path) -> None:
         raise EnvironmentMissing(f"{path}: its UNet takes {first[1]} channels, expected 4: an inpainting model")
 
 
+def marks(checkpoint: Path) -> dict[str, Any]:
+    """What a single file says of its noise levels, as its scheduler's configuration."""
+    names = models.header(checkpoint)
+    return {key: value for mark, (key, value) in MARKS.items() if mark in names}
+
+
 def numbers(paths: Iterable[Path]) -> int:
     """How many numbers weight files hold."""
     return sum(math.prod(shape) for shape in models.shapes(paths).values())
@@ -131,7 +148,8 @@ def need(
 
 
 def room(device: str) -> float:
-    """GB that are free on a device."""
+    """GB that are free on a device, networks that nobody holds any more counted as gone."""
+    empty(device)
     if device == "cuda":
         import torch
 
@@ -145,6 +163,19 @@ def room(device: str) -> float:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
     except (AttributeError, ValueError, OSError):
         return math.inf
+
+
+def empty(device: str) -> None:
+    """Give back what networks left on a device: those that nobody holds any more, and memory kept for later ones."""
+    import torch
+
+    gc.collect()
+    if "drjit" in sys.modules:
+        from mistyle.render.device import give_back
+
+        give_back()
+    if device in ("cuda", "mps"):
+        getattr(torch, device).empty_cache()
 
 
 def memory(what: str, needed: float, allowed: float, device: str, offload: bool) -> None:

@@ -27,6 +27,8 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
     proxies are huggingface_hub's. Raises UsageError unless downloading was allowed.
     """
     model = models.get(name)
+    if model.url:
+        raise UsageError(f"'{name}' does not lie on the hub: {models.how_to_get(model, folder)}")
     if not allowed:
         raise UsageError(
             f"fetching '{name}' downloads about {model.gigabytes} GB from {model.repo} under its licence "
@@ -39,9 +41,11 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
     transport: Any = next(base for base in HfHubHTTPError.__mro__ if base.__name__ == "HTTPError")
     place = folder / name
     try:
-        known = models.read_lock(folder).get(name, {}).get("files", {})
+        noted = models.read_lock(folder).get(name, {})
+        known = noted.get("files", {})
         own = set(_files(place)) - set(known)  # put there by hand: never removed
-        wanted = _download(model, place, None if overwrite else known) | dict(model.sha256)
+        revision = _commit(model, noted.get("revision", ""))
+        wanted = _download(model, revision, place, None if overwrite else known) | dict(model.sha256)
     except (transport, OSError) as error:
         if isinstance(error, OSError) and error.errno in (*faults.FULL, errno.EFBIG, *faults.NOT_TO_BE_WRITTEN):
             raise MistyleError(
@@ -61,7 +65,7 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
         convert(place / "diffusion_pytorch_model.bin", place, overwrite=overwrite)
         entries = {path: entries.get(path) or _checked(place / path, None) for path in _files(place)}
     lock = models.read_lock(folder)
-    lock[name] = {"repo": model.repo, "revision": model.revision, "files": entries}
+    lock[name] = {"repo": model.repo, "revision": revision, "files": entries}
     models.write_lock(folder, lock)
     lost = models.lacking(model, place, model.loose)
     if lost:
@@ -79,7 +83,8 @@ def adopt(name: str, folder: Path) -> Path:
     if lost:
         raise EnvironmentMissing(f"{lost[0]} is not there; {name} needs {', '.join(model.folders + model.loose)}")
     lock = models.read_lock(folder)
-    entries = {path: _checked(place / path, None) for path in _files(place) if path.endswith(".safetensors")}
+    weights = [path for path in _files(place) if path.endswith(".safetensors") or path in model.loose]
+    entries = {path: _checked(place / path, None) for path in weights}
     lock[name] = {"repo": model.repo, "revision": "adopted", "files": entries}
     models.write_lock(folder, lock)
     return place
@@ -90,7 +95,17 @@ def _files(place: Path) -> list[str]:
     return [p.as_posix() for p in every if p.parts[0] != PARTIAL]
 
 
-def _download(model: models.Model, place: Path, known: Mapping[str, Any] | None) -> dict[str, str]:
+def _commit(model: models.Model, noted: str) -> str:
+    """The commit to fetch. Where nobody is known to have published one, that of the first fetching stays: what the hub
+    calls `main` may change meanwhile."""
+    from huggingface_hub import HfApi
+
+    if model.revision != "main":
+        return model.revision
+    return noted if re.fullmatch("[0-9a-f]{40}", noted) else str(HfApi().model_info(model.repo).sha)
+
+
+def _download(model: models.Model, revision: str, place: Path, known: Mapping[str, Any] | None) -> dict[str, str]:
     """Fetch what is not there; returns the sha256 that the hub states for its large files.
 
     A file of another size is replaced if it is `known`, noted in the folder's lock (None: all are). UsageError else.
@@ -102,11 +117,11 @@ def _download(model: models.Model, place: Path, known: Mapping[str, Any] | None)
     from huggingface_hub.file_download import http_get
     from huggingface_hub.utils import build_hf_headers, filter_repo_objects
 
-    every = HfApi().list_repo_files(model.repo, revision=model.revision)
+    every = HfApi().list_repo_files(model.repo, revision=revision)
     stated, partial = {}, place / PARTIAL
     for path in filter_repo_objects(every, allow_patterns=list(model.patterns)):
         target = _inside(place, path)
-        url = hf_hub_url(model.repo, path, revision=model.revision)
+        url = hf_hub_url(model.repo, path, revision=revision)
         found = get_hf_file_metadata(url)
         tag = found.etag or ""
         if re.fullmatch("[0-9a-f]{64}", tag):
@@ -191,7 +206,7 @@ def listing(folder: Path | None) -> list[dict[str, Any]]:
     lock = models.read_lock(folder) if folder else {}
     for model in models.MODELS.values():
         there = next((p for p in models.places(model, folder) if p.is_dir()), None)
-        lost = models.lacking(model, there, ()) if there else []
+        lost = models.lacking(model, there, model.loose if model.url else ()) if there else []
         locked = lock.get(model.name, {}).get("files", {})
         hashes = {k: v["sha256"] for k, v in locked.items() if k.endswith(".safetensors")}
         rows.append(
@@ -203,6 +218,7 @@ def listing(folder: Path | None) -> list[dict[str, Any]]:
                 "gigabytes": model.gigabytes,
                 "licence": model.licence,
                 "purpose": model.purpose,
+                "url": model.url,
                 "folders": [f or "." for f in model.folders] + list(model.loose),
                 "found": str(there) if there and not lost else None,
             }

@@ -14,7 +14,8 @@ BASE = ("tokenizer", "text_encoder", "unet", "vae", "scheduler")  # folders of a
 @dataclass(frozen=True)
 class Model:
     """One model that mistyle can use. `folders` hold networks or tokenizers ('' is the model's own folder), `loose`
-    are single weight files; `patterns` are fetched."""
+    are single weight files; `patterns` are fetched. `sha256` may hold the first digits only, where no more is known.
+    What has a `url` is one file outside the hub, to be put in its place by hand."""
 
     name: str
     repo: str
@@ -26,6 +27,7 @@ class Model:
     patterns: tuple[str, ...]
     loose: tuple[str, ...] = ()
     sha256: Mapping[str, str] = field(default_factory=dict)
+    url: str = ""
 
 
 def _network(*folders: str) -> tuple[str, ...]:
@@ -171,6 +173,45 @@ MODELS = {
             "inpainter with paint3d.recipe=paint3d: inpaint ControlNet",
             ("",),
             _network(""),
+        ),
+        Model(
+            "vgg19",
+            "torchvision, IMAGENET1K_V1",
+            "dcbb9e9d",
+            0.6,
+            "BSD-3-Clause (torchvision; trained on ImageNet)",
+            "fit with fit.features=vgg19: the features of the style loss",
+            (),
+            (),
+            ("vgg19-dcbb9e9d.pth",),
+            {"vgg19-dcbb9e9d.pth": "dcbb9e9d"},  # torchvision names files by the first digits of their sha256
+            "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth",
+        ),
+        Model(
+            "vgg19-normalised",
+            "naoto0804/pytorch-AdaIN",
+            "v0.0.0",
+            0.1,
+            "CC-BY-4.0 (Oxford's VGG-19; scaled by Li et al.)",
+            "fit with fit.features=vgg19-normalised: the features that AdaIN and WCT use",
+            (),
+            (),
+            ("vgg_normalised.pth",),
+            {},
+            "https://github.com/naoto0804/pytorch-AdaIN/releases/download/v0.0.0/vgg_normalised.pth",
+        ),
+        Model(
+            "birefnet",
+            "danielgatis/rembg",
+            "v0.0.0",
+            1.0,
+            "MIT",
+            "sweep with sweep.segmenter=birefnet: the foreground of stylized views (pip install onnxruntime)",
+            (),
+            (),
+            ("BiRefNet-general-epoch_244.onnx",),
+            {"BiRefNet-general-epoch_244.onnx": "58f621f00f5d756097615970a88a791584600dcf7c45b18a0a6267535a1ebd3c"},
+            "https://github.com/danielgatis/rembg/releases/download/v0.0.0/BiRefNet-general-epoch_244.onnx",
         ),
     )
 }

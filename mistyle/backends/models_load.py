@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
-from mistyle.backends import models
+from mistyle.backends import models, models_check
 from mistyle.backends.diffusion_settings import ModelSettings
 from mistyle.backends.models_list import ENCODER
 from mistyle.core.errors import EnvironmentMissing
@@ -29,10 +29,22 @@ def device_of(settings: ModelSettings) -> str:
 
 
 def precision_of(settings: ModelSettings, device: str) -> torch.dtype:
-    """The type of the frozen networks' numbers."""
-    if settings.precision != "auto":
-        return getattr(torch, settings.precision)
-    return torch.float32 if device == "cpu" else torch.bfloat16
+    """The type of the frozen networks' numbers; auto takes bfloat16 where a card computes it itself, else float16."""
+    chosen = settings.precision
+    if chosen == "auto":
+        chosen = "float32" if device == "cpu" else "bfloat16" if computes_bfloat16(device) else "float16"
+    elif chosen == "bfloat16" and not computes_bfloat16(device):
+        raise EnvironmentMissing(
+            "models.precision=bfloat16: this card does not compute it; use auto, float16 or float32"
+        )
+    return getattr(torch, chosen)
+
+
+def computes_bfloat16(device: str) -> bool:
+    """Whether a device has bfloat16 of its own: CPUs always, CUDA cards from Ampere on, MPS not counted on."""
+    if device == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    return device != "mps"
 
 
 @contextmanager
@@ -61,42 +73,51 @@ def network(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
     return made.requires_grad_(False).eval()
 
 
-def base_parts(place: Path, kind: str, dtype: torch.dtype, checkpoint: Path | None = None) -> dict[str, Any]:
-    """The parts of a base model ('sdxl' or 'sd15'), as diffusers' pipelines take them; the VAE is float32.
-
-    Sampling is Euler's with trailing spacing for SDXL (ConsisLoRA's choice; the paper's equations (1)-(3) need its
-    unscaled noise levels).
-    """
-    from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
+def base_parts(
+    place: Path, kind: str, dtype: torch.dtype, checkpoint: Path | None = None, prediction: str = "auto"
+) -> dict[str, Any]:
+    """The parts of a base model ('sdxl' or 'sd15'), as diffusers' pipelines take them; the VAE is float32 (vae.py)."""
     from diffusers.models.unets.unet_2d_condition import UNet2DConditionModel
-    from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
     from transformers import CLIPTextModel, CLIPTextModelWithProjection, CLIPTokenizer
 
+    from mistyle.backends.vae import ExactVae
+
     if checkpoint is not None:
-        return _from_checkpoint(place, dtype, checkpoint)
+        return _from_checkpoint(place, dtype, checkpoint) | {"scheduler": schedule(place, checkpoint, prediction)}
     parts = {
         "tokenizer": CLIPTokenizer.from_pretrained(place / "tokenizer", local_files_only=True),
         "text_encoder": network(CLIPTextModel, place / "text_encoder", dtype),
         "unet": network(UNet2DConditionModel, place / "unet", dtype),
-        "vae": network(AutoencoderKL, place / "vae", torch.float32),
+        "vae": network(ExactVae, place / "vae", torch.float32),
     }
     if kind == "sdxl":
         parts["tokenizer_2"] = CLIPTokenizer.from_pretrained(place / "tokenizer_2", local_files_only=True)
         parts["text_encoder_2"] = network(CLIPTextModelWithProjection, place / "text_encoder_2", dtype)
-        parts["scheduler"] = EulerDiscreteScheduler.from_pretrained(place / "scheduler", timestep_spacing="trailing")
+        parts["scheduler"] = schedule(place, None, prediction)
     return parts
 
 
-def _from_checkpoint(place: Path, dtype: torch.dtype, checkpoint: Path) -> dict[str, Any]:
-    from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
-    from diffusers.pipelines.stable_diffusion_xl.pipeline_stable_diffusion_xl import StableDiffusionXLPipeline
+def schedule(place: Path, checkpoint: Path | None, prediction: str) -> Any:
+    """SDXL's noise levels, Euler's with trailing spacing (ConsisLoRA's choice; the paper's equations (1)-(3) need its
+    unscaled levels), and what the network predicts: as set, else as a single file's marks or the configuration say."""
     from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
+
+    more: dict[str, Any] = {} if checkpoint is None else models_check.marks(checkpoint)
+    if prediction != "auto":
+        more["prediction_type"] = prediction
+    return EulerDiscreteScheduler.from_pretrained(place / "scheduler", timestep_spacing="trailing", **more)
+
+
+def _from_checkpoint(place: Path, dtype: torch.dtype, checkpoint: Path) -> dict[str, Any]:
+    from diffusers.pipelines.stable_diffusion_xl.pipeline_stable_diffusion_xl import StableDiffusionXLPipeline
+
+    from mistyle.backends.vae import ExactVae
 
     with quiet():
         pipeline = StableDiffusionXLPipeline.from_single_file(
             str(checkpoint), config=str(place), local_files_only=True, torch_dtype=dtype, add_watermarker=False
         )
-        vae = AutoencoderKL.from_single_file(
+        vae = ExactVae.from_single_file(
             str(checkpoint), config=str(place), subfolder="vae", local_files_only=True, torch_dtype=torch.float32
         )
     names = ("tokenizer", "tokenizer_2", "text_encoder", "text_encoder_2", "unet")
@@ -104,7 +125,6 @@ def _from_checkpoint(place: Path, dtype: torch.dtype, checkpoint: Path) -> dict[
     parts["vae"] = vae
     for name in ("text_encoder", "text_encoder_2", "unet", "vae"):
         parts[name].requires_grad_(False).eval()
-    parts["scheduler"] = EulerDiscreteScheduler.from_pretrained(place / "scheduler", timestep_spacing="trailing")
     return parts
 
 
@@ -116,13 +136,11 @@ def controlnets(places: list[Path], dtype: torch.dtype) -> list[Any]:
 
 
 def settle(pipeline: Any, settings: ModelSettings, device: str) -> Any:
-    """Put a pipeline where it runs: whole on the device, or network by network with tiles for the VAE."""
+    """Put a pipeline where it runs: whole on the device, or network by network, which changes no number."""
     pipeline.set_progress_bar_config(disable=True)
-    if settings.offload:
-        pipeline.vae.enable_tiling()
-        if device == "cuda":
-            pipeline.enable_model_cpu_offload()
-            return pipeline
+    if settings.offload and device not in ("cpu", "mps"):
+        pipeline.enable_model_cpu_offload(device=device)
+        return pipeline
     return pipeline.to(device)
 
 

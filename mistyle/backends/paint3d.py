@@ -5,7 +5,8 @@ inpainting UNet (the paper), and Paint3D's own, plain SD 1.5 with a second Contr
 never downloaded here. Full-size networks have not been run yet; the tests run every path on tiny random ones.
 """
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +35,12 @@ class Recipe:
     guidance: float
     style: float
     scheduler: str
+    sampling: Mapping[str, Any] = field(default_factory=dict)
 
 
 RECIPES = {
-    "inpaint": Recipe("inpaint", 9, ("position",), (1.0,), 30, 4.0, 0.6, "DDIMScheduler"),
+    # Latents go far beyond the -1..1 that DDIM clips its pictures to unless its configuration says otherwise.
+    "inpaint": Recipe("inpaint", 9, ("position",), (1.0,), 30, 4.0, 0.6, "DDIMScheduler", {"clip_sample": False}),
     "paint3d": Recipe(
         "sd15", 4, ("position", "inpaint-control"), (1.0, 0.5), 20, 3.0, 1.0, "EulerAncestralDiscreteScheduler"
     ),
@@ -71,7 +74,7 @@ def check(settings: ModelSettings, chosen: Paint3dSettings) -> None:
     adapter = ip / LOOSE_NEEDED["sd15"]
     models_check.ip_adapter(adapter, ip / ENCODER, unet, "Stable Diffusion 1.5")
     device = device_of(settings)
-    width = precision_of(settings, device).itemsize
+    width = precision_of(own(settings, chosen), device).itemsize
     folders = [*(place / n for n in ("unet", "vae", "text_encoder")), *controls, ip / ENCODER]
     needed = models_check.need("sd15", folders, chosen.size**2, width, settings.offload)
     models_check.memory(f"inpainting {chosen.size}² texels", needed, settings.memory, device, settings.offload)
@@ -83,12 +86,17 @@ def _places(settings: ModelSettings, recipe: Recipe) -> tuple[Path, list[Path], 
     return place, controls, models.find("ip-adapter", settings.folder, [LOOSE_NEEDED["sd15"]])
 
 
-def identity(settings: ModelSettings, chosen: Paint3dSettings) -> str:
-    """Which networks the recipe's are."""
+def own(settings: ModelSettings, chosen: Paint3dSettings) -> ModelSettings:
+    """The models' settings with the inpainter's own precision."""
+    return settings if chosen.precision == "same" else settings.model_copy(update={"precision": chosen.precision})
+
+
+def identity(settings: ModelSettings, chosen: Paint3dSettings) -> list[str]:
+    """Which networks the recipe's are, and in which precision: where they lie and run decides nothing."""
     place, controls, ip = _places(settings, RECIPES[chosen.recipe])
     folders = [*(place / n for n in ("unet", "vae", "text_encoder")), *controls, ip / ENCODER]
     files = [file for folder in folders for file in models.weights(folder)]
-    return models.fingerprint([*files, ip / LOOSE_NEEDED["sd15"]])
+    return [models.fingerprint([*files, ip / LOOSE_NEEDED["sd15"]]), own(settings, chosen).precision]
 
 
 def inpainter(
@@ -125,10 +133,10 @@ def load(settings: ModelSettings, chosen: Paint3dSettings, style: Float[np.ndarr
     recipe = RECIPES[chosen.recipe]
     place, controls, ip = _places(settings, recipe)
     device = device_of(settings)
-    dtype = precision_of(settings, device)
+    dtype = precision_of(own(settings, chosen), device)
     nets = controlnets(controls, dtype)
     parts: dict[str, Any] = base_parts(place, "sd15", dtype) | {"safety_checker": None, "feature_extractor": None}
-    parts["scheduler"] = getattr(diffusers, recipe.scheduler).from_pretrained(place / "scheduler")
+    parts["scheduler"] = getattr(diffusers, recipe.scheduler).from_pretrained(place / "scheduler", **recipe.sampling)
     parts["controlnet"] = nets if len(nets) > 1 else nets[0]
     pipeline = StableDiffusionControlNetInpaintPipeline(**parts, requires_safety_checker=False)
     scale = chosen.style if chosen.style >= 0 else recipe.style

@@ -131,8 +131,10 @@ def _list(options: argparse.Namespace) -> int:
         print(f"  {row['purpose']}")
         print(f"  {row['repo']} at {row['revision']}, {row['gigabytes']} GB, {row['licence']}")
         print(f"  in {options.models or 'DIR'}/{row['name']}: {', '.join(row['folders'])}")
+        if row["url"]:
+            print(f"  from {row['url']}")
         for file, value in row["sha256"].items():
-            print(f"  sha256 {value}  {file}")
+            print(f"  sha256 {value}{'…' * (len(value) < 64)}  {file}")
     print(
         "\nNothing is downloaded unless you say so: mistyle models fetch NAME --models DIR --allow-download. "
         "Each model's licence is yours to accept.\nRevisions and hashes come from other projects' lock files; they "

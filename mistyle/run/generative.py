@@ -7,11 +7,12 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset, Picture
-from mistyle.core.errors import UsageError
+from mistyle.core.errors import EnvironmentMissing, UsageError
 from mistyle.core.view import View
 from mistyle.run.progress import Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
+from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.inpaint import Inpainter
 from mistyle.stages.mvst import Stylizer
 
@@ -19,9 +20,38 @@ LORAS = "loras"  # in work/: trained LoRAs outlive the stages that asked for the
 SPOKEN = 20.0  # seconds between two lines about a training
 
 
+def named(settings: Settings, path: Path | None) -> Path | None:
+    """A file that a setting names: the user's own, or that of a model of `mistyle models` by the model's name."""
+    from mistyle.backends.models import MODELS, file
+
+    if path is None or path.exists() or str(path) not in MODELS:
+        return path
+    return file(str(path), settings.models.folder)
+
+
+def fit_settings(settings: Settings) -> FitSettings:
+    """The fit's settings with what the rest of the job decides: where the features lie, and how the views are
+    painted."""
+    chosen, painted = settings.fit, settings.fit.painted
+    if painted == "auto":
+        painted = "with-light" if settings.stylizer == "diffusion" else "without-light"
+    return chosen.model_copy(update={"features": named(settings, chosen.features), "painted": painted})
+
+
 def check(settings: Settings, say: Callable[[str], None]) -> None:
     """Refuse what the generative backends of a job lack, in one sentence, before anything is rendered; say what they
     cost."""
+    try:
+        _check(settings, say)
+    except EnvironmentMissing as error:
+        raise EnvironmentMissing(
+            f"{error}. Without models: --preset fine, with the paper's sizes and the embedded stylizer"
+        ) from None
+
+
+def _check(settings: Settings, say: Callable[[str], None]) -> None:
+    fit_settings(settings)
+    named(settings, settings.sweep.segmenter)
     if settings.stylizer == "diffusion":
         from mistyle.backends.diffusion import announcement
         from mistyle.backends.diffusion import check as check_stylizer
@@ -100,9 +130,16 @@ def inpainter_inputs(settings: Settings, style: Picture) -> list[Any]:
         return []
     from mistyle.backends.paint3d import identity
 
-    own = settings.models.model_dump(include={"device", "precision", "offload"})
-    networks = identity(settings.models, settings.paint3d)
-    return [settings.inpainter, settings.paint3d, own, networks, style.rgb, style.alpha]
+    chosen = settings.paint3d.model_dump(exclude={"precision"})
+    return [settings.inpainter, chosen, identity(settings.models, settings.paint3d), style.rgb, style.alpha]
+
+
+def release(settings: Settings) -> None:
+    """Free the device of networks whose stage is over: the next one asks how much is free."""
+    from mistyle.backends.models_check import empty
+    from mistyle.backends.models_load import device_of
+
+    empty(device_of(settings.models))
 
 
 def texture_inpainter(settings: Settings, asset: Asset, style: Picture) -> Inpainter:

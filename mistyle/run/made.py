@@ -20,12 +20,16 @@ class Atlas:
 class Baked:
     """Per texture set: the maps with the painted albedo, and by how many views each texel is seen.
 
-    `begin` are the same maps with the painting's relief, where the fit starts at them (else empty).
+    `begin` are the same maps with the painting's relief, where the fit starts at them (else empty); `gains` are the
+    factors, per stylized view, that took the painted light out of it, where the stylizer paints lit objects, and
+    `taken` the share of the known shading that this was.
     """
 
     maps: tuple[Maps, ...]
     seen: tuple[np.ndarray, ...]
     begin: tuple[Maps, ...] = ()
+    gains: tuple[np.ndarray, ...] = ()
+    taken: float | None = None
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,10 @@ from typing import Any
 
 from mistyle.core import names
 
-PRESET_HELP = "draft: about a minute; standard (default); paper: the paper's own counts"
+PRESET_HELP = (
+    "draft: about a minute; standard (default); fine: 4096² and more steps; paper: the paper to the letter, with its "
+    "diffusion models (see mistyle models)"
+)
 
 
 def examples(text: str) -> dict[str, Any]:
@@ -20,7 +23,7 @@ def examples(text: str) -> dict[str, Any]:
 
 def add_job_options(
     verb: argparse.ArgumentParser,
-    presets: Sequence[str] = ("draft", "standard", "paper"),
+    presets: Sequence[str] = ("draft", "standard", "fine", "paper"),
     preset_help: str = PRESET_HELP,
 ) -> None:
     """Options that every job has; None means: not said here."""

@@ -19,7 +19,7 @@ from mistyle.run import asset_files
 from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.run.generative import check as check_generative
-from mistyle.run.generative import inpainter_inputs, texture_inpainter
+from mistyle.run.generative import fit_settings, inpainter_inputs, opaque, release, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
 from mistyle.run.painting import bake, check_coat, coat, coat_files, stylized_stage, unlit_views
@@ -99,7 +99,10 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     if "stylized" in run.edited:
         baked, stylized = retouched_stage(run, asset, atlas, baked, stylized)
         painted = ["retouch"]
-    fitted = run.record("fit", painted, [s.fit, seed], lambda r: fit(asset, atlas, baked, stylized, s, r))
+    look = [style.rgb] if s.fit.tv_from == "style" else []
+    fitted = run.record(
+        "fit", painted, [fit_settings(s), seed, *look], lambda r: fit(asset, style, atlas, baked, stylized, s, r)
+    )
     masks = masks_stage(run, asset, atlas, baked, fitted)
     repaired = run.record(
         "repair",
@@ -183,12 +186,31 @@ def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:
     return read_views(folder)
 
 
-def fit(asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View], settings: Settings, report: Report) -> Any:
+def fit(
+    asset: Asset,
+    style: Picture,
+    atlas: Atlas,
+    baked: Baked,
+    stylized: Sequence[View],
+    settings: Settings,
+    report: Report,
+) -> Any:
     """Section 4.2: normal and roughness, then albedo."""
     from mistyle.stages.fit import two_phase
+    from mistyle.stages.unlight import unlit
 
-    begin = baked.begin or None
-    return two_phase(asset.mesh, baked.maps, stylized, atlas.texels, settings.fit, settings.seed, report, begin=begin)
+    return two_phase(
+        asset.mesh,
+        baked.maps,
+        stylized,
+        atlas.texels,
+        fit_settings(settings),
+        settings.seed,
+        report,
+        begin=baked.begin or None,
+        style=opaque(style) if settings.fit.tv_from == "style" else None,
+        unlit=unlit(stylized, baked.gains) if baked.gains else None,
+    )
 
 
 def repair(
@@ -215,6 +237,9 @@ def repair(
         again = network or from_paint(baked.maps[part].albedo)
         maps.append(repair_part(fitted.maps[part], mask, texels, again, settings.repair, rng))
         report(0.3 * (part + 1) / len(atlas.texels))
+    if network is not None:
+        del network, again
+        release(settings)
     maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
     if settings.coat.protect is not None:
         own = [painted_mask(settings.coat.protect, texels) for texels in atlas.texels]
@@ -244,7 +269,9 @@ def settle_relief(
     steps = round(settings.fit.iterations1 * SETTLING)
     if settings.fit.refine == "off" or steps == 0 or not any(mask.any() for mask in masks):
         return list(maps)
-    short = settings.fit.model_copy(update={"refine": "normal-roughness", "iterations1": steps})
+    short = fit_settings(settings).model_copy(
+        update={"painted": "without-light", "refine": "normal-roughness", "iterations1": steps}
+    )
     targets = unlit_views(asset, maps, views, lambda done: None)
     settled = two_phase(
         asset.mesh, maps, targets, atlas.texels, short, seed=settings.seed + 1, progress=report, only=masks

@@ -10,7 +10,7 @@ from jaxtyping import Bool
 
 from mistyle.core.asset import Asset
 from mistyle.core.camera import resized
-from mistyle.core.image import erode, srgb_from_linear
+from mistyle.core.image import erode, resize, srgb_from_linear
 from mistyle.core.view import View
 from mistyle.run.made import Atlas, Baked, Retouched
 from mistyle.run.painting import unlit_views
@@ -52,7 +52,7 @@ def retouch(
         drawn = before[k] if file.endswith(".exr") else _as_written(folder, views[k], before[k])
         lossy = file.lower().endswith((".jpg", ".jpeg", ".webp")) or views[k].camera.size != asked[k]
         new = differs(views[k], drawn, *(LOSSY if lossy else EXACT))
-        brushes.append(replace(traced[k], mask=traced[k].mask & new))
+        brushes.append(_without_light(replace(traced[k], mask=traced[k].mask & new), baked.gains[k : k + 1]))
     painted, begun = [], []
     for part, (texels, maps) in enumerate(zip(atlas.texels, baked.maps, strict=True)):
         found = backproject(brushes, texels, settings.bake, mesh=asset.mesh)
@@ -71,7 +71,14 @@ def retouch(
         else unlit_views(asset, painted, _plain(asset, view, size), lambda done: None)[0]
         for view, size in zip(shown, asked, strict=True)
     ]
-    return Retouched(Baked(tuple(painted), baked.seen, tuple(begun)), tuple(shown))
+    return Retouched(replace(baked, maps=tuple(painted), begin=tuple(begun)), tuple(shown))
+
+
+def _without_light(view: View, gains: Sequence[np.ndarray]) -> View:
+    """An edited view as the texture takes it: what was taken out of the view is taken out of the edit."""
+    if not gains:
+        return view
+    return replace(view, rgb=(view.rgb * resize(gains[0], view.camera.size)[..., None]).astype(np.float32))
 
 
 def _plain(asset: Asset, view: View, size: tuple[int, int]) -> list[View]:

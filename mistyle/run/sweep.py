@@ -23,6 +23,7 @@ def swept_stages(
 ) -> tuple[Baked, list[View]]:
     """The stages 'surface', 'bake' and 'stylized' of a stylizer that paints view by view (paper 4.1.3 and 4.1.4)."""
     from mistyle.files.views import read_views, write_views
+    from mistyle.run.generative import fit_settings
     from mistyle.run.painting import coat_files
 
     s = run.job.settings
@@ -34,7 +35,14 @@ def swept_stages(
     painted = run.record("surface", ["texels", "views"], inputs, lambda r: swept(run, asset, style, atlas, views, r))
     shutil.rmtree(run.hidden.root / KEPT, ignore_errors=True)
     stylized = [finished(view, one) for view, one in zip(views, painted, strict=True)]
-    baked = run.record("bake", ["surface"], [s.bake], lambda r: bake(asset, stylized, painted, atlas, s, r))
+    chosen = fit_settings(s)
+    lit = chosen.painted == "with-light" and chosen.unlight > 0
+    light = [chosen.unlight, s.draw] if lit else []
+    baked = run.record(
+        "bake", ["surface"], [s.bake, *light], lambda r: bake(asset, stylized, painted, atlas, s, r, lit)
+    )
+    if baked.taken is not None:
+        run.progress.note(said_of_light(baked.taken))
     shown = run.stage("stylized", ["bake"], [], lambda folder, r: write_views(folder, stylized, (), progress=r))
     return baked, read_views(shown)
 
@@ -71,8 +79,10 @@ def stylizer_of(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, 
 def masker_of(settings: Settings) -> Masker | None:
     """The segmenter that the settings name; None for the rendered masks."""
     from mistyle.backends.masks import segmenter
+    from mistyle.run.generative import named
 
-    return None if settings.sweep.segmenter is None else segmenter(settings.sweep.segmenter)
+    path = named(settings, settings.sweep.segmenter)
+    return None if path is None else segmenter(path)
 
 
 def swept(
@@ -82,7 +92,7 @@ def swept(
     s = run.job.settings
     network = s.stylizer == "diffusion"
     if network:
-        from mistyle.run.generative import view_stylizer
+        from mistyle.run.generative import release, view_stylizer
 
         paint = view_stylizer(run, style, views, lambda done: report(0.1 * done))
     else:
@@ -100,6 +110,9 @@ def swept(
         key=key,
     )
     run.progress.say(sentence(result))
+    del paint
+    if network:
+        release(s)
     return result.painted
 
 
@@ -119,14 +132,22 @@ def bake(
     atlas: Atlas,
     settings: Settings,
     report: Report,
+    lit: bool,
 ) -> Baked:
     """Section 4.1.4: every texel takes the colour of the view that faces it most; what no view saw takes the nearest
-    colour of its island."""
+    colour of its island. Of `lit` views the painted light is divided out first."""
     from mistyle.stages.backproject import backproject, fill
     from mistyle.stages.coat import painted_mask, protected
     from mistyle.stages.texels import pad
+    from mistyle.stages.unlight import gain, share, unlit
 
     views = [replace(view, mask=view.mask & one.mask) for view, one in zip(stylized, painted, strict=True)]
+    taken, gains = None, []
+    if lit:
+        shading = bare_shape(asset, views, settings)
+        taken = share(views, shading, settings.fit.unlight)
+        gains = [gain(view, bare, taken) for view, bare in zip(stylized, shading, strict=True)]
+        views = unlit(views, gains)
     maps, seen = [], []
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
         found = backproject(views, texels, settings.bake, mesh=asset.mesh)
@@ -136,4 +157,27 @@ def bake(
         maps.append(coated)
         seen.append(found.seen)
         report((part + 1) / len(atlas.texels))
-    return Baked(tuple(maps), tuple(seen))
+    return Baked(tuple(maps), tuple(seen), (), tuple(gains), taken)
+
+
+def bare_shape(asset: Asset, views: Sequence[View], settings: Settings) -> list[np.ndarray]:
+    """Luminance of the white, matt mesh from every camera under the light that the views were drawn in."""
+    from mistyle.core.image import luminance
+    from mistyle.core.maps import flat_maps
+    from mistyle.render.draw import draw_views
+
+    white = [flat_maps(2, albedo=0.8, roughness=1.0) for _ in asset.mesh.parts]
+    cameras = [view.camera for view in views]
+    template = settings.draw.scene or "paper_views"
+    drawn = draw_views(asset.mesh, white, cameras, template, settings.draw.spp, settings.seed)
+    return [luminance(view.rgb) for view in drawn]
+
+
+def said_of_light(taken: float) -> str:
+    """What a person should know of light that was taken out of the views."""
+    if taken == 0:
+        return "no light was found in the stylized views that the lights of the rendered ones explain (fit.unlight)."
+    return (
+        f"{100 * taken:.0f} % of the shading under the rendered views' lights was found in the stylized views and "
+        "divided out before the texture took their colours (fit.unlight)."
+    )

@@ -25,6 +25,7 @@ Both phases are judged afterwards (`fit_judge.py`), and undone where they made t
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -80,14 +81,17 @@ def two_phase(
     phase1_lights: Lights | None = None,
     only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
     begin: Sequence[Maps] | None = None,
+    style: Float[np.ndarray, "sh sw 3"] | None = None,
+    unlit: Sequence[View] | None = None,
 ) -> Fit:
     """Fit `maps` (one per texture set, as baked) so that renders look like `targets` (linear rgb, stylized).
 
     `phase1_lights` replaces those of `scenes/phase1_directional.xml`; `only` names the texels that may change, all
     others keep their bytes. Phase 1 starts at the normal and roughness of `begin`, where given; what counts as unfitted
-    is `maps` all the same, and they are what stays where the phase is undone. The same inputs, settings, seed and
-    thread count give the same bytes. A gradient that is not a number ends its phase at the last good state, and a note
-    says where.
+    is `maps` all the same, and they are what stays where the phase is undone. With `style` (sRGB) its gradient lowers
+    the albedo's total variation, not the targets'. `unlit` are the targets of phase 2, where light was taken out of
+    them. The same inputs, settings, seed and thread count give the same bytes. A gradient that is not a number ends its
+    phase at the last good state, and a note says where.
     """
     if settings.metallic == "zero":
         maps = [replace(m, metallic=np.zeros_like(m.metallic)) for m in maps]
@@ -98,13 +102,16 @@ def two_phase(
     shrink = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
     table = fit_table.build(maps, texels, shrink, only)
     begun = {} if begin is None else fit_table.build(begin, texels, shrink, only).values
-    phases = _phases(settings, phase1_lights or lights("phase1"), targets)
+    phases = _phases(settings, phase1_lights or lights("phase1"), targets, style, unlit is not None)
     judge = fit_judge.bench(world.traced, world.tangents, targets) if settings.judge else None
     total, done = max(sum(phase.iterations for phase in phases), 1), 0
     fit = Fit(tuple(maps), nothing, nothing, {}, {}, {}, ())
     for phase, rng in zip(phases, np.random.default_rng(seed).spawn(len(phases)), strict=True):
         if phase.iterations:
             share = (done / total, phase.iterations / total)
+            if phase.name == "phase2" and unlit is not None:
+                world = replace(world, targets=_pictures(unlit))
+                judge = fit_judge.bench(world.traced, world.tangents, unlit) if settings.judge else None
             with memory.kept():
                 first = begun if phase is phases[0] else {}
                 fit = _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress, first)
@@ -164,31 +171,45 @@ def view_mask(view: View) -> Bool[np.ndarray, "h w"]:
     return view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1)
 
 
-def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
+def _inside(view: View) -> Bool[np.ndarray, "h w"]:
+    return erode(view_mask(view), 1)
+
+
+def _pictures(targets: Sequence[View]) -> tuple[Any, ...]:
+    """Targets as a World holds them."""
     import torch
 
+    pictures = []
+    for view in targets:
+        rgb = srgb_from_linear(np.nan_to_num(view.rgb, posinf=1.0))
+        stacked = np.concatenate([rgb, _inside(view)[..., None].astype(np.float32)], axis=-1)
+        pictures.append(torch.from_numpy(memory.copied(stacked.transpose(2, 0, 1))))
+    return tuple(pictures)
+
+
+def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
     from mistyle.measure.features import load_features
     from mistyle.render.draw import tracer
 
-    pictures, masks = [], []
-    for view in targets:
-        rgb, inside = np.nan_to_num(view.rgb, posinf=1.0), erode(view_mask(view), 1)
-        stacked = np.concatenate([srgb_from_linear(rgb), inside[..., None].astype(np.float32)], axis=-1)
-        pictures.append(torch.from_numpy(memory.copied(stacked.transpose(2, 0, 1))))
-        masks.append(inside)
     return World(
         traced=tracer(mesh),
         tangents=corner_tangents(mesh),
         cameras=tuple(view.camera for view in targets),
-        targets=tuple(pictures),
-        masks=tuple(masks),
+        targets=_pictures(targets),
+        masks=tuple(_inside(view) for view in targets),
         features=load_features(settings.features),
     )
 
 
-def _phases(settings: FitSettings, directional: Lights, targets: Sequence[View]) -> list[Phase]:
-    """Phase 1, and with refine = all phase 2."""
-    flat = settings.painted == "without-light"
+def _phases(
+    settings: FitSettings,
+    directional: Lights,
+    targets: Sequence[View],
+    style: Float[np.ndarray, "h w 3"] | None = None,
+    unlit: bool = False,
+) -> list[Phase]:
+    """Phase 1, and with refine = all phase 2; `unlit` where the latter's targets show no light."""
+    flat = settings.painted != "with-light"
     moving = {"tilt": settings.rate_normal, "roughness": settings.rate_roughness}
     first = Phase(
         name="phase1",
@@ -208,18 +229,22 @@ def _phases(settings: FitSettings, directional: Lights, targets: Sequence[View])
         lights=lights("phase2"),
         one_by_one=False,
         clay=False,
-        gloss=not flat,
+        gloss=not (flat or unlit),
         rates={"albedo": settings.rate_albedo} | {name: rate * settings.reduced for name, rate in moving.items()},
-        variation={"albedo": _albedo_variation(settings, targets)},
+        variation={"albedo": _albedo_variation(settings, targets, style)},
         iterations=settings.iterations2,
         loss=_colour_loss(settings),
     )
     return [first, second]
 
 
-def _albedo_variation(settings: FitSettings, targets: Sequence[View]) -> float:
+def _albedo_variation(
+    settings: FitSettings, targets: Sequence[View], style: Float[np.ndarray, "h w 3"] | None
+) -> float:
     from mistyle.measure.losses import adaptive_tv_weight, mean_gradient
 
+    if style is not None:
+        return adaptive_tv_weight(mean_gradient(style), settings.tv_albedo)
     gradients = [mean_gradient(srgb_from_linear(np.nan_to_num(view.rgb)), view_mask(view)) for view in targets]
     return adaptive_tv_weight(float(np.mean(gradients)), settings.tv_albedo)
 

@@ -12,8 +12,16 @@ class FitSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     refine: Literal["off", "normal-roughness", "all"] = Field(default="all", description="which maps may change")
-    painted: Literal["without-light", "with-light"] = Field(
-        default="without-light", description="whether the stylized views show lit objects"
+    painted: Literal["auto", "without-light", "with-light"] = Field(
+        default="auto",
+        description="whether the stylized views show lit objects; auto: as the stylizer paints (diffusion with light)",
+    )
+    unlight: float = Field(
+        default=1.0,
+        ge=0,
+        le=1,
+        description="largest share of the shading under the views' own lights that is divided out of views painted "
+        "with light, before the texture and phase 2 see them; 0: none (the paper)",
     )
     lights: Literal["together", "one-per-view"] = Field(
         default="one-per-view",
@@ -22,7 +30,11 @@ class FitSettings(BaseModel):
     metallic: Literal["keep", "zero", "fit"] = Field(
         default="keep", description="the asset's own metallic map (0 without one), 0, or moved by phase 1"
     )
-    features: Path | None = Field(default=None, description="weights of VGG-19; none: the embedded filter bank")
+    features: Path | None = Field(
+        default=None,
+        description="weights of VGG-19, or vgg19 (vgg19-normalised), which `mistyle models` lists; none: the embedded "
+        "filter bank",
+    )
     bridge: Literal["frozen", "wrap"] = Field(
         default="frozen",
         description="between torch and Dr.Jit: recorded functions, or dr.wrap around mi.render (slower, same numbers)",
@@ -62,6 +74,11 @@ class FitSettings(BaseModel):
     statistics2: float = Field(default=0.0, ge=0, description="weight of the features' statistics in phase 2")
     tv_albedo: float = Field(
         default=0.05, ge=0, description="largest weight of the albedo's total variation, for a flat style"
+    )
+    tv_from: Literal["views", "style"] = Field(
+        default="views",
+        description="whose mean gradient lowers it: the stylized views', which are at the fit's own scale, or the "
+        "style picture's (the paper)",
     )
     colour2: float = Field(
         default=5.0, ge=0, description="weight of the sliced Wasserstein distance in phase 2 (the paper's)"

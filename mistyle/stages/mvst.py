@@ -52,7 +52,8 @@ class SweepSettings(BaseModel):
     )
     segmenter: Path | None = Field(
         default=None,
-        description="ONNX file (BiRefNet) that finds the foreground of a stylized view; left out: the rendered mask",
+        description="ONNX file that finds the foreground of a stylized view, or birefnet, which `mistyle models` "
+        "lists; left out: the rendered mask",
     )
     follow_outline: bool | None = Field(
         default=None,

@@ -1,0 +1,78 @@
+"""Light that a stylizer painted into its views, divided out as far as the known shading explains it.
+
+A network that paints from rendered views paints lit objects. The light of those views is known, and with it the
+shading of the bare shape. How much of it the views show is measured: the slope of a view's log luminance over the
+shading's, both blurred until strokes are gone, and how firmly the two go together. What any painter does with a form,
+lighter above than below, is taken off both first: it is the painting's own. Views of one sweep go on from each other,
+so one answer is looked for in all of them, the median. Where they do not go together nothing is taken, and never more
+than the shading itself.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.image import erode, gaussian, luminance
+from mistyle.core.view import View
+
+STROKE = 1 / 48  # of the picture's width: the blur under which strokes are lost and the form's shading stays
+NOISE = 1 / 512  # of its width: the blur that takes the noise of few samples from the shading
+BOUND = 4.0  # largest factor by which a pixel is made brighter or darker
+LEAST = 0.02  # of the brightest: darker shading and darker paint say nothing of each other
+# Correlation that the embedded stylizer's paintings, which show no light, have with the shading at most (in the median
+# over views, `python -m benchmarks.unlight`), and how far beyond it nothing is left to chance.
+CHANCE, CERTAIN = 0.5, 0.65
+
+
+def share(views: Sequence[View], shading: Sequence[Float[np.ndarray, "h w"]], largest: float = 1.0) -> float:
+    """The exponent of the shading that the views show, 0..`largest`; `shading` is the luminance of the bare shape under
+    the views' light, multiplied by coverage as `view.rgb` is."""
+    found = [pair for pair in map(_together, views, shading) if pair is not None]
+    if not found:
+        return 0.0
+    slope, correlation = np.median(found, axis=0)
+    certain = np.clip((correlation - CHANCE) / (CERTAIN - CHANCE), 0, 1)
+    return float(min(certain * np.clip(slope, 0, 1), largest))
+
+
+def _together(view: View, shading: Float[np.ndarray, "h w"]) -> tuple[float, float] | None:
+    """Slope and correlation of a view's log luminance with the shading's; None where there is nothing to compare."""
+    width = view.mask.shape[1]
+    inside = erode(view.mask & (view.coverage > 0.99) & np.isfinite(view.rgb).all(axis=-1), 1)
+    seen = luminance(np.nan_to_num(view.rgb))
+    if inside.sum() < 16 or seen[inside].max() <= 0 or shading[inside].max() <= 0:
+        return None
+    planes = _log(shading, inside), _log(seen, inside), view.normal[..., 1]
+    bare, shown, upward = (_blurred(p, inside, STROKE * width)[inside].astype(np.float64) for p in planes)
+    form = np.stack([np.ones_like(upward), upward], axis=1)
+    x, y = (values - form @ np.linalg.lstsq(form, values, rcond=None)[0] for values in (bare, shown))
+    spread = float(x @ x)
+    if min(spread, float(y @ y)) <= 1e-6 * len(x):
+        return None
+    return float(x @ y) / spread, float(x @ y) / float(np.sqrt(spread * (y @ y)))
+
+
+def gain(view: View, shading: Float[np.ndarray, "h w"], exponent: float) -> Float[np.ndarray, "h w"]:
+    """The factor that takes a share of the shading out of a view and leaves its mean lightness; 1 off the mesh."""
+    if exponent == 0:
+        return np.ones(view.mask.shape, np.float32)
+    logs = _blurred(_log(shading, view.mask), view.mask, NOISE * view.mask.shape[1])
+    factor = np.exp(-exponent * (logs - logs[view.mask].mean()))
+    return np.where(view.mask, np.clip(factor, 1 / BOUND, BOUND), 1).astype(np.float32)
+
+
+def unlit(views: Sequence[View], gains: Sequence[Float[np.ndarray, "h w"]]) -> list[View]:
+    """The views without the light that was found in them."""
+    return [replace(v, rgb=(v.rgb * g[..., None]).astype(np.float32)) for v, g in zip(views, gains, strict=True)]
+
+
+def _log(plane: Float[np.ndarray, "h w"], inside: np.ndarray) -> Float[np.ndarray, "h w"]:
+    return np.log(np.maximum(plane, LEAST * float(plane[inside].max()))).astype(np.float32)
+
+
+def _blurred(plane: Float[np.ndarray, "h w"], inside: np.ndarray, sigma: float) -> Float[np.ndarray, "h w"]:
+    """A mean over what is inside, about each pixel."""
+    weight = inside.astype(np.float32)
+    return gaussian(plane * weight, sigma) / np.maximum(gaussian(weight, sigma), 1e-3)

@@ -1,0 +1,173 @@
+"""Networks on a device, by a stand-in for it: what lies where, offloading, and what is left between the stages."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import standin
+import test_diffusion as views_of
+import test_paint3d as atlas_of
+import tiny_models
+import torch
+from test_surface_paint import asset_of
+
+from mistyle.backends import consislora_make, diffusion, models_check, models_load, paint3d
+from mistyle.backends.diffusion_settings import ModelSettings
+from mistyle.core.asset import Picture
+from mistyle.core.errors import EnvironmentMissing
+from mistyle.core.maps import flat_maps
+from mistyle.run.generative import inpainter_inputs
+from mistyle.run.made import Atlas, Baked
+from mistyle.run.progress import Progress
+from mistyle.run.settings import resolve
+from mistyle.run.stages import Job, Run
+from mistyle.stages.fit import Fit
+from mistyle.stages.texels import rasterise
+
+torch.set_num_threads(1)
+
+
+def test_the_stand_in_refuses_what_cuda_refuses_and_counts(monkeypatch):
+    with standin.device(monkeypatch) as found:
+        there = torch.ones(1000).to("cuda") + 1
+        with pytest.raises(RuntimeError, match="expected all tensors on the same device"):
+            there + torch.ones(1000)
+        assert there.device.type == "cuda" and torch.equal(there.cpu(), torch.full((1000,), 2.0))
+        assert models_check.room("cuda") == pytest.approx((standin.TOTAL - 4000) / 1e9)
+        del there
+        assert models_check.room("cuda") == standin.TOTAL / 1e9 and found == [4000, 0]
+
+
+ONCE = views_of.QUICK.model_copy(update={"steps": 1, "block": 1, "repeats": 1, "refinement": 0.0})
+
+
+def painter(tmp_path, seen, change: dict, **more):
+    """The stylizer with as little work as shows what lies where."""
+    job = views_of.job(tmp_path, ONCE.model_copy(update=change), **more)
+    short = job.training.model_copy(update={"steps": 1, "style_steps": 1, "switch": 0})
+    return diffusion.stylizer(replace(job, training=short), seen)
+
+
+def paint(tmp_path, adapter: str, **more) -> list[np.ndarray]:
+    """A later view first, as a resumed sweep has it, then one whose content LoRA takes the first one's place."""
+    content = "per-view" if adapter == "lora" else "none"
+    seen = [views_of.view(0.0), views_of.view(30.0)]
+    paints = painter(tmp_path, seen, {"adapter": adapter, "content": content}, precision="float32", **more)
+    rng = np.random.default_rng(0)
+    return [paints(v, p, rng) for v, p in ((seen[1], views_of.half_prior()), (seen[0], None))]
+
+
+@pytest.mark.parametrize("adapter", ["lora", "ip"])
+def test_views_are_painted_on_the_device_offloaded_or_not(tmp_path, monkeypatch, adapter):
+    plain = paint(tmp_path, adapter)
+    with standin.device(monkeypatch):
+        answers = [paint(tmp_path, adapter, offload=offload) for offload in (False, True)]
+        assert standin.bytes_alive() == 0
+    assert np.array_equal(*(np.stack(pictures) for pictures in answers)), "offloading changes no number"
+    np.testing.assert_allclose(np.stack(answers[0]), np.stack(plain), atol=2e-3)
+
+
+def test_guidance_finds_everything_on_the_device(tmp_path, monkeypatch):
+    change = {"content": "shared", "style_guidance": 1.0, "content_guidance": 1.0}
+    with standin.device(monkeypatch):
+        paints = painter(tmp_path, [views_of.view()], change, offload=True)
+        assert np.isfinite(paints(views_of.view(), views_of.half_prior(), np.random.default_rng(0))).all()
+
+
+@pytest.mark.parametrize("recipe", list(paint3d.RECIPES))
+def test_the_inpainter_runs_on_the_device_offloaded_or_not(monkeypatch, recipe):
+    chosen = atlas_of.SETTINGS.model_copy(update={"recipe": recipe, "steps": 1})
+    with standin.device(monkeypatch):
+        answers = []
+        for offload in (False, True):
+            brush = paint3d.load(atlas_of.settings(offload=offload), chosen, atlas_of.picture())
+            answers.append(atlas_of.answer(brush))
+        held = standin.bytes_alive()
+        del brush
+        assert 0 == standin.bytes_alive() < held
+    assert np.array_equal(*answers) and np.isfinite(answers[0]).all()
+
+
+def test_offloading_keeps_less_on_the_device(tmp_path, monkeypatch):
+    held = []
+    with standin.device(monkeypatch):
+        for offload in (False, True):
+            made, _ = diffusion._pipeline(views_of.job(tmp_path, offload=offload))
+            views_of.paint(made, ONCE)
+            held.append(standin.bytes_alive())
+            del made
+    assert held[1] < 0.7 * held[0]
+
+
+def test_nothing_is_left_on_the_device_when_a_stage_asks_what_is_free(tmp_path, monkeypatch):
+    """Sweep with its training, then repair, as a job runs them: every question is asked of an empty device."""
+    from mistyle.run import pipeline
+    from mistyle.run.sweep import swept
+
+    chosen = {"steps": 1, "repeats": 1, "refinement": 0.0, "content": "shared"}
+    training = {"rank": 4, "steps": 1, "style_steps": 1, "switch": 0, "resolution": 16}
+    texture = {"size": 32, "overlap": 8, "steps": 1}
+    place = {"folder": str(tiny_models.folder()), "precision": "float32"}
+    said = {"stylizer": "diffusion", "inpainter": "paint3d", "models": place, "diffusion": chosen, "train": training}
+    settings = resolve("standard", None, said | {"paint3d": texture, "fit": {"refine": "off"}}, {})
+    job = Job(Path("mesh.obj"), Path("wave.png"), tmp_path, settings, "x")
+    style = Picture(views_of.picture(), None, Path("wave.png"))
+    asset, maps = asset_of(atlas_of.mesh()), (flat_maps(32, albedo=0.3),)
+    texels = rasterise(asset.mesh, 0, 32)
+    atlas, baked, nothing = Atlas((texels,), maps), Baked(maps, (np.ones((32, 32), int),)), (np.zeros((32, 32)),)
+    fitted = Fit(maps, nothing, nothing, {}, {}, {}, ())
+    masks = [atlas_of.middle() & texels.covered]
+    held: list[int] = []
+
+    def report(done: float) -> None:
+        held.append(standin.bytes_alive())
+
+    with standin.device(monkeypatch) as found, Run(job, Progress(quiet=True)) as run:
+        run.keys["surface"] = "k"
+        swept(run, asset, style, atlas, [views_of.view()], report)
+        assert len(found) == 2 and max(held) > 0 == standin.bytes_alive(), "stylizer and training asked"
+        monkeypatch.setattr(pipeline, "settle_relief", lambda *a: held.append(standin.bytes_alive()) or a[2])
+        pipeline.repair(asset, style, atlas, baked, [], fitted, masks, settings, report)
+        assert len(found) == 3 and held[-2] > held[-1] == 0 == standin.bytes_alive()
+    assert not any(found)
+
+
+def test_training_gives_its_memory_back_before_the_stylizer_loads(tmp_path, monkeypatch):
+    left = []
+    original = diffusion._pipeline
+    monkeypatch.setattr(diffusion, "_pipeline", lambda job: left.append(standin.bytes_alive()) or original(job))
+    with standin.device(monkeypatch):
+        painter(tmp_path, [views_of.view()], {})
+    assert left == [0]
+
+
+@pytest.mark.parametrize(
+    ("device", "card", "chosen"), [("cpu", None, "float32"), ("cuda", True, "bfloat16"), ("cuda", False, "float16")]
+)
+def test_bfloat16_only_where_the_card_has_it(monkeypatch, device, card, chosen):
+    monkeypatch.setattr(torch.cuda, "is_bf16_supported", lambda including_emulation=True: card or including_emulation)
+    assert models_load.precision_of(ModelSettings(), device) == getattr(torch, chosen)
+    assert models_load.precision_of(ModelSettings(), "mps") == torch.float16
+    if card is False:
+        with pytest.raises(EnvironmentMissing, match="this card does not compute it"):
+            models_load.precision_of(ModelSettings(precision="bfloat16"), device)
+
+
+def test_what_decides_nothing_is_in_no_key(tmp_path):
+    style, seen = Picture(views_of.picture(), None, Path("wave.png")), [views_of.view()]
+    plain = {"folder": str(tiny_models.folder()), "device": "cpu"}
+
+    def keys(paint: dict, **more) -> tuple:
+        s = resolve("standard", None, {"inpainter": "paint3d", "models": plain | more, "paint3d": paint}, {})
+        job = diffusion.Job(s.models, s.train, s.diffusion, style.rgb, "wave", tmp_path, 0)
+        trained = consislora_make.lora_key("style", style.rgb, "[v]", s.train, s.models, 0)
+        return diffusion.key(job, seen), trained, inpainter_inputs(s, style)
+
+    base = keys({})
+    assert keys({}, offload=True) == keys({}, device="auto") == keys({}, memory=3) == base
+    for other in ({"precision": "float16"}, {"prediction": "v_prediction"}):
+        assert keys({}, **other)[:2] != base[:2]
+    repaired = keys({"precision": "float16"})
+    assert repaired[:2] == base[:2] and repaired[2] != base[2], "the repair's precision repaints no view"
+    assert keys({"precision": "float16"}, precision="float16")[2] == keys({}, precision="float16")[2]

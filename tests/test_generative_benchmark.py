@@ -1,0 +1,22 @@
+"""Every path of the generative stages runs in half precision: the benchmark's own figures."""
+
+import json
+import sys
+
+import torch
+from helpers import ROOT
+
+
+def test_every_path_runs_in_half_precision(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(ROOT))
+    from benchmarks import generative
+
+    threads = torch.get_num_threads()
+    words = ["--device", "cpu", "--tiny", "--precision", "bfloat16", "--json", str(tmp_path / "x.json")]
+    monkeypatch.setattr(sys, "argv", ["generative", *words])
+    generative.main()
+    torch.set_num_threads(threads)
+    figures = json.loads((tmp_path / "x.json").read_text())["figures"]
+    assert figures["paths"] == figures["paths_run"] == 16
+    stylizers = [name for name in figures if name.split(".")[0] in ("lora", "ip") and not name.endswith(".cpu")]
+    assert len(stylizers) == 8 and all("bfloat16" in name for name in stylizers)
