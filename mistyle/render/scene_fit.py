@@ -21,8 +21,8 @@ from mistyle.render.scene_result import FittedScene, Residual
 RATE = 0.02
 SHARE = 0.7  # of the rate that each coarser level of the pyramid has
 LAST_RATE = 0.05  # share of the rate at the end
-TAIL = 0.3  # share of the steps at the end whose mean is the result where gradients are noisy
-TAIL_RATE = 0.1  # share of the rate there
+COURSE = 0.3  # share of the steps at the end that are looked at for drift and spread
+TAIL = 0.15  # share of them whose mean is the result where gradients are noisy
 MOST_BAD = 100  # numbers that are reported one by one
 
 
@@ -99,8 +99,8 @@ def _finished(
     job: scene_job.Job, state: scene_job.State, before: Sequence[scene_result.Look], notes: Sequence[str], progress: Any
 ) -> FittedScene:
     """The result, measured against the start, undone where it is worse."""
-    if state.course and job.fast is None:
-        mean = {p.key: (state.tail[p.key] / len(state.course)).astype(np.float32) for p in job.chosen}
+    if (count := state.iteration - _first(job, TAIL)) > 0 and not (job.newton or job.fast):
+        mean = {p.key: (state.tail[p.key] / count).astype(np.float32) for p in job.chosen}
         # What stands still keeps its bytes.
         state.values = {k: np.where(state.values[k] == state.start[k], state.start[k], v) for k, v in mean.items()}
     after = scene_result.looks(job, state.values, progress)
@@ -153,16 +153,22 @@ def _step(job: scene_job.Job, state: scene_job.State) -> None:
         state.values[p.key] = np.where(usable, moved, state.values[p.key])
     state.trace.append(total)
     state.iteration += 1
-    if step >= (1 - TAIL) * plan.iterations:
+    if step >= _first(job, TAIL):
         for p in job.chosen:
             state.tail[p.key] += state.values[p.key]
+    if step >= _first(job, COURSE):
         state.course.append(np.concatenate([scene_result.brief(p, state.values[p.key]) for p in job.chosen]))
+
+
+def _first(job: scene_job.Job, share: float) -> int:
+    """The first of the last steps that are the share of all."""
+    return int(np.ceil((1 - share) * job.plan.iterations))
 
 
 def _falling(step: int, steps: int, noisy: bool) -> float:
     """The rate's share: along a cosine; where gradients are noisy, it has ended before the steps that are averaged."""
-    last, end = (TAIL_RATE, (1 - TAIL) * steps) if noisy else (LAST_RATE, steps)
-    return last + (1 - last) * 0.5 * (1 + np.cos(np.pi * min(step / end, 1.0)))
+    end = (1 - TAIL) * steps if noisy else steps
+    return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * min(step / end, 1.0)))
 
 
 def _gradients(job: scene_job.Job, state: scene_job.State, k: int, seeds: tuple[int, int]):

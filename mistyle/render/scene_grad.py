@@ -68,7 +68,9 @@ def relative(weights: Any) -> Loss:
     return lambda picture, reference: dr.mean(weights * dr.square(picture - reference), axis=None)
 
 
-def relative_weights(reference: Float[np.ndarray, "h w 3"], used: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
+def relative_weights(
+    reference: Float[np.ndarray, "h w 3"], used: Bool[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w 3"]:
     """1 / (m + ε): m the mean square of the reference's used values around a pixel, without its own and its
     neighbours' (AROUND, HOLE); ε the square of DARK times the median of its positive values.
 
@@ -309,7 +311,7 @@ def derivative(
     integrator: Any,
     sensor: Any,
     spp: int,
-    seeds: tuple[int, int],
+    seed: int,
 ) -> Float[np.ndarray, "h w 3"]:
     """The picture's derivative along one direction of the parameters, an unbiased estimate in forward mode.
 
@@ -325,12 +327,9 @@ def derivative(
         # All directions are arrays, so that every column runs the same kernel.
         table[p.key] = typed(kind, values[p.key]) + typed(kind, direction[p.key]) * along
     table.update()
-    numbers = [dr.opaque(mi.UInt32, n) for n in seeds]
-    image = mi.render(
-        scene, table, sensor, integrator, seed=numbers[0], seed_grad=numbers[1], spp=spp, spp_grad=spp
-    )
-    dr.forward(along)
-    result = np.array(dr.grad(image), dtype=np.float32)[..., :3]
+    dr.forward(along, dr.ADFlag.ClearEdges)
+    image = integrator.render_forward(scene, table, sensor, seed=dr.opaque(mi.UInt32, seed), spp=spp)
+    result = np.array(image, dtype=np.float32)[..., :3]
     return np.where(np.isfinite(result), result, np.float32(0))
 
 

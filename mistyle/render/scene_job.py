@@ -116,7 +116,9 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
     unsuited = "regularizers came" if regularizers else scene_newton.refusal(chosen, free, views, loss)
     unsuited = "gradients are exact without it" if quick is not None else unsuited
     if plan.solver == "gauss-newton" and unsuited:
-        raise UsageError(f"the solver 'gauss-newton' cannot do this fit: {unsuited}. Leave it to 'auto', or use 'adam'.")
+        raise UsageError(
+            f"the solver 'gauss-newton' cannot do this fit: {unsuited}. Leave it to 'auto', or use 'adam'."
+        )
     newton = plan.solver != "adam" and not unsuited
     notes.append(_way(quick, engine, why))
     if quick is None and loss == "log_srgb_l1":
@@ -131,7 +133,9 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
 
 def _way(quick: Any, engine: Any, why: str) -> str:
     if quick is not None:
-        return "Gradients came without Monte Carlo: direct light of points and directions on plain `principled` materials."
+        return (
+            "Gradients came without Monte Carlo: direct light of points and directions on plain `principled` materials."
+        )
     return f"Gradients came through {str(engine).partition('[')[0]}, not through the fast path: {why}"
 
 
@@ -246,7 +250,9 @@ def restored(saved: Mapping[str, np.ndarray], job: Job) -> State:
             for k in range(count)
         )
     kinds = {"values": np.float32, "held": bool, "start": np.float32, "tail": np.float64}
-    held = {name: {p.key: np.array(saved[f"{p.name}/{name}"], kind) for p in job.chosen} for name, kind in kinds.items()}
+    held = {
+        name: {p.key: np.array(saved[f"{p.name}/{name}"], kind) for p in job.chosen} for name, kind in kinds.items()
+    }
     newton = {k.removeprefix("newton/"): v for k, v in saved.items() if k.startswith("newton/")}
     return State(
         int(saved["iteration"]),

@@ -123,7 +123,7 @@ def merged(chosen: Sequence[Parameter]) -> tuple[str, ...]:
 
 
 def _reader(shape: Any, attribute: str, children: scene_reach.Children) -> tuple[str, Any, str | None]:
-    """Role and owner of a mesh's attribute by the texture that reads it, and why it cannot be fitted where none does."""
+    """Role and owner of a mesh's attribute by the texture that reads it, or why it cannot be fitted."""
     found = scene_reach.readers(shape, attribute, children)
     if found:
         return *found[0], None

@@ -51,7 +51,7 @@ class Newton:
 
 @dataclass
 class _Seen:
-    """Sums over one camera's pictures of a round: of I - R where it counts, of its square, and of the loss's weights."""
+    """Sums of I - R and of its square over one camera's pictures of a round, and the weights of the loss."""
 
     weights: Float[np.ndarray, "h w 3"]
     count: int = 0
@@ -113,7 +113,8 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
     for m, turn in enumerate(turns):
         if stopping.asked():
             return False
-        found = [_look(job, k, scene_grad.seeds(job.plan.seed, state.iteration + m, j)[0], seen[k]) for j, k in enumerate(turn)]
+        numbers = [scene_grad.seeds(job.plan.seed, state.iteration + m, slot)[0] for slot in range(len(turn))]
+        found = [_look(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
         losses.append(float(np.mean([value for value, _ in found])))
         for k, (_, wrong) in zip(turn, found, strict=True):
             broken[k] += wrong
@@ -164,13 +165,9 @@ def _columns(job: Any, fill: Any, theta: Float[np.ndarray, " n"], k: int, number
         one = np.zeros(len(theta))
         one[n] = 1
         direction = spread(job, one, zero)
-        seeds = scene_grad.seeds(job.plan.seed, 2**30 + number, k, n)
-        view = job.views[k]
-        result.append(
-            scene_grad.derivative(
-                job.scene, job.table, job.chosen, values, direction, job.engine, view.sensor, job.plan.spp_grad or SPP, seeds
-            )
-        )
+        seed, sensor = scene_grad.seeds(job.plan.seed, 2**30 + number, k, n)[0], job.views[k].sensor
+        given = (job.scene, job.table, job.chosen, values, direction, job.engine, sensor)
+        result.append(scene_grad.derivative(*given, job.plan.spp_grad or SPP, seed))
     return np.stack(result)
 
 

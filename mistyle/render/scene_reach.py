@@ -38,7 +38,7 @@ def drawn(scene: Any, held: Children) -> set[Any]:
 
 
 def readers(shape: Any, attribute: str, held: Children) -> list[tuple[str, Any]] | None:
-    """(role, owner) of the textures that read a mesh's attribute; None where a plugin of the user's may do so itself."""
+    """(role, owner) of the textures that read a mesh's attribute; None where a user's plugin may read it itself."""
     found, own = [], False
     for name, holder, child in below(shape, held):
         if child.class_name() == "MeshAttribute" and re.search(rf'name = "{re.escape(attribute)}"', str(child)):
@@ -52,7 +52,7 @@ def no_gradient(node: Any, owner: Any, role: str, engine: Any) -> str | None:
     import mitsuba as mi
 
     detached = engine is None or isinstance(engine, mi.ad.integrators.common.ADIntegrator)
-    called = "prb" if engine is None else engine.class_name().removesuffix("Integrator").lower()
+    called = "prb" if engine is None else str(engine).partition("[")[0].removesuffix("Integrator").lower()
     inside = isinstance(owner, (mi.Medium, mi.PhaseFunction)) or isinstance(node, mi.Volume)
     if inside and engine is not None and "vol" not in called:
         return f"it belongs to a medium, and the integrator {called} follows no light through media."

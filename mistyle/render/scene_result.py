@@ -63,7 +63,7 @@ class FittedScene:
 
 @dataclass(frozen=True)
 class Look:
-    """A camera's pictures: loss, PSNR and noise as in `Residual`, and per value the estimate of the squared difference."""
+    """One camera: loss, PSNR and noise as in `Residual`, and the squared difference of every value that counts."""
 
     loss: float
     psnr: float
