@@ -78,13 +78,13 @@ def relative_weights(
     """
     square = np.where(used[..., None], np.square(reference, dtype=np.float64), 0)
     count = used[..., None].astype(np.float64)
-    total, number = (_sums(x, AROUND) - _sums(x, HOLE) for x in (square, count))
+    total, number = (sums_around(x, AROUND) - sums_around(x, HOLE) for x in (square, count))
     mean = np.where(number > 0, total / np.maximum(number, 1), square.sum(axis=(0, 1)) / count.sum())
     positive = reference[used][reference[used] > 0]
     return (1 / (np.maximum(mean, 0) + (DARK * float(np.median(positive))) ** 2)).astype(np.float32)
 
 
-def _sums(values: Float[np.ndarray, "h w c"], side: int) -> Float[np.ndarray, "h w c"]:
+def sums_around(values: Float[np.ndarray, "h w c"], side: int) -> Float[np.ndarray, "h w c"]:
     """Sums over squares around every pixel; nothing lies outside."""
     for axis in (0, 1):
         edge = [(0, 0)] * 3

@@ -1,12 +1,12 @@
 """Gauss–Newton on the few numbers of a scene: literals and colours under a squared loss, from noisy renders.
 
 A round renders the picture's derivative J by every number (forward mode) at the values θ, then pictures I by other
-random numbers, and solves H Δ = -g with g = Jᵀ W (mean I - R) and H = Jᵀ W J. J and I are independent, so g has no
-bias; H multiplies two independent estimates of J, of this round and of the one before, so it has none from J's noise.
+random numbers, and solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ W J. Φ is J without outliers: at the solution
+the expected I is R, so that any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds
+with the J of others, so it has no bias from J's noise.
 
 The first rounds are short and walk to the neighbourhood of the solution. The rest share the remaining steps and do
-not replace one another: each adds its H and H θ - g to one system, whose solution is the mean of all of them, weighted
-by how much each knew. Their disagreement is the result's standard error.
+not replace one another: the result is the mean of their solutions, and their disagreement its standard error.
 """
 
 import math
@@ -22,8 +22,9 @@ from mistyle.render import scene_grad, scene_keys
 from mistyle.render.scene_keys import Parameter
 
 MOST_NUMBERS = 32
-MOST_BYTES = 1e9  # of the derivatives that are kept
-SPP = 8  # of the derivatives, unless given
+MOST_BYTES = 2.5e8  # of the derivatives that are kept, in checkpoints too
+SPP = (8, 64)  # fewest and most of the derivatives, unless given: as many as cost about what the pictures do
+OUTLIER, BESIDE = 8.0, 5  # a derivative counts at most so many times the mean size around it, in a square of pixels
 APPROACH = 0.6  # share of the steps at most that the short rounds take
 SHORT = 4  # steps of a short round, at least
 NEAR = 0.1  # relative change from which the long rounds begin
@@ -33,20 +34,29 @@ WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays as it i
 DAMPING = 1e-3  # of the short rounds
 
 
+@dataclass(frozen=True)
+class Round:
+    """A long round: cameras, steps, where it stood, and g there."""
+
+    views: tuple[int, ...]
+    steps: int
+    theta: Float[np.ndarray, " n"]
+    gradient: Float[np.ndarray, " n"]
+
+
 @dataclass
 class Newton:
-    """What moves, all of it small; `columns` are the last round's derivatives, which `previous` brings back."""
+    """What moves; `columns` are sums of derivatives by camera, of every other round, and `counts` their numbers."""
 
     theta: Float[np.ndarray, " n"]
     round: int = 0
     near: bool = False
     size: int = 0  # steps of a long round; 0 before them
-    previous: Float[np.ndarray, " n"] | None = None
     best: tuple[float, Float[np.ndarray, " n"]] | None = None
-    system: list[tuple[Float[np.ndarray, "n n"], Float[np.ndarray, " n"]]] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
+    rounds: list[Round] = field(default_factory=list)
     noise: Float[np.ndarray, "n n"] | None = None  # covariance of g by the references' noise
-    columns: dict[int, Float[np.ndarray, "n h w 3"]] = field(default_factory=dict)
+    columns: dict[int, Float[np.ndarray, "2 n h w 3"]] = field(default_factory=dict)
+    counts: dict[int, Float[np.ndarray, " 2"]] = field(default_factory=dict)
 
 
 @dataclass
@@ -103,10 +113,8 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
     newton: Newton = state.newton
     size, long = _size(job, state)
     turns = [[camera(state.iteration + m, slot) for slot in range(job.plan.sensors_per_step)] for m in range(size)]
-    views = sorted({k for turn in turns for k in turn})
-    columns = {k: _columns(job, state.values, newton.theta, k, newton.round) for k in views}
-    if newton.previous is not None and not newton.columns:
-        newton.columns = {k: _columns(job, state.values, newton.previous, k, newton.round - 1) for k in views}
+    views = tuple(sorted({k for turn in turns for k in turn}))
+    columns = {k: _columns(job, state.values, newton, k, size) for k in views}
     scene_grad.put(job.table, job.chosen, state.values)
     seen = {k: _Seen(_weights(job, k)) for k in views}
     losses, broken = [], dict.fromkeys(views, 0)
@@ -118,28 +126,26 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
         losses.append(float(np.mean([value for value, _ in found])))
         for k, (_, wrong) in zip(turn, found, strict=True):
             broken[k] += wrong
-    matrix, gradient = _normal(columns, newton.columns, seen)
-    old = newton.theta
+    _remember(newton, columns)
+    old, gradient = newton.theta, _gradient(newton, seen)
     if long:
         newton.size = newton.size or size
-        newton.system.append((size * matrix, size * (matrix @ old - gradient)))
-        newton.steps.append(size)
-        newton.noise = _reference_noise(columns, newton.columns, seen)
-        new = _bounded(job, old, *_total(newton))
+        newton.rounds.append(Round(views, size, old, gradient))
+        newton.noise = _reference_noise(newton, seen)
+        new = _bounded(job, old, *_system(job, newton, _used(newton)))
     else:
-        new = _short(job, newton, matrix, gradient, seen)
+        new = _short(job, newton, gradient, seen)
         newton.near = newton.round >= 2 and bool((np.abs(new - old) < NEAR * (np.abs(new) + 0.02 * _scales(job))).all())
-    newton.previous, newton.columns = old, columns
     newton.theta, newton.round = new, newton.round + 1
     state.values = spread(job, new, state.values)
     state.trace += losses
     state.iteration += size
     for k, count in broken.items():
         state.broken[k] = state.broken.get(k, 0) + count
+    reached = np.any([np.any(newton.columns[k] != 0, axis=(0, 2, 3, 4)) for k in views], axis=0)
+    shown = spread(job, reached.astype(float), {p.key: np.zeros(p.shape) for p in job.chosen})
     for p in job.chosen:
-        reached = np.zeros(p.shape, bool)
-        reached[job.free[p.key]] = True
-        state.moments[p.key][0].steps[reached] += size
+        state.moments[p.key][0].steps[shown[p.key] > 0] += size
     return True
 
 
@@ -157,17 +163,50 @@ def _size(job: Any, state: Any) -> tuple[int, bool]:
     return math.ceil(left / rounds), True
 
 
-def _columns(job: Any, fill: Any, theta: Float[np.ndarray, " n"], k: int, number: int) -> Float[np.ndarray, "n h w 3"]:
-    """The picture's derivatives of camera k at theta; round `number` gives the seeds."""
+def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int) -> Float[np.ndarray, "n h w 3"]:
+    """The picture's derivatives of camera k where the round of `size` steps stands."""
+    theta = newton.theta
     values, zero = spread(job, theta, fill), {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
+    own = size * job.plan.spp * job.plan.sensors_per_step // (2 * len(theta) * len(job.views))
+    spp = job.plan.spp_grad or min(max(own, SPP[0]), SPP[1])
     result = []
     for n in range(len(theta)):
         one = np.zeros(len(theta))
         one[n] = 1
-        direction = spread(job, one, zero)
-        seed, sensor = scene_grad.seeds(job.plan.seed, 2**30 + number, k, n)[0], job.views[k].sensor
-        given = (job.scene, job.table, job.chosen, values, direction, job.engine, sensor)
-        result.append(scene_grad.derivative(*given, job.plan.spp_grad or SPP, seed))
+        seed, sensor = scene_grad.seeds(job.plan.seed, 2**30 + newton.round, k, n)[0], job.views[k].sensor
+        given = (job.scene, job.table, job.chosen, values, spread(job, one, zero), job.engine, sensor)
+        result.append(scene_grad.derivative(*given, spp, seed))
+    return np.stack(result)
+
+
+def _remember(newton: Newton, columns: Mapping[int, Float[np.ndarray, "n h w 3"]]) -> None:
+    """Add derivatives to the half of this round; short rounds first forget what that half knew."""
+    half = newton.round % 2
+    for k, new in columns.items():
+        if k not in newton.columns:
+            newton.columns[k], newton.counts[k] = np.zeros((2, *new.shape), np.float32), np.zeros(2)
+        if not newton.near and not newton.size:
+            newton.columns[k][half], newton.counts[k][half] = 0, 0
+        newton.columns[k][half] += new
+        newton.counts[k][half] += 1
+
+
+def _halves(newton: Newton, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mean derivatives (n, values) of either half of the rounds; twice the same where there is one half only."""
+    means = [s.reshape(len(s), -1) / max(c, 1) for s, c in zip(newton.columns[k], newton.counts[k], strict=True)]
+    first, second = (means[h if newton.counts[k][h] else 1 - h].astype(np.float64) for h in (0, 1))
+    return first, second
+
+
+def _tamed(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[np.ndarray, "n v"]:
+    """Derivatives without outliers: each at most OUTLIER times the mean size beside it, plus that of its picture."""
+    result = []
+    for column in columns:
+        size = np.abs(column.reshape(shape))
+        inside = scene_grad.sums_around(np.ones_like(size[..., :1]), BESIDE) - 1
+        beside = (scene_grad.sums_around(size, BESIDE) - size) / np.maximum(inside, 1)
+        most = OUTLIER * np.maximum(beside, 0) + size.mean()
+        result.append(np.clip(column, -most.ravel(), most.ravel()))
     return np.stack(result)
 
 
@@ -176,7 +215,7 @@ def _weights(job: Any, k: int) -> Float[np.ndarray, "h w 3"]:
     view = job.views[k]
     counts = np.array(view.counts).astype(np.float64)
     weights = counts * np.array(view.weights) if job.loss == "relative" else counts
-    return weights / (counts.sum() * len(job.views))
+    return weights / counts.sum()
 
 
 def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
@@ -187,51 +226,67 @@ def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
     wrong = np.where(finite, shown - np.array(view.reference), 0).astype(np.float64)
     square = wrong**2
     seen.count, seen.total, seen.square = seen.count + 1, seen.total + wrong, seen.square + square
-    return float((seen.weights * square).sum()) * len(job.views), int((~finite).sum())
+    return float((seen.weights * square).sum()), int((~finite).sum())
 
 
-def _normal(columns: Any, before: Any, seen: Mapping[int, _Seen]) -> tuple[np.ndarray, np.ndarray]:
-    """H and g of the loss's half."""
-    matrix: Any = 0.0
-    gradient: Any = 0.0
-    for k, sums in seen.items():
-        now = columns[k].reshape(len(columns[k]), -1).astype(np.float64)
-        other = now if k not in before else before[k].reshape(now.shape).astype(np.float64)
-        weights = sums.weights.ravel()
-        product = (now * weights) @ other.T
-        matrix = matrix + (product + product.T) / 2
-        gradient = gradient + ((now + other) / 2) @ (weights * (sums.total / sums.count).ravel())
-    return matrix, gradient
-
-
-def _reference_noise(columns: Any, before: Any, seen: Mapping[int, _Seen]) -> np.ndarray:
-    """Covariance of g by what is left of I - R without render noise: Σ J W² r² Jᵀ."""
+def _gradient(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, " n"]:
+    """g of half the loss, mean over the cameras that were seen."""
     total: Any = 0.0
     for k, sums in seen.items():
-        now = columns[k].reshape(len(columns[k]), -1).astype(np.float64)
-        other = now if k not in before else before[k].reshape(now.shape)
-        product = (now * (sums.weights**2 * sums.products()).ravel()) @ other.T
+        test = _tamed(np.mean(_halves(newton, k), axis=0), sums.weights.shape)
+        total = total + test @ (sums.weights * sums.total / sums.count).ravel()
+    return total / len(seen)
+
+
+def _matrices(job: Any, newton: Newton, views: Sequence[int]) -> dict[int, Float[np.ndarray, "n n"]]:
+    """H of half the loss by camera."""
+    result = {}
+    for k in views:
+        weights, shape = _weights(job, k).ravel(), _weights(job, k).shape
+        first, second = _halves(newton, k)
+        product = (_tamed(first, shape) * weights) @ second.T + (_tamed(second, shape) * weights) @ first.T
+        result[k] = (product + product.T) / 4
+    return result
+
+
+def _reference_noise(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, "n n"]:
+    """Covariance of g by what is left of I - R without render noise: Σ Φ W² r² Φᵀ."""
+    total: Any = 0.0
+    for k, sums in seen.items():
+        first, second = (_tamed(half, sums.weights.shape) for half in _halves(newton, k))
+        product = (first * (sums.weights**2 * sums.products()).ravel()) @ second.T
         total = total + (product + product.T) / 2
-    return total
+    return total / len(seen) ** 2
 
 
-def _short(job: Any, newton: Newton, matrix: Any, gradient: Any, seen: Mapping[int, _Seen]) -> np.ndarray:
+def _short(job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
     """Where a short round goes: a damped step, or half the way back to the best place so far."""
-    loss = sum(float((s.weights * s.products()).sum()) for s in seen.values())
-    noise = sum(s.noise() for s in seen.values())
+    loss = float(np.mean([(s.weights * s.products()).sum() for s in seen.values()]))
+    noise = float(np.mean([s.noise() for s in seen.values()]))
     if newton.best is not None and loss > WORSE * newton.best[0] + noise:
         return (newton.theta + newton.best[1]) / 2
     if newton.best is None or loss < newton.best[0]:
         newton.best = loss, newton.theta
-    matrix = matrix + DAMPING * np.diag(np.diag(matrix))
+    matrix: Any = np.mean(list(_matrices(job, newton, list(seen)).values()), axis=0)
+    matrix = matrix + DAMPING * np.diag(np.abs(np.diag(matrix)))
     return _bounded(job, newton.theta, matrix, matrix @ newton.theta - gradient)
 
 
-def _total(newton: Newton, first: int | None = None, last: int | None = None) -> tuple[np.ndarray, np.ndarray]:
-    """The system of the long rounds `first`..`last`; of all but the first, which began furthest away, by default."""
-    begin = int(len(newton.system) >= LONG[0]) if first is None else first
-    part = newton.system[begin:last]
-    return np.sum([m for m, _ in part], axis=0), np.sum([r for _, r in part], axis=0)
+def _used(newton: Newton) -> list[Round]:
+    """The long rounds that count: all but the first, which began furthest away."""
+    return newton.rounds[int(len(newton.rounds) >= LONG[0]) :]
+
+
+def _system(job: Any, newton: Newton, rounds: Sequence[Round]) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and right side whose solution is the rounds' mean, each weighted by its steps."""
+    each = _matrices(job, newton, sorted({k for r in rounds for k in r.views}))
+    matrix: Any = 0.0
+    right: Any = 0.0
+    for r in rounds:
+        own = np.mean([each[k] for k in r.views], axis=0)
+        matrix = matrix + r.steps * own
+        right = right + r.steps * (own @ r.theta - r.gradient)
+    return matrix, right
 
 
 def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -281,54 +336,58 @@ def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
 
     Render noise comes from the long rounds' disagreement, the references' noise from what is left of the residuals.
     """
-    count = len(newton.theta)
-    begin = int(len(newton.system) >= LONG[0])
-    used = newton.system[begin:]
+    count, used = len(newton.theta), _used(newton)
     if len(used) < 2 or newton.noise is None:
         return np.full(count, np.nan), np.zeros(count, bool)
-    matrix, _ = _total(newton)
-    inverse = _inverse(matrix)
-    left = np.array([m @ newton.theta - r for m, r in used])
+    inverse = _inverse(_system(job, newton, used)[0])
+    ends = [_system(job, newton, [r]) for r in used]
+    left = np.array([m @ newton.theta - right for m, right in ends])
     rendered = left.T @ left * len(used) / (len(used) - 1)
-    own = sum(newton.steps[begin:]) ** 2 * newton.noise
+    own = sum(r.steps for r in used) ** 2 * newton.noise
     variance = np.diag(inverse @ rendered @ inverse) + np.maximum(np.diag(inverse @ own @ inverse), 0)
     error = np.sqrt(np.maximum(variance, 0))
     error[~(np.diag(inverse) > 0)] = np.nan
-    half = begin + len(used) // 2
-    ends = [_bounded(job, newton.theta, *_total(newton, *part)) for part in ((begin, half), (half, None))]
-    drift = np.abs(ends[1] - ends[0])
+    half = len(used) // 2
+    first, second = (_bounded(job, newton.theta, *_system(job, newton, part)) for part in (used[:half], used[half:]))
+    drift = np.abs(second - first)
     return error, (drift > 6 * np.nan_to_num(error)) & (drift > 0.02 * (np.abs(newton.theta) + 0.02 * _scales(job)))
 
 
 def saved(newton: Newton) -> dict[str, np.ndarray]:
-    """Everything but the derivatives, which are rendered again."""
+    """Everything, as arrays."""
     count = len(newton.theta)
     best = (np.nan, np.full(count, np.nan)) if newton.best is None else newton.best
-    return {
+    result = {
         "theta": newton.theta,
-        "counts": np.array([newton.round, int(newton.near), newton.size]),
-        "previous": np.full(count, np.nan) if newton.previous is None else newton.previous,
+        "numbers": np.array([newton.round, int(newton.near), newton.size, len(newton.rounds)]),
         "best": np.append(best[0], best[1]),
-        "matrices": np.array([m for m, _ in newton.system]).reshape(-1, count, count),
-        "rights": np.array([r for _, r in newton.system]).reshape(-1, count),
-        "steps": np.array(newton.steps, int),
         "noise": np.full((count, count), np.nan) if newton.noise is None else newton.noise,
     }
+    for n, r in enumerate(newton.rounds):
+        result[f"round{n}"] = np.concatenate([[r.steps], r.theta, r.gradient])
+        result[f"views{n}"] = np.array(r.views, int)
+    for k, sums in newton.columns.items():
+        result |= {f"columns{k}": sums.copy(), f"counts{k}": newton.counts[k].copy()}
+    return result
 
 
 def brought_back(arrays: Mapping[str, np.ndarray]) -> Newton:
     """The reverse of `saved`."""
     held = {name: np.array(value) for name, value in arrays.items()}
-    number, near, size = (int(n) for n in held["counts"])
-    best = None if np.isnan(held["best"]).all() else (float(held["best"][0]), held["best"][1:])
+    number, near, size, rounds = (int(n) for n in held["numbers"])
+    count = len(held["theta"])
+    views = [int(name.removeprefix("columns")) for name in held if name.startswith("columns")]
     return Newton(
         held["theta"],
         number,
         bool(near),
         size,
-        None if np.isnan(held["previous"]).any() else held["previous"],
-        best,
-        list(zip(held["matrices"], held["rights"], strict=True)),
-        [int(n) for n in held["steps"]],
+        None if np.isnan(held["best"]).all() else (float(held["best"][0]), held["best"][1:]),
+        [
+            Round(tuple(int(k) for k in held[f"views{n}"]), int(row[0]), row[1 : 1 + count], row[1 + count :])
+            for n, row in ((n, held[f"round{n}"]) for n in range(rounds))
+        ],
         None if np.isnan(held["noise"]).any() else held["noise"],
+        {k: held[f"columns{k}"] for k in views},
+        {k: held[f"counts{k}"] for k in views},
     )
