@@ -21,14 +21,16 @@ import numpy as np
 from benchmarks.common import arguments, finish
 from benchmarks.scene_recovery_scenes import HOUSE, INCLUDE, Case, cases, cornell
 
-STEPS, SIZE, REFERENCE_SPP = 256, 64, 2048
+STEPS, IMAGE_STEPS, SIZE, REFERENCE_SPP = 192, 256, 64, 2048
 SCALES = (0.98, 1.0, 1.02)
 TRUE_INCLUDE = np.array([0.7, 0.2, 0.1])
 
 
 def reference(scene: Any, spp: int, seed: int = 1) -> list[np.ndarray]:
     """Pictures by every sensor, with samples of their own."""
-    import mitsuba as mi
+    import mitsuba
+
+    mi: Any = mitsuba
 
     result = []
     for k, sensor in enumerate(scene.sensors()):
@@ -43,7 +45,9 @@ def reference(scene: Any, spp: int, seed: int = 1) -> list[np.ndarray]:
 def plain(scene: Any, keys: list[str], pictures: list[np.ndarray], steps: int) -> dict[str, np.ndarray]:
     """What a Mitsuba user writes: mi.render, a mean squared difference, Adam, values clipped to 0..1."""
     import drjit as dr
-    import mitsuba as mi
+    import mitsuba
+
+    mi: Any = mitsuba
 
     from mistyle.render.scene_grad import ad_integrator
 
@@ -101,8 +105,10 @@ def compared(case: Case, steps: int, size: int, spp: int) -> dict[str, float]:
 
 
 def included(steps: int, size: int, spp: int) -> dict[str, float]:
-    """The scene file with an include, fitted by the verb: its values are those of the written file, as Mitsuba loads it."""
-    import mitsuba as mi
+    """The scene file with an include, fitted by the verb; judged by the written file as Mitsuba loads it."""
+    import mitsuba
+
+    mi: Any = mitsuba
 
     from mistyle.files.images import write_exr
     from mistyle.run.progress import Progress
@@ -155,9 +161,11 @@ def refused(size: int) -> dict[str, float]:
 def least(spp: int, pictures: int, size: int, wanted: np.ndarray, name: str = "relative") -> float:
     """Where the loss is least along the common scale, minus 1: the vertex of the parabola through three scales.
 
-    A squared loss is taken of pairs of different pictures, which is what its gradient from independent samples descends.
+    A squared loss is taken of pairs of different pictures: that is the loss whose gradient the fit takes.
     """
-    import mitsuba as mi
+    import mitsuba
+
+    mi: Any = mitsuba
 
     from mistyle.render import scene_grad
 
@@ -180,20 +188,21 @@ def least(spp: int, pictures: int, size: int, wanted: np.ndarray, name: str = "r
 
 
 def main(argv: list[str] | None = None) -> int:
-    options = arguments(__doc__.splitlines()[0], argv)
+    options = arguments((__doc__ or "").splitlines()[0], argv)
     from mistyle.render import device
 
     device.use()
-    steps, size, spp = (64, 32, 256) if options.quick else (STEPS, SIZE, REFERENCE_SPP)
+    steps, more, size, spp = (64, 64, 32, 256) if options.quick else (STEPS, IMAGE_STEPS, SIZE, REFERENCE_SPP)
     figures: dict[str, float] = {}
     for case in cases():
-        figures |= compared(case, steps, size, spp)
+        figures |= compared(case, more if case.images else steps, size, spp)
         print(
             case.name,
             {k.partition(".")[2]: round(v, 4) for k, v in figures.items() if k.startswith(case.name)},
             file=sys.stderr,
         )
     figures |= included(steps, size, spp) | refused(size)
+    print("include", {k: round(v, 4) for k, v in figures.items() if k.startswith("include")}, file=sys.stderr)
     figures["worst_relative_error"] = max(v for k, v in figures.items() if k.endswith(".relative_error"))
     figures["worst_db"] = min(v for k, v in figures.items() if k.endswith(".db"))
     true = next(c for c in cases() if c.name == "cornell_box").true

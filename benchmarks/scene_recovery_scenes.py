@@ -184,7 +184,7 @@ def attribute(values: Values, size: int) -> Any:
         mi.UInt32(faces.ravel().astype(np.uint32)),
     )
     table.update()
-    mesh.add_attribute("vertex_paint", 3, np.asarray(values["wall.vertex_paint"], np.float32))
+    mesh.add_attribute("vertex_paint", 3, [float(v) for v in values["wall.vertex_paint"]])
     mesh.set_id("wall")
     return room(size, wall=mesh, cam=camera((0, 0.6, 4), (0, 0, 0), size, 38))
 
@@ -205,7 +205,9 @@ def registered() -> str:
     class Root(door.BSDF):
         def __init__(self, props: Any) -> None:
             door.BSDF.__init__(self, props)
-            self.paint = props["paint"]
+            given = props["paint"]
+            # Mitsuba hands a plain colour over as three numbers.
+            self.paint = given if isinstance(given, mi.Texture) else mi.load_dict(rgb(given))
             flags = mi.BSDFFlags.DiffuseReflection | mi.BSDFFlags.FrontSide
             self.m_components, self.m_flags = [flags], flags
 

@@ -113,9 +113,9 @@ def fit_scene(
     references        one a sensor, of the film's size: linear Rec.709 radiance (h, w, 3), or paths of pictures
     loss              None: "relative", or "log_srgb_l1" where gradients come without Monte Carlo.
                       "relative": (I - R)² over the reference's mean square around the pixel; "l2": (I - R)². Render
-                      noise does not move the minimum of these two. "log_srgb_l1": |s(I) - s(R)|, s(x) = sRGB(log(1 + x));
-                      noise moves its minimum by percents. Or a function (picture, reference) -> number on Mitsuba
-                      tensors (h, w, 3); pixels that do not count have the reference's value in both
+                      noise does not move the minimum of these two. "log_srgb_l1": |s(I) - s(R)| with s(x) =
+                      sRGB(log(1 + x)); noise moves its minimum by percents. Or a function (picture, reference) ->
+                      number on Mitsuba tensors (h, w, 3); pixels that do not count are equal in both
     regularizers      functions ({key: value}) -> number on Mitsuba tensors and arrays, added to the loss (Adam only)
     callback          (iteration, loss, values) after each step of Adam or round of Gauss–Newton; a true answer ends it
     iterations        steps; each renders `sensors_per_step` cameras, every one once before any comes again
@@ -149,7 +149,8 @@ def fit_scene(
     from mistyle.run.scene_references import read_reference
 
     notes: list[str] = []
-    pictures, counts = [], list(masks) if masks is not None else [None] * len(references)
+    pictures: list[Any] = []
+    counts: list[Any] = [None] * len(references) if masks is None else list(masks)
     for k, picture in enumerate(references):
         if isinstance(picture, (str, PathLike)):
             picture, usable, said = read_reference(Path(picture), channels)

@@ -128,12 +128,13 @@ def drawn(
     import mitsuba as mi
 
     device.use()
-    more: dict[str, Any] = {} if integrator is None else {"integrator": mi.load_dict(integrator)}
     times, each = passes(spp)
     total: Any = 0
-    for k in range(times):
-        picture = mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32, **more)
-        total = total + np.array(picture, dtype=np.float64)
+    with device.plain_errors("the scene was rendered"):
+        more: dict[str, Any] = {} if integrator is None else {"integrator": mi.load_dict(integrator)}
+        for k in range(times):
+            picture = mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32, **more)
+            total = total + np.array(picture, dtype=np.float64)
     return np.ascontiguousarray((total / times).astype(np.float32)[..., :4])
 
 

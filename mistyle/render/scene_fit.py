@@ -23,6 +23,7 @@ SHARE = 0.7  # of the rate that each coarser level of the pyramid has
 LAST_RATE = 0.05  # share of the rate at the end
 COURSE = 0.3  # share of the steps at the end that are looked at for drift and spread
 TAIL = 0.15  # share of them whose mean is the result where gradients are noisy
+DOING = "the scene was fitted"
 MOST_BAD = 100  # numbers that are reported one by one
 
 
@@ -63,12 +64,14 @@ def fit_scene(
     device.use()
     plan = scene_job.Plan(iterations, spp, spp_grad, rate, pyramid, sensors_per_step, seed, solver)
     given = (scene, keys, sensors, references, masks, only, loss, regularizers, integrator)
-    with scene_grad.plain_errors("the scene was fitted"):
+    with device.plain_errors(DOING):
         job, notes = scene_job.prepare(*given, plan, fast)
-        state = scene_job.begun(job) if resume is None else scene_job.restored(resume, job)
-        edge = len(job.views) / (2 * len(job.views) + iterations * sensors_per_step)
+    state = scene_job.begun(job) if resume is None else scene_job.restored(resume, job)
+    edge = len(job.views) / (2 * len(job.views) + iterations * sensors_per_step)
+    with device.plain_errors(DOING):
         before = scene_result.looks(job, state.start, lambda done: progress(edge * done))
-        _descend(job, state, callback, save, save_every, lambda done: progress(edge + (1 - 2 * edge) * done))
+    _descend(job, state, callback, save, save_every, lambda done: progress(edge + (1 - 2 * edge) * done))
+    with device.plain_errors(DOING):
         return _finished(job, state, before, notes, lambda done: progress(1 - edge + edge * done))
 
 
@@ -78,10 +81,11 @@ def _descend(
     """All steps that are left; ends early where the callback says so."""
     saved, stopped = time.monotonic(), False
     while state.iteration < job.plan.iterations and not stopped:
-        if job.newton:
-            scene_newton.advance(job, state, lambda step, slot: _camera(job, step, slot))
-        else:
-            _step(job, state)
+        with device.plain_errors(DOING):
+            if job.newton:
+                scene_newton.advance(job, state, lambda step, slot: _camera(job, step, slot))
+            else:
+                _step(job, state)
         progress(state.iteration / job.plan.iterations)
         try:
             stopped = callback is not None and bool(callback(state.iteration - 1, state.trace[-1], dict(state.values)))

@@ -8,19 +8,18 @@ without the pixel itself: a weight that knew the reference's own noise there wou
 """
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core import stopping
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.lanes import aligned
 from mistyle.render import scene as scenery
+from mistyle.render import scene_walk
 from mistyle.render.scene_keys import Parameter
 
 # (picture, reference) -> number; both Mitsuba tensors (h, w, 3), linear
@@ -110,28 +109,6 @@ def loss_of(loss: str | Loss, view: Sight) -> Loss:
     return relative(view.weights) if loss == "relative" else LOSSES[loss]
 
 
-@contextmanager
-def plain_errors(doing: str) -> Iterator[None]:
-    """What Mitsuba and Dr.Jit raise while `doing`, as one sentence (InputRefused); a request to stop stays one.
-
-    Dr.Jit wraps what is raised inside a loop, signals included, into a RuntimeError.
-    """
-    try:
-        yield
-    except RuntimeError as error:
-        stopping.check()
-        cause: BaseException = error
-        while (inner := cause.__cause__ or cause.__context__) is not None:
-            cause = inner
-        said = " ".join(str(cause).split())
-        if "not attached to the AD graph" in said:
-            said = "no gradient reaches the chosen parameters: no camera sees them, or their plugin passes none on"
-        raise InputRefused(
-            f"Mitsuba failed while {doing}: {said[:400].rstrip('.')}. Check the scene with the mitsuba command, and "
-            "the chosen parameters with --list."
-        ) from error
-
-
 def _log_srgb(linear: Any) -> Any:
     import drjit as dr
 
@@ -176,11 +153,15 @@ def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]
     own = scene.integrator()
     if own is None:
         return mi.load_dict({"type": "prb"}), ("The scene has no integrator; prb takes its place.",)
-    if isinstance(own, mi.ad.integrators.common.ADIntegrator) or own.class_name() == "DirectIntegrator":
-        return own, ()
-    depth = re.search(r"max_depth = (\d+)", str(own))
-    plugin = "prbvolpath" if "vol" in own.class_name().lower() else "prb"
-    replacement: dict[str, Any] = {"type": plugin, "hide_emitters": bool(getattr(own, "hide_emitters", False))}
+    # `aov` and `moment` hold the integrators whose pictures they are about; the first one's comes first.
+    inner = own
+    while held := [x for _, x in scene_walk.children(inner)[inner] if isinstance(x, mi.Integrator)]:
+        inner = held[0]
+    if isinstance(inner, mi.ad.integrators.common.ADIntegrator) or inner.class_name() == "DirectIntegrator":
+        return inner, () if inner is own else (f"The picture is that of {inner.class_name()} in {own.class_name()}.",)
+    depth = re.search(r"max_depth = (\d+)", str(inner))
+    plugin = "prbvolpath" if "vol" in inner.class_name().lower() else "prb"
+    replacement: dict[str, Any] = {"type": plugin, "hide_emitters": bool(getattr(inner, "hide_emitters", False))}
     if depth:
         # Unlimited depth is stored as 2^32 - 1.
         replacement["max_depth"] = int(depth[1]) if int(depth[1]) < 2**31 else -1

@@ -249,8 +249,8 @@ def restored(saved: Mapping[str, np.ndarray], job: Job) -> State:
             laplacian.Moments(*(np.array(saved[f"{p.name}/{name}{k}"]) for name in ("first", "second", "steps")))
             for k in range(count)
         )
-    kinds = {"values": np.float32, "held": bool, "start": np.float32, "tail": np.float64}
-    held = {
+    kinds: Any = {"values": np.float32, "held": bool, "start": np.float32, "tail": np.float64}
+    held: Any = {
         name: {p.key: np.array(saved[f"{p.name}/{name}"], kind) for p in job.chosen} for name, kind in kinds.items()
     }
     newton = {k.removeprefix("newton/"): v for k, v in saved.items() if k.startswith("newton/")}

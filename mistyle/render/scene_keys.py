@@ -175,7 +175,8 @@ def limits(parameter: Parameter) -> tuple[float, float] | None:
     light = parameter.owner.endswith(("Emitter", "Light"))
     if light or any(word in parameter.role for word in ("radiance", "intensity", "emittance")):
         return 0.0, np.inf
-    return None
+    # A spectrum of a role that nobody knows here, in a plugin of the user's for example.
+    return (0.0, np.inf) if parameter.kind == "value" and "Spectrum" in parameter.plugin else None
 
 
 def project(parameter: Parameter, values: Float[np.ndarray, "..."], tilt: float = 0.95) -> Float[np.ndarray, "..."]:

@@ -30,6 +30,7 @@ SHORT = 4  # steps of a short round, at least
 NEAR = 0.1  # relative change from which the long rounds begin
 LONG = (4, 8)  # fewest and most long rounds
 WORSE = 1.3  # times the best loss from which a round goes half the way back
+LOST = 0.01  # share of a picture's values that are no numbers from which it does so too
 WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays as it is
 DAMPING = 1e-3  # of the short rounds
 
@@ -134,7 +135,8 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
         newton.noise = _reference_noise(newton, seen)
         new = _bounded(job, old, *_system(job, newton, _used(newton)))
     else:
-        new = _short(job, newton, gradient, seen)
+        lost = sum(broken.values()) / (size * job.plan.sensors_per_step * np.size(next(iter(seen.values())).weights))
+        new = _short(job, newton, gradient, seen, lost)
         newton.near = newton.round >= 2 and bool((np.abs(new - old) < NEAR * (np.abs(new) + 0.02 * _scales(job))).all())
     newton.theta, newton.round = new, newton.round + 1
     state.values = spread(job, new, state.values)
@@ -259,11 +261,15 @@ def _reference_noise(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndar
     return total / len(seen) ** 2
 
 
-def _short(job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
-    """Where a short round goes: a damped step, or half the way back to the best place so far."""
+def _short(
+    job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _Seen], lost: float
+) -> Float[np.ndarray, " n"]:
+    """Where a short round goes: a damped step, or half the way back to the best place so far, where the pictures have
+    become worse or `lost`, the share of their values that are no numbers, says that the step left what the plugins know.
+    """
     loss = float(np.mean([(s.weights * s.products()).sum() for s in seen.values()]))
     noise = float(np.mean([s.noise() for s in seen.values()]))
-    if newton.best is not None and loss > WORSE * newton.best[0] + noise:
+    if newton.best is not None and (lost > LOST or loss > WORSE * newton.best[0] + noise):
         return (newton.theta + newton.best[1]) / 2
     if newton.best is None or loss < newton.best[0]:
         newton.best = loss, newton.theta

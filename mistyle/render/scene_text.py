@@ -11,6 +11,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from mistyle.core.errors import InputRefused
 from mistyle.render.scene_keys import Parameter
 
 Edit = tuple[int, int, str]  # first byte, byte after the last, what comes in their place
@@ -93,7 +94,10 @@ def _elements(source: bytes) -> list[_Element]:
         element["end"] = element["body"] if alone else end + source[end:].index(b">") + 1
 
     parser.StartElementHandler, parser.EndElementHandler = opened, closed
-    parser.Parse(source, True)
+    try:
+        parser.Parse(source, True)
+    except expat.ExpatError as error:
+        raise InputRefused(f"found a scene file that is not XML ({error}); check the file.") from error
     return [_Element(**element) for element in found]
 
 
