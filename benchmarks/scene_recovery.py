@@ -21,7 +21,7 @@ import numpy as np
 from benchmarks.common import arguments, finish
 from benchmarks.scene_recovery_scenes import HOUSE, INCLUDE, Case, cases, cornell
 
-STEPS, IMAGE_STEPS, SIZE, REFERENCE_SPP = 192, 256, 64, 2048
+STEPS, SIZE, REFERENCE_SPP = 256, 64, 8192
 SCALES = (0.98, 1.0, 1.02)
 TRUE_INCLUDE = np.array([0.7, 0.2, 0.1])
 
@@ -192,10 +192,10 @@ def main(argv: list[str] | None = None) -> int:
     from mistyle.render import device
 
     device.use()
-    steps, more, size, spp = (64, 64, 32, 256) if options.quick else (STEPS, IMAGE_STEPS, SIZE, REFERENCE_SPP)
+    steps, size, spp = (64, 32, 1024) if options.quick else (STEPS, SIZE, REFERENCE_SPP)
     figures: dict[str, float] = {}
     for case in cases():
-        figures |= compared(case, more if case.images else steps, size, spp)
+        figures |= compared(case, steps, size, spp)
         print(
             case.name,
             {k.partition(".")[2]: round(v, 4) for k, v in figures.items() if k.startswith(case.name)},
@@ -206,7 +206,7 @@ def main(argv: list[str] | None = None) -> int:
     figures["worst_relative_error"] = max(v for k, v in figures.items() if k.endswith(".relative_error"))
     figures["worst_db"] = min(v for k, v in figures.items() if k.endswith(".db"))
     true = next(c for c in cases() if c.name == "cornell_box").true
-    (wanted,) = reference(cornell(true, size), 2 * spp, seed=2)
+    (wanted,) = reference(cornell(true, size), spp, seed=2)
     share = 8 if options.quick else 1
     for samples, pictures in ((4, 256), (16, 64), (64, 16)):
         figures[f"bias_{samples}spp"] = least(samples, max(pictures // share, 2), size, wanted)

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core import stopping
 from mistyle.core.asset import Asset, Material
 from mistyle.core.camera import Camera
 from mistyle.core.light import (
@@ -112,6 +113,7 @@ def file_scene(path: Path) -> Any:
         with device.file_threads():
             scene = mi.load_file(str(path))
     except RuntimeError as error:
+        stopping.check()
         raise InputRefused(f"{path}: Mitsuba cannot load this scene. {error}") from error
     if not isinstance(scene, mi.Scene) or not scene.sensors():
         raise InputRefused(f"{path}: found no scene with a sensor; expected a Mitsuba scene file.")

@@ -82,10 +82,10 @@ def _descend(
     saved, stopped = time.monotonic(), False
     while state.iteration < job.plan.iterations and not stopped:
         with device.plain_errors(DOING):
-            if job.newton:
-                scene_newton.advance(job, state, lambda step, slot: _camera(job, step, slot))
-            else:
+            if not job.newton:
                 _step(job, state)
+            elif not scene_newton.advance(job, state, lambda step, slot: _camera(job, step, slot)):
+                _interrupted(job, state, save)
         progress(state.iteration / job.plan.iterations)
         try:
             stopped = callback is not None and bool(callback(state.iteration - 1, state.trace[-1], dict(state.values)))
@@ -97,6 +97,13 @@ def _descend(
             save(scene_job.checkpoint(state, job))
             saved = time.monotonic()
             stopping.check()
+
+
+def _interrupted(job: scene_job.Job, state: scene_job.State, save: Any) -> None:
+    """A request to stop came within a round: what was known before it is kept."""
+    if save is not None:
+        save(scene_job.checkpoint(state, job))
+    stopping.check()
 
 
 def _finished(

@@ -264,8 +264,10 @@ def _reference_noise(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndar
 def _short(
     job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _Seen], lost: float
 ) -> Float[np.ndarray, " n"]:
-    """Where a short round goes: a damped step, or half the way back to the best place so far, where the pictures have
-    become worse or `lost`, the share of their values that are no numbers, says that the step left what the plugins know.
+    """Where a short round goes: a damped step, or half the way back to the best place so far.
+
+    It goes back where the pictures have become worse, or where `lost`, the share of their values that are no numbers,
+    says that the last step left the plugins' domain.
     """
     loss = float(np.mean([(s.weights * s.products()).sum() for s in seen.values()]))
     noise = float(np.mean([s.noise() for s in seen.values()]))

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.core import stopping
 from mistyle.core.errors import InputRefused
 from mistyle.render import device, scene_text
 from mistyle.render.scene_keys import Parameter
@@ -68,6 +69,7 @@ def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = Non
             # Loading empties what was parsed, and `write_scene` needs it.
             made = mi.parser.instantiate(config, _parsed(config, file, given)[0])
     except RuntimeError as error:
+        stopping.check()
         raise InputRefused(f"{file}: Mitsuba cannot load this scene. {error}") from error
     scene: Any = made[0] if isinstance(made, list) else made
     if not isinstance(scene, mi.Scene):
