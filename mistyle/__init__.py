@@ -123,6 +123,7 @@ def fit_scene(
                       for Gauss–Newton and 1 for Adam
     rate              of Adam, for values in 0..1; what has no range is scaled by its first root mean square
     pyramid           False: plain Adam on the texels
+    seed              every random choice follows from it
     solver            "auto": Gauss–Newton for up to 32 numbers of literals and colours under a squared loss, else Adam;
                       "adam"; "gauss-newton"
     integrator        an `mi.Integrator`, a plugin's name or a dictionary; None: the scene's own where it has gradients,

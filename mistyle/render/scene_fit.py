@@ -154,20 +154,23 @@ def _step(job: scene_job.Job, state: scene_job.State) -> None:
         value, found = scene_grad.regularized(job.table, job.chosen, state.values, job.regularizers)
         total += value
         _add(gradient, found, state, 1.0, None)
-    noisy = job.fast is None
+    noisy, paces = job.fast is None, []
     for p in job.chosen:
         usable = job.free[p.key] & ~state.held[p.key]
         rate = plan.rate * _falling(step, plan.iterations, noisy) * job.scales[p.key]
         own = np.where(usable, gradient[p.key], 0)
         change = laplacian.change(state.moments[p.key], own, rate, SHARE, fair=noisy)
         moved = scene_keys.project(p, state.values[p.key] + change)
-        state.values[p.key] = np.where(usable, moved, state.values[p.key])
+        old = state.values[p.key]
+        state.values[p.key] = np.where(usable, moved, old)
+        paces.append(scene_result.pace(p, state.values[p.key] - old, rate))
     state.trace.append(total)
     state.iteration += 1
     if step >= _first(job, TAIL):
         for p in job.chosen:
             state.tail[p.key] += state.values[p.key]
     if step >= _first(job, COURSE):
+        state.paces.append(np.concatenate(paces))
         state.course.append(np.concatenate([scene_result.brief(p, state.values[p.key]) for p in job.chosen]))
 
 

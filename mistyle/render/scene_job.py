@@ -70,6 +70,7 @@ class State:
     start   the values before the first step
     tail    sums of the values over the last steps (Adam on noisy gradients: their mean is the result)
     course  means of every parameter (`scene_result.brief`) after each of the last steps
+    paces   mean changes in the same steps (`scene_result.pace`)
     """
 
     iteration: int
@@ -80,6 +81,7 @@ class State:
     tail: dict[str, np.ndarray]
     trace: list[float]
     course: list[np.ndarray] = field(default_factory=list)
+    paces: list[np.ndarray] = field(default_factory=list)
     newton: scene_newton.Newton | None = None
     bad: list[Bad] = field(default_factory=list)
     lost: int = 0
@@ -224,6 +226,7 @@ def checkpoint(state: State, job: Job) -> dict[str, np.ndarray]:
         "iteration": np.array(state.iteration),
         "trace": np.array(state.trace),
         "course": np.array(state.course, np.float64),
+        "paces": np.array(state.paces, np.float64),
     }
     for p in job.chosen:
         for name in ("values", "start", "tail", "held"):
@@ -259,6 +262,7 @@ def restored(saved: Mapping[str, np.ndarray], job: Job) -> State:
         moments=moments,
         trace=[float(x) for x in saved["trace"]],
         course=list(np.array(saved["course"])),
+        paces=list(np.array(saved["paces"])),
         newton=scene_newton.brought_back(newton) if newton else None,
         **held,
     )

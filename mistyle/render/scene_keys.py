@@ -114,10 +114,15 @@ def merged(chosen: Sequence[Parameter]) -> tuple[str, ...]:
     for p in chosen:
         heads = {name.partition(".")[0] for name in p.names if re.search(r"\.(bsdf|emitter)\.", name)}
         if len(heads) > 1:
+            shown = ", ".join(sorted(heads)[:5]) + ", …" * (len(heads) > 5)
             notes.append(
-                f"{p.name} belongs to {len(heads)} shapes ({', '.join(sorted(heads)[:5])}{', …' * (len(heads) > 5)}): "
-                "mi.load_file merges equal materials. Load with `optimize=False`, or give them unequal values, to fit "
-                "them one by one."
+                f"{p.name} belongs to {len(heads)} shapes ({shown}): mi.load_file merges equal materials. Load with "
+                "`optimize=False`, or give them unequal values, to fit them one by one."
+            )
+        elif p.name.startswith("unnamed"):
+            notes.append(
+                f"{p.name} belongs to a shape without a name: mi.load_file merges meshes of equal materials. Load with "
+                "`optimize=False` to fit them one by one."
             )
     return tuple(notes)
 
@@ -248,6 +253,10 @@ def _unknown(listed: Sequence[Parameter], pattern: str) -> str:
     everything = list(dict.fromkeys(name for p in listed for name in p.names))
     near = get_close_matches(pattern, usable, 5, 0.4) or get_close_matches(pattern, everything, 5, 0.4) or usable[:5]
     told = f"The nearest keys: {', '.join(near)}." if near else "Nothing in this scene can be optimised."
+    if any(name.startswith("unnamed") for name in everything):
+        told += (
+            " Shapes without a name may have been merged by mi.load_file or mi.load_dict; `optimize=False` keeps them."
+        )
     return f"'{pattern}' matches no parameter of the scene. {told}"
 
 

@@ -12,6 +12,7 @@ from mistyle.render.scene_keys import Parameter
 
 BATCHES = 8  # of the last steps, whose means' spread is the standard error
 DRIFT = 0.02  # relative change over the last steps that counts as not converged
+PACE = 0.3  # so does a mean change of more than this share of the rate: most gradients have one sign
 SURE = 2.0  # standard errors by which a result must be worse to be undone
 
 
@@ -80,6 +81,13 @@ def brief(p: Parameter, values: np.ndarray) -> np.ndarray:
     return values.mean(axis=(0, 1), dtype=np.float64)
 
 
+def pace(p: Parameter, change: np.ndarray, rate: float) -> np.ndarray:
+    """The numbers of `brief` for one step's change, over what has moved only, as a share of the rate."""
+    moved = change.reshape(-1, change.size if len(p.shape) < 3 and change.size <= 4 else p.channels)
+    count = np.count_nonzero(moved, axis=0)
+    return moved.sum(axis=0, dtype=np.float64) / np.maximum(count, 1) / rate
+
+
 def looks(job: Job, values: Mapping[str, np.ndarray], progress: Callable[[float], None]) -> list[Look]:
     """Two pictures of every camera, with the same seeds in every call: no difference comes from the noise alone."""
     scene_grad.put(job.table, job.chosen, values)
@@ -130,14 +138,25 @@ def errors(job: Job, state: State) -> tuple[dict[str, np.ndarray], tuple[str, ..
         return {p.key: by_key[p.key].astype(np.float64) for p in job.chosen}, names
     widths = [len(brief(p, state.values[p.key])) for p in job.chosen]
     course = np.array(state.course).reshape(-1, sum(widths))
+    paces = np.array(state.paces).reshape(-1, sum(widths))
     found, names, start = {}, [], 0
     for p, width in zip(job.chosen, widths, strict=True):
         part = course[:, start : start + width]
-        start += width
         found[p.key], drifts = _spread(part, job.scales[p.key])
+        drifts |= _one_way(paces[:, start : start + width])
+        start += width
         if drifts:
             names.append(p.name)
     return found, tuple(names)
+
+
+def _one_way(paces: np.ndarray) -> bool:
+    """Whether the steps go one way, beyond what their momentum makes of noise."""
+    if len(paces) < 2:
+        return False
+    # Adam's running mean makes (1 + β) / (1 - β) steps as good as one.
+    error = paces.std(axis=0, ddof=1) * np.sqrt(19 / len(paces))
+    return bool((np.abs(paces.mean(axis=0)) > np.maximum(PACE, 4 * error)).any())
 
 
 def _spread(course: np.ndarray, scale: float) -> tuple[np.ndarray, bool]:
@@ -148,7 +167,7 @@ def _spread(course: np.ndarray, scale: float) -> tuple[np.ndarray, bool]:
     error = means.std(axis=0, ddof=1) / np.sqrt(BATCHES)
     half = BATCHES // 2
     drift = np.abs(means[half:].mean(axis=0) - means[:half].mean(axis=0))
-    # A straight line's batches spread too: the halves of one differ by 3.5 of these errors.
+    # A trend spreads the batches of a half too, so that a straight line's halves differ by 6 of these errors.
     rest = means - np.repeat([means[:half].mean(axis=0), means[half:].mean(axis=0)], half, axis=0)
     own = rest.std(axis=0, ddof=2) / np.sqrt(half)
     far = drift > DRIFT * (np.abs(course[-1]) + 0.02 * scale)
