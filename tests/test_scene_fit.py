@@ -140,7 +140,7 @@ def test_colour_and_roughness_are_recovered(truth):
         flat(),
         ["wall.bsdf.base_color", "wall.*.roughness"],
         references=truth,
-        iterations=48,
+        iterations=96,
         callback=lambda step, loss, values: steps.append((step, loss)),
     )
     seen = fitted.seen[COLOUR].min(axis=-1) > 0
@@ -151,7 +151,7 @@ def test_colour_and_roughness_are_recovered(truth):
         assert residual.psnr[1] > residual.psnr[0] + 15
     assert error < 0.02 < 0.1 < np.abs(0.5 - TRUE_COLOUR)[seen].mean()
     assert np.abs(fitted.values[ROUGH] - TRUE_ROUGH)[seen].mean() < 0.85 * np.abs(0.5 - TRUE_ROUGH)[seen].mean()
-    assert [step for step, _ in steps] == list(range(48)) and [loss for _, loss in steps] == list(fitted.trace)
+    assert [step for step, _ in steps] == list(range(96)) and [loss for _, loss in steps] == list(fitted.trace)
     assert not fitted.bad and len(fitted.notes) == 1 and "not through the fast path" in fitted.notes[0]
 
 

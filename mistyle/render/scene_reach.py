@@ -59,7 +59,7 @@ def no_gradient(node: Any, owner: Any, role: str, engine: Any) -> str | None:
     if not isinstance(owner, mi.BSDF) or not int(owner.flags()) & int(mi.BSDFFlags.Delta):
         return None
     if role == "diffuse_reflectance":
-        return None
+        return None  # that lobe's own; `prb` adds some of the mirrored light, which leaves the solution in place
     kind = re.sub(r"(BSDF|BRDF)$", "", owner.class_name())
     if detached:
         return (
