@@ -29,8 +29,7 @@ APPROACH = 0.6  # share of the steps at most that the short rounds take
 SHORT = 4  # steps of a short round, at least
 NEAR = 0.1  # relative change from which the long rounds begin
 LONG = (4, 8)  # fewest and most long rounds
-WORSE = 1.3  # times the best loss from which a round goes half the way back
-LOST = 0.01  # share of a picture's values that are no numbers from which it does so too
+LOST = 0.01  # share of a picture's values that are no numbers from which a round goes half the way back
 WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays as it is
 DAMPING = 1e-3  # of the short rounds
 
@@ -182,13 +181,13 @@ def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int) -> Float[np
 
 
 def _remember(newton: Newton, columns: Mapping[int, Float[np.ndarray, "n h w 3"]]) -> None:
-    """Add derivatives to the half of this round; short rounds first forget what that half knew."""
+    """Add derivatives to the half of this round; short rounds first forget all: far from there J was another."""
     half = newton.round % 2
     for k, new in columns.items():
         if k not in newton.columns:
             newton.columns[k], newton.counts[k] = np.zeros((2, *new.shape), np.float32), np.zeros(2)
         if not newton.near and not newton.size:
-            newton.columns[k][half], newton.counts[k][half] = 0, 0
+            newton.columns[k][:], newton.counts[k][:] = 0, 0
         newton.columns[k][half] += new
         newton.counts[k][half] += 1
 
@@ -271,7 +270,7 @@ def _short(
     """
     loss = float(np.mean([(s.weights * s.products()).sum() for s in seen.values()]))
     noise = float(np.mean([s.noise() for s in seen.values()]))
-    if newton.best is not None and (lost > LOST or loss > WORSE * newton.best[0] + noise):
+    if newton.best is not None and (lost > LOST or loss > newton.best[0] + noise):
         return (newton.theta + newton.best[1]) / 2
     if newton.best is None or loss < newton.best[0]:
         newton.best = loss, newton.theta
