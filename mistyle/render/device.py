@@ -83,8 +83,7 @@ def plain_errors(doing: str) -> Iterator[None]:
         if "not attached to the AD graph" in said:
             said = "no gradient reaches the chosen parameters: no camera sees them, or their plugin passes none on"
         raise InputRefused(
-            f"Mitsuba failed while {doing}: {said[:400].rstrip('.')}. Check the scene with the mitsuba command, and "
-            "the chosen parameters with --list."
+            f"Mitsuba failed while {doing}: {said[:400].rstrip('.')}. Check that the mitsuba command renders the scene."
         ) from error
 
 

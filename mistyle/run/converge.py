@@ -76,6 +76,7 @@ def run_converge(options: argparse.Namespace) -> int:
         found, drew = measure(what, shot, chosen, counts, options.seeds, reference, progress)
     record = summary(found, [r.name for r in chosen], counts) | {
         "scene": str(options.scene),
+        "defines": list(options.defines),
         "shot": shot.name,
         "reference": said,
         "definitions": definitions_of(),
