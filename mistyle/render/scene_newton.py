@@ -114,7 +114,8 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
     size, long = _size(job, state)
     turns = [[camera(state.iteration + m, slot) for slot in range(job.plan.sensors_per_step)] for m in range(size)]
     views = tuple(sorted({k for turn in turns for k in turn}))
-    columns = {k: _columns(job, state.values, newton, k, size) for k in views}
+    # A short round needs both halves where it stands: H then has no bias from J's noise there either.
+    parts = [{k: _columns(job, state.values, newton, k, size, part) for k in views} for part in range(1 if long else 2)]
     scene_grad.put(job.table, job.chosen, state.values)
     seen = {k: _Seen(_weights(job, k)) for k in views}
     losses, broken = [], dict.fromkeys(views, 0)
@@ -126,7 +127,7 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
         losses.append(float(np.mean([value for value, _ in found])))
         for k, (_, wrong) in zip(turn, found, strict=True):
             broken[k] += wrong
-    _remember(newton, columns)
+    _remember(newton, parts)
     old, gradient = newton.theta, _gradient(newton, seen)
     if long:
         newton.size = newton.size or size
@@ -164,7 +165,7 @@ def _size(job: Any, state: Any) -> tuple[int, bool]:
     return math.ceil(left / rounds), True
 
 
-def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int) -> Float[np.ndarray, "n h w 3"]:
+def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) -> Float[np.ndarray, "n h w 3"]:
     """The picture's derivatives of camera k where the round of `size` steps stands."""
     theta = newton.theta
     values, zero = spread(job, theta, fill), {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
@@ -174,22 +175,23 @@ def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int) -> Float[np
     for n in range(len(theta)):
         one = np.zeros(len(theta))
         one[n] = 1
-        seed, sensor = scene_grad.seeds(job.plan.seed, 2**30 + newton.round, k, n)[0], job.views[k].sensor
+        seed, sensor = scene_grad.seeds(job.plan.seed, 2**30 + 2 * newton.round + part, k, n)[0], job.views[k].sensor
         given = (job.scene, job.table, job.chosen, values, spread(job, one, zero), job.engine, sensor)
         result.append(scene_grad.derivative(*given, spp, seed))
     return np.stack(result)
 
 
-def _remember(newton: Newton, columns: Mapping[int, Float[np.ndarray, "n h w 3"]]) -> None:
-    """Add derivatives to the half of this round; short rounds first forget all: far from there J was another."""
-    half = newton.round % 2
-    for k, new in columns.items():
-        if k not in newton.columns:
-            newton.columns[k], newton.counts[k] = np.zeros((2, *new.shape), np.float32), np.zeros(2)
-        if not newton.near and not newton.size:
-            newton.columns[k][:], newton.counts[k][:] = 0, 0
-        newton.columns[k][half] += new
-        newton.counts[k][half] += 1
+def _remember(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n h w 3"]]]) -> None:
+    """Add a long round's derivatives to one half; a short round's two take the place of all before: J was another."""
+    for part, columns in enumerate(parts):
+        for k, new in columns.items():
+            if k not in newton.columns:
+                newton.columns[k], newton.counts[k] = np.zeros((2, *new.shape), np.float32), np.zeros(2)
+            half = part if len(parts) == 2 else newton.round % 2
+            if len(parts) == 2:
+                newton.columns[k][half], newton.counts[k][half] = 0, 0
+            newton.columns[k][half] += new
+            newton.counts[k][half] += 1
 
 
 def _halves(newton: Newton, k: int) -> tuple[np.ndarray, np.ndarray]:
