@@ -140,6 +140,7 @@ def test_colour_and_roughness_are_recovered(truth):
         flat(),
         ["wall.bsdf.base_color", "wall.*.roughness"],
         references=truth,
+        loss="log_srgb_l1",  # nothing but jitter is random here
         iterations=48,
         callback=lambda step, loss, values: steps.append((step, loss)),
     )
@@ -152,7 +153,8 @@ def test_colour_and_roughness_are_recovered(truth):
     assert error < 0.02 < 0.1 < np.abs(0.5 - TRUE_COLOUR)[seen].mean()
     assert np.abs(fitted.values[ROUGH] - TRUE_ROUGH)[seen].mean() < 0.85 * np.abs(0.5 - TRUE_ROUGH)[seen].mean()
     assert [step for step, _ in steps] == list(range(48)) and [loss for _, loss in steps] == list(fitted.trace)
-    assert not fitted.bad and len(fitted.notes) == 1 and "not through the fast path" in fitted.notes[0]
+    assert not fitted.bad and not fitted.unconverged and len(fitted.notes) == 2
+    assert "not through the fast path" in fitted.notes[0] and "not linear in the picture" in fitted.notes[1]
 
 
 def test_from_few_views_the_pyramid_gets_further_than_plain_adam(truth):

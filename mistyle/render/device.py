@@ -8,7 +8,8 @@ from contextlib import contextmanager
 from typing import Any
 
 from mistyle.bootstrap import known_llvm, use_llvm
-from mistyle.core.errors import EnvironmentMissing
+from mistyle.core import stopping
+from mistyle.core.errors import EnvironmentMissing, InputRefused
 
 # The first that answers is taken; a GPU needs no LLVM.
 VARIANTS = {"cuda_ad_rgb": "CUDA", "metal_ad_rgb": "Metal", "llvm_ad_rgb": "LLVM"}
@@ -63,6 +64,27 @@ def file_threads() -> Iterator[None]:
     finally:
         if before < 2:
             dr.set_thread_count(before)
+
+
+@contextmanager
+def plain_errors(doing: str) -> Iterator[None]:
+    """What Mitsuba and Dr.Jit raise while `doing`, as one sentence (InputRefused); a request to stop stays one.
+
+    Dr.Jit wraps what is raised inside a loop, signals included, into a RuntimeError.
+    """
+    try:
+        yield
+    except RuntimeError as error:
+        stopping.check()
+        cause: BaseException = error
+        while (inner := cause.__cause__ or cause.__context__) is not None:
+            cause = inner
+        said = " ".join(str(cause).split())
+        if "not attached to the AD graph" in said:
+            said = "no gradient reaches the chosen parameters: no camera sees them, or their plugin passes none on"
+        raise InputRefused(
+            f"Mitsuba failed while {doing}: {said[:400].rstrip('.')}. Check that the mitsuba command renders the scene."
+        ) from error
 
 
 def give_back() -> None:

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core import stopping
 from mistyle.core.asset import Asset, Material
 from mistyle.core.camera import Camera
 from mistyle.core.light import (
@@ -116,6 +117,7 @@ def file_scene(path: Path) -> Any:
         with device.file_threads():
             scene = mi.load_file(str(path))
     except RuntimeError as error:
+        stopping.check()
         raise InputRefused(f"{path}: Mitsuba cannot load this scene. {error}") from error
     if not isinstance(scene, mi.Scene) or not scene.sensors():
         raise InputRefused(f"{path}: found no scene with a sensor; expected a Mitsuba scene file.")
@@ -132,12 +134,13 @@ def drawn(
     import mitsuba as mi
 
     device.use()
-    more: dict[str, Any] = {} if integrator is None else {"integrator": mi.load_dict(integrator)}
     times, each = passes(spp)
     total: Any = 0
-    for k in range(times):
-        picture = mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32, **more)
-        total = total + np.array(picture, dtype=np.float64)
+    with device.plain_errors("the scene was rendered"):
+        more: dict[str, Any] = {} if integrator is None else {"integrator": mi.load_dict(integrator)}
+        for k in range(times):
+            picture = mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32, **more)
+            total = total + np.array(picture, dtype=np.float64)
     return np.ascontiguousarray((total / times).astype(np.float32)[..., :4])
 
 

@@ -5,6 +5,9 @@ weights. The gradient of a level is U_l^T dL/dT, so coarse levels hear many texe
 before the fine ones have heard enough. Every level has its own Adam (beta_1 0.9, beta_2 0.99). Because T is linear in
 the levels, the levels themselves need not be kept: a step adds Σ_l U_l Δc_l to the texture.
 
+Of noisy gradients Adam makes a bias: a gradient that is large by chance is also divided by more. `fair` divides every
+gradient by the root mean square of those before it, which do not know its noise, and takes the running mean afterwards.
+
 Everything here is NumPy in a fixed order: the same gradients give the same bytes.
 """
 
@@ -15,6 +18,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 BETA_1, BETA_2 = 0.9, 0.99
+WARM = 10  # gradients that are divided by a mean with themselves in it, because too few came before
+MOST = 10.0  # times the root mean square before it that a gradient counts at most, as in Adam
 
 
 @dataclass(frozen=True)
@@ -44,20 +49,24 @@ def sizes(shape: tuple[int, ...], pyramid: bool = True) -> list[tuple[int, ...]]
 
 
 def change(
-    moments: tuple[Moments, ...], gradient: Float[np.ndarray, "..."], rate: float, share: float = 1.0
+    moments: tuple[Moments, ...],
+    gradient: Float[np.ndarray, "..."],
+    rate: float,
+    share: float = 1.0,
+    fair: bool = False,
 ) -> Float[np.ndarray, "..."]:
     """What to add to the texture, from dL/dT; the state moves on.
 
     Numbers whose gradient is exactly zero neither move nor forget (masked updates): most texels are not seen by the
     one camera of a step. Every number counts its own steps for Adam's start-up correction. Level l moves at the rate
-    rate · share^l.
+    rate · share^l. `fair`: see the module.
     """
     steps = []
     level = np.ascontiguousarray(gradient, np.float32)
     for k, state in enumerate(moments):
         if k:
             level = reduce(level)
-        steps.append(_adam(state, level, rate * share**k))
+        steps.append((_fair if fair else _adam)(state, level, rate * share**k))
     total = steps[-1]
     for finer in reversed(steps[:-1]):
         total = finer + enlarge(total, finer.shape[:2])
@@ -80,6 +89,27 @@ def _adam(state: Moments, gradient: Float[np.ndarray, "..."], rate: float) -> Fl
     spread = np.sqrt(v / (1 - BETA_2**past).astype(np.float32)[count])
     result = np.zeros_like(flat)
     result[moved] = np.float32(-rate) * mean / (spread + np.float32(1e-20))
+    return result.reshape(gradient.shape)
+
+
+def _fair(state: Moments, gradient: Float[np.ndarray, "..."], rate: float) -> Float[np.ndarray, "..."]:
+    """As `_adam`; `first` holds the running mean of gradients that were divided already."""
+    flat = gradient.ravel()
+    moved = np.flatnonzero(flat)
+    first, second, steps = state.first.ravel(), state.second.ravel(), state.steps.ravel()
+    g, count = flat[moved], steps[moved] + 1
+    known = second[moved]
+    v = np.float32(BETA_2) * known + np.float32(1 - BETA_2) * g * g
+    past = np.arange(int(count.max(initial=0)) + 1)
+    with np.errstate(divide="ignore"):
+        weight_1, weight_2 = (1 / (1 - beta**past) for beta in (BETA_1, BETA_2))
+    own = v * weight_2.astype(np.float32)[count]
+    before = known * weight_2.astype(np.float32)[np.maximum(count - 1, 1)]
+    spread = np.sqrt(np.where(count > WARM, np.maximum(before, g * g / np.float32(MOST**2)), own))
+    m = np.float32(BETA_1) * first[moved] + np.float32(1 - BETA_1) * g / (spread + np.float32(1e-20))
+    first[moved], second[moved], steps[moved] = m, v, count
+    result = np.zeros_like(flat)
+    result[moved] = np.float32(-rate) * m * weight_1.astype(np.float32)[count]
     return result.reshape(gradient.shape)
 
 

@@ -9,15 +9,19 @@ from mistyle.render import device
 from mistyle.render.scene import passes
 
 
-def sensor_picture(scene: Any, sensor: int, spp: int = 64, seed: int = 0) -> Float[np.ndarray, "h w 3"]:
-    """Linear Rec.709 from sensor number `sensor`, at least `spp` samples a pixel, by the scene's integrator."""
+def sensor_picture(
+    scene: Any, sensor: int, spp: int = 64, seed: int = 0, integrator: Any = None
+) -> Float[np.ndarray, "h w 3"]:
+    """Linear Rec.709 from sensor number `sensor`, at least `spp` samples a pixel; by the scene's own integrator where
+    none is given."""
     import mitsuba as mi
 
     device.use()
     times, each = passes(spp)
     total: Any = 0
     for k in range(times):
-        picture = mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32)
+        number = (seed + k * 0x9E3779B1) % 2**32
+        picture = mi.render(scene, sensor=sensor, integrator=integrator, spp=each, seed=number)
         total = total + np.array(picture, dtype=np.float32)[..., :3]
     return np.ascontiguousarray(total / np.float32(times))
 

@@ -1,8 +1,10 @@
-"""One camera's loss and its gradient for the parameters of a live Mitsuba scene.
+"""One camera's loss and its derivatives for the parameters of a live Mitsuba scene.
 
-The picture is rendered with many samples and no gradient, the loss is differentiated for the pixels, and that goes
-back through the scene with few samples (`render_backward`). The two take different random numbers, so the gradient
-of a squared loss has no bias from the picture's own noise.
+The picture I is rendered with many samples and no gradient, the loss is differentiated for the pixels, and that goes
+back through the scene with few samples (`render_backward`). The two take independent random numbers: E[dL/dI · dI'] =
+dL/df · df for the expected picture f wherever dL/dI is linear in I. So the squared losses have no bias from render
+noise at any number of samples, and the logarithmic one has. The relative loss divides by the reference around a pixel,
+without the pixel itself: a weight that knew the reference's own noise there would prefer darker pictures.
 """
 
 import re
@@ -11,24 +13,33 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Float
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.lanes import aligned
 from mistyle.render import scene as scenery
+from mistyle.render import scene_walk
 from mistyle.render.scene_keys import Parameter
 
 # (picture, reference) -> number; both Mitsuba tensors (h, w, 3), linear
 Loss = Callable[[Any, Any], Any]
 
 
+# Of the relative loss: the square around a pixel and the hole in it (a film's filter mixes neighbours), in pixels, and
+# the share of the median radiance below which differences count as absolute.
+AROUND, HOLE, DARK = 7, 3, 0.1
+
+
 @dataclass(frozen=True)
 class Sight:
-    """A camera and what it should see: tensors (h, w, c) of the reference and of the values that count."""
+    """A camera and what it should see: tensors (h, w, 3) of the reference, of the values that count, and of the
+    relative loss's weights."""
 
     sensor: Any
     reference: Any
     counts: Any
+    weights: Any
     share: float  # of the pixels that count
 
 
@@ -49,7 +60,53 @@ def l2(picture: Any, reference: Any) -> Any:
     return dr.mean(dr.square(picture - reference), axis=None)
 
 
+def relative(weights: Any) -> Loss:
+    """Mean weights · (picture - reference)², with the weights of `relative_weights` as a tensor."""
+    import drjit as dr
+
+    return lambda picture, reference: dr.mean(weights * dr.square(picture - reference), axis=None)
+
+
+def relative_weights(
+    reference: Float[np.ndarray, "h w 3"], used: Bool[np.ndarray, "h w"]
+) -> Float[np.ndarray, "h w 3"]:
+    """1 / (m + ε): m the mean square of the reference's used values around a pixel, without its own and its
+    neighbours' (AROUND, HOLE); ε the square of DARK times the median of its positive values.
+
+    Renders have noise in proportion to their radiance, so every pixel counts about as much as it is known.
+    """
+    square = np.where(used[..., None], np.square(reference, dtype=np.float64), 0)
+    count = used[..., None].astype(np.float64)
+    total, number = (sums_around(x, AROUND) - sums_around(x, HOLE) for x in (square, count))
+    mean = np.where(number > 0, total / np.maximum(number, 1), square.sum(axis=(0, 1)) / count.sum())
+    positive = reference[used][reference[used] > 0]
+    return (1 / (np.maximum(mean, 0) + (DARK * float(np.median(positive))) ** 2)).astype(np.float32)
+
+
+def sums_around(values: Float[np.ndarray, "h w c"], side: int) -> Float[np.ndarray, "h w c"]:
+    """Sums over squares around every pixel; nothing lies outside."""
+    for axis in (0, 1):
+        edge = [(0, 0)] * 3
+        edge[axis] = (side // 2 + 1, side // 2)
+        running = np.cumsum(np.pad(values, edge), axis=axis)
+        low, high = np.arange(values.shape[axis]), np.arange(values.shape[axis]) + side
+        values = running.take(high, axis=axis) - running.take(low, axis=axis)
+    return values
+
+
 LOSSES: dict[str, Loss] = {"log_srgb_l1": log_srgb_l1, "l2": l2}
+NAMES = ("relative", *LOSSES)
+# Their gradients are linear in the picture, which makes them free of bias under render noise.
+SQUARED = ("relative", "l2")
+
+
+def loss_of(loss: str | Loss, view: Sight) -> Loss:
+    """The function of a named loss for one camera. Raises UsageError for an unknown name."""
+    if not isinstance(loss, str):
+        return loss
+    if loss not in NAMES:
+        raise UsageError(f"the loss '{loss}' is not known; expected {', '.join(NAMES)}, or a function.")
+    return relative(view.weights) if loss == "relative" else LOSSES[loss]
 
 
 def _log_srgb(linear: Any) -> Any:
@@ -96,11 +153,15 @@ def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]
     own = scene.integrator()
     if own is None:
         return mi.load_dict({"type": "prb"}), ("The scene has no integrator; prb takes its place.",)
-    if isinstance(own, mi.ad.integrators.common.ADIntegrator) or own.class_name() == "DirectIntegrator":
-        return own, ()
-    depth = re.search(r"max_depth = (\d+)", str(own))
-    plugin = "prbvolpath" if "vol" in own.class_name().lower() else "prb"
-    replacement: dict[str, Any] = {"type": plugin, "hide_emitters": bool(getattr(own, "hide_emitters", False))}
+    # `aov` and `moment` hold the integrators whose pictures they are about; the first one's comes first.
+    inner = own
+    while held := [x for _, x in scene_walk.children(inner)[inner] if isinstance(x, mi.Integrator)]:
+        inner = held[0]
+    if isinstance(inner, mi.ad.integrators.common.ADIntegrator) or inner.class_name() == "DirectIntegrator":
+        return inner, () if inner is own else (f"The picture is that of {inner.class_name()} in {own.class_name()}.",)
+    depth = re.search(r"max_depth = (\d+)", str(inner))
+    plugin = "prbvolpath" if "vol" in inner.class_name().lower() else "prb"
+    replacement: dict[str, Any] = {"type": plugin, "hide_emitters": bool(getattr(inner, "hide_emitters", False))}
     if depth:
         # Unlimited depth is stored as 2^32 - 1.
         replacement["max_depth"] = int(depth[1]) if int(depth[1]) < 2**31 else -1
@@ -143,6 +204,7 @@ def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str
         sensor=sensor,
         reference=mi.TensorXf(aligned(clean)),
         counts=mi.TensorXb(aligned(np.broadcast_to(used[..., None], clean.shape), bool)),
+        weights=mi.TensorXf(aligned(relative_weights(clean, used))),
         share=float(used.mean()),
     )
 
@@ -219,6 +281,37 @@ def gradients(
     )
     result = {p.key: array(dr.grad(moving[p.key]), p) / np.float32(scale * view.share) for p in chosen}
     return value, result, broken
+
+
+def derivative(
+    scene: Any,
+    table: Any,
+    chosen: Sequence[Parameter],
+    values: Mapping[str, np.ndarray],
+    direction: Mapping[str, np.ndarray],
+    integrator: Any,
+    sensor: Any,
+    spp: int,
+    seed: int,
+) -> Float[np.ndarray, "h w 3"]:
+    """The picture's derivative along one direction of the parameters, an unbiased estimate in forward mode.
+
+    Numbers that are none are zero.
+    """
+    import drjit as dr
+    import mitsuba as mi
+
+    along = mi.Float(0)
+    dr.enable_grad(along)
+    for p in chosen:
+        kind = type(table[p.key])
+        # All directions are arrays, so that every column runs the same kernel.
+        table[p.key] = typed(kind, values[p.key]) + typed(kind, direction[p.key]) * along
+    table.update()
+    dr.forward(along, dr.ADFlag.ClearEdges)
+    image = integrator.render_forward(scene, table, sensor, seed=dr.opaque(mi.UInt32, seed), spp=spp)
+    result = np.array(image, dtype=np.float32)[..., :3]
+    return np.where(np.isfinite(result), result, np.float32(0))
 
 
 def regularized(

@@ -9,10 +9,11 @@ import numpy as np
 
 from mistyle.core.errors import UsageError
 from mistyle.render import pyramid as laplacian
-from mistyle.render import scene_grad, scene_keys
+from mistyle.render import scene_grad, scene_keys, scene_newton
 from mistyle.render.scene_keys import Parameter
 
 FEWEST_VIEWS = 3
+SOLVERS = ("auto", "adam", "gauss-newton")
 
 # ({key: value}) -> number, on Mitsuba tensors and arrays
 Regularizer = Callable[[Mapping[str, Any]], Any]
@@ -31,15 +32,16 @@ class Bad:
 
 @dataclass(frozen=True)
 class Plan:
-    """The settings that decide the result."""
+    """The settings that decide the result; `spp_grad` None leaves it to the solver."""
 
     iterations: int
     spp: int
-    spp_grad: int
+    spp_grad: int | None
     rate: float
     pyramid: bool
     sensors_per_step: int
     seed: int
+    solver: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -51,24 +53,36 @@ class Job:
     chosen: tuple[Parameter, ...]
     views: tuple[scene_grad.Sight, ...]
     engine: Any
-    loss: scene_grad.Loss
+    loss: str | scene_grad.Loss
+    losses: tuple[scene_grad.Loss, ...]  # of every camera
     regularizers: tuple[Regularizer, ...]
     free: dict[str, np.ndarray]
     scales: dict[str, float]
     plan: Plan
     fast: Any = None  # scene_fast.Fast, where its pictures are the scene's
+    newton: bool = False  # Gauss–Newton instead of Adam
 
 
 @dataclass
 class State:
-    """What moves, and in `held` which numbers do so no more; all but `bad`, `lost`, `broken` goes into a checkpoint."""
+    """What moves, and in `held` which numbers do so no more; all but `bad`, `lost`, `broken` goes into a checkpoint.
+
+    start   the values before the first step
+    tail    sums of the values over the last steps (Adam on noisy gradients: their mean is the result)
+    course  means of every parameter (`scene_result.brief`) after each of the last steps
+    paces   mean changes in the same steps (`scene_result.pace`)
+    """
 
     iteration: int
     values: dict[str, np.ndarray]
     moments: dict[str, tuple[laplacian.Moments, ...]]
     held: dict[str, np.ndarray]
-    before: np.ndarray
+    start: dict[str, np.ndarray]
+    tail: dict[str, np.ndarray]
     trace: list[float]
+    course: list[np.ndarray] = field(default_factory=list)
+    paces: list[np.ndarray] = field(default_factory=list)
+    newton: scene_newton.Newton | None = None
     bad: list[Bad] = field(default_factory=list)
     lost: int = 0
     broken: dict[int, int] = field(default_factory=dict)
@@ -78,13 +92,16 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
     """Check everything and put it together; returns the job and notes."""
     import mitsuba as mi
 
-    if min(plan.iterations, plan.spp, plan.spp_grad, plan.sensors_per_step) < 1 or not plan.rate > 0:
+    counts = [plan.iterations, plan.spp, plan.sensors_per_step, 1 if plan.spp_grad is None else plan.spp_grad]
+    if min(counts) < 1 or not plan.rate > 0:
         raise UsageError("iterations, spp, spp_grad and sensors_per_step must be 1 or more, and rate above 0.")
-    if isinstance(loss, str) and loss not in scene_grad.LOSSES:
-        raise UsageError(f"the loss '{loss}' is not known; expected {', '.join(scene_grad.LOSSES)}, or a function.")
-    chosen = scene_keys.match(scene, [keys] if isinstance(keys, str) else keys)
-    views = _views(scene, sensors, references, masks)
+    if isinstance(loss, str) and loss not in scene_grad.NAMES:
+        raise UsageError(f"the loss '{loss}' is not known; expected {', '.join(scene_grad.NAMES)}, or a function.")
+    if plan.solver not in SOLVERS:
+        raise UsageError(f"the solver '{plan.solver}' is not known; expected {', '.join(SOLVERS)}.")
     engine, notes = scene_grad.ad_integrator(scene, integrator)
+    chosen = scene_keys.match(scene, [keys] if isinstance(keys, str) else keys, engine)
+    views = _views(scene, sensors, references, masks)
     notes = [*notes, *(f"{p.name}: {note}" for p in chosen for note in p.notes)]
     if len(views) < FEWEST_VIEWS:
         notes.append(
@@ -93,8 +110,41 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
         )
     table = mi.traverse(scene)
     table.properties = {p.key: table.properties[p.key] for p in chosen}
+    free = _free(chosen, only or {})
+    scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
+    quick, why = _fast(scene, chosen, views, loss or "log_srgb_l1", engine) if fast else (None, "it was not asked for.")
+    if loss is None:
+        loss = "relative" if quick is None else "log_srgb_l1"
+    unsuited = "regularizers came" if regularizers else scene_newton.refusal(chosen, free, views, loss)
+    unsuited = "gradients are exact without it" if quick is not None else unsuited
+    if plan.solver == "gauss-newton" and unsuited:
+        raise UsageError(
+            f"the solver 'gauss-newton' cannot do this fit: {unsuited}. Leave it to 'auto', or use 'adam'."
+        )
+    newton = plan.solver != "adam" and not unsuited
+    notes.append(_way(quick, engine, why))
+    if quick is None and loss == "log_srgb_l1":
+        notes.append(
+            "The loss log_srgb_l1 is not linear in the picture: render noise shifts its minimum, by several percent at "
+            "16 samples a pixel. The loss 'relative' has no such bias."
+        )
+    losses = tuple(scene_grad.loss_of(loss, view) for view in views)
+    given = (scene, table, chosen, views, engine, loss, losses, tuple(regularizers), free, scales, plan)
+    return Job(*given, fast=quick, newton=newton), notes
+
+
+def _way(quick: Any, engine: Any, why: str) -> str:
+    if quick is not None:
+        return (
+            "Gradients came without Monte Carlo: direct light of points and directions on plain `principled` materials."
+        )
+    return f"Gradients came through {str(engine).partition('[')[0]}, not through the fast path: {why}"
+
+
+def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Which numbers may change."""
     free = {p.key: np.ones(p.shape, bool) for p in chosen}
-    for name, mask in (only or {}).items():
+    for name, mask in only.items():
         for p in scene_keys.choose(chosen, [name]):
             wide = mask[..., None] if np.ndim(mask) == len(p.shape) - 1 else mask
             if np.ndim(wide) != len(p.shape) or any(
@@ -102,15 +152,7 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
             ):
                 raise UsageError(f"`only` of {p.name} has the shape {np.shape(mask)}; expected {p.shape}.")
             free[p.key] = np.broadcast_to(wide, p.shape).astype(bool)
-    scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
-    function = scene_grad.LOSSES[loss] if isinstance(loss, str) else loss
-    quick, why = _fast(scene, chosen, views, loss, engine) if fast else (None, "it was not asked for.")
-    notes.append(
-        "Gradients came without Monte Carlo: direct light of points and directions on plain `principled` materials."
-        if quick is not None
-        else f"Gradients came through {str(engine).partition('[')[0]}, not through the fast path: {why}"
-    )
-    return Job(scene, table, chosen, views, engine, function, tuple(regularizers), free, scales, plan, quick), notes
+    return free
 
 
 def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
@@ -161,9 +203,19 @@ def first(parameter: Parameter, job: Job) -> np.ndarray:
     return np.where(job.free[parameter.key], scene_keys.project(parameter, values), values)
 
 
+def begun(job: Job) -> State:
+    """The state before the first step."""
+    values = {p.key: first(p, job) for p in job.chosen}
+    moments = {p.key: laplacian.start(p.shape, job.plan.pyramid) for p in job.chosen}
+    held = {p.key: np.zeros(p.shape, bool) for p in job.chosen}
+    tail = {p.key: np.zeros(p.shape) for p in job.chosen}
+    newton = scene_newton.Newton(scene_newton.gathered(job, values)) if job.newton else None
+    return State(0, values, moments, held, dict(values), tail, [], newton=newton)
+
+
 def _fingerprint(job: Job) -> str:
     """What must be the same for a checkpoint to fit."""
-    loss = getattr(job.loss, "__name__", type(job.loss).__name__)
+    loss = job.loss if isinstance(job.loss, str) else getattr(job.loss, "__name__", type(job.loss).__name__)
     films = [list(view.reference.shape) for view in job.views]
     return json.dumps([[(p.name, p.shape) for p in job.chosen], films, loss, len(job.regularizers), asdict(job.plan)])
 
@@ -172,15 +224,18 @@ def checkpoint(state: State, job: Job) -> dict[str, np.ndarray]:
     result = {
         "job": np.array(_fingerprint(job)),
         "iteration": np.array(state.iteration),
-        "before": state.before,
         "trace": np.array(state.trace),
+        "course": np.array(state.course, np.float64),
+        "paces": np.array(state.paces, np.float64),
     }
     for p in job.chosen:
-        result[f"{p.name}/value"] = state.values[p.key].copy()
-        result[f"{p.name}/held"] = state.held[p.key].copy()
+        for name in ("values", "start", "tail", "held"):
+            result[f"{p.name}/{name}"] = getattr(state, name)[p.key].copy()
         for k, level in enumerate(state.moments[p.key]):
             for name in ("first", "second", "steps"):
                 result[f"{p.name}/{name}{k}"] = getattr(level, name).copy()
+    if state.newton is not None:
+        result |= {f"newton/{name}": value for name, value in scene_newton.saved(state.newton).items()}
     return result
 
 
@@ -197,8 +252,17 @@ def restored(saved: Mapping[str, np.ndarray], job: Job) -> State:
             laplacian.Moments(*(np.array(saved[f"{p.name}/{name}{k}"]) for name in ("first", "second", "steps")))
             for k in range(count)
         )
-    values = {p.key: np.array(saved[f"{p.name}/value"], np.float32) for p in job.chosen}
-    held = {p.key: np.array(saved[f"{p.name}/held"], bool) for p in job.chosen}
+    kinds: Any = {"values": np.float32, "held": bool, "start": np.float32, "tail": np.float64}
+    held: Any = {
+        name: {p.key: np.array(saved[f"{p.name}/{name}"], kind) for p in job.chosen} for name, kind in kinds.items()
+    }
+    newton = {k.removeprefix("newton/"): v for k, v in saved.items() if k.startswith("newton/")}
     return State(
-        int(saved["iteration"]), values, moments, held, np.array(saved["before"]), [float(x) for x in saved["trace"]]
+        int(saved["iteration"]),
+        moments=moments,
+        trace=[float(x) for x in saved["trace"]],
+        course=list(np.array(saved["course"])),
+        paces=list(np.array(saved["paces"])),
+        newton=scene_newton.brought_back(newton) if newton else None,
+        **held,
     )

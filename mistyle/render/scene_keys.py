@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import UsageError
-from mistyle.render import scene_walk
+from mistyle.render import scene_reach, scene_walk
 
 ROUGHNESS_FLOOR = 0.04
 # `principled` clamps alpha = roughness^2 at 0.001; below, its derivative is exactly zero.
@@ -44,6 +44,7 @@ class Parameter:
     storage  "float32", "float16", "uint8", …
     reason   why a fit cannot move it; None where it can
     notes    what a fit will do that one may not expect
+    channels numbers of a texel, of a vertex or face, or of the value
     """
 
     key: str
@@ -56,19 +57,24 @@ class Parameter:
     storage: str
     reason: str | None
     notes: tuple[str, ...] = ()
+    channels: int = 1
 
     @property
     def name(self) -> str:
         return self.names[0]
 
 
-def parameters(scene: Any) -> list[Parameter]:
-    """Every parameter of a live `mi.Scene` (or of any other Mitsuba object), in the order of `mi.traverse`."""
+def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
+    """Every parameter of a live `mi.Scene` (or of any other Mitsuba object), in the order of `mi.traverse`.
+
+    `engine` is the integrator that is to give the gradients (`scene_grad.ad_integrator`); None means `prb`.
+    """
     import mitsuba as mi
 
     found = mi.traverse(scene)
     children = scene_walk.children(scene)
     ways = scene_walk.ways(scene, children)
+    used = scene_reach.drawn(scene, children) if isinstance(scene, mi.Scene) else None
     # Where several hold a plugin, the one that is not the scene says what it is for.
     holders: dict[Any, tuple[str, Any]] = {}
     for holder, held in children.items():
@@ -79,29 +85,70 @@ def parameters(scene: Any) -> list[Parameter]:
     for key, (_, _, node, flags) in found.properties.items():
         leaf = key.rpartition(".")[2]
         value: Any = found[key]
-        role, owner = holders[node] if isinstance(node, mi.Texture) and node in holders else (leaf, node)
+        held_as = isinstance(node, (mi.Texture, mi.Volume)) and node in holders
+        role, owner = holders[node] if held_as else (leaf, node)
         names = scene_walk.names([f"{way}.{leaf}" if way else leaf for way in ways.get(node, ())] or [key])
         shape, storage = tuple(int(n) for n in np.shape(value)), _storage(value)
         if not storage.startswith(("float", "uint", "int")) or storage == "python":
             shape = ()
         kind = _kind(node, leaf, shape)
         reason = _reason(node, owner, role, kind, flags, value, storage)
+        if reason is None and used is not None and node not in used:
+            reason = "no shape and no light uses it."
+        if kind == "attribute":
+            role, owner, unread = _reader(node, leaf, children)
+            reason = reason or unread
+        reason = reason or scene_reach.no_gradient(node, owner, role, engine)
         notes = _notes(node, owner, role, value, storage) if reason is None else ()
         if len(shape) == 2 and kind == "value":
             shape = shape[:1]
-        result.append(
-            Parameter(key, names, node.class_name(), owner.class_name(), role, kind, shape, storage, reason, notes)
-        )
+        classes = node.class_name(), owner.class_name()
+        more = (reason, notes, _channels(node, leaf, kind, shape))
+        result.append(Parameter(key, names, *classes, role, kind, shape, storage, *more))
     return _without_ambiguous(result)
 
 
-def match(scene: Any, patterns: Sequence[str]) -> tuple[Parameter, ...]:
+def merged(chosen: Sequence[Parameter]) -> tuple[str, ...]:
+    """Notes for a live scene: which parameters belong to several shapes, as those do that `mi.load_file` merged."""
+    notes = []
+    for p in chosen:
+        heads = {name.partition(".")[0] for name in p.names if re.search(r"\.(bsdf|emitter)\.", name)}
+        if len(heads) > 1:
+            shown = ", ".join(sorted(heads)[:5]) + ", …" * (len(heads) > 5)
+            notes.append(
+                f"{p.name} belongs to {len(heads)} shapes ({shown}): mi.load_file merges equal materials. Load with "
+                "`optimize=False`, or give them unequal values, to fit them one by one."
+            )
+        elif p.name.startswith("unnamed"):
+            notes.append(
+                f"{p.name} belongs to a shape without a name: mi.load_file merges meshes of equal materials. Load with "
+                "`optimize=False` to fit them one by one."
+            )
+    return tuple(notes)
+
+
+def _reader(shape: Any, attribute: str, children: scene_reach.Children) -> tuple[str, Any, str | None]:
+    """Role and owner of a mesh's attribute by the texture that reads it, or why it cannot be fitted."""
+    found = scene_reach.readers(shape, attribute, children)
+    if found:
+        return *found[0], None
+    return attribute, shape, None if found is None else f"no material of its shape reads {attribute}."
+
+
+def _channels(node: Any, leaf: str, kind: str, shape: tuple[int, ...]) -> int:
+    if kind == "attribute":
+        count = node.vertex_count() if leaf.startswith("vertex_") else node.face_count()
+        return max(int(np.prod(shape)) // max(int(count), 1), 1)
+    return int(shape[-1]) if shape else 1
+
+
+def match(scene: Any, patterns: Sequence[str], engine: Any = None) -> tuple[Parameter, ...]:
     """The parameters that globs name, each once, in the scene's order; a final `.data` or `.value` may be left out.
 
     A pattern may match things that cannot move as long as it matches one that can. Raises UsageError naming the nearest
     keys when a pattern matches nothing, and saying why when it matches only what cannot be moved.
     """
-    return choose(parameters(scene), patterns)
+    return choose(parameters(scene, engine), patterns)
 
 
 def choose(listed: Sequence[Parameter], patterns: Sequence[str]) -> tuple[Parameter, ...]:
@@ -128,10 +175,13 @@ def limits(parameter: Parameter) -> tuple[float, float] | None:
         return ROUGHNESS_FLOOR, 1.0
     if parameter.role in UNIT:
         return 0.0, 1.0
+    if parameter.kind == "attribute" and re.search("colou?r", parameter.role):
+        return 0.0, 1.0
     light = parameter.owner.endswith(("Emitter", "Light"))
     if light or any(word in parameter.role for word in ("radiance", "intensity", "emittance")):
         return 0.0, np.inf
-    return None
+    # A spectrum of a role that nobody knows here, in a plugin of the user's for example.
+    return (0.0, np.inf) if parameter.kind == "value" and "Spectrum" in parameter.plugin else None
 
 
 def project(parameter: Parameter, values: Float[np.ndarray, "..."], tilt: float = 0.95) -> Float[np.ndarray, "..."]:
@@ -203,6 +253,10 @@ def _unknown(listed: Sequence[Parameter], pattern: str) -> str:
     everything = list(dict.fromkeys(name for p in listed for name in p.names))
     near = get_close_matches(pattern, usable, 5, 0.4) or get_close_matches(pattern, everything, 5, 0.4) or usable[:5]
     told = f"The nearest keys: {', '.join(near)}." if near else "Nothing in this scene can be optimised."
+    if any(name.startswith("unnamed") for name in everything):
+        told += (
+            " Shapes without a name may have been merged by mi.load_file or mi.load_dict; `optimize=False` keeps them."
+        )
     return f"'{pattern}' matches no parameter of the scene. {told}"
 
 

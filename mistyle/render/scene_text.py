@@ -11,6 +11,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from mistyle.core.errors import InputRefused
 from mistyle.render.scene_keys import Parameter
 
 Edit = tuple[int, int, str]  # first byte, byte after the last, what comes in their place
@@ -56,7 +57,7 @@ def _child(state: Any, node: Any, name: str) -> int | None:
             return index
     stem, number = re.fullmatch(r"(.*?)(?:_(\d+))?", name).groups()  # pyright: ignore[reportOptionalMemberAccess]
     kinds = {"bsdf": mi.ObjectType.BSDF, "brdf": mi.ObjectType.BSDF, "nested_bsdf": mi.ObjectType.BSDF}
-    kinds |= {"emitter": mi.ObjectType.Emitter, "normalmap": mi.ObjectType.Texture}
+    kinds |= {"emitter": mi.ObjectType.Emitter, "normalmap": mi.ObjectType.Texture, "shape": mi.ObjectType.Shape}
     fitting = [index for _, index in held if state.nodes[index].type == kinds.get(stem)]
     place = int(number or 0)
     return fitting[place] if place < len(fitting) else None
@@ -93,20 +94,31 @@ def _elements(source: bytes) -> list[_Element]:
         element["end"] = element["body"] if alone else end + source[end:].index(b">") + 1
 
     parser.StartElementHandler, parser.EndElementHandler = opened, closed
-    parser.Parse(source, True)
+    try:
+        parser.Parse(source, True)
+    except expat.ExpatError as error:
+        raise InputRefused(f"found a scene file that is not XML ({error}); check the file.") from error
     return [_Element(**element) for element in found]
 
 
 def edits_of(
-    state: Any, source: bytes, p: Parameter, values: np.ndarray, file: Path | None, out: Path
-) -> list[Edit] | str:
-    """What to replace in the text for one parameter, or why that cannot be."""
+    state: Any, sources: Sequence[bytes], p: Parameter, values: np.ndarray, file: Path | None
+) -> tuple[int, list[Edit]] | str:
+    """The number of the file and what to replace in its text for one parameter, or why that cannot be.
+
+    `sources` are the texts of `state.files`: the scene's, then what it includes.
+    """
     place = _find(state, p)
     if place is None:
         return "its element could not be told from the others."
     node, literal = place
-    if node.file_index:
-        return "it stands in an included file, which is left as it is."
+    found = _edits(node, literal, sources[node.file_index], p, values, file)
+    return found if isinstance(found, str) else (node.file_index, found)
+
+
+def _edits(
+    node: Any, literal: str | None, source: bytes, p: Parameter, values: np.ndarray, file: Path | None
+) -> list[Edit] | str:
     elements = _elements(source)
     at = next((k for k, e in enumerate(elements) if e.begin == node.offset - 1), None)
     if at is None:
@@ -119,6 +131,8 @@ def edits_of(
         edits = [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>')]
         # An 8-bit or 16-bit format would round what the file holds.
         return edits + [(inner[name].begin, inner[name].end, "") for name in ("format",) if name in inner]
+    if p.kind == "attribute":
+        return _mesh_edits(elements, at, file)
     if p.kind != "value":
         return f"a scene file cannot hold it; it was written as {file.name if file else 'nothing'}."
     old = inner.get(literal)
@@ -135,24 +149,58 @@ def edits_of(
     return [(element.end - 2, element.end, f">{text}</{element.tag}>")]
 
 
+def _mesh_edits(elements: Sequence[_Element], at: int, file: Path | None) -> list[Edit] | str:
+    """A PLY mesh gives way to the written one, whose vertices stand in the world already."""
+    inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
+    if file is None or elements[at].attributes.get("type") != "ply" or "filename" not in inner:
+        return (
+            f"only a mesh that comes from a PLY can be replaced; it was written as {file.name if file else 'nothing'}."
+        )
+    old = inner["filename"]
+    moved = [(inner["to_world"].begin, inner["to_world"].end, "")] if "to_world" in inner else []
+    return [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>'), *moved]
+
+
+def include_edit(source: bytes, included: Path, defines: Mapping[str, str], new: str) -> list[Edit]:
+    """What makes `source` include the file `new` instead of `included`; nothing where it does not include that."""
+    elements = _elements(source)
+    given = {e.attributes.get("name", ""): e.attributes.get("value", "") for e in elements if e.tag == "default"}
+    given |= defines
+    for e in elements:
+        name = e.attributes.get("filename", "")
+        for key in sorted(given, key=len, reverse=True):
+            name = name.replace(f"${key}", given[key])
+        if e.tag == "include" and name and included.as_posix().endswith(Path(name).as_posix().lstrip("./")):
+            return [(e.begin, e.end, f"<include filename={quoteattr(new)}/>")]
+    return []
+
+
 def surroundings(source: bytes, path: Path, defines: Mapping[str, str], out: Path) -> list[Edit]:
-    """Defaults as they were given, and the way back to the original's folder."""
+    """Defaults as they were given, those that the file does not have too, and the way back to the original's folder."""
     edits: list[Edit] = []
     elements = _elements(source)
+    there = {e.attributes.get("name", "") for e in elements if e.tag == "default"}
+    new = [f"\n<default name={quoteattr(k)} value={quoteattr(v)}/>" for k, v in defines.items() if k not in there]
     for e in elements:
         name = e.attributes.get("name", "")
         if e.tag == "default" and name in defines:
             text = f"<default name={quoteattr(name)} value={quoteattr(defines[name])}/>"
             edits.append((e.begin, e.end, text))
     if out.parent.resolve() == path.parent.resolve():
-        return edits
+        return edits + [(elements[0].body, elements[0].body, "".join(new))] if new else edits
     for e in elements:
         if e.tag == "path" and not Path(e.attributes.get("value", "/")).is_absolute():
             there = _from(out, path.parent / e.attributes["value"])
             edits.append((e.begin, e.end, f"<path value={quoteattr(there)}/>"))
     body = elements[0].body
-    edits.append((body, body, f"\n<path value={quoteattr(_from(out, path.parent))}/>"))
+    edits.append((body, body, f"\n<path value={quoteattr(_from(out, path.parent))}/>" + "".join(new)))
     return edits
+
+
+def resolved(path: Path, defines: Mapping[str, str], out: Path) -> bytes:
+    """A scene file's text for another folder, with its parameters as given: it loads as `path` does with `defines`."""
+    source = path.read_bytes()
+    return spliced(source, surroundings(source, path, defines, out))
 
 
 def _from(out: Path, folder: Path) -> str:

@@ -4,7 +4,7 @@ Mitsuba's own parser reads the file (includes, defaults and paths are its busine
 text with the fitted elements replaced, not a new file: comments, ids and structure stay.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.core import stopping
 from mistyle.core.errors import InputRefused
 from mistyle.core.names import WRITTEN, distinct, safe_name
 from mistyle.render import device, scene_text
@@ -68,6 +69,7 @@ def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = Non
             # Loading empties what was parsed, and `write_scene` needs it.
             made = mi.parser.instantiate(config, _parsed(config, file, given)[0])
     except RuntimeError as error:
+        stopping.check()
         raise InputRefused(f"{file}: Mitsuba cannot load this scene. {error}") from error
     scene: Any = made[0] if isinstance(made, list) else made
     if not isinstance(scene, mi.Scene):
@@ -143,8 +145,9 @@ def write_scene(
     """Write the fitted values (a `FittedScene`) as float EXR textures, and the scene file that uses them at `path`.
 
     The scene file is a copy of the one that was loaded: the fitted bitmaps' file names and the fitted literals' values
-    are replaced, `<default>`s hold the values it was loaded with, and a `<path>` leads to the folder of the original,
-    where its meshes and other files stay. It needs no mistyle. It is loaded once and its values are compared with the
+    are replaced (in copies of the files that it includes too), `<default>`s hold the values it was loaded with, and a
+    `<path>` leads to the folder of the original, where its meshes and other files stay. A mesh with fitted attributes
+    is written as PLY. It needs no mistyle. It is loaded once and its values are compared with the
     fitted ones; where that fails it is not kept and a note says why. From a live `mi.Scene` only textures are written.
     `write_exr` is that of `files/images.py`, `write_file` may be `atomic_write` of `files/store.py`.
     """
@@ -153,22 +156,25 @@ def write_scene(
     textures: dict[str, Path] = {}
     room = max(WRITTEN - len(f"{out.stem}_.exr".encode()), 16)
     stems = distinct([safe_name(p.name.removesuffix(".data"), room) for p in fitted.parameters], limit=room)
+    live = scene.scene if isinstance(scene, SceneFile) else scene
     for p, stem in zip(fitted.parameters, stems, strict=True):
-        textures |= _write_value(out, stem, p, fitted.values[p.key], write_exr)
+        textures |= _write_value(out, stem, p, fitted.values[p.key], write_exr, live)
     if not isinstance(scene, SceneFile):
         return Written(None, textures, ("The scene does not come from a file: only its textures were written.",))
-    source = scene.path.read_bytes()
-    edits, notes = [], []
+    sources = [Path(str(file)).read_bytes() for file in scene.state.files]
+    edits: dict[int, list[scene_text.Edit]] = {0: []}
+    notes = []
     for p in fitted.parameters:
-        found = scene_text.edits_of(scene.state, source, p, fitted.values[p.key], textures.get(p.key), out)
+        found = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
         if isinstance(found, str):
-            notes.append(f"{p.name} is not in {out.name}: {found}")
+            notes.append(f"{p.name} is not in {out.name}: {found} Its value stands in run.json and in the report.")
         else:
-            edits += found
-    if not edits:
+            edits.setdefault(found[0], []).extend(found[1])
+    if not any(edits.values()):
         return Written(None, textures, tuple(notes))
-    edits += scene_text.surroundings(source, scene.path, scene.defines, out)
-    write_file(out, scene_text.spliced(source, edits))
+    notes += _rewrite_includes(scene, sources, edits, out, write_file)
+    edits[0] += scene_text.surroundings(sources[0], scene.path, scene.defines, out)
+    write_file(out, scene_text.spliced(sources[0], edits[0]))
     wrong = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
     if wrong:
         out.unlink()
@@ -178,10 +184,36 @@ def write_scene(
     return Written(out, textures, tuple(notes))
 
 
+def _rewrite_includes(
+    scene: SceneFile,
+    sources: Sequence[bytes],
+    edits: dict[int, list[scene_text.Edit]],
+    out: Path,
+    write_file: Callable[[Path, bytes], Any],
+) -> list[str]:
+    """Write included files with fitted values beside the scene, from the innermost outwards, and include those."""
+    notes = []
+    for k in range(len(sources) - 1, 0, -1):
+        if not edits.get(k):
+            continue
+        included = Path(str(scene.state.files[k]))
+        new = out.with_name(f"{out.stem}_{k}_{included.name}")
+        for parent in range(len(sources)):
+            change = scene_text.include_edit(sources[parent], included, scene.defines, new.name)
+            if change and parent != k:
+                edits.setdefault(parent, []).extend(change)
+                write_file(new, scene_text.spliced(sources[k], edits[k]))
+                notes.append(f"{out.name} includes {new.name}, a copy of {included.name} with the fitted values.")
+                break
+    return notes
+
+
 def _write_value(
-    out: Path, stem: str, p: Parameter, values: np.ndarray, write_exr: Callable[..., None]
+    out: Path, stem: str, p: Parameter, values: np.ndarray, write_exr: Callable[..., None], scene: Any
 ) -> dict[str, Path]:
-    """An image as EXR, a mesh's attribute as .npy, nothing for a number or a colour."""
+    """An image as EXR, a mesh's attribute as PLY in world space, nothing for a number or a colour."""
+    import mitsuba as mi
+
     if p.kind == "texture" and values.ndim == 3 and values.shape[2] <= 4:
         file = out.with_name(f"{out.stem}_{stem}.exr")
         shown = _without_seam(values) if p.owner == "EnvironmentMapEmitter" else values
@@ -191,6 +223,12 @@ def _write_value(
         return {p.key: file}
     if p.kind == "value":
         return {}
+    if p.kind == "attribute":
+        file = out.with_name(f"{out.stem}_{stem}.ply")
+        node: Any = mi.traverse(scene).properties[p.key][2]
+        with device.file_threads():
+            node.write_ply(str(file))
+        return {p.key: file}
     file = out.with_name(f"{out.stem}_{stem}.npy")
     np.save(file, values)
     return {p.key: file}

@@ -60,6 +60,9 @@ def add_converge(verbs: Any) -> None:
     verb.add_argument("--lights", default="studio", metavar="A", help="of a mesh: studio, key, grazing, FILE.hdr")
     verb.add_argument("--size", type=int, default=256, metavar="N", help="of a mesh: pixels along each side")
     verb.add_argument("--sensor", type=int, default=0, metavar="K", help="of a scene file: the sensor")
+    verb.add_argument(
+        "-D", dest="defines", action="append", default=[], metavar="NAME=VALUE", help="of a scene file: as for mitsuba"
+    )
     verb.add_argument("--blender", metavar="PYTHON", help="Python with bpy, for blender:cycles")
     verb.add_argument("--threads", type=int, metavar="N", help="threads of blender:cycles (default: all)")
     add_overwrite_option(verb)

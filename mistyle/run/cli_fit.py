@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mistyle.core import names
 from mistyle.core.errors import UsageError
 from mistyle.run.options import (
     DELIVERY_OPTIONS,
@@ -37,6 +38,9 @@ OPTIONS = {
     "iterations": "recover.iterations",
     "memory": "memory",
     **DELIVERY_OPTIONS,
+}
+SCENE_OPTIONS = {
+    name: name for name in ("seed", "threads", "variant", "iterations", "spp", "spp_grad", "loss", "channels")
 }
 
 
@@ -120,10 +124,25 @@ def _add_scene_options(verb: argparse.ArgumentParser) -> None:
     )
     scene.add_argument("--optimize", nargs="+", default=[], metavar="KEY", help="parameters to fit; globs")
     scene.add_argument("--list", action="store_true", help="list what can be fitted, and why the rest cannot, and stop")
+    scene.add_argument(
+        "--loss",
+        choices=["auto", "relative", "log_srgb_l1", "l2"],
+        help="relative (default where renders have noise): squared, over the reference's square; free of noise bias",
+    )
+    scene.add_argument("--spp", type=int, metavar="N", help="samples a pixel of a step's picture (default 16)")
+    scene.add_argument(
+        "--spp-grad", type=int, metavar="N", help="and of its derivative (default 8 for numbers, 1 for textures)"
+    )
+    scene.add_argument(
+        "--channels", metavar="PREFIX|A,B,C", help="channels of EXR references that hold more than R, G, B"
+    )
     scene.add_argument("-D", dest="defines", action="append", default=[], metavar="NAME=VALUE", help="as for mitsuba")
     scene.add_argument("-m", dest="variant", metavar="VARIANT", help="as for mitsuba")
     scene.add_argument("-s", dest="sensor", type=int, metavar="INDEX", help="fit to this sensor only")
     scene.add_argument("-t", dest="threads", type=int, metavar="N", help="as --threads")
+
+
+_ONLY_SCENE = ("optimize", "list", "defines", "sensor", "loss", "spp", "spp_grad", "channels")
 
 
 def run_fit(options: argparse.Namespace) -> int:
@@ -131,18 +150,16 @@ def run_fit(options: argparse.Namespace) -> int:
     if options.scene is not None:
         if options.mesh is not None:
             raise UsageError("give either MESH and REFERENCES, or --scene SCENE.xml with --references DIR, not both")
-        from mistyle.run.scene_fit import run_scene
-
-        return run_scene(options)
+        return _fit_scene(options)
     settings = material_settings(options)
     if options.print_config:
         from mistyle.run.settings import as_toml
 
         sys.stdout.write(as_toml(settings))
         return 0
-    wrong = [f"--{name}" for name in ("optimize", "list", "defines", "sensor") if getattr(options, name)]
+    wrong = [f"--{name}" for name in _ONLY_SCENE if getattr(options, name)]
     if wrong:
-        raise UsageError(f"{wrong[0]} belongs to --scene SCENE.xml; see mistyle fit --help")
+        raise UsageError(f"{wrong[0].replace('_', '-')} belongs to --scene SCENE.xml; see mistyle fit --help")
     missing = [n for n in ("mesh", "references", "out") if getattr(options, n) is None]
     if missing:
         wanted = ", ".join("-o OUT" if m == "out" else m.upper() for m in missing)
@@ -157,6 +174,42 @@ def material_settings(options: argparse.Namespace) -> Any:
 
     said = said_settings(options, OPTIONS)
     return resolve(options.preset, options.config, said, root=MaterialSettings, presets=MATERIAL_PRESETS)
+
+
+def _fit_scene(options: argparse.Namespace) -> int:
+    """List a scene's parameters, or fit them."""
+    from mistyle.run.progress import Progress
+    from mistyle.run.scene_fit import SceneJob, describe, fit_scene, given_defines, list_row, listed, loaded
+    from mistyle.run.scene_report import row_text
+    from mistyle.run.scene_settings import SCENE_PRESETS, SceneSettings
+    from mistyle.run.settings import as_toml, resolve
+
+    said = said_settings(options, SCENE_OPTIONS)
+    settings = resolve(options.preset, options.config, said, root=SceneSettings, presets=SCENE_PRESETS)
+    defines = given_defines(options.defines)
+    if options.print_config:
+        sys.stdout.write(as_toml(settings))
+        return 0
+    if options.list:
+        found = listed(loaded(options.scene, defines, settings))
+        print(json.dumps([list_row(p) for p in found]) if options.json else describe(found))
+        return 0
+    missing = [n for n, v in (("--references DIR", options.shots), ("-o OUT", options.out)) if v is None]
+    if missing:
+        raise UsageError(f"fit --scene needs {' and '.join(missing)}; --list shows what can be fitted")
+    name = names.asset_name(options.name, options.scene.stem)
+    given = (options.scene, options.shots, options.out, tuple(options.optimize), settings, name, defines)
+    progress = Progress()
+    summary = fit_scene(SceneJob(*given, sensor=options.sensor, overwrite=options.overwrite), progress)
+    if options.json:
+        print(json.dumps(summary))
+    else:
+        for row in summary["values"]:
+            print(f"{row['name']}: {row_text(row)}", file=sys.stderr)
+        for label in ("scene", "pictures", "report"):
+            print(f"{label:<9} {summary[label]}", file=sys.stderr)
+    progress.tell_notes()
+    return 0
 
 
 def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:

@@ -71,7 +71,8 @@ def run_converge(options: argparse.Namespace) -> int:
     counts = [2**k for k in range(int(math.log2(options.max_spp)) + 1)]
     progress = Progress()
     with TemporaryDirectory(prefix="mistyle-") as work:
-        what = subject(options.scene, Path(work), chosen, options.threads or 0)
+        path = _defined(options.scene, options.defines, Path(work))
+        what = subject(path, Path(work), chosen, options.threads or 0)
         shot = shots(what, [options.lights], 1, options.size)[options.sensor]
         reference, said = _reference(options, what, shot, chosen[0], progress)
         found, drew = measure(what, shot, chosen, counts, options.seeds, reference, progress)
@@ -80,6 +81,7 @@ def run_converge(options: argparse.Namespace) -> int:
         progress.note(f"Mitsuba does not draw {', '.join(missing)} of {options.scene.name} here.")
     record = summary(found, [r.name for r in chosen], counts) | {
         "scene": str(options.scene),
+        "defines": list(options.defines),
         "shot": shot.name,
         "reference": said,
         "definitions": definitions_of(),
@@ -92,6 +94,22 @@ def run_converge(options: argparse.Namespace) -> int:
     _tell(options, record)
     progress.tell_notes()
     return 0
+
+
+def _defined(scene: Path, pairs: Sequence[str], work: Path) -> Path:
+    """The scene file with its parameters as -D gives them, for every renderer; itself without any."""
+    if not pairs:
+        return scene
+    from mistyle.render.scene_text import resolved
+    from mistyle.run.scene_fit import given_defines
+
+    if scene.suffix.lower() != ".xml":
+        raise UsageError(f"-D {pairs[0]}: {scene.name} has no parameters; -D belongs to Mitsuba scene files (.xml)")
+    if not scene.is_file():
+        raise InputRefused(f"{scene}: found nothing; expected a Mitsuba scene file. Check the path.")
+    path = work / scene.name
+    path.write_bytes(resolved(scene, given_defines(pairs), path))
+    return path
 
 
 def _split(text: str) -> list[str]:

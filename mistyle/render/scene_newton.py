@@ -1,0 +1,402 @@
+"""Gauss–Newton on the few numbers of a scene: literals and colours under a squared loss, from noisy renders.
+
+A round renders the picture's derivative J by every number (forward mode) at the values θ, then pictures I by other
+random numbers, and solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ W J. Φ is J without outliers: at the solution
+the expected I is R, so that any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds
+with the J of others, so it has no bias from J's noise.
+
+The first rounds are short and walk to the neighbourhood of the solution. The rest share the remaining steps and do
+not replace one another: the result is the mean of their solutions, and their disagreement its standard error.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core import stopping
+from mistyle.render import scene_grad, scene_keys
+from mistyle.render.scene_keys import Parameter
+
+MOST_NUMBERS = 32
+MOST_BYTES = 2.5e8  # of the derivatives that are kept, in checkpoints too
+SPP = (8, 64)  # fewest and most of the derivatives, unless given: as many as cost about what the pictures do
+OUTLIER, BESIDE = 8.0, 5  # a derivative counts at most so many times the mean size around it, in a square of pixels
+APPROACH = 0.6  # share of the steps at most that the short rounds take
+SHORT = 4  # steps of a short round, at least
+NEAR = 0.1  # relative change from which the long rounds begin
+LONG = (4, 8)  # fewest and most long rounds
+LOST = 0.01  # share of a picture's values that are no numbers from which a round goes half the way back
+WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays as it is
+DAMPING = 1e-3  # of the short rounds
+
+
+@dataclass(frozen=True)
+class Round:
+    """A long round: cameras, steps, where it stood, and g there."""
+
+    views: tuple[int, ...]
+    steps: int
+    theta: Float[np.ndarray, " n"]
+    gradient: Float[np.ndarray, " n"]
+
+
+@dataclass
+class Newton:
+    """What moves; `columns` are sums of derivatives by camera, of every other round, and `counts` their numbers."""
+
+    theta: Float[np.ndarray, " n"]
+    round: int = 0
+    near: bool = False
+    size: int = 0  # steps of a long round; 0 before them
+    best: tuple[float, Float[np.ndarray, " n"]] | None = None
+    rounds: list[Round] = field(default_factory=list)
+    noise: Float[np.ndarray, "n n"] | None = None  # covariance of g by the references' noise
+    columns: dict[int, Float[np.ndarray, "2 n h w 3"]] = field(default_factory=dict)
+    counts: dict[int, Float[np.ndarray, " 2"]] = field(default_factory=dict)
+
+
+@dataclass
+class _Seen:
+    """Sums of I - R and of its square over one camera's pictures of a round, and the weights of the loss."""
+
+    weights: Float[np.ndarray, "h w 3"]
+    count: int = 0
+    total: Any = 0.0
+    square: Any = 0.0
+
+    def products(self) -> Float[np.ndarray, "h w 3"]:
+        """Estimates of the expected picture's squared difference, without the render noise where there are two."""
+        if self.count < 2:
+            return self.square
+        return (self.total**2 - self.square) / (self.count * (self.count - 1))
+
+    def noise(self) -> float:
+        """The loss of the mean picture's noise alone."""
+        return float((self.weights * (self.total**2 / self.count**2 - self.products())).sum())
+
+
+def refusal(chosen: Sequence[Parameter], free: Mapping[str, np.ndarray], views: Sequence[Any], loss: Any) -> str:
+    """Why Gauss–Newton does not suit a fit; nothing where it does."""
+    count = sum(int(free[p.key].sum()) for p in chosen)
+    if any(p.kind != "value" for p in chosen):
+        return "textures and attributes have too many numbers"
+    if not 0 < count <= MOST_NUMBERS:
+        return f"there are {count} numbers; expected 1 to {MOST_NUMBERS}"
+    if loss not in scene_grad.SQUARED:
+        return "the loss is not a square"
+    size = 2 * 4 * count * sum(int(np.prod(view.reference.shape)) for view in views)
+    return f"the derivatives would take {size / 1e9:.1f} GB" if size > MOST_BYTES else ""
+
+
+def gathered(job: Any, values: Mapping[str, np.ndarray]) -> Float[np.ndarray, " n"]:
+    """The numbers that move, in one vector."""
+    return np.concatenate([values[p.key][job.free[p.key]] for p in job.chosen]).astype(np.float64)
+
+
+def spread(job: Any, theta: Float[np.ndarray, " n"], fill: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The reverse of `gathered`; numbers that stand still come from `fill`."""
+    result, start = {}, 0
+    for p in job.chosen:
+        free = job.free[p.key]
+        result[p.key] = np.array(fill[p.key], np.float32)
+        result[p.key][free] = theta[start : start + int(free.sum())]
+        start += int(free.sum())
+    return result
+
+
+def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
+    """One round; False, with nothing changed, where the run was asked to stop. `camera` of a step and a slot."""
+    newton: Newton = state.newton
+    size, long = _size(job, state)
+    turns = [[camera(state.iteration + m, slot) for slot in range(job.plan.sensors_per_step)] for m in range(size)]
+    views = tuple(sorted({k for turn in turns for k in turn}))
+    # A short round needs both halves where it stands: H then has no bias from J's noise there either.
+    parts = [{k: _columns(job, state.values, newton, k, size, part) for k in views} for part in range(1 if long else 2)]
+    scene_grad.put(job.table, job.chosen, state.values)
+    seen = {k: _Seen(_weights(job, k)) for k in views}
+    losses, broken = [], dict.fromkeys(views, 0)
+    for m, turn in enumerate(turns):
+        if stopping.asked():
+            return False
+        numbers = [scene_grad.seeds(job.plan.seed, state.iteration + m, slot)[0] for slot in range(len(turn))]
+        found = [_look(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
+        losses.append(float(np.mean([value for value, _ in found])))
+        for k, (_, wrong) in zip(turn, found, strict=True):
+            broken[k] += wrong
+    _remember(newton, parts)
+    old, gradient = newton.theta, _gradient(newton, seen)
+    if long:
+        newton.size = newton.size or size
+        newton.rounds.append(Round(views, size, old, gradient))
+        newton.noise = _reference_noise(newton, seen)
+        new = _bounded(job, old, *_system(job, newton, _used(newton)))
+    else:
+        lost = sum(broken.values()) / (size * job.plan.sensors_per_step * np.size(next(iter(seen.values())).weights))
+        new = _short(job, newton, gradient, seen, lost)
+        newton.near = newton.round >= 2 and bool((np.abs(new - old) < NEAR * (np.abs(new) + 0.02 * _scales(job))).all())
+    newton.theta, newton.round = new, newton.round + 1
+    state.values = spread(job, new, state.values)
+    state.trace += losses
+    state.iteration += size
+    for k, count in broken.items():
+        state.broken[k] = state.broken.get(k, 0) + count
+    reached = np.any([np.any(newton.columns[k] != 0, axis=(0, 2, 3, 4)) for k in views], axis=0)
+    shown = spread(job, reached.astype(float), {p.key: np.zeros(p.shape) for p in job.chosen})
+    for p in job.chosen:
+        state.moments[p.key][0].steps[shown[p.key] > 0] += size
+    return True
+
+
+def _size(job: Any, state: Any) -> tuple[int, bool]:
+    """Steps of the next round, and whether it is a long one."""
+    left = job.plan.iterations - state.iteration
+    if state.newton.size:
+        return min(state.newton.size, left), True
+    all_views = math.ceil(len(job.views) / job.plan.sensors_per_step)
+    short = max(SHORT, all_views)
+    if not state.newton.near and state.iteration + short <= APPROACH * job.plan.iterations:
+        return short, False
+    cost = len(state.newton.theta) * len(job.views) / job.plan.sensors_per_step
+    rounds = min(max(int(left / cost), LONG[0]), LONG[1], left)
+    return math.ceil(left / rounds), True
+
+
+def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) -> Float[np.ndarray, "n h w 3"]:
+    """The picture's derivatives of camera k where the round of `size` steps stands."""
+    theta = newton.theta
+    values, zero = spread(job, theta, fill), {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
+    own = size * job.plan.spp * job.plan.sensors_per_step // (2 * len(theta) * len(job.views))
+    spp = job.plan.spp_grad or min(max(own, SPP[0]), SPP[1])
+    result = []
+    for n in range(len(theta)):
+        one = np.zeros(len(theta))
+        one[n] = 1
+        seed, sensor = scene_grad.seeds(job.plan.seed, 2**30 + 2 * newton.round + part, k, n)[0], job.views[k].sensor
+        given = (job.scene, job.table, job.chosen, values, spread(job, one, zero), job.engine, sensor)
+        result.append(scene_grad.derivative(*given, spp, seed))
+    return np.stack(result)
+
+
+def _remember(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n h w 3"]]]) -> None:
+    """Add a long round's derivatives to one half; a short round's two take the place of all before: J was another."""
+    for part, columns in enumerate(parts):
+        for k, new in columns.items():
+            if k not in newton.columns:
+                newton.columns[k], newton.counts[k] = np.zeros((2, *new.shape), np.float32), np.zeros(2)
+            half = part if len(parts) == 2 else newton.round % 2
+            if len(parts) == 2:
+                newton.columns[k][half], newton.counts[k][half] = 0, 0
+            newton.columns[k][half] += new
+            newton.counts[k][half] += 1
+
+
+def _halves(newton: Newton, k: int) -> tuple[np.ndarray, np.ndarray]:
+    """The mean derivatives (n, values) of either half of the rounds; twice the same where there is one half only."""
+    means = [s.reshape(len(s), -1) / max(c, 1) for s, c in zip(newton.columns[k], newton.counts[k], strict=True)]
+    first, second = (means[h if newton.counts[k][h] else 1 - h].astype(np.float64) for h in (0, 1))
+    return first, second
+
+
+def _tamed(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[np.ndarray, "n v"]:
+    """Derivatives without outliers: each at most OUTLIER times the mean size beside it, plus that of its picture."""
+    result = []
+    for column in columns:
+        size = np.abs(column.reshape(shape))
+        inside = scene_grad.sums_around(np.ones_like(size[..., :1]), BESIDE) - 1
+        beside = (scene_grad.sums_around(size, BESIDE) - size) / np.maximum(inside, 1)
+        most = OUTLIER * np.maximum(beside, 0) + size.mean()
+        result.append(np.clip(column, -most.ravel(), most.ravel()))
+    return np.stack(result)
+
+
+def _weights(job: Any, k: int) -> Float[np.ndarray, "h w 3"]:
+    """Of the squared differences, so that their sum is the loss: 0 where nothing counts."""
+    view = job.views[k]
+    counts = np.array(view.counts).astype(np.float64)
+    weights = counts * np.array(view.weights) if job.loss == "relative" else counts
+    return weights / counts.sum()
+
+
+def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
+    """Render camera k, add the picture; its loss with its noise, and how many values are no numbers."""
+    view = job.views[k]
+    shown = np.array(scene_grad.picture(job.scene, job.engine, view.sensor, job.plan.spp, seed))[..., :3]
+    finite = np.isfinite(shown)
+    wrong = np.where(finite, shown - np.array(view.reference), 0).astype(np.float64)
+    square = wrong**2
+    seen.count, seen.total, seen.square = seen.count + 1, seen.total + wrong, seen.square + square
+    return float((seen.weights * square).sum()), int((~finite).sum())
+
+
+def _gradient(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, " n"]:
+    """g of half the loss, mean over the cameras that were seen."""
+    total: Any = 0.0
+    for k, sums in seen.items():
+        test = _tamed(np.mean(_halves(newton, k), axis=0), sums.weights.shape)
+        total = total + test @ (sums.weights * sums.total / sums.count).ravel()
+    return total / len(seen)
+
+
+def _matrices(job: Any, newton: Newton, views: Sequence[int]) -> dict[int, Float[np.ndarray, "n n"]]:
+    """H of half the loss by camera."""
+    result = {}
+    for k in views:
+        weights, shape = _weights(job, k).ravel(), _weights(job, k).shape
+        first, second = _halves(newton, k)
+        product = (_tamed(first, shape) * weights) @ second.T + (_tamed(second, shape) * weights) @ first.T
+        result[k] = (product + product.T) / 4
+    return result
+
+
+def _reference_noise(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, "n n"]:
+    """Covariance of g by what is left of I - R without render noise: Σ Φ W² r² Φᵀ."""
+    total: Any = 0.0
+    for k, sums in seen.items():
+        first, second = (_tamed(half, sums.weights.shape) for half in _halves(newton, k))
+        product = (first * (sums.weights**2 * sums.products()).ravel()) @ second.T
+        total = total + (product + product.T) / 2
+    return total / len(seen) ** 2
+
+
+def _short(
+    job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _Seen], lost: float
+) -> Float[np.ndarray, " n"]:
+    """Where a short round goes: a damped step, or half the way back to the best place so far.
+
+    It goes back where the pictures have become worse, or where `lost`, the share of their values that are no numbers,
+    says that the last step left the plugins' domain.
+    """
+    loss = float(np.mean([(s.weights * s.products()).sum() for s in seen.values()]))
+    noise = float(np.mean([s.noise() for s in seen.values()]))
+    if newton.best is not None and (lost > LOST or loss > newton.best[0] + noise):
+        return (newton.theta + newton.best[1]) / 2
+    if newton.best is None or loss < newton.best[0]:
+        newton.best = loss, newton.theta
+    matrix: Any = np.mean(list(_matrices(job, newton, list(seen)).values()), axis=0)
+    matrix = matrix + DAMPING * np.diag(np.abs(np.diag(matrix)))
+    return _bounded(job, newton.theta, matrix, matrix @ newton.theta - gradient)
+
+
+def _used(newton: Newton) -> list[Round]:
+    """The long rounds that count: all but the first, which began furthest away."""
+    return newton.rounds[int(len(newton.rounds) >= LONG[0]) :]
+
+
+def _system(job: Any, newton: Newton, rounds: Sequence[Round]) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix and right side whose solution is the rounds' mean, each weighted by its steps."""
+    each = _matrices(job, newton, sorted({k for r in rounds for k in r.views}))
+    matrix: Any = 0.0
+    right: Any = 0.0
+    for r in rounds:
+        own = np.mean([each[k] for k in r.views], axis=0)
+        matrix = matrix + r.steps * own
+        right = right + r.steps * (own @ r.theta - r.gradient)
+    return matrix, right
+
+
+def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    """Pseudo-inverse of the scaled matrix: directions of which the pictures say next to nothing stay."""
+    size = np.sqrt(np.maximum(np.diag(matrix), 0))
+    scale = np.where(size > 0, 1 / np.where(size > 0, size, 1), 0)
+    values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
+    strong = np.where(values > WEAK, 1 / np.maximum(values, WEAK), 0)
+    return np.outer(scale, scale) * ((vectors * strong) @ vectors.T)
+
+
+def _bounded(job: Any, theta: np.ndarray, matrix: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The solution of matrix · x = right inside the bounds, not too far from theta."""
+    low, high = _bounds(job)
+    scales = _scales(job)
+    reach = np.where(np.isfinite(high), 0.3 * scales, 2 * np.maximum(np.abs(theta), 0.05 * scales))
+    low = np.maximum(low, np.where(np.isfinite(high), theta - reach, np.minimum(theta / 4, theta - reach * (low < 0))))
+    high = np.minimum(high, theta + reach)
+    held = np.zeros(len(theta), bool)
+    step = np.zeros(len(theta))
+    wanted = right - matrix @ theta
+    for _ in range(len(theta)):
+        step[~held] = _inverse(matrix[np.ix_(~held, ~held)]) @ (wanted - matrix[:, held] @ step[held])[~held]
+        new = theta + step
+        outside = ~held & ((new < low) | (new > high))
+        if not outside.any():
+            break
+        step = np.clip(new, low, high) - theta
+        held |= outside
+    return np.clip(theta + step, low, high)
+
+
+def _scales(job: Any) -> np.ndarray:
+    return np.concatenate([np.full(int(job.free[p.key].sum()), job.scales[p.key]) for p in job.chosen])
+
+
+def _bounds(job: Any) -> tuple[np.ndarray, np.ndarray]:
+    ends = []
+    for p in job.chosen:
+        ends += [scene_keys.limits(p) or (-np.inf, np.inf)] * int(job.free[p.key].sum())
+    low, high = np.array(ends, float).T
+    return low, high
+
+
+def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
+    """Standard error of every number (NaN where nothing tells), and whether its rounds still drift.
+
+    Render noise comes from the long rounds' disagreement, the references' noise from what is left of the residuals.
+    """
+    count, used = len(newton.theta), _used(newton)
+    if len(used) < 2 or newton.noise is None:
+        return np.full(count, np.nan), np.zeros(count, bool)
+    inverse = _inverse(_system(job, newton, used)[0])
+    ends = [_system(job, newton, [r]) for r in used]
+    left = np.array([m @ newton.theta - right for m, right in ends])
+    rendered = left.T @ left * len(used) / (len(used) - 1)
+    own = sum(r.steps for r in used) ** 2 * newton.noise
+    variance = np.diag(inverse @ rendered @ inverse) + np.maximum(np.diag(inverse @ own @ inverse), 0)
+    error = np.sqrt(np.maximum(variance, 0))
+    error[~(np.diag(inverse) > 0)] = np.nan
+    half = len(used) // 2
+    first, second = (_bounded(job, newton.theta, *_system(job, newton, part)) for part in (used[:half], used[half:]))
+    drift = np.abs(second - first)
+    return error, (drift > 6 * np.nan_to_num(error)) & (drift > 0.02 * (np.abs(newton.theta) + 0.02 * _scales(job)))
+
+
+def saved(newton: Newton) -> dict[str, np.ndarray]:
+    """Everything, as arrays."""
+    count = len(newton.theta)
+    best = (np.nan, np.full(count, np.nan)) if newton.best is None else newton.best
+    result = {
+        "theta": newton.theta,
+        "numbers": np.array([newton.round, int(newton.near), newton.size, len(newton.rounds)]),
+        "best": np.append(best[0], best[1]),
+        "noise": np.full((count, count), np.nan) if newton.noise is None else newton.noise,
+    }
+    for n, r in enumerate(newton.rounds):
+        result[f"round{n}"] = np.concatenate([[r.steps], r.theta, r.gradient])
+        result[f"views{n}"] = np.array(r.views, int)
+    for k, sums in newton.columns.items():
+        result |= {f"columns{k}": sums.copy(), f"counts{k}": newton.counts[k].copy()}
+    return result
+
+
+def brought_back(arrays: Mapping[str, np.ndarray]) -> Newton:
+    """The reverse of `saved`."""
+    held = {name: np.array(value) for name, value in arrays.items()}
+    number, near, size, rounds = (int(n) for n in held["numbers"])
+    count = len(held["theta"])
+    views = [int(name.removeprefix("columns")) for name in held if name.startswith("columns")]
+    return Newton(
+        held["theta"],
+        number,
+        bool(near),
+        size,
+        None if np.isnan(held["best"]).all() else (float(held["best"][0]), held["best"][1:]),
+        [
+            Round(tuple(int(k) for k in held[f"views{n}"]), int(row[0]), row[1 : 1 + count], row[1 + count :])
+            for n, row in ((n, held[f"round{n}"]) for n in range(rounds))
+        ],
+        None if np.isnan(held["noise"]).any() else held["noise"],
+        {k: held[f"columns{k}"] for k in views},
+        {k: held[f"counts{k}"] for k in views},
+    )

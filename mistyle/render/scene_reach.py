@@ -1,0 +1,71 @@
+"""What a parameter of a live Mitsuba scene can do to a picture, and whether its integrator differentiates that.
+
+Every rule is about a kind. Detached sampling (`prb`, `prbvolpath`) has no derivative of lobes without an extent: those
+of mirrors and smooth glass, and of what passes a mask. Attached sampling (`direct`) has one of their colours, and none
+of the share by which one of them was chosen.
+"""
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+Children = Mapping[Any, list[tuple[str, Any]]]
+
+# Roles that decide between lobes, where sampling is attached.
+SHARES = {"opacity", "weight", "eta", "int_ior", "ext_ior"}
+
+
+def below(node: Any, held: Children) -> Iterator[tuple[str, Any, Any]]:
+    """(name, holder, plugin) of everything that a plugin holds, itself left out, each plugin once a holder."""
+    left, seen = [node], set()
+    while left:
+        holder = left.pop()
+        if holder in seen:
+            continue
+        seen.add(holder)
+        for name, child in held.get(holder, ()):
+            yield name, holder, child
+            left.append(child)
+
+
+def drawn(scene: Any, held: Children) -> set[Any]:
+    """The plugins that rendering reads: shapes, lights, cameras, integrators and what they hold."""
+    import mitsuba as mi
+
+    kinds = (mi.Shape, mi.Emitter, mi.Sensor, mi.Integrator)
+    roots = [child for _, child in held[scene] if isinstance(child, kinds)]
+    return {scene, *roots, *(child for root in roots for _, _, child in below(root, held))}
+
+
+def readers(shape: Any, attribute: str, held: Children) -> list[tuple[str, Any]] | None:
+    """(role, owner) of the textures that read a mesh's attribute; None where a user's plugin may read it itself."""
+    found, own = [], False
+    for name, holder, child in below(shape, held):
+        if child.class_name() == "MeshAttribute" and re.search(rf'name = "{re.escape(attribute)}"', str(child)):
+            found.append((name, holder))
+        own |= type(child).__module__.partition(".")[0] not in ("mitsuba", "drjit")
+    return found if found or not own else None
+
+
+def no_gradient(node: Any, owner: Any, role: str, engine: Any) -> str | None:
+    """Why the integrator has no true gradient of a parameter; None where it has. `engine` None: `prb`."""
+    import mitsuba as mi
+
+    detached = engine is None or isinstance(engine, mi.ad.integrators.common.ADIntegrator)
+    called = "prb" if engine is None else str(engine).partition("[")[0].removesuffix("Integrator").lower()
+    inside = isinstance(owner, (mi.Medium, mi.PhaseFunction)) or isinstance(node, mi.Volume)
+    if inside and engine is not None and "vol" not in called:
+        return f"it belongs to a medium, and the integrator {called} follows no light through media."
+    if not isinstance(owner, mi.BSDF) or not int(owner.flags()) & int(mi.BSDFFlags.Delta):
+        return None
+    if role == "diffuse_reflectance":
+        return None  # that lobe's own; `prb` adds some of the mirrored light, which leaves the solution in place
+    kind = re.sub(r"(BSDF|BRDF)$", "", owner.class_name())
+    if detached:
+        return (
+            f"{kind} has a lobe without an extent (a mirror's, smooth glass's or what a mask lets pass), of which the "
+            f"integrator {called} has no true gradient; a rough material in its place can be fitted."
+        )
+    if role in SHARES and "Conductor" not in kind:
+        return f"it decides how often {kind} takes one lobe or another, of which {called} has no true gradient."
+    return None

@@ -1,0 +1,205 @@
+"""What a fit of a scene found: values before and after with their errors, what is left, and what has to be said."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from mistyle.render import scene_grad, scene_keys, scene_newton
+from mistyle.render.scene_job import Bad, Job, State
+from mistyle.render.scene_keys import Parameter
+
+BATCHES = 8  # of the last steps, whose means' spread is the standard error
+DRIFT = 0.02  # relative change over the last steps that counts as not converged
+PACE = 0.3  # so does a mean change of more than this share of the rate: most gradients have one sign
+SURE = 2.0  # standard errors by which a result must be worse to be undone
+
+
+@dataclass(frozen=True)
+class Residual:
+    """How far a camera's picture is from its reference, before and after the fit.
+
+    loss   of the expected picture: without its render noise where the loss is a square
+    psnr   dB of clipped sRGB, of the mean of two pictures
+    noise  share of one picture's relative squared difference that is render noise, 0..1
+    """
+
+    sensor: int
+    loss: tuple[float, float]
+    psnr: tuple[float, float]
+    noise: tuple[float, float]
+
+
+@dataclass(frozen=True)
+class FittedScene:
+    """What the fit made; the scene itself holds the values too.
+
+    values       by `mi.traverse` key: (h, w, c) of textures, (n,) of the rest, float32
+    start        the same before the fit
+    errors       by key: standard errors of what `brief` gives, NaN where too few steps tell
+    seen         by key, the values' shapes: in how many steps a gradient reached the number; 0 means that what stands
+                 there was only carried over from its neighbours by the pyramid, or is as it came
+    trace        loss of each step, render noise included
+    residuals    per camera
+    bad          gradients that were no numbers (the first MOST_BAD)
+    parameters   what was fitted
+    unconverged  names of parameters that still drifted at the end
+    undone       the result was worse than its start, which stands again
+    notes        sentences for the report
+    """
+
+    values: dict[str, np.ndarray]
+    start: dict[str, np.ndarray]
+    errors: dict[str, np.ndarray]
+    seen: dict[str, np.ndarray]
+    trace: tuple[float, ...]
+    residuals: tuple[Residual, ...]
+    bad: tuple[Bad, ...]
+    parameters: tuple[Parameter, ...]
+    unconverged: tuple[str, ...]
+    undone: bool
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Look:
+    """One camera: loss, PSNR and noise as in `Residual`, and the squared difference of every value that counts."""
+
+    loss: float
+    psnr: float
+    noise: float
+    squares: np.ndarray
+
+
+def brief(p: Parameter, values: np.ndarray) -> np.ndarray:
+    """A parameter in few numbers: its own where it has at most 4, else the mean of every channel."""
+    if len(p.shape) < 3:
+        if values.size <= 4:
+            return values.astype(np.float64)
+        return values.reshape(-1, p.channels).mean(axis=0, dtype=np.float64)
+    return values.mean(axis=(0, 1), dtype=np.float64)
+
+
+def pace(p: Parameter, change: np.ndarray, rate: float) -> np.ndarray:
+    """The numbers of `brief` for one step's change, over what has moved only, as a share of the rate."""
+    moved = change.reshape(-1, change.size if len(p.shape) < 3 and change.size <= 4 else p.channels)
+    count = np.count_nonzero(moved, axis=0)
+    return moved.sum(axis=0, dtype=np.float64) / np.maximum(count, 1) / rate
+
+
+def looks(job: Job, values: Mapping[str, np.ndarray], progress: Callable[[float], None]) -> list[Look]:
+    """Two pictures of every camera, with the same seeds in every call: no difference comes from the noise alone."""
+    scene_grad.put(job.table, job.chosen, values)
+    result = []
+    for k, view in enumerate(job.views):
+        seeds = scene_grad.seeds(job.plan.seed, k, 2**31)
+        pair = [scene_grad.picture(job.scene, job.engine, view.sensor, job.plan.spp, s) for s in seeds]
+        result.append(_look(job, k, pair))
+        progress((k + 1) / len(job.views))
+    return result
+
+
+def _look(job: Job, k: int, pair: Sequence[Any]) -> Look:
+    view = job.views[k]
+    counts, reference = np.array(view.counts), np.array(view.reference, np.float64)
+    wrong = []
+    for shown in pair:
+        plain = np.array(shown, dtype=np.float64)[..., :3]
+        wrong.append(np.where(counts & np.isfinite(plain), plain - reference, 0))
+    weights = np.array(view.weights, np.float64)
+    squares = (weights if job.loss != "l2" else 1) * wrong[0] * wrong[1]
+    noise = (weights * (wrong[0] - wrong[1]) ** 2).sum() / 2
+    whole = (weights * (wrong[0] ** 2 + wrong[1] ** 2)).sum() / 2
+    mean = (pair[0] + pair[1]) / 2
+    loss = float(squares.sum() / counts.sum())
+    if job.loss not in scene_grad.SQUARED:
+        loss = scene_grad.compare(mean, view, job.losses[k])[0]
+    return Look(loss, scene_grad.psnr(mean, view), float(min(noise / max(whole, 1e-300), 1)), squares[counts])
+
+
+def worse(job: Job, before: Sequence[Look], after: Sequence[Look]) -> bool:
+    """Whether the pictures fit less well than before, beyond the noise of that comparison."""
+    change = sum(a.loss - b.loss for a, b in zip(after, before, strict=True))
+    if job.loss not in scene_grad.SQUARED:
+        return change > 0
+    parts = [a.squares - b.squares for a, b in zip(after, before, strict=True)]
+    spread = np.sqrt(sum(float(np.var(x)) / x.size for x in parts))
+    return bool(change > SURE * spread)
+
+
+def errors(job: Job, state: State) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+    """Standard errors of `brief` by key, and the names of what still drifts."""
+    if state.newton is not None:
+        error, drifts = scene_newton.errors(job, state.newton)
+        zero = {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
+        by_key, moving = (scene_newton.spread(job, x.astype(float), zero) for x in (error, drifts))
+        names = tuple(p.name for p in job.chosen if moving[p.key].any())
+        return {p.key: by_key[p.key].astype(np.float64) for p in job.chosen}, names
+    widths = [len(brief(p, state.values[p.key])) for p in job.chosen]
+    course = np.array(state.course).reshape(-1, sum(widths))
+    paces = np.array(state.paces).reshape(-1, sum(widths))
+    found, names, start = {}, [], 0
+    for p, width in zip(job.chosen, widths, strict=True):
+        part = course[:, start : start + width]
+        found[p.key], drifts = _spread(part, job.scales[p.key])
+        drifts |= _one_way(paces[:, start : start + width])
+        start += width
+        if drifts:
+            names.append(p.name)
+    return found, tuple(names)
+
+
+def _one_way(paces: np.ndarray) -> bool:
+    """Whether the steps go one way, beyond what their momentum makes of noise."""
+    if len(paces) < 2:
+        return False
+    # Adam's running mean makes (1 + β) / (1 - β) steps as good as one.
+    error = paces.std(axis=0, ddof=1) * np.sqrt(19 / len(paces))
+    return bool((np.abs(paces.mean(axis=0)) > np.maximum(PACE, 4 * error)).any())
+
+
+def _spread(course: np.ndarray, scale: float) -> tuple[np.ndarray, bool]:
+    """Standard error of the mean over steps that depend on one another, by the means of batches; whether they drift."""
+    if len(course) < 2 * BATCHES:
+        return np.full(course.shape[1], np.nan), False
+    means = np.array([part.mean(axis=0) for part in np.array_split(course, BATCHES)])
+    error = means.std(axis=0, ddof=1) / np.sqrt(BATCHES)
+    half = BATCHES // 2
+    drift = np.abs(means[half:].mean(axis=0) - means[:half].mean(axis=0))
+    # A trend spreads the batches of a half too, so that a straight line's halves differ by 6 of these errors.
+    rest = means - np.repeat([means[:half].mean(axis=0), means[half:].mean(axis=0)], half, axis=0)
+    own = rest.std(axis=0, ddof=2) / np.sqrt(half)
+    far = drift > DRIFT * (np.abs(course[-1]) + 0.02 * scale)
+    return error, bool((far & (drift > 4 * own)).any())
+
+
+def afterthoughts(job: Job, state: State, unconverged: Sequence[str], undone: bool) -> list[str]:
+    """Sentences about what did not go as one would expect."""
+    notes = []
+    if undone:
+        notes.append(
+            "The fitted values matched the references less well than the start: they were undone, the scene is as it "
+            "came. Other parameters, more views or another start may help."
+        )
+    for p in job.chosen:
+        if not state.moments[p.key][0].steps.any():
+            notes.append(f"{p.name} never had a gradient: no camera sees it, or its plugin passes none on.")
+            continue
+        ends = [end for end in scene_keys.limits(p) or () if np.isfinite(end)]
+        value = state.values[p.key][job.free[p.key]]
+        if p.kind == "value" and any(np.isclose(value, end).any() for end in ends) and not undone:
+            notes.append(f"{p.name} stands at the end of its range, {' '.join(f'{v:.4g}' for v in value)}.")
+    if unconverged:
+        notes.append(f"{', '.join(unconverged)} still moved at the end: give more --iterations.")
+    if state.lost:
+        first = state.bad[0]
+        source = "a regularizer" if first.sensor is None else f"sensor {first.sensor}"
+        notes.append(
+            f"{state.lost} gradients were no numbers, the first at {first.key}{list(first.texel)} from {source} in "
+            f"step {first.iteration}; their texels kept their last good values from then on."
+        )
+    for k, count in sorted(state.broken.items()):
+        if count:
+            notes.append(f"sensor {k}: {count} values of its pictures were NaN or infinite; they were left out.")
+    return notes
