@@ -44,6 +44,10 @@ class Heard(Progress):
     def say(self, text: str) -> None:
         self.said.append(text)
 
+    def note(self, *texts: str) -> None:
+        super().note(*texts)
+        self.said += texts
+
 
 @pytest.fixture(scope="module")
 def inputs(tmp_path_factory) -> tuple[Path, Path]:
