@@ -205,8 +205,9 @@ def replace_files(
     clean_leftovers(root.parent, name=root.name)
     if root.is_dir():
         clean_leftovers(root)
-    # Beside a folder that will be swapped, inside one that will be merged into: it may be a disk of its own.
-    place = root if not os.path.lexists(root) or whole() else root / "files"
+    # Beside the folder, so that it can be swapped; inside where it is a disk of its own or nothing else may be written.
+    alone = os.path.ismount(root) or (root.is_dir() and not os.access(root.parent, os.W_OK))
+    place = root / "files" if alone else root
     count = next(COUNTER)
     temporary = hidden(place, count, "tmp")
     try:
