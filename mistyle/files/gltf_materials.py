@@ -7,13 +7,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core.retexture import Wrap, Wraps
 from mistyle.files.bounds import beside, read_bytes
-from mistyle.files.glb import Buffers
+from mistyle.files.glb import CLAMP_TO_EDGE, MIRRORED_REPEAT, REPEAT, Buffers
 from mistyle.files.gltf_check import data_uri
 from mistyle.files.pictures import Budget, texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 
 Tree = dict[str, Any]
+WRAPS: dict[int | None, Wrap] = {CLAMP_TO_EDGE: "clamp", MIRRORED_REPEAT: "mirror", REPEAT: "repeat"}
 FLIP_V = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # (u, v) -> (u, 1 - v): glTF's origin is at the top left
 
 
@@ -24,12 +26,44 @@ def texture_infos(tree: Tree, material: int | None) -> dict[str, Tree]:
     entry = tree["materials"][material]
     pbr = entry.get("pbrMetallicRoughness", {})
     glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+    base = entry.get("emissiveTexture") if shadeless(entry) else pbr.get("baseColorTexture")
     found = {
-        "albedo": pbr.get("baseColorTexture") or glossy.get("diffuseTexture"),
+        "albedo": base or glossy.get("diffuseTexture"),
         "orm": pbr.get("metallicRoughnessTexture"),
         "normal": entry.get("normalTexture"),
     }
     return {name: info for name, info in found.items() if isinstance(info, dict) and "index" in info}
+
+
+def emits(entry: Tree) -> bool:
+    return any(c > 0 for c in entry.get("emissiveFactor", [0, 0, 0]))
+
+
+def shadeless(entry: Tree) -> bool:
+    """Whether a material shows its emission alone: a black base colour is how files say so without an extension."""
+    base = entry.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1, 1, 1, 1])
+    return emits(entry) and not any(c > 0 for c in base[:3])
+
+
+def has_tangents(tree: Tree, material: int) -> bool:
+    """Whether the file gives the frames of the material's normal map itself."""
+    primitives = [p for mesh in tree.get("meshes", []) for p in mesh["primitives"] if p.get("material") == material]
+    return all("TANGENT" in p["attributes"] for p in primitives)
+
+
+def image_of(tree: Tree, texture: int) -> int | None:
+    """The number of a texture's image; None where there is none that can be read."""
+    entry, images = tree["textures"][texture], tree.get("images", [])
+    named = [entry.get("extensions", {}).get(name) for name in ("EXT_texture_webp", "EXT_texture_avif")]
+    sources = [one.get("source") for one in named if isinstance(one, dict)] + [entry.get("source")]
+    return next((s for s in sources if isinstance(s, int) and 0 <= s < len(images)), None)
+
+
+def wrap_of(tree: Tree, texture: int) -> Wraps:
+    """The wrap modes of a texture's sampler along u and v; it repeats where nothing is said."""
+    number, samplers = tree["textures"][texture].get("sampler"), tree.get("samplers", [])
+    sampler = samplers[number] if number is not None else {}
+    return WRAPS.get(sampler.get("wrapS"), "repeat"), WRAPS.get(sampler.get("wrapT"), "repeat")
 
 
 def set_of(info: Tree) -> int:
@@ -75,7 +109,7 @@ def read_material(
             "metallicFactor": 0.0,
             "roughnessFactor": rough,
         }
-    colour = pbr.get("baseColorFactor", [1, 1, 1])
+    colour = entry["emissiveFactor"] if shadeless(entry) else pbr.get("baseColorFactor", [1, 1, 1])
     rough, metal = pbr.get("roughnessFactor", 1.0), pbr.get("metallicFactor", 1.0)
     if "KHR_materials_unlit" in entry.get("extensions", {}):
         metal = 0.0
@@ -96,7 +130,7 @@ def _load(
 ) -> tuple[Maps, tuple[str, ...]]:
     """The material's textures. glTF has no tiles."""
     maps: dict[str, RawMap] = {}
-    notes: list[str] = []
+    notes = _unseen(tree["materials"][index], index)
     base = base_set(tree, index)
     for name, info in texture_infos(tree, index).items():
         image = _image(tree, buffers, path, info["index"], notes)
@@ -104,29 +138,53 @@ def _load(
             continue
         where, data = image
         number = set_of(info)
-        lookup: Tree = dict(uvs=other.get(number) if number != base else None, transform=texture_transform(info))
+        lookup: Tree = dict(
+            uvs=other.get(number) if number != base else None,
+            transform=texture_transform(info),
+            wrap=wrap_of(tree, info["index"]),
+        )
         pixels = texture(data, where, budget)
         if name == "albedo":
             maps["albedo"] = RawMap(pixels, **lookup, kind="colour")
         elif name == "normal":
-            maps["normal"] = RawMap(pixels, **lookup, kind="normal", scale=float(info.get("scale", 1.0)))
+            # Without TANGENT the frames follow the place of the lookup (as three.js and Khronos' viewer have it).
+            frame: Tree = dict(scale=float(info.get("scale", 1.0)))
+            frame |= dict(tangents="authored" if has_tangents(tree, index) else "looked up")
+            maps["normal"] = RawMap(pixels, **lookup, kind="normal", **frame)
         else:
             maps["roughness"] = RawMap(np.ascontiguousarray(pixels[..., 1]), **lookup, kind="data")
             maps["metallic"] = RawMap(np.ascontiguousarray(pixels[..., 2]), **lookup, kind="data")
     return maps, tuple(notes)
 
 
+def _unseen(entry: Tree, index: int) -> list[str]:
+    """What the material says that renders here do not show as it says it."""
+    name, notes = entry.get("name") or f"material_{index}", []
+    if shadeless(entry):
+        notes.append(
+            f"Material '{name}' is black and shows its emission alone: that was taken as its albedo, and finished "
+            "assets have it so."
+        )
+    elif emits(entry):
+        notes.append(
+            f"Material '{name}' emits light, which renders here leave out; it stays in a finished asset and is added "
+            "to the painting."
+        )
+    if "KHR_materials_unlit" in entry.get("extensions", {}):
+        notes.append(
+            f"Material '{name}' is unlit: viewers show its albedo alone, no normal or roughness; --lit makes it lit."
+        )
+    return notes
+
+
 def _image(tree: Tree, buffers: Buffers, path: Path, texture: int, notes: list[str]) -> tuple[str, bytes] | None:
     """Where a texture's image comes from, and its bytes; None with a note where it is not there or of a kind that
     cannot be read."""
-    images = tree.get("images", [])
-    entry = tree["textures"][texture]
-    webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
-    source = webp.get("source", entry.get("source")) if isinstance(webp, dict) else entry.get("source")
-    if not isinstance(source, int) or not 0 <= source < len(images):
-        notes.append(f"Texture {texture} has no PNG, JPEG or WebP image and was left out.")
+    source = image_of(tree, texture)
+    if source is None:
+        notes.append(f"Texture {texture} has no PNG, JPEG, WebP or AVIF image and was left out.")
         return None
-    image = images[source]
+    image = tree["images"][source]
     where = f"{path} image {source}"
     if "bufferView" in image:
         view = tree["bufferViews"][image["bufferView"]]

@@ -110,7 +110,13 @@ class Material(Part):
     extensions: dict[str, Any] = {}
 
 
+class Sampler(Part):
+    wrapS: int = 10497
+    wrapT: int = 10497
+
+
 class Texture(Part):
+    sampler: int | None = Field(None, ge=0)
     source: int | None = Field(None, ge=0)
     extensions: dict[str, Any] = {}
 
@@ -140,5 +146,6 @@ class Document(Part):
     materials: list[Material] = []
     textures: list[Texture] = []
     images: list[Image] = []
+    samplers: list[Sampler] = []
     extensionsUsed: list[str] = []
     extensionsRequired: list[str] = []

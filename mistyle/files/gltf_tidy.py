@@ -25,6 +25,8 @@ _UNDERSTOOD = (
 _GOES_WITH_TEXTURES = (
     "KHR_texture_transform",
     "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_unlit",
     "EXT_texture_webp",
     "EXT_texture_avif",
     "KHR_texture_basisu",
