@@ -41,7 +41,9 @@ def carry_corners(
     """A texture of size² for `uvs` that shows what `values` gives the corners, interpolated over each face as `carry`
     looks textures up."""
     pieces, face, weights = covered_texels(uvs, size)
-    return _filled(pieces, face, np.einsum("nk,nkc->nc", weights, values[face], dtype=np.float32), size)[0]
+    return _filled(
+        pieces, face, np.einsum("nk,nkc->nc", weights.astype(np.float32), values[face].astype(np.float32)), size
+    )[0]
 
 
 def covered_texels(

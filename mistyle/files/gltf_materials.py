@@ -171,9 +171,7 @@ def _unseen(entry: Tree, index: int) -> list[str]:
             "to the painting."
         )
     if "KHR_materials_unlit" in entry.get("extensions", {}):
-        notes.append(
-            f"Material '{name}' is unlit: viewers show its albedo alone, no normal or roughness; --lit makes it lit."
-        )
+        notes.append(f"Material '{name}' is unlit: without --lit, viewers of a result show its albedo alone.")
     return notes
 
 

@@ -115,13 +115,14 @@ def _separate_nodes(tree: Tree, patches: dict[int, list[Patch]]) -> list[Patch]:
 def _alike(a: list[Patch], b: list[Patch]) -> bool:
     same = [x.primitive for x in a] == [x.primitive for x in b]
     return same and all(
-        np.array_equal(x.part, y.part) and np.abs(_wrapped(x.uvs - y.uvs)).max(initial=0) < SAME_UV
+        np.array_equal(x.part, y.part) and np.abs(_but_for_tiles(x.uvs - y.uvs)).max(initial=0) < SAME_UV
         for x, y in zip(a, b, strict=True)
     )
 
 
-def _wrapped(difference: np.ndarray) -> np.ndarray:
-    return difference - np.rint(difference)
+def _but_for_tiles(difference: np.ndarray) -> np.ndarray:
+    """Differences of corner UVs (f 3 2) without whole tiles by which faces were moved."""
+    return difference - np.rint(difference[:, :1])
 
 
 def _with_texcoords(tree: Tree, buffers: Buffers, patches: list[Patch]) -> list[Patch]:
@@ -158,7 +159,7 @@ def _is_kept(tree: Tree, buffers: Buffers, patch: Patch) -> bool:
     if own is None:
         return False
     difference = np.stack([own[..., 0] - patch.uvs[..., 0], 1 - own[..., 1] - patch.uvs[..., 1]], axis=-1)
-    return bool(np.abs(_wrapped(difference)).max(initial=0) < SAME_UV)
+    return bool(np.abs(_but_for_tiles(difference)).max(initial=0) < SAME_UV)
 
 
 def _repeating(tree: Tree, buffers: Buffers, patches: list[Patch]) -> set[int]:

@@ -12,12 +12,13 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.retexture import REPEAT, Wraps, wrapped
+from mistyle.core.retexture import REPEAT, Wrap, Wraps, wrapped
 from mistyle.files.bounds import WORK_TEXTURE
 from mistyle.files.raw import Maps, Raw, RawMap, RawMaterial
 
 # UVs that leave the unit square by less show nothing of what lies outside.
 OUTSIDE = 1e-3
+FARTHEST = 1e4  # tiles
 ORDER = ("albedo", "roughness", "metallic", "normal")
 WORDS = {"mirror": "mirrored", "clamp": "clamped"}
 Spans = tuple[tuple[float, float], tuple[float, float]]  # along u and along v
@@ -48,6 +49,8 @@ def plain_lookups(raw: Raw) -> Raw:
         if base is None or not rows.any():
             continue
         lookup = looked_up(base, raw.uvs, rows)
+        if lookup is not None and not np.nanmax(np.abs(lookup)) < FARTHEST:
+            continue  # nothing to paint there; the maps are resampled from wherever that is
         wrap = REPEAT if lookup is None else effective(base.wrap, lookup)
         if lookup is None or (base.uvs is None and base.transform is None and wrap == REPEAT):
             continue
@@ -87,7 +90,11 @@ def effective(wrap: Wraps, lookup: Float[np.ndarray, "n 3 2"]) -> Wraps:
     repeat."""
     low, high = np.nanmin(lookup, axis=(0, 1)), np.nanmax(lookup, axis=(0, 1))
     inside = (low >= -OUTSIDE) & (high <= 1 + OUTSIDE)
-    return ("repeat" if inside[0] else wrap[0], "repeat" if inside[1] else wrap[1])
+
+    def shown(axis: int) -> Wrap:
+        return "repeat" if inside[axis] or wrap[axis] not in WORDS else wrap[axis]
+
+    return shown(0), shown(1)
 
 
 def framed(entry: RawMap) -> RawMap:

@@ -334,7 +334,7 @@ def _placed(name: str, entry: RawMap, raw: Raw, mesh: Mesh, rows: np.ndarray, si
         return None
     wrap = effective(entry.wrap, lookup)
     entry = (framed(entry) if name == "normal" else entry).finished()
-    lookup = np.nan_to_num(lookup)
+    lookup = np.clip(np.nan_to_num(lookup), -1e6, 1e6)
     side = min(size, max(entry.values.shape[:2]))
     values, face = carry(entry.values, lookup, mesh.corner_uvs[rows], side, wrap)
     if name == "normal":
