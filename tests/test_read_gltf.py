@@ -375,6 +375,10 @@ BROKEN = {
     "unknown": (edit("extensionsRequired", to=["ACME_holograms"]), "ACME_holograms"),
     "empty scene": (edit("scenes", 0, "nodes", to=[]), "no triangles"),
     "scene": (edit("scene", to=4), "scene 4"),
+    "sampler": (edit("textures", to=[{"sampler": 3}]), "sampler 3"),
+    "emission": (edit("materials", to=[{"emissiveTexture": {"index": 2}}]), "texture 2"),
+    "emission's colour": (edit("materials", to=[{"emissiveFactor": [1]}]), "materials.0.emissiveFactor"),
+    "flat colours": (edit("meshes", 0, "primitives", 0, "attributes", "COLOR_0", to=2), "VEC3 or VEC4"),
 }
 
 

@@ -267,7 +267,11 @@ def _check_indices(d: Document, path: Path) -> None:
         check("buffer view", image.bufferView, d.bufferViews)
     for m in d.materials:
         pbr = m.pbrMetallicRoughness
-        infos = [m.normalTexture, *((pbr.baseColorTexture, pbr.metallicRoughnessTexture) if pbr else ())]
+        infos = [
+            m.normalTexture,
+            m.emissiveTexture,
+            *((pbr.baseColorTexture, pbr.metallicRoughnessTexture) if pbr else ()),
+        ]
         for info in infos:
             check("texture", info.index if info else None, d.textures)
 

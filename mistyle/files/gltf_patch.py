@@ -20,7 +20,7 @@ from mistyle.core.asset import Asset, Primitive
 from mistyle.core.errors import MistyleError
 from mistyle.files.glb import TRIANGLES, Buffers, Builder, Tree, values
 from mistyle.files.gltf_alpha import image_bytes
-from mistyle.files.gltf_materials import shadeless
+from mistyle.files.gltf_infos import shadeless
 from mistyle.files.gltf_tidy import drop_unused
 from mistyle.files.gltf_vertices import Patch, rewrite, triangles
 from mistyle.files.images import encode_png

@@ -12,7 +12,8 @@ from mistyle.core.normals import area_vectors
 from mistyle.files.bounds import refuse
 from mistyle.files.glb import Buffers, values
 from mistyle.files.gltf_check import AGAIN, load_gltf
-from mistyle.files.gltf_materials import base_set, read_material, wanted_sets
+from mistyle.files.gltf_infos import base_set, wanted_sets
+from mistyle.files.gltf_materials import read_material
 from mistyle.files.gltf_vertices import triangles
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_indices, check_positions, too_many

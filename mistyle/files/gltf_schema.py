@@ -107,6 +107,8 @@ class Material(Part):
     name: str | None = None
     pbrMetallicRoughness: Metallic | None = None
     normalTexture: Info | None = None
+    emissiveTexture: Info | None = None
+    emissiveFactor: list[float] = Field([0.0, 0.0, 0.0], min_length=3, max_length=3)
     extensions: dict[str, Any] = {}
 
 

@@ -83,7 +83,7 @@ def add_textures(builder: Builder, pictures: Pictures, stem: str, *, repeat: boo
 
 
 def drop_emission(material: Tree) -> None:
-    """Take the emission out of a material, whose albedo shows it now (gltf_materials.py `shadeless`)."""
+    """Take the emission out of a material, whose albedo shows it now (gltf_infos.py `shadeless`)."""
     for key in ("emissiveTexture", "emissiveFactor"):
         material.pop(key, None)
     drop_extension(material, "KHR_materials_emissive_strength")
