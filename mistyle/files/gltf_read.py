@@ -85,12 +85,14 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
         notes=tuple(dict.fromkeys(notes)),
     )
     uvs = _joined([p.uvs or _same_for_all(len(p.faces), [np.nan] * 2) for p in pieces], faces)
-    colours = _joined([p.colours or _same_for_all(len(p.faces), [1.0] * 3) for p in pieces], faces)
+    colours = None
+    if any(p.colours is not None and (p.colours.values != 1).any() for p in pieces):
+        colours = _joined([p.colours or _same_for_all(len(p.faces), [1.0] * 3) for p in pieces], faces)
     return Indexed(
         raw,
         _joined([p.normals for p in pieces], faces),
         uvs if np.isfinite(uvs.values).any() else None,
-        colours if (colours.values != 1).any() else None,
+        colours,
     )
 
 
@@ -190,6 +192,7 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
         if f"TEXCOORD_{n}" in attributes
     }
     base = base_set(tree, primitive.get("material"))
+    colours = _colours(tree, buffers, attributes["COLOR_0"], path) if "COLOR_0" in attributes else None
     start = first[where[0], attributes["POSITION"]]
     return _Piece(
         node=where[0],
@@ -202,9 +205,7 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
         normals=normals,
         uvs=sets.get(base),
         other_uvs={n: uvs.finished() for n, uvs in sets.items() if n != base},
-        colours=Corners(_colours(tree, buffers, attributes["COLOR_0"], path), index)
-        if "COLOR_0" in attributes
-        else None,
+        colours=None if colours is None else Corners(colours, index),
     )
 
 
