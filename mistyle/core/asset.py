@@ -94,8 +94,10 @@ class Source:
                     applied; a skinned mesh in its bind pose)
     work_from_user  takes user_positions (homogeneous columns) to `Mesh.positions`
     old_uvs         the authored corner UVs as the file has them, v up; None when it has none
-    uv              "kept" (bit-equal to old_uvs), "shifted" (moved by integers) or "new" (unwrapped here)
+    uv              "kept" (bit-equal to old_uvs), "shifted" (moved by integers, or as texture transforms and wrap modes
+                    demand) or "new" (unwrapped here)
     notes           sentences for the report
+    lit             whether a result's unlit materials are to become lit ones (glTF)
     """
 
     path: Path
@@ -106,6 +108,7 @@ class Source:
     old_uvs: Float[np.ndarray, "f 3 2"] | None
     uv: str
     notes: tuple[str, ...]
+    lit: bool = False
 
 
 @dataclass(frozen=True)

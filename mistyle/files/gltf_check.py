@@ -4,6 +4,7 @@ import base64
 import binascii
 import json
 import struct
+from collections.abc import Callable
 from math import isfinite
 from pathlib import Path
 from typing import Any
@@ -28,7 +29,7 @@ READABLE = {
     *("KHR_materials_ior", "KHR_materials_transmission", "KHR_materials_volume", "KHR_materials_emissive_strength"),
     *("KHR_materials_anisotropy", "KHR_materials_iridescence", "KHR_materials_dispersion", "KHR_animation_pointer"),
     *("KHR_materials_pbrSpecularGlossiness", "KHR_node_visibility", "KHR_xmp_json_ld", "EXT_lights_image_based"),
-    *("EXT_texture_webp", "KHR_texture_basisu"),
+    *("EXT_texture_webp", "EXT_texture_avif", "KHR_texture_basisu"),
 }
 COMPRESSED = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
 
@@ -77,17 +78,18 @@ def _check_depth(tree: Any, path: Path) -> None:
     raise refuse(path, f"JSON nested deeper than {MAX_DEPTH} levels", f"at most {MAX_DEPTH}", AGAIN)
 
 
-def load_gltf(path: Path) -> tuple[dict[str, Any], Buffers]:
+def load_gltf(path: Path, say: Callable[[str], None] = lambda note: None) -> tuple[dict[str, Any], Buffers]:
     """The JSON and the buffers of a .glb or .gltf file, checked: types and ranges of everything that is used later,
     indices, buffer lengths against what accessors and views reach, the node graph (a forest), required extensions.
 
     Buffers come from the file, from data URIs or from files in the folder of `path` or below; nothing is fetched.
-    Raises InputRefused with the reason.
+    Compressed copies of data that are there plainly are left out of the JSON. `say` hears of them, and of what others
+    may refuse. Raises InputRefused with the reason.
     """
     path = Path(path)
     binary = None
     if read_bytes(path, count=4) == b"glTF":
-        tree, binary = _unpack(path)
+        tree, binary = _unpack(path, say)
     else:
         data = read_bytes(path)
         if len(data) > MAX_JSON_BYTES:
@@ -98,9 +100,12 @@ def load_gltf(path: Path) -> tuple[dict[str, Any], Buffers]:
     document = _validated(tree, path)
     if not document.asset.version.startswith("2."):
         raise refuse(path, f"glTF version {document.asset.version[:20]}", "2.0", "Convert it to glTF 2.0")
-    unknown = sorted(set(document.extensionsRequired) - READABLE)
     packed = sorted(COMPRESSED & (set(document.extensionsRequired) | set(document.extensionsUsed)))
-    if packed:
+    unknown = sorted(set(document.extensionsRequired) - READABLE)
+    if packed and not COMPRESSED & set(document.extensionsRequired) and _is_plain(tree, document):
+        _forget_compression(tree)
+        say(f"The compressed copy of its data ({', '.join(packed)}) was left out; the plain one was read.")
+    elif packed:
         raise refuse(path, f"compressed data ({', '.join(packed)})", "plain glTF buffers", DECOMPRESS)
     if unknown:
         raise refuse(path, f"required extensions {', '.join(unknown)[:200]}", "core glTF 2.0", "Export it without them")
@@ -117,6 +122,38 @@ def load_gltf(path: Path) -> tuple[dict[str, Any], Buffers]:
     return tree, buffers
 
 
+def _is_plain(tree: dict[str, Any], d: Document) -> bool:
+    """Whether everything that is compressed is there plainly as well."""
+    for mesh in d.meshes:
+        for primitive in mesh.primitives:
+            if COMPRESSED & set(primitive.extensions):
+                used = [*primitive.attributes.values(), *([] if primitive.indices is None else [primitive.indices])]
+                known = [d.accessors[i] for i in used if 0 <= i < len(d.accessors)]
+                if any(a.bufferView is None and a.sparse is None for a in known):
+                    return False
+    # The place of what a view's compressed bytes decode to is a buffer of its own, which need not be in the file.
+    views = [v for v in tree.get("bufferViews", []) if COMPRESSED & set(_extensions(v))]
+    buffers = [d.buffers[v["buffer"]] for v in views if v["buffer"] < len(d.buffers)]
+    return all(b.uri is not None or b is d.buffers[0] for b in buffers)
+
+
+def _extensions(item: dict[str, Any]) -> dict[str, Any]:
+    found = item.get("extensions")
+    return found if isinstance(found, dict) else {}
+
+
+def _forget_compression(tree: dict[str, Any]) -> None:
+    primitives = [p for mesh in tree.get("meshes", []) for p in mesh["primitives"]]
+    for item in [*primitives, *tree.get("bufferViews", []), *tree.get("buffers", [])]:
+        if COMPRESSED & set(_extensions(item)):
+            item["extensions"] = {k: v for k, v in item["extensions"].items() if k not in COMPRESSED}
+            if not item["extensions"]:
+                del item["extensions"]
+    tree["extensionsUsed"] = [name for name in tree["extensionsUsed"] if name not in COMPRESSED]
+    if not tree["extensionsUsed"]:
+        del tree["extensionsUsed"]
+
+
 def _validated(tree: dict[str, Any], path: Path) -> Document:
     try:
         return Document.model_validate(tree)
@@ -126,7 +163,7 @@ def _validated(tree: dict[str, Any], path: Path) -> Document:
         raise refuse(path, f"at {where}: {first['msg'][:160]}", "glTF 2.0 as specified", AGAIN) from error
 
 
-def _unpack(path: Path) -> tuple[dict[str, Any], memoryview | None]:
+def _unpack(path: Path, say: Callable[[str], None]) -> tuple[dict[str, Any], memoryview | None]:
     """JSON and binary chunk of a .glb (glTF 2.0, chapter 4), each read to where it stays."""
     size, head = path.stat().st_size, read_part(path, 0, 12)
     if size < 20:
@@ -155,7 +192,10 @@ def _unpack(path: Path) -> tuple[dict[str, Any], memoryview | None]:
     if len(chunks[0][1]) > MAX_JSON_BYTES:
         raise refuse(path, f"{len(chunks[0][1]) >> 20} MiB of JSON", f"at most {MAX_JSON_BYTES >> 20} MiB", AGAIN)
     binary = chunks[1][1] if len(chunks) > 1 and chunks[1][0] == b"BIN\0" else None
-    return parse_json(bytes(chunks[0][1]), path), binary
+    text = bytes(chunks[0][1])
+    if text.endswith(b"\0"):
+        say("The JSON of the .glb is padded with zero bytes, which strict readers refuse; glTF demands spaces.")
+    return parse_json(text.rstrip(b"\0"), path), binary
 
 
 def _buffer(buffer: Buffer, binary: bytes | memoryview | None, path: Path) -> bytes | memoryview:
@@ -222,11 +262,16 @@ def _check_indices(d: Document, path: Path) -> None:
     check("scene", d.scene, d.scenes)
     for texture in d.textures:
         check("image", texture.source, d.images)
+        check("sampler", texture.sampler, d.samplers)
     for image in d.images:
         check("buffer view", image.bufferView, d.bufferViews)
     for m in d.materials:
         pbr = m.pbrMetallicRoughness
-        infos = [m.normalTexture, *((pbr.baseColorTexture, pbr.metallicRoughnessTexture) if pbr else ())]
+        infos = [
+            m.normalTexture,
+            m.emissiveTexture,
+            *((pbr.baseColorTexture, pbr.metallicRoughnessTexture) if pbr else ()),
+        ]
         for info in infos:
             check("texture", info.index if info else None, d.textures)
 

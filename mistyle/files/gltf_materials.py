@@ -5,58 +5,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from mistyle.files.bounds import beside, read_bytes
 from mistyle.files.glb import Buffers
 from mistyle.files.gltf_check import data_uri
+from mistyle.files.gltf_infos import (
+    base_set,
+    emits,
+    has_tangents,
+    image_of,
+    set_of,
+    shadeless,
+    texture_infos,
+    texture_transform,
+    wrap_of,
+)
 from mistyle.files.pictures import Budget, texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 
 Tree = dict[str, Any]
-FLIP_V = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # (u, v) -> (u, 1 - v): glTF's origin is at the top left
-
-
-def texture_infos(tree: Tree, material: int | None) -> dict[str, Tree]:
-    """The texture references of a material that reading uses: albedo, orm, normal."""
-    if material is None or material < 0:
-        return {}
-    entry = tree["materials"][material]
-    pbr = entry.get("pbrMetallicRoughness", {})
-    glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-    found = {
-        "albedo": pbr.get("baseColorTexture") or glossy.get("diffuseTexture"),
-        "orm": pbr.get("metallicRoughnessTexture"),
-        "normal": entry.get("normalTexture"),
-    }
-    return {name: info for name, info in found.items() if isinstance(info, dict) and "index" in info}
-
-
-def set_of(info: Tree) -> int:
-    moved = info.get("extensions", {}).get("KHR_texture_transform", {})
-    return int(moved.get("texCoord", info.get("texCoord", 0)))
-
-
-def base_set(tree: Tree, material: int | None) -> int:
-    """The TEXCOORD set that the material's first texture uses, 0 without textures."""
-    infos = texture_infos(tree, material)
-    return next((set_of(infos[name]) for name in ("albedo", "orm", "normal") if name in infos), 0)
-
-
-def wanted_sets(tree: Tree, material: int | None) -> set[int]:
-    return {base_set(tree, material), *(set_of(info) for info in texture_infos(tree, material).values())}
-
-
-def texture_transform(info: Tree) -> Float[np.ndarray, "3 3"] | None:
-    """KHR_texture_transform (uv' = translation * rotation * scale * uv, v down) as a matrix for v up; None without."""
-    moved = info.get("extensions", {}).get("KHR_texture_transform")
-    if not moved:
-        return None
-    x, y = moved.get("offset", [0, 0])
-    c, s = np.cos(moved.get("rotation", 0.0)), np.sin(moved.get("rotation", 0.0))
-    sx, sy = moved.get("scale", [1, 1])
-    down = np.array([[c, s, x], [-s, c, y], [0, 0, 1]]) @ np.diag([sx, sy, 1.0])
-    return FLIP_V @ down @ FLIP_V
 
 
 def read_material(
@@ -75,7 +42,7 @@ def read_material(
             "metallicFactor": 0.0,
             "roughnessFactor": rough,
         }
-    colour = pbr.get("baseColorFactor", [1, 1, 1])
+    colour = entry["emissiveFactor"] if shadeless(entry) else pbr.get("baseColorFactor", [1, 1, 1])
     rough, metal = pbr.get("roughnessFactor", 1.0), pbr.get("metallicFactor", 1.0)
     if "KHR_materials_unlit" in entry.get("extensions", {}):
         metal = 0.0
@@ -96,7 +63,7 @@ def _load(
 ) -> tuple[Maps, tuple[str, ...]]:
     """The material's textures. glTF has no tiles."""
     maps: dict[str, RawMap] = {}
-    notes: list[str] = []
+    notes = _unseen(tree["materials"][index], index)
     base = base_set(tree, index)
     for name, info in texture_infos(tree, index).items():
         image = _image(tree, buffers, path, info["index"], notes)
@@ -104,29 +71,51 @@ def _load(
             continue
         where, data = image
         number = set_of(info)
-        lookup: Tree = dict(uvs=other.get(number) if number != base else None, transform=texture_transform(info))
+        lookup: Tree = dict(
+            uvs=other.get(number) if number != base else None,
+            transform=texture_transform(info),
+            wrap=wrap_of(tree, info["index"]),
+        )
         pixels = texture(data, where, budget)
         if name == "albedo":
             maps["albedo"] = RawMap(pixels, **lookup, kind="colour")
         elif name == "normal":
-            maps["normal"] = RawMap(pixels, **lookup, kind="normal", scale=float(info.get("scale", 1.0)))
+            # Without TANGENT the frames follow the place of the lookup (as three.js and Khronos' viewer have it).
+            frame: Tree = dict(scale=float(info.get("scale", 1.0)))
+            frame |= dict(tangents="authored" if has_tangents(tree, index) else "looked up")
+            maps["normal"] = RawMap(pixels, **lookup, kind="normal", **frame)
         else:
             maps["roughness"] = RawMap(np.ascontiguousarray(pixels[..., 1]), **lookup, kind="data")
             maps["metallic"] = RawMap(np.ascontiguousarray(pixels[..., 2]), **lookup, kind="data")
     return maps, tuple(notes)
 
 
+def _unseen(entry: Tree, index: int) -> list[str]:
+    """What the material says that renders here do not show as it says it."""
+    name, notes = entry.get("name") or f"material_{index}", []
+    if shadeless(entry):
+        notes.append(
+            f"Material '{name}' is black and shows its emission alone: that was taken as its albedo, and finished "
+            "assets have it so."
+        )
+    elif emits(entry):
+        notes.append(
+            f"Material '{name}' emits light, which renders here leave out; it stays in a finished asset and is added "
+            "to the painting."
+        )
+    if "KHR_materials_unlit" in entry.get("extensions", {}):
+        notes.append(f"Material '{name}' is unlit: without --lit, viewers of a result show its albedo alone.")
+    return notes
+
+
 def _image(tree: Tree, buffers: Buffers, path: Path, texture: int, notes: list[str]) -> tuple[str, bytes] | None:
     """Where a texture's image comes from, and its bytes; None with a note where it is not there or of a kind that
     cannot be read."""
-    images = tree.get("images", [])
-    entry = tree["textures"][texture]
-    webp = entry.get("extensions", {}).get("EXT_texture_webp", {})
-    source = webp.get("source", entry.get("source")) if isinstance(webp, dict) else entry.get("source")
-    if not isinstance(source, int) or not 0 <= source < len(images):
-        notes.append(f"Texture {texture} has no PNG, JPEG or WebP image and was left out.")
+    source = image_of(tree, texture)
+    if source is None:
+        notes.append(f"Texture {texture} has no PNG, JPEG, WebP or AVIF image and was left out.")
         return None
-    image = images[source]
+    image = tree["images"][source]
     where = f"{path} image {source}"
     if "bufferView" in image:
         view = tree["bufferViews"][image["bufferView"]]

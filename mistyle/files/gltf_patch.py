@@ -1,10 +1,11 @@
 """Writing a user's glTF again with new textures and otherwise as it was.
 
 Nodes, names, skins, animations, cameras, extras and extensions are taken over as they are, vertex attributes byte by
-byte. What changes: textures of the painted materials; TANGENT (MikkTSpace) of the painted primitives; where the mesh
-was unwrapped anew, the next free TEXCOORD set. Where corners of one vertex need different tangents or texture
-coordinates, copies of the vertex are appended behind the old ones with everything it carries (joints, weights,
-colours, morph targets, custom attributes), so old vertex numbers stay valid.
+byte. What changes: textures of the painted materials; TANGENT (MikkTSpace) of the painted primitives; their COLOR_0,
+which viewers would multiply the painting by, goes (reading took it into the albedo); where the mesh was unwrapped anew
+or its texture coordinates were transformed, the next free TEXCOORD set. Where corners of one vertex need different
+tangents or texture coordinates, copies of the vertex are appended behind the old ones with everything it carries
+(joints, weights, morph targets, custom attributes), so old vertex numbers stay valid.
 """
 
 import copy
@@ -19,11 +20,12 @@ from mistyle.core.asset import Asset, Primitive
 from mistyle.core.errors import MistyleError
 from mistyle.files.glb import TRIANGLES, Buffers, Builder, Tree, values
 from mistyle.files.gltf_alpha import image_bytes
+from mistyle.files.gltf_infos import shadeless
 from mistyle.files.gltf_tidy import drop_unused
 from mistyle.files.gltf_vertices import Patch, rewrite, triangles
 from mistyle.files.images import encode_png
 from mistyle.files.read import load_gltf
-from mistyle.files.textures import Pictures, add_textures, part_stems, set_textures
+from mistyle.files.textures import Pictures, add_textures, drop_emission, drop_extension, part_stems, set_textures
 
 # Texture coordinates that were shifted by integers differ in their last bits; a texel of 16384 is 6e-5.
 SAME_UV = 1e-5
@@ -42,6 +44,7 @@ def patch_tree(asset: Asset, pictures: Sequence[Pictures], *, name: str, provena
     patches = _with_texcoords(tree, buffers, _separate_nodes(tree, _patches(tree, buffers, asset)))
     repeating = _repeating(tree, buffers, patches)
     faces = rewrite(builder, buffers, patches)
+    _drop_colours(tree, patches)
     materials = _set_materials(builder, asset, patches, pictures, repeating, name)
     for patch in patches:
         _divide(builder, patch, faces[patch.mesh, patch.primitive], materials)
@@ -55,6 +58,14 @@ def patch_tree(asset: Asset, pictures: Sequence[Pictures], *, name: str, provena
     if missing:
         note["mistyle"]["missing_images"] = missing
     return builder
+
+
+def _drop_colours(tree: Tree, patches: Sequence[Patch]) -> None:
+    """Take the vertex colours from the painted primitives, and those that their morph targets add."""
+    for patch in patches:
+        primitive = tree["meshes"][patch.mesh]["primitives"][patch.primitive]
+        for group in (primitive["attributes"], *primitive.get("targets", [])):
+            group.pop("COLOR_0", None)
 
 
 def _patches(tree: Tree, buffers: Buffers, asset: Asset) -> dict[int, list[Patch]]:
@@ -104,13 +115,14 @@ def _separate_nodes(tree: Tree, patches: dict[int, list[Patch]]) -> list[Patch]:
 def _alike(a: list[Patch], b: list[Patch]) -> bool:
     same = [x.primitive for x in a] == [x.primitive for x in b]
     return same and all(
-        np.array_equal(x.part, y.part) and np.abs(_wrapped(x.uvs - y.uvs)).max(initial=0) < SAME_UV
+        np.array_equal(x.part, y.part) and np.abs(_but_for_tiles(x.uvs - y.uvs)).max(initial=0) < SAME_UV
         for x, y in zip(a, b, strict=True)
     )
 
 
-def _wrapped(difference: np.ndarray) -> np.ndarray:
-    return difference - np.rint(difference)
+def _but_for_tiles(difference: np.ndarray) -> np.ndarray:
+    """Differences of corner UVs (f 3 2) without whole tiles by which faces were moved."""
+    return difference - np.rint(difference[:, :1])
 
 
 def _with_texcoords(tree: Tree, buffers: Buffers, patches: list[Patch]) -> list[Patch]:
@@ -147,7 +159,7 @@ def _is_kept(tree: Tree, buffers: Buffers, patch: Patch) -> bool:
     if own is None:
         return False
     difference = np.stack([own[..., 0] - patch.uvs[..., 0], 1 - own[..., 1] - patch.uvs[..., 1]], axis=-1)
-    return bool(np.abs(_wrapped(difference)).max(initial=0) < SAME_UV)
+    return bool(np.abs(_but_for_tiles(difference)).max(initial=0) < SAME_UV)
 
 
 def _repeating(tree: Tree, buffers: Buffers, patches: list[Patch]) -> set[int]:
@@ -186,6 +198,10 @@ def _set_materials(
             if part not in textures:
                 textures[part] = add_textures(builder, pictures[part], stems[part], repeat=part in repeating)
             material = copy.deepcopy(originals[patch.material]) if patch.material >= 0 else {}
+            if shadeless(material):
+                drop_emission(material)
+            if asset.source.lit:
+                drop_extension(material, "KHR_materials_unlit")
             set_textures(material, textures[part], patch.fresh[-1] if patch.fresh else patch.texcoord)
             further = any(m == patch.material for m, _ in made)
             if patch.material < 0 or further:
@@ -233,4 +249,6 @@ def _mime(data: bytes) -> str:
         return "image/png"
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         return "image/webp"
+    if data[4:12] == b"ftypavif":
+        return "image/avif"
     return "image/ktx2" if data.startswith(b"\xabKTX 20") else "image/jpeg"

@@ -12,7 +12,8 @@ from mistyle.core.normals import area_vectors
 from mistyle.files.bounds import refuse
 from mistyle.files.glb import Buffers, values
 from mistyle.files.gltf_check import AGAIN, load_gltf
-from mistyle.files.gltf_materials import base_set, read_material, wanted_sets
+from mistyle.files.gltf_infos import base_set, wanted_sets
+from mistyle.files.gltf_materials import read_material
 from mistyle.files.gltf_vertices import triangles
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_indices, check_positions, too_many
@@ -35,6 +36,7 @@ class _Piece:
     normals: Corners
     uvs: Corners | None
     other_uvs: dict[int, np.ndarray]
+    colours: Corners | None
 
 
 def read_gltf(path: Path, max_faces: int) -> Indexed:
@@ -42,11 +44,11 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
 
     Positions are in world space, node transforms applied. A skinned mesh comes in its bind pose: its own node's
     transform has no meaning (glTF 2.0, 3.7.3.3), it is placed as its skeleton's root places it. Morph targets stay
-    at their base shape. Primitives of points and lines are left out with a note. Where NORMAL is missing faces are
-    flat, as the specification demands.
+    at their base shape. Primitives of points and lines, hidden nodes (KHR_node_visibility) and nodes scaled to nothing
+    are left out with a note. Where NORMAL is missing faces are flat, as the specification demands.
     """
-    tree, buffers = load_gltf(path)
     notes: list[str] = []
+    tree, buffers = load_gltf(path, notes.append)
     with np.errstate(over="ignore", invalid="ignore"):  # transforms may overflow; what comes of it is refused
         pieces, positions = _pieces(tree, buffers, path, max_faces, notes)
     if not pieces:
@@ -82,12 +84,20 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
         twin=_twins(pieces, starts),
         notes=tuple(dict.fromkeys(notes)),
     )
-    uvs = _joined([p.uvs or _no_uvs(len(p.faces)) for p in pieces], faces)
-    return Indexed(raw, _joined([p.normals for p in pieces], faces), uvs if np.isfinite(uvs.values).any() else None)
+    uvs = _joined([p.uvs or _same_for_all(len(p.faces), [np.nan] * 2) for p in pieces], faces)
+    colours = None
+    if any(p.colours is not None and (p.colours.values != 1).any() for p in pieces):
+        colours = _joined([p.colours or _same_for_all(len(p.faces), [1.0] * 3) for p in pieces], faces)
+    return Indexed(
+        raw,
+        _joined([p.normals for p in pieces], faces),
+        uvs if np.isfinite(uvs.values).any() else None,
+        colours,
+    )
 
 
-def _no_uvs(faces: int) -> Corners:
-    return Corners(np.full((1, 2), np.nan, np.float32), np.zeros((faces, 3), np.int32))
+def _same_for_all(faces: int, values: list[float]) -> Corners:
+    return Corners(np.array([values], np.float32), np.zeros((faces, 3), np.int32))
 
 
 def _joined(corners: list[Corners], faces: Int[np.ndarray, "f 3"]) -> Corners:
@@ -106,7 +116,7 @@ def _pieces(
     vertices = faces = 0
     world = world_matrices(tree)
     first: dict[tuple[int, int], int] = {}
-    for node in _scene_nodes(tree):
+    for node in _scene_nodes(tree, notes):
         entry = tree["nodes"][node]
         if "mesh" not in entry:
             continue
@@ -116,6 +126,9 @@ def _pieces(
             notes.append("A skinned mesh was read in its bind pose; skin and animations stay as they are.")
         if not np.isfinite(matrix).all():
             raise refuse(path, f"node {node} with a transform that is not finite", "finite numbers", AGAIN)
+        if _flattened(matrix):
+            notes.append("Nodes that are scaled to a point or a line were left out; they stay in a finished asset.")
+            continue
         if "EXT_mesh_gpu_instancing" in entry.get("extensions", {}):
             notes.append("Instances (EXT_mesh_gpu_instancing) were read once; all of them show the same texels.")
         for number, primitive in enumerate(tree["meshes"][entry["mesh"]]["primitives"]):
@@ -140,6 +153,12 @@ def _pieces(
     return pieces, positions
 
 
+def _flattened(matrix: Float[np.ndarray, "4 4"]) -> bool:
+    """Whether nothing with an area is left of what a node shows."""
+    first, second, _ = np.linalg.svd(matrix[:3, :3], compute_uv=False)
+    return bool(second <= 1e-9 * first)
+
+
 def _placed(local: Float[np.ndarray, "v 3"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "v 3"]:
     """Positions in world space; where that is the node's own, the file's float32 as they are: half of the bytes."""
     if local.dtype == np.float32 and np.array_equal(matrix, np.eye(4)):
@@ -155,8 +174,6 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
     index = index.astype(np.int32)
     if np.linalg.det(matrix[:3, :3]) < 0:
         index = index[:, [0, 2, 1]]
-    if "COLOR_0" in attributes:
-        notes.append("Vertex colours were not read.")
     if "NORMAL" in attributes:
         vectors = _vectors(tree, buffers, attributes["NORMAL"], 3, path).astype(np.float64)
         if not np.array_equal(matrix[:3, :3], np.eye(3)):
@@ -175,6 +192,7 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
         if f"TEXCOORD_{n}" in attributes
     }
     base = base_set(tree, primitive.get("material"))
+    colours = _colours(tree, buffers, attributes["COLOR_0"], path) if "COLOR_0" in attributes else None
     start = first[where[0], attributes["POSITION"]]
     return _Piece(
         node=where[0],
@@ -187,6 +205,7 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
         normals=normals,
         uvs=sets.get(base),
         other_uvs={n: uvs.finished() for n, uvs in sets.items() if n != base},
+        colours=None if colours is None else Corners(colours, index),
     )
 
 
@@ -218,8 +237,25 @@ def _texcoords(tree: Tree, buffers: Buffers, accessor: int, path: Path) -> Float
     return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
 
 
-def _scene_nodes(tree: Tree) -> list[int]:
-    """Nodes of the default scene, parents before children; without scenes all nodes."""
+def _colours(tree: Tree, buffers: Buffers, accessor: int, path: Path) -> Float[np.ndarray, "n 3"]:
+    """Linear vertex colours 0..1, without their alpha (which files/gltf_alpha.py reads)."""
+    kind = tree["accessors"][accessor]
+    if kind["type"] not in ("VEC3", "VEC4"):
+        raise refuse(path, f"vertex colours of {kind['type']}", "VEC3 or VEC4", AGAIN)
+    found = values(tree, buffers, accessor)[:, :3]
+    if found.dtype.kind != "f":  # whole numbers that the file forgot to call normalised
+        found = found / np.float32(np.iinfo(found.dtype).max)
+    return np.clip(np.nan_to_num(found.astype(np.float32), nan=1.0), 0, 1)
+
+
+def _hidden(node: Tree) -> bool:
+    said = node.get("extensions", {}).get("KHR_node_visibility")
+    return isinstance(said, dict) and said.get("visible", True) is False
+
+
+def _scene_nodes(tree: Tree, notes: list[str]) -> list[int]:
+    """Nodes of the default scene that are not hidden, parents before children; without scenes all such nodes. A hidden
+    node hides all below it."""
     nodes = tree.get("nodes", [])
     if tree.get("scenes"):
         roots = tree["scenes"][tree.get("scene", 0)].get("nodes", [])
@@ -232,6 +268,9 @@ def _scene_nodes(tree: Tree) -> list[int]:
         if node in seen:
             continue
         seen.add(node)
+        if _hidden(nodes[node]):
+            notes.append("Hidden nodes (KHR_node_visibility) were left out; they stay in a finished asset.")
+            continue
         order.append(node)
         stack.extend(reversed(nodes[node].get("children", [])))
     return order

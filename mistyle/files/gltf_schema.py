@@ -107,10 +107,18 @@ class Material(Part):
     name: str | None = None
     pbrMetallicRoughness: Metallic | None = None
     normalTexture: Info | None = None
+    emissiveTexture: Info | None = None
+    emissiveFactor: list[float] = Field([0.0, 0.0, 0.0], min_length=3, max_length=3)
     extensions: dict[str, Any] = {}
 
 
+class Sampler(Part):
+    wrapS: int = 10497
+    wrapT: int = 10497
+
+
 class Texture(Part):
+    sampler: int | None = Field(None, ge=0)
     source: int | None = Field(None, ge=0)
     extensions: dict[str, Any] = {}
 
@@ -140,5 +148,6 @@ class Document(Part):
     materials: list[Material] = []
     textures: list[Texture] = []
     images: list[Image] = []
+    samplers: list[Sampler] = []
     extensionsUsed: list[str] = []
     extensionsRequired: list[str] = []

@@ -25,6 +25,8 @@ _UNDERSTOOD = (
 _GOES_WITH_TEXTURES = (
     "KHR_texture_transform",
     "KHR_materials_pbrSpecularGlossiness",
+    "KHR_materials_emissive_strength",
+    "KHR_materials_unlit",
     "EXT_texture_webp",
     "EXT_texture_avif",
     "KHR_texture_basisu",
@@ -43,6 +45,7 @@ def drop_unused(builder: Builder) -> None:
         return
     infos = list(_texture_infos(tree.get("materials", [])))
     _renumber(tree, "textures", [(info, "index") for info in infos])
+    _forget_extensions(tree)
     textures = tree.get("textures", [])
     sources = [(t, "source") for t in textures if "source" in t]
     extensions = [e for t in textures for e in t.get("extensions", {}).values() if isinstance(e, dict)]

@@ -10,6 +10,7 @@ read here: it can name any file and plugin and is trusted like code.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -76,6 +77,7 @@ def read_mesh(
     up: Literal["y", "z"] = "y",
     max_faces: int = 5_000_000,
     size: int = 2048,
+    lit: bool = False,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Asset:
     """A mesh file as an asset: vertex and face order as in the file, bounding sphere of radius 1, Y up.
@@ -85,17 +87,21 @@ def read_mesh(
     up        "z" turns a mesh modelled with Z up
     max_faces refuses larger meshes (and more than three times as many vertices)
     size      the atlas size that a new unwrapping's padding is meant for
+    lit       writing a glTF result takes KHR_materials_unlit from its painted materials
     progress  hears a share of 1; reading takes the first tenth, unwrapping most of the rest
 
     OBJ, PLY, STL, OFF, GLB, glTF and USD, each without merging or reordering vertices (STL, which repeats them, is
     joined and says so). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees
-    (glTF: flat, as it demands). One part per material and UDIM tile. Not read: vertex colours, morph targets (the base
-    shape is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression (refused).
+    (glTF: flat, as it demands). One part per material and UDIM tile. Texture transforms, wrap modes and glTF's vertex
+    colours are resolved: the maps repeat at the mesh's UVs, the albedo has the colours in it. Not read: vertex colours
+    of other formats, morph targets (the base shape is), animations (a skinned mesh comes in its bind pose), Draco and
+    meshopt compression without a plain copy (refused).
     """
     from mistyle.files.prepare import prepare
 
     path = Path(path)
-    return prepare(_raw(path, max_faces), path, uv, up, size, progress)
+    asset = prepare(_raw(path, max_faces), path, uv, up, size, progress)
+    return replace(asset, source=replace(asset.source, lit=lit)) if lit else asset
 
 
 def _raw(path: Path, max_faces: int) -> Raw:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -81,6 +82,22 @@ def add_textures(builder: Builder, pictures: Pictures, stem: str, *, repeat: boo
     return result
 
 
+def drop_emission(material: Tree) -> None:
+    """Take the emission out of a material, whose albedo shows it now (gltf_infos.py `shadeless`)."""
+    for key in ("emissiveTexture", "emissiveFactor"):
+        material.pop(key, None)
+    drop_extension(material, "KHR_materials_emissive_strength")
+
+
+def drop_extension(item: Tree, name: str) -> Any:
+    """Take an extension out of an object; what it said, or None."""
+    found = item.get("extensions", {})
+    said = found.pop(name, None)
+    if said is not None and not found:
+        del item["extensions"]
+    return said
+
+
 def set_textures(material: Tree, textures: dict[str, int], texcoord: int = 0) -> None:
     """Let a material show the textures in full: factors, normal scale and occlusion strength are 1.
 
@@ -92,10 +109,7 @@ def set_textures(material: Tree, textures: dict[str, int], texcoord: int = 0) ->
     def info(name: str) -> Tree:
         return {"index": textures[name]} | ({"texCoord": texcoord} if texcoord else {})
 
-    old = material.get("extensions", {})
-    glossy = old.pop("KHR_materials_pbrSpecularGlossiness", None)
-    if glossy is not None and not old:
-        del material["extensions"]
+    glossy = drop_extension(material, "KHR_materials_pbrSpecularGlossiness")
     if "pbrMetallicRoughness" not in material:
         material["pbrMetallicRoughness"] = {"baseColorFactor": (glossy or {}).get("diffuseFactor", [1, 1, 1, 1])}
     surface = material["pbrMetallicRoughness"]

@@ -229,6 +229,7 @@ OPTIONS = {
     "memory": "memory",
     "uv": "read.uv",
     "up": "read.up",
+    "lit": "read.lit",
     "resolution": "rig.resolution",
     "spp": "draw.spp",
     "scene": "draw.scene",

@@ -26,6 +26,7 @@ OPTIONS = {
     "threads": "threads",
     "uv": "read.uv",
     "up": "read.up",
+    "lit": "read.lit",
     "atlas": "atlas.size",
     "start": "start",
     "align": "references.align",

@@ -187,6 +187,9 @@ def add_mesh_options(verb: argparse.ArgumentParser) -> None:
         help="authored UVs: keep, replace, or (auto) replace only where unusable",
     )
     verb.add_argument("--up", choices=["y", "z"], help="the axis of the mesh file that points up (default y)")
+    verb.add_argument(
+        "--lit", action="store_const", const=True, help="unlit glTF materials become lit ones in the asset"
+    )
 
 
 def said_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict[str, Any]:

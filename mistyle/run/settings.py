@@ -38,6 +38,7 @@ class ReadSettings(BaseModel):
     )
     up: Literal["y", "z"] = Field(default="y", description="the axis of the user's file that points up")
     max_faces: int = Field(default=5_000_000, ge=1, description="meshes with more faces are refused")
+    lit: bool = Field(default=False, description="unlit glTF materials become lit ones in the asset")
 
 
 class DrawSettings(BaseModel):

@@ -32,7 +32,8 @@ def read(path: Path, chosen: ReadSettings, size: int, report: Report) -> Asset:
     """The mesh, normalised and with UVs usable for an atlas of `size`."""
     from mistyle.files.read import read_mesh
 
-    return read_mesh(path, uv=chosen.uv, up=chosen.up, max_faces=chosen.max_faces, size=size, progress=report)
+    how: dict[str, Any] = dict(uv=chosen.uv, up=chosen.up, max_faces=chosen.max_faces, lit=chosen.lit)
+    return read_mesh(path, **how, size=size, progress=report)
 
 
 def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:

@@ -18,9 +18,10 @@ from jaxtyping import Float
 
 from mistyle import __version__
 from mistyle.core.asset import Asset
-from mistyle.core.image import bilinear, nearest_fill
+from mistyle.core.image import nearest_fill
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.names import checked
+from mistyle.core.retexture import fetch
 from mistyle.files.gltf import patch_glb, write_glb
 from mistyle.files.gltf_alpha import Cutout, cutouts
 from mistyle.files.images import write_exr, write_png
@@ -197,8 +198,7 @@ def _carried(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, 
     rows, columns, face, weights = corner_weights(asset.mesh, texels)
     height, width = texels.covered.shape
     place = (weights[..., None] * cutout.uvs[face]).sum(axis=1)
-    size = np.array(cutout.alpha.shape[::-1])
-    px = np.stack([place[:, 0], 1 - place[:, 1]], axis=1) * size
     alpha = np.ones((height, width), np.float32)
-    alpha[rows, columns] = bilinear(cutout.alpha, px, edge="repeat")
+    alpha[rows, columns] = fetch(cutout.alpha[..., None], place, cutout.wrap)[:, 0]
+    alpha[rows, columns] *= (weights * cutout.corners[face]).sum(axis=1)
     return nearest_fill(alpha, texels.covered)

@@ -197,7 +197,7 @@ def corner_weights(
     point = np.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], axis=1)
     uvs = mesh.corner_uvs[face].astype(np.float64)
     # UVs count modulo 1: a face that crosses the border paints texels on the other side of the square.
-    point += np.rint(uvs.mean(axis=1) - point)
+    point += np.rint((uvs.min(axis=1) + uvs.max(axis=1)) / 2 - point)
     return rows, columns, face, _barycentric(uvs, point)
 
 
