@@ -13,6 +13,7 @@ from mistyle.files.bounds import MAX_PIXELS, read_bytes, refuse
 MAX_CHANNELS = 256
 MAX_SAMPLES = 1 << 29  # texels times channels: 2 GiB of float32
 AGAIN = "Write or copy it again"
+EXR_MAGIC = b"\x76\x2f\x31\x01"
 
 
 def read_exr(path: Path) -> dict[str, Shaped[np.ndarray, "h w"]]:
@@ -28,6 +29,17 @@ def read_exr(path: Path) -> dict[str, Shaped[np.ndarray, "h w"]]:
     return planes
 
 
+def colour_of_exr(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """The picture in a file that serves as a texture: R, G and B, of a layer where they stand in one (the first by
+    name), else its first channel three times. NaN and infinities are 0."""
+    planes = read_exr(path)
+    layers = sorted(name[:-1] for name in planes if name.endswith("R"))
+    layer = next((x for x in layers if {f"{x}G", f"{x}B"} <= set(planes)), None)
+    names = [f"{layer}{c}" for c in "RGB"] if layer is not None else ["Y" if "Y" in planes else sorted(planes)[0]] * 3
+    colour = np.stack([planes[name] for name in names], axis=-1).astype(np.float32)
+    return np.nan_to_num(colour, nan=0.0, posinf=0.0, neginf=0.0)
+
+
 def size_of_exr(path: Path) -> tuple[int, int]:
     """See `read_stored_size` in files/read.py."""
     width, height = window_of(headers_of_exr(path)[0], "displayWindow")[2:]
@@ -38,7 +50,7 @@ def parts_of_exr(path: Path) -> list[Any]:
     """The decoded parts of a file whose headers have passed; every part that the file announces is there."""
     import OpenEXR
 
-    if read_bytes(path, count=4) != b"\x76\x2f\x31\x01":
+    if read_bytes(path, count=4) != EXR_MAGIC:
         raise refuse(path, "no OpenEXR header", "an .exr file", "Check that it is the right file")
     headers = headers_of_exr(path)
     try:

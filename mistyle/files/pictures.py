@@ -89,6 +89,23 @@ def texture(data: bytes, where: str, budget: Budget) -> Shaped[np.ndarray, "h w 
     return _pixels(image, data, where, notes, managed=False)[0]
 
 
+def texture_file(path: Path, budget: Budget) -> tuple[Shaped[np.ndarray, "h w 3"], bool]:
+    """A mesh's texture in a file of its own, and whether its values are linear: EXR and Radiance files' are, in floats
+    without bounds; a single channel counts for all three."""
+    from mistyle.files import hdr
+
+    head = read_bytes(path, count=10)
+    if head[:4] == hdr.EXR_MAGIC:
+        height, width = hdr.size_of_exr(path)
+        budget.take(height * width)
+        return hdr.colour_of_exr(path), True
+    if head[:2] == b"#?":
+        pixels = hdr.read_hdr(path)
+        budget.take(pixels.shape[0] * pixels.shape[1])
+        return pixels, True
+    return texture(read_bytes(path, MAX_PICTURE_BYTES), str(path), budget), False
+
+
 def decode(data: bytes, where: str, budget: Budget, kind: Kind, scale: float = 1.0) -> Float[np.ndarray, "h w 3"]:
     """A mesh's texture as `Material` has it: see files/texels.py `finished`; at most WORK_TEXTURE on a side."""
     return finished(texture(data, where, budget), kind, scale, WORK_TEXTURE)

@@ -1,12 +1,15 @@
 """Which other files a mesh file names: material libraries, textures, buffers, images."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import MAX_JSON_BYTES, beside, read_bytes
 from mistyle.files.gltf_check import parse_json
-from mistyle.files.obj_read import MAX_LIBRARY_BYTES, TEXTURES, file_name, file_names
+from mistyle.files.mtl_read import NAMING, read_library, statement, tile_name
+from mistyle.files.nearby import named_file, unmarked
+from mistyle.files.obj_read import library_files
 
 
 def references(path: Path) -> list[Path]:
@@ -23,21 +26,20 @@ def references(path: Path) -> list[Path]:
 
 
 def _of_obj(path: Path) -> list[Path]:
-    found: list[Path] = []
-    for line in read_bytes(path).splitlines():
-        words = line.split(None, 1)
-        if len(words) == 2 and words[0] == b"mtllib":
-            for name in file_names(words[1].strip().decode("utf-8", "replace"), path):
-                found += _inside(path, name)
-    return found + [texture for library in found if library.is_file() for texture in _of_library(library)]
+    words = (line.split(None, 1) for line in unmarked(read_bytes(path)).splitlines())
+    named = [line[1].strip() for line in words if len(line) == 2 and line[0] == b"mtllib"]
+    libraries = library_files(named, path)[0]
+    return libraries + [texture for library in libraries for texture in _of_library(library, path)]
 
 
-def _of_library(path: Path) -> list[Path]:
+def _of_library(library: Path, path: Path) -> list[Path]:
     found: list[Path] = []
-    for line in read_bytes(path, MAX_LIBRARY_BYTES).splitlines():
-        words = line.split(None, 1)
-        if len(words) == 2 and words[0].lower() in TEXTURES:
-            found += _inside(path, file_name(words[1].strip()).replace("%", "%25"))
+    for entry in read_library(library, path)[0].values():
+        for key in NAMING & set(entry.values):
+            file = statement(entry.values[key]).file
+            tile = tile_name(file, 1001)
+            with suppress(InputRefused):
+                found += [named_file(library, entry.roots, tile or file)[0] or library]
     return found
 
 
