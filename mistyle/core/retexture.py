@@ -1,5 +1,7 @@
 """Carry a texture from one set of UVs to another."""
 
+from typing import Literal
+
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -7,34 +9,72 @@ from mistyle.core.normals import area_vectors
 from mistyle.core.raster import fragments
 from mistyle.core.uvs import signed_areas
 
+# What a texture shows outside the unit square: itself again, itself mirrored at every whole number, or its last texel.
+Wrap = Literal["repeat", "mirror", "clamp"]
+Wraps = tuple[Wrap, Wrap]  # along u and along v
+REPEAT: Wraps = ("repeat", "repeat")
+
 
 def carry(
-    values: np.ndarray, lookup: Float[np.ndarray, "f 3 2"], uvs: Float[np.ndarray, "f 3 2"], size: int
+    values: np.ndarray,
+    lookup: Float[np.ndarray, "f 3 2"],
+    uvs: Float[np.ndarray, "f 3 2"],
+    size: int,
+    wrap: Wraps = REPEAT,
 ) -> tuple[np.ndarray, Int[np.ndarray, "h w"]]:
     """A texture of size² for `uvs` that shows on every face what `values` shows at `lookup`, and each texel's face.
 
-    Both UVs are v up, row 0 is v = 1, both repeat. Sampled bilinearly at texel centres; where faces share a texel the
-    first in face order counts; texels without a face (face -1) take their nearest covered neighbour.
+    Both UVs are v up, row 0 is v = 1; the new texture repeats, the old one does as `wrap` says. Sampled bilinearly at
+    texel centres; where faces share a texel the first in face order counts; texels without a face (face -1) take their
+    nearest covered neighbour.
     """
     channels = values if values.ndim == 3 else values[..., None]
+    pieces, face, weights = covered_texels(uvs, size)
+    at = np.einsum("nk,nkc->nc", weights, lookup[face].astype(np.float64))
+    result, faces = _filled(pieces, face, fetch(channels, at, wrap), size)
+    return (result if values.ndim == 3 else result[..., 0]), faces
+
+
+def carry_corners(
+    values: Float[np.ndarray, "f 3 c"], uvs: Float[np.ndarray, "f 3 2"], size: int
+) -> Float[np.ndarray, "h w c"]:
+    """A texture of size² for `uvs` that shows what `values` gives the corners, interpolated over each face as `carry`
+    looks textures up."""
+    pieces, face, weights = covered_texels(uvs, size)
+    return _filled(
+        pieces, face, np.einsum("nk,nkc->nc", weights.astype(np.float32), values[face].astype(np.float32)), size
+    )[0]
+
+
+def covered_texels(
+    uvs: Float[np.ndarray, "f 3 2"], size: int
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 3"]]:
+    """The texels (row * size + column) whose centres a face covers, the first such face, and the centre's barycentric
+    coordinates in it. UVs are v up and repeat."""
     spot = uvs.astype(np.float64) * [size, -size] + [0, size]  # y grows with the row
     face, texel = fragments(spot, size)
     owner = np.full(size * size, -1, np.int64)
     # Written backwards, so that the first face stays.
     owner[texel[::-1]] = np.arange(len(texel))[::-1]
     pieces = np.flatnonzero(owner >= 0)
-    chosen = owner[pieces]
-    weights = _weights(spot[face[chosen]], pieces, size)
-    at = np.einsum("nk,nkc->nc", weights, lookup[face[chosen]].astype(np.float64))
-    result = np.zeros((size * size, channels.shape[2]), np.float32)
-    result[pieces] = fetch(channels, at)
+    face = face[owner[pieces]]
+    return pieces, face, texel_weights(spot[face], pieces, size)
+
+
+def _filled(
+    pieces: Int[np.ndarray, " n"], face: Int[np.ndarray, " n"], values: Float[np.ndarray, "n c"], size: int
+) -> tuple[Float[np.ndarray, "h w c"], Int[np.ndarray, "h w"]]:
+    """The texture in which the texels `pieces` have these values and faces, the others those of their neighbours."""
+    result = np.zeros((size * size, values.shape[1]), np.float32)
+    result[pieces] = values
     faces = np.full(size * size, -1, np.int64)
-    faces[pieces] = face[chosen]
-    result = _spread(result.reshape(size, size, -1), faces.reshape(size, size) >= 0)
-    return (result if values.ndim == 3 else result[..., 0]), faces.reshape(size, size)
+    faces[pieces] = face
+    return _spread(result.reshape(size, size, -1), faces.reshape(size, size) >= 0), faces.reshape(size, size)
 
 
-def _weights(spot: Float[np.ndarray, "n 3 2"], texel: Int[np.ndarray, " n"], size: int) -> Float[np.ndarray, "n 3"]:
+def texel_weights(
+    spot: Float[np.ndarray, "n 3 2"], texel: Int[np.ndarray, " n"], size: int
+) -> Float[np.ndarray, "n 3"]:
     """Barycentric coordinates of a texel's centre in the triangle that covers it, whatever tile that lies in."""
     centre = np.stack([texel % size, texel // size], axis=1) + 0.5
     centre += np.ceil((spot.min(axis=1) - centre) / size) * size  # the repetition inside the triangle's box
@@ -49,13 +89,26 @@ def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
-def fetch(values: Float[np.ndarray, "h w c"], uv: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n c"]:
-    """Bilinear lookup, v up, repeating."""
+def wrapped(index: Int[np.ndarray, " n"], count: int, wrap: Wrap) -> Int[np.ndarray, " n"]:
+    """The texel among `count` that stands at `index`, which may be any whole number."""
+    if wrap == "clamp":
+        return np.clip(index, 0, count - 1)
+    if wrap == "mirror":
+        there = index % (2 * count)
+        return np.minimum(there, 2 * count - 1 - there)
+    return index % count
+
+
+def fetch(
+    values: Float[np.ndarray, "h w c"], uv: Float[np.ndarray, "n 2"], wrap: Wraps = REPEAT
+) -> Float[np.ndarray, "n c"]:
+    """Bilinear lookup, v up; `wrap` says what lies outside the unit square."""
     h, w = values.shape[:2]
     x, y = uv[:, 0] * w - 0.5, (1 - uv[:, 1]) * h - 0.5
     left, top = np.floor(x).astype(np.int64), np.floor(y).astype(np.int64)
     s, t = (x - left)[:, None].astype(np.float32), (y - top)[:, None].astype(np.float32)
-    x0, x1, y0, y1 = left % w, (left + 1) % w, top % h, (top + 1) % h
+    x0, x1 = wrapped(left, w, wrap[0]), wrapped(left + 1, w, wrap[0])
+    y0, y1 = wrapped(top, h, wrap[1]), wrapped(top + 1, h, wrap[1])
     upper = values[y0, x0] * (1 - s) + values[y0, x1] * s
     lower = values[y1, x0] * (1 - s) + values[y1, x1] * s
     return upper * (1 - t) + lower * t

@@ -9,29 +9,37 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.asset import TURNED, Asset, Material, Source
+from mistyle.core.image import resize
 from mistyle.core.mesh import Mesh
 from mistyle.core.names import distinct
 from mistyle.core.normals import area_vectors, crease_normals, same_points, usable_normals
-from mistyle.core.retexture import carry, turn_normals
+from mistyle.core.raster import fragments
+from mistyle.core.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
 from mistyle.core.unwrap import unwrap
 from mistyle.core.uvs import Layout, Verdict, arrange
 from mistyle.files.bounds import refuse
+from mistyle.files.lookups import effective, framed, looked_up, plain_lookups
 from mistyle.files.polygons import check_positions
 from mistyle.files.raw import Raw, RawMap
 
 # Faces below this area in the unit sphere have none that anything could be computed from (float32 positions).
 NO_AREA = 1e-13
+ONE_COLOUR = 1 / 512  # vertex colours that differ by less (linear) are one
+TORN = "faces that share texels have different vertex colours"
+MAX_TORN = 0.05  # two faces may give a texel vertex colours that differ so far (linear)
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
 UnwrapMode = Literal["keep", "new", "auto"]
 
 
 @dataclass(frozen=True)
 class _Plan:
-    """What becomes of one material's UVs: rows of its faces, kept layout (None: unwrap), the reason for unwrapping."""
+    """What becomes of one material's UVs: rows of its faces, kept layout (None: unwrap), the reason for unwrapping,
+    whether its maps have to be carried over to the new or kept UVs."""
 
     rows: Int[np.ndarray, " n"]
     layout: Layout | None
     reason: str
+    carried: bool = True
 
 
 def prepare(
@@ -40,6 +48,8 @@ def prepare(
     """Decide, unwrap where needed, and put everything into the working space. `size` is the atlas that padding is
     meant for."""
     check_positions(raw.positions, path)
+    raw = plain_lookups(raw)
+    authored = raw.uvs if raw.authored is None else raw.authored
     work_from_user = _work_matrix(raw, path, up)
     work = raw.positions @ work_from_user[:3, :3].T + work_from_user[:3, 3]
     area = np.linalg.norm(area_vectors(work, raw.faces), axis=1)
@@ -63,11 +73,11 @@ def prepare(
         parts=names,
     )
     materials = tuple(
-        _material(raw, mesh, p, material, tile, plans[material].layout is None, size, notes)
+        _material(raw, mesh, p, material, tile, plans[material].carried, size, notes)
         for p, (material, tile) in enumerate(owners)
     )
     progress(1.0)
-    kept = raw.uvs is not None and np.array_equal(corner_uvs, raw.uvs)
+    kept = authored is not None and np.array_equal(corner_uvs, authored)
     how = "new" if any(p.layout is None for p in plans) else "kept" if kept else "shifted"
     source = Source(
         path=path,
@@ -75,7 +85,7 @@ def prepare(
         primitives=tuple(_with_part(p, part) for p in raw.primitives),
         user_positions=raw.positions,
         work_from_user=work_from_user,
-        old_uvs=None if raw.uvs is None else np.nan_to_num(raw.uvs).astype(np.float32),
+        old_uvs=None if authored is None else np.nan_to_num(authored).astype(np.float32),
         uv=how,
         notes=tuple(dict.fromkeys(notes)),
     )
@@ -83,9 +93,11 @@ def prepare(
 
 
 def _work_matrix(raw: Raw, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
-    """Turns Z up to Y up where asked, and brings the sphere around the used vertices' box to the unit sphere."""
+    """Turns Z up to Y up where asked, and brings the sphere around the box of the vertices that faces with an area use
+    to the unit sphere."""
     turn = Y_FROM_Z if up == "z" else np.eye(3)
-    used = raw.positions[np.unique(raw.faces)] @ turn.T
+    seen = raw.faces[area_vectors(raw.positions, raw.faces).any(axis=1)]
+    used = raw.positions[np.unique(seen if len(seen) else raw.faces)] @ turn.T
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     radius = float(np.linalg.norm(used - centre, axis=1).max())
     if radius <= 0:
@@ -122,26 +134,61 @@ def _plan(
     """Keep a material's UVs or unwrap it; says so in `notes`, refuses where `keep` cannot be."""
     rows = np.flatnonzero(raw.material == material)
     name = raw.materials[material].name
-    own = rows if raw.twin is None else rows[raw.twin[rows] == rows]
+    own = _own(raw, rows)
     if uv == "new":
         notes.append(f"Material '{name}' was unwrapped anew, as asked.")
         return _Plan(rows, None, "asked for")
-    layout = None
-    if raw.uvs is not None and np.isfinite(raw.uvs[rows]).any():
-        layout = arrange(points[raw.faces[own]], raw.uvs[own], area[own], raw.materials[material].udim)
-    if layout is not None and layout.usable:
+    layout, reason = _layout(raw, raw.uvs, rows, points, area)
+    if reason and raw.authored is not None:
+        other, no = _layout(raw, raw.authored, rows, points, area)
+        if not no and other is not None:
+            notes.append(
+                f"Material '{name}' keeps its UVs as authored and its textures were resampled to them, since with "
+                f"their transform {reason}."
+            )
+            _say(name, other.verdicts, len(own) < len(rows), notes)
+            return _Plan(rows, other, "")
+    if layout is not None and reason == TORN and uv == "keep":
+        notes.append(f"Of material '{name}' {reason}; of each texel the first face's were taken.")
+        reason = ""
+    if layout is not None and not reason:
         _say(name, layout.verdicts, len(own) < len(rows), notes)
-        return _Plan(rows, layout, "")
-    reason = (
-        "it has no UVs"
-        if layout is None
-        else "its UVs cannot be painted: " + next(v.reason for v in layout.verdicts if not v.usable)
-    )
+        return _Plan(rows, layout, "", carried=False)
     if uv == "keep":
         found = f"material '{name}' whose UVs cannot be kept ({reason})"
         raise refuse(path, found, "UVs that cover the surface without overlaps", "Use --uv auto or --uv new")
     notes.append(f"Material '{name}' was unwrapped anew, since {reason}.")
     return _Plan(rows, None, reason)
+
+
+def _layout(
+    raw: Raw, uvs: Float[np.ndarray, "f 3 2"] | None, rows: np.ndarray, points: np.ndarray, area: np.ndarray
+) -> tuple[Layout | None, str]:
+    """One material's faces laid out at `uvs`, and why they cannot be painted so ("": they can)."""
+    if uvs is None or not np.isfinite(uvs[rows]).any():
+        return None, "it has no UVs"
+    own = _own(raw, rows)
+    udim = raw.materials[int(raw.material[rows[0]])].udim
+    layout = arrange(points[raw.faces[own]], uvs[own], area[own], udim)
+    if not layout.usable:
+        return layout, "its UVs cannot be painted: " + next(v.reason for v in layout.verdicts if not v.usable)
+    return layout, "" if _one_colour_a_texel(raw, own, layout) else TORN
+
+
+def _one_colour_a_texel(raw: Raw, own: Int[np.ndarray, " n"], layout: Layout) -> bool:
+    """Whether faces that share texels have (nearly) the same vertex colours there, so that a texture can have them."""
+    if raw.colours is None or max(v.shared + v.overlap for v in layout.verdicts) == 0:
+        return True
+    colours, size, covered, torn = raw.colours[own], 256, 0, 0
+    for tile in np.unique(layout.tile):
+        spot = layout.uvs[layout.tile == tile].astype(np.float64) * size
+        face, texel = fragments(spot, size)
+        at = np.einsum("nk,nkc->nc", texel_weights(spot[face], texel, size), colours[layout.tile == tile][face])
+        low, high = np.full((size**2, 3), np.inf), np.full((size**2, 3), -np.inf)
+        np.minimum.at(low, texel, at)
+        np.maximum.at(high, texel, at)
+        covered, torn = covered + len(np.unique(texel)), torn + int(((high - low).max(axis=1) > MAX_TORN).sum())
+    return torn <= 0.01 * covered
 
 
 def _say(name: str, verdicts: tuple[Verdict, ...], instances: bool, notes: list[str]) -> None:
@@ -215,46 +262,81 @@ def _with_part(primitive, part: Int[np.ndarray, " f"]):
 
 
 def _material(
-    raw: Raw, mesh: Mesh, part: int, material: int, tile: int, new: bool, size: int, notes: list[str]
+    raw: Raw, mesh: Mesh, part: int, material: int, tile: int, all_carried: bool, size: int, notes: list[str]
 ) -> Material:
     """The part's maps in its working UVs, carried over where the file's lookup differs from them."""
     source = raw.materials[material]
     maps, said = source.load(tile)
     notes.extend(said)
     rows = np.flatnonzero(mesh.part == part)
-    old = None if raw.uvs is None else raw.uvs[rows]
-    done = {name: _placed(name, entry, mesh, rows, old, new, size) for name, entry in maps.items()}
+    plain = {name for name, entry in maps.items() if not all_carried and _is_plain(entry, raw.uvs, rows)}
+    done = {
+        name: entry.finished().values if name in plain else _placed(name, entry, raw, mesh, rows, size)
+        for name, entry in maps.items()
+    }
+    carried = sorted(name for name, values in done.items() if values is not None and name not in plain)
+    if carried and not all_carried:
+        notes.append(
+            f"The {' and '.join(carried)} of material '{source.name}' have texture coordinates of their own and were "
+            "resampled to those of its other textures."
+        )
+    albedo, factor = done.get("albedo"), np.array(source.albedo_factor, np.float32)
+    if raw.colours is not None and (raw.colours[rows] != 1).any():
+        albedo, factor = _tinted(albedo, factor, raw.colours[rows], mesh.corner_uvs[rows], size)
+        notes.append(f"The vertex colours of material '{source.name}' were taken into its albedo.")
     for name in [n for n, values in done.items() if values is None]:
         notes.append(
             f"The {name} map of material '{source.name}' was left out: its faces have no UVs to look it up at."
         )
     return Material(
         name=mesh.parts[part],
-        albedo=done.get("albedo"),
+        albedo=albedo,
         normal=done.get("normal"),
         roughness=done.get("roughness"),
         metallic=done.get("metallic"),
-        albedo_factor=np.array(source.albedo_factor, np.float32),
+        albedo_factor=factor,
         roughness_factor=float(source.roughness_factor),
         metallic_factor=float(source.metallic_factor),
     )
 
 
-def _placed(
-    name: str, entry: RawMap, mesh: Mesh, rows: np.ndarray, old: np.ndarray | None, new: bool, size: int
-) -> np.ndarray | None:
-    """One map in the part's working UVs; None where there is nothing to look it up by."""
-    lookup = old if entry.uvs is None else entry.uvs[rows]
-    if not new and entry.uvs is None and entry.transform is None:
-        return entry.values
-    if lookup is None or not np.isfinite(lookup).any():
+def _is_plain(entry: RawMap, uvs: Float[np.ndarray, "f 3 2"] | None, rows: np.ndarray) -> bool:
+    """Whether a map is looked up at the mesh's UVs and repeats there."""
+    if entry.uvs is not None or entry.transform is not None:
+        return False
+    lookup = None if entry.wrap == REPEAT else looked_up(entry, uvs, rows)
+    return lookup is None or effective(entry.wrap, lookup) == REPEAT
+
+
+def _tinted(
+    albedo: Float[np.ndarray, "h w 3"] | None,
+    factor: Float[np.ndarray, "3"],
+    colours: Float[np.ndarray, "f 3 3"],
+    uvs: Float[np.ndarray, "f 3 2"],
+    size: int,
+) -> tuple[Float[np.ndarray, "h2 w2 3"] | None, Float[np.ndarray, "3"]]:
+    """Albedo and its factor, multiplied by the colours of the faces' corners. One colour for all goes into the factor,
+    others into a texture of `size` texels along a side, or more where the albedo has more."""
+    low, high = colours.min(axis=(0, 1)), colours.max(axis=(0, 1))
+    if (high - low).max() < ONE_COLOUR:
+        return albedo, factor * (low + high) / 2
+    side = size if albedo is None else max(size, *albedo.shape[:2])
+    tint = carry_corners(colours, uvs, side)
+    if albedo is not None:
+        tint *= resize(albedo, (side, side), "repeat")
+    return tint, factor
+
+
+def _placed(name: str, entry: RawMap, raw: Raw, mesh: Mesh, rows: np.ndarray, size: int) -> np.ndarray | None:
+    """One map carried over to the part's working UVs; None where there is nothing to look it up by."""
+    lookup = looked_up(entry, raw.uvs, rows)
+    if lookup is None:
         return None
-    lookup = np.nan_to_num(lookup).astype(np.float64)
-    frame = lookup
-    if entry.transform is not None:
-        lookup = lookup @ entry.transform[:2, :2].T + entry.transform[:2, 2]
+    wrap = effective(entry.wrap, lookup)
+    entry = (framed(entry) if name == "normal" else entry).finished()
+    lookup = np.nan_to_num(lookup)
     side = min(size, max(entry.values.shape[:2]))
-    values, face = carry(entry.values, lookup, mesh.corner_uvs[rows], side)
+    values, face = carry(entry.values, lookup, mesh.corner_uvs[rows], side, wrap)
     if name == "normal":
-        values = turn_normals(values, face, mesh.positions, mesh.faces[rows], frame, mesh.corner_uvs[rows])
+        values = turn_normals(values, face, mesh.positions, mesh.faces[rows], lookup, mesh.corner_uvs[rows])
     return values

@@ -2,12 +2,14 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive
 from mistyle.core.errors import InputRefused
+from mistyle.core.retexture import REPEAT, Wraps
 from mistyle.files.bounds import WORK_TEXTURE
 from mistyle.files.texels import Kind, finished
 
@@ -18,7 +20,9 @@ class RawMap:
     still the file's own numbers, which files/texels.py makes into such (normals with x and y times `scale`).
 
     The lookup is at `uvs` where the map uses another UV set than the material's base, else at the mesh's UVs; then
-    `transform` (v up, homogeneous rows) is applied to it.
+    `transform` (v up, homogeneous rows) is applied to it, and `wrap` says what lies outside the unit square.
+    `tangents` says which frame the normals of a normal map stand in: that of the UVs as authored, before the transform,
+    or that of the place where the map is looked up.
     """
 
     values: np.ndarray
@@ -26,6 +30,8 @@ class RawMap:
     transform: Float[np.ndarray, "3 3"] | None = None
     kind: Kind | None = None
     scale: float = 1.0
+    wrap: Wraps = REPEAT
+    tangents: Literal["authored", "looked up"] = "authored"
 
     def finished(self) -> "RawMap":
         """With values as `Material` has them."""
@@ -50,7 +56,8 @@ class Tile:
 
 @dataclass(frozen=True)
 class Textures:
-    """The `load` of a material whose textures are decoded: tiles by number, 1001 for every number that is not there."""
+    """The `load` of a material whose textures are decoded: tiles by number, 1001 for every number that is not there.
+    Its maps may be unfinished."""
 
     tiles: dict[int, Tile]
 
@@ -58,7 +65,7 @@ class Textures:
         found = self.tiles.get(tile) or self.tiles[1001]
         if found.refused is not None:
             raise InputRefused(found.refused)
-        return {name: entry.finished() for name, entry in found.maps.items()}, found.notes
+        return found.maps, found.notes
 
 
 @dataclass(frozen=True)
@@ -83,6 +90,8 @@ class Raw:
     uvs       per corner, v up, NaN where a face has none; None where no face has any
     material  index into `materials` per face
     twin      the face whose UVs each face shares because the file stores them once (glTF instances), itself otherwise
+    authored  the `uvs` of the file where files/lookups.py made others of them, else None
+    colours   per corner, linear Rec.709, 0..1: what the albedo is to be multiplied by (vertex colours); None for white
     """
 
     kind: str
@@ -95,6 +104,8 @@ class Raw:
     primitives: tuple[Primitive, ...]
     twin: Int[np.ndarray, " f"] | None = None
     notes: tuple[str, ...] = field(default=())
+    authored: Float[np.ndarray, "f 3 2"] | None = None
+    colours: Float[np.ndarray, "f 3 3"] | None = None
 
 
 @dataclass(frozen=True)
@@ -112,12 +123,13 @@ class Corners:
 
 @dataclass(frozen=True)
 class Indexed:
-    """A Raw on its way from one process to another: its normals and uvs, several times smaller, beside it, and its
-    positions perhaps as float32."""
+    """A Raw on its way from one process to another: its normals, uvs and colours, several times smaller, beside it, and
+    its positions perhaps as float32."""
 
     raw: Raw
     normals: Corners
     uvs: Corners | None
+    colours: Corners | None = None
 
     def finished(self) -> Raw:
         """As everything after the border has it."""
@@ -126,6 +138,7 @@ class Indexed:
             positions=self.raw.positions.astype(np.float64, copy=False),
             normals=self.normals.finished(),
             uvs=None if self.uvs is None else self.uvs.finished(),
+            colours=None if self.colours is None else self.colours.finished(),
         )
 
 
