@@ -14,8 +14,9 @@ from PIL import Image
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
 from mistyle.files import bounds
-from mistyle.files.mesh_formats import read_off, read_ply, read_stl
+from mistyle.files.mesh_formats import read_off, read_stl
 from mistyle.files.obj_read import read_obj
+from mistyle.files.ply_read import read_ply
 from mistyle.files.polygons import fan, triangulate
 from mistyle.files.read import read_json, read_mesh
 
@@ -30,7 +31,7 @@ NASTY = {
     "capsule.obj": (10200, "capsule.mtl is not there"),
     "chair_model.obj": (12756, "repeats many times"),
     "empty.obj": "no faces",
-    "nancolor.obj": (12, "Vertex colours were not read"),
+    "nancolor.obj": (12, "were taken into its albedo"),
     "no_indices_3storybuilding.glb": (72, "has no UVs"),
     "notenoughindices.obj": (1, "fewer than three corners"),
     "obj_points.obj": "8 vertices and no faces",

@@ -9,6 +9,7 @@ from PIL import Image
 
 from mistyle.core.asset import Asset
 from mistyle.core.image import linear_from_srgb
+from mistyle.core.retexture import fetch
 from mistyle.files.images import write_exr
 from mistyle.files.mtl_read import Statement, statement
 from mistyle.files.nearby import unmarked
@@ -18,7 +19,6 @@ from mistyle.files.read import read_mesh, read_references
 SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\n"
 FACE = "f 1/1/1 2/2/1 3/3/1 4/4/1\n"
 RED, GREEN, BLUE, YELLOW = (220, 40, 40), (40, 200, 40), (40, 40, 220), (230, 220, 40)
-SRGB8 = 0.5 / 255
 
 
 def quadrants(path: Path, side: int = 16) -> Path:
@@ -39,14 +39,24 @@ def square(folder: Path, mtl: str | bytes | None, head: str = "mtllib m.mtl\n", 
 
 
 def corners(asset: Asset) -> list[list[int]]:
-    """The albedo at the four quadrants' middles, sRGB in 8 bits: top left, top right, bottom left, bottom right."""
+    """The colours of the square's quadrants as they are seen: top left, top right, bottom left, bottom right."""
+    return [nearest(shown(asset, x, y)) for y in (0.5, -0.5) for x in (-0.5, 0.5)]
+
+
+def shown(asset: Asset, x: float, y: float) -> np.ndarray:
+    """The linear albedo at a point of the square in the file's own coordinates."""
     (material,) = asset.materials
     assert material.albedo is not None
-    height, width = material.albedo.shape[:2]
-    spots = [material.albedo[int(v * height), int(u * width)] for v in (0.25, 0.75) for u in (0.25, 0.75)]
+    where = asset.source.user_positions[asset.mesh.faces].reshape(-1, 3)
+    plane = np.linalg.lstsq(np.c_[where[:, :2], np.ones(len(where))], asset.mesh.corner_uvs.reshape(-1, 2), rcond=None)[
+        0
+    ]
+    return fetch(material.albedo, np.array([[x, y, 1]]) @ plane)[0] * material.albedo_factor
+
+
+def nearest(linear: np.ndarray) -> list[int]:
     wanted = np.array([RED, GREEN, BLUE, YELLOW])
-    linear = linear_from_srgb(wanted / np.float32(255))
-    return [wanted[np.abs(linear - spot).max(axis=1).argmin()].tolist() for spot in spots]
+    return wanted[np.abs(linear_from_srgb(wanted / np.float32(255)) - linear).max(axis=1).argmin()].tolist()
 
 
 SEEN = [list(RED), list(GREEN), list(BLUE), list(YELLOW)]
@@ -195,6 +205,17 @@ def test_scale_and_offset_move_the_lookup(tmp_path: Path) -> None:
     assert corners(asset) == [SEEN[k] for k in (1, 0, 3, 2)]
     asset = read_mesh(square(tmp_path, "newmtl mat\nmap_Kd -s 0.5 0.5 -o 0 .5 wood.png\n"), uv="keep")
     assert corners(asset) == [list(RED)] * 4
+
+
+def test_clamped_textures(tmp_path: Path) -> None:
+    """Beyond the unit square the last texels go on; without -clamp the picture comes again."""
+    quadrants(tmp_path / "wood.png")
+    path = square(tmp_path, "newmtl mat\nmap_Kd -clamp on -o 0.75 0 0 wood.png\n")
+    asset = read_mesh(path, uv="keep")
+    assert [nearest(shown(asset, x, 0.5)) for x in (-0.9, -0.3, 0.9)] == [list(GREEN)] * 3
+    (tmp_path / "m.mtl").write_text("newmtl mat\nmap_Kd -o 0.75 0 0 wood.png\n")
+    asset = read_mesh(path, uv="keep")
+    assert [nearest(shown(asset, x, 0.5)) for x in (-0.9, 0, 0.9)] == [list(GREEN), list(RED), list(GREEN)]
 
 
 def test_values_are_scaled_and_channels_chosen(tmp_path: Path) -> None:

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from mistyle.core.errors import InputRefused
+from mistyle.core.retexture import REPEAT
 from mistyle.files.bounds import read_bytes
-from mistyle.files.nearby import decoded, named_file, unmarked
-from mistyle.files.pictures import Budget, texture_file
+from mistyle.files.nearby import decoded, unmarked
+from mistyle.files.pictures import Budget, named_texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 from mistyle.files.texels import Kind, fractions, linear_rows
 
@@ -194,7 +194,7 @@ def _load(textures: dict[str, Statement], entry: Entry, budget: Budget, tile: in
             if said.file != textures["normal"].file:
                 notes.append(f"Bump map {wanted} was left out beside the normal map of material '{entry.name}'.")
             continue
-        pixels = texels_of(entry.library, entry.roots, wanted, budget, notes)
+        pixels = named_texture(entry.library, entry.roots, wanted, budget, notes)
         if pixels is None:
             continue
         found = _meant("normal" if name == "bump" else name, said, *pixels, notes)
@@ -203,24 +203,6 @@ def _load(textures: dict[str, Statement], entry: Entry, budget: Budget, tile: in
             continue
         maps["normal" if name == "bump" else name] = found
     return maps, tuple(notes)
-
-
-def texels_of(
-    where: Path, roots: Sequence[Path], name: str, budget: Budget, notes: list[str]
-) -> tuple[Shaped[np.ndarray, "h w 3"], bool] | None:
-    """The texture that the file `where` names, and whether its values are linear; None, with a note, without one."""
-    try:
-        target, place = named_file(where, roots, name)
-        if target is None:
-            notes.append(f"Texture {name} is not there and was left out.")
-            return None
-        pixels = texture_file(target, budget)
-    except InputRefused as error:
-        notes.append(f"Texture {name} was left out: {error}")
-        return None
-    if place is not None:
-        notes.append(f"Texture {name} was found by its name at {place}.")
-    return pixels
 
 
 def _meant(name: str, said: Statement, pixels: np.ndarray, linear: bool, notes: list[str]) -> RawMap:
@@ -236,7 +218,13 @@ def _meant(name: str, said: Statement, pixels: np.ndarray, linear: bool, notes: 
         pixels = _channel(linear_rows(pixels) if said.space in SRGB and said.space != "auto" else pixels, said, notes)
     if (said.base, said.gain) != (0, 1) and kind != "normal":
         pixels = np.clip(fractions(pixels) * np.float32(said.gain) + np.float32(said.base), 0, 1)
-    return RawMap(pixels, transform=said.transform, kind=kind, scale=said.strength if kind == "normal" else 1.0)
+    return RawMap(
+        pixels,
+        transform=said.transform,
+        kind=kind,
+        scale=said.strength if kind == "normal" else 1.0,
+        wrap=("clamp", "clamp") if said.clamp else REPEAT,
+    )
 
 
 def _channel(pixels: Shaped[np.ndarray, "h w 3"], said: Statement, notes: list[str]) -> Shaped[np.ndarray, "h w"]:

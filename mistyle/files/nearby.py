@@ -35,6 +35,11 @@ def decoded(*texts: bytes) -> tuple[list[str], bool]:
     return [text.decode("latin-1") for text in texts], False
 
 
+def mesh_folders(path: Path) -> tuple[Path, ...]:
+    """Where a mesh file's own names lead: its folder, then that of the file behind a link."""
+    return tuple(dict.fromkeys((path.parent.resolve(), path.resolve().parent)))
+
+
 def named_file(
     where: Path, roots: Sequence[Path], name: str, *, picture: bool = True
 ) -> tuple[Path | None, str | None]:

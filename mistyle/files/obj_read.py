@@ -9,8 +9,9 @@ from jaxtyping import Float, Int
 from mistyle.core.asset import Primitive
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import read_bytes, refuse
+from mistyle.files.colours import coloured, linear_colours
 from mistyle.files.mtl_read import Entry, material, read_library, unread
-from mistyle.files.nearby import decoded, named_file, unmarked
+from mistyle.files.nearby import decoded, mesh_folders, named_file, unmarked
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_positions, parse_numbers, too_many, triangulate
 from mistyle.files.raw import Raw, RawMaterial, no_textures
@@ -26,17 +27,15 @@ WITHOUT_LOOKS |= {b"trace_obj", b"maplib", b"usemap"}
 
 
 def read_obj(path: Path, max_faces: int) -> Raw:
-    """Polygons become fans around their first corner (concave ones are cut into ears), in file order. Lines, points and
-    free-form surfaces are left out; so are faces with fewer than three corners, with a note. Vertex colours are not
-    read."""
+    """Polygons become fans around their first corner (concave ones are cut into ears), in file order. Lines, points,
+    free-form surfaces and faces with fewer than three corners are left out, with a note. Vertex colours (v x y z r g b)
+    are the albedo where there is no texture of it."""
     data = re.sub(rb"\\\r?\n", b" ", unmarked(read_bytes(path)))
     lines, notes = _sorted_lines(data), []
     positions = _table(lines[b"v"], 3, path, "vertices")
     if len(lines[b"f"]) == 0:
         fix = "Export the mesh with its faces"
         raise refuse(path, f"{len(positions)} vertices and no faces", "at least one triangle", fix)
-    if max((len(line.split()) for line in lines[b"v"][:1]), default=3) >= 6:
-        notes.append("Vertex colours were not read.")
     too_many(len(positions), 3 * max_faces, path, "vertices")
     corners, sizes = _corners(lines, path, max_faces)
     small = int((sizes < 3).sum())
@@ -51,6 +50,11 @@ def read_obj(path: Path, max_faces: int) -> Raw:
     kind = b"o" if lines[b"o"] else b"g"
     thing, things = _stated(lines[kind], lines[kind + b"_at"], polygon)
     materials, said = _materials(names, lines, path)
+    notes += said
+    colours = _colours(lines[b"v"], path)
+    if colours is not None:
+        colours, materials, said = coloured(colours[index[..., 0]], material, materials)
+        notes += said
     return Raw(
         kind="obj",
         positions=positions,
@@ -60,7 +64,8 @@ def read_obj(path: Path, max_faces: int) -> Raw:
         material=material,
         materials=materials,
         primitives=_runs(material, thing, things),
-        notes=(*notes, *said, *_left_out(lines)),
+        notes=(*notes, *_left_out(lines)),
+        colours=colours,
     )
 
 
@@ -114,6 +119,17 @@ def _table(lines: list[bytes], width: int, path: Path, what: str) -> Float[np.nd
     if short is not None:
         raise refuse(path, f"line {short + 1} of its {what} with {len(rows[short])} numbers", f"{width}", AGAIN)
     return parse_numbers(b" ".join(b" ".join(row) for row in rows), path, what).reshape(-1, width)
+
+
+def _colours(lines: list[bytes], path: Path) -> Float[np.ndarray, "v 3"] | None:
+    """Linear vertex colours, white for vertices that have none; None where no vertex has any."""
+    if max((line.count(b" ") + line.count(b"\t") for line in lines), default=0) < 5:
+        return None
+    rows = [line.partition(b"#")[0].split()[3:6] for line in lines]
+    if not any(len(row) == 3 for row in rows):
+        return None
+    text = b" ".join(b" ".join(row) if len(row) == 3 else b"nan nan nan" for row in rows)
+    return linear_colours(parse_numbers(text, path, "vertex colours").reshape(-1, 3))
 
 
 def _corners(
@@ -207,11 +223,6 @@ def library_files(names: list[bytes], path: Path) -> tuple[list[Path], list[str]
         if place is not None:
             notes.append(f"Material library {name} was found by its name at {place}.")
     return list(found), notes
-
-
-def mesh_folders(path: Path) -> tuple[Path, ...]:
-    """Where a mesh file's own names lead: its folder, then that of the file behind a link."""
-    return tuple(dict.fromkeys((path.parent.resolve(), path.resolve().parent)))
 
 
 def file_names(statement: str, path: Path) -> list[str]:

@@ -2,6 +2,7 @@
 
 import io
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from jaxtyping import Float, Shaped
 from mistyle.core.asset import Picture, Pixels
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import MAX_PIXELS, MAX_TEXTURE_PIXELS, WORK_TEXTURE, read_bytes, refuse
+from mistyle.files.nearby import named_file
 from mistyle.files.texels import Kind, finished, fractions
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "AVIF", "TGA")
@@ -104,6 +106,25 @@ def texture_file(path: Path, budget: Budget) -> tuple[Shaped[np.ndarray, "h w 3"
         budget.take(pixels.shape[0] * pixels.shape[1])
         return pixels, True
     return texture(read_bytes(path, MAX_PICTURE_BYTES), str(path), budget), False
+
+
+def named_texture(
+    where: Path, roots: Sequence[Path], name: str, budget: Budget, notes: list[str]
+) -> tuple[Shaped[np.ndarray, "h w 3"], bool] | None:
+    """The `texture_file` that the file `where` names, relative to one of `roots` or found near them (files/nearby.py);
+    None, with a note, where there is none that can be used."""
+    try:
+        target, place = named_file(where, roots, name)
+        if target is None:
+            notes.append(f"Texture {name} is not there and was left out.")
+            return None
+        found = texture_file(target, budget)
+    except InputRefused as error:
+        notes.append(f"Texture {name} was left out: {error}")
+        return None
+    if place is not None:
+        notes.append(f"Texture {name} was found by its name at {place}.")
+    return found
 
 
 def decode(data: bytes, where: str, budget: Budget, kind: Kind, scale: float = 1.0) -> Float[np.ndarray, "h w 3"]:

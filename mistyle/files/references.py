@@ -8,18 +8,19 @@ from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import MAX_JSON_BYTES, beside, read_bytes
 from mistyle.files.gltf_check import parse_json
 from mistyle.files.mtl_read import NAMING, read_library, statement, tile_name
-from mistyle.files.nearby import named_file, unmarked
+from mistyle.files.nearby import mesh_folders, named_file, unmarked
 from mistyle.files.obj_read import library_files
+from mistyle.files.ply_read import MAX_HEADER, texture_files
 
 
 def references(path: Path) -> list[Path]:
-    """The files that an .obj or .gltf file names, that exist and lie in its folder or below; others name none.
+    """The files that an .obj, .ply or .gltf file names, that exist and that its reader opens; others name none.
 
     A file that cannot be read names none: the reader refuses it, with the sentence that explains it.
     """
     kind = path.suffix.lower()
     try:
-        named = _of_obj(path) if kind == ".obj" else _of_gltf(path) if kind == ".gltf" else []
+        named = NAMED[kind](path) if kind in NAMED else []
     except InputRefused:
         return []
     return sorted({file for file in named if file.is_file()})
@@ -43,6 +44,15 @@ def _of_library(library: Path, path: Path) -> list[Path]:
     return found
 
 
+def _of_ply(path: Path) -> list[Path]:
+    header = read_bytes(path, count=MAX_HEADER).partition(b"end_header")[0]
+    found: list[Path] = []
+    for name in texture_files(header):
+        with suppress(InputRefused):
+            found += [named_file(path, mesh_folders(path), name)[0] or path]
+    return found
+
+
 def _of_gltf(path: Path) -> list[Path]:
     tree = parse_json(read_bytes(path, MAX_JSON_BYTES), path)
     lists: list[Any] = [tree.get("buffers"), tree.get("images")]
@@ -56,3 +66,6 @@ def _inside(path: Path, name: str) -> list[Path]:
         return [beside(path, name)]
     except InputRefused:
         return []
+
+
+NAMED = {".obj": _of_obj, ".ply": _of_ply, ".gltf": _of_gltf}
