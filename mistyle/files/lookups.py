@@ -12,12 +12,13 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.retexture import REPEAT, Wraps, wrapped
+from mistyle.core.retexture import REPEAT, Wrap, Wraps, wrapped
 from mistyle.files.bounds import WORK_TEXTURE
 from mistyle.files.raw import Maps, Raw, RawMap, RawMaterial
 
 # UVs that leave the unit square by less show nothing of what lies outside.
 OUTSIDE = 1e-3
+FARTHEST = 1e4  # tiles
 ORDER = ("albedo", "roughness", "metallic", "normal")
 WORDS = {"mirror": "mirrored", "clamp": "clamped"}
 Spans = tuple[tuple[float, float], tuple[float, float]]  # along u and along v
@@ -45,9 +46,11 @@ def plain_lookups(raw: Raw) -> Raw:
         maps = {} if material.udim else material.load(1001)[0]
         base = next((maps[name] for name in ORDER if name in maps), None)
         rows = raw.material == m
-        if base is None or not rows.any():
+        if base is None or (base.uvs is None and base.transform is None and base.wrap == REPEAT):
             continue
         lookup = looked_up(base, raw.uvs, rows)
+        if lookup is not None and not np.nanmax(np.abs(lookup)) < FARTHEST:
+            continue  # nothing to paint there; the maps are resampled from wherever that is
         wrap = REPEAT if lookup is None else effective(base.wrap, lookup)
         if lookup is None or (base.uvs is None and base.transform is None and wrap == REPEAT):
             continue
@@ -76,9 +79,9 @@ def looked_up(
     own = uvs if entry.uvs is None else entry.uvs
     if own is None or not np.isfinite(own[rows]).any():
         return None
-    lookup = own[rows].astype(np.float64)
+    lookup = own[rows]
     if entry.transform is not None:
-        lookup = lookup @ entry.transform[:2, :2].T + entry.transform[:2, 2]
+        lookup = lookup.astype(np.float64) @ entry.transform[:2, :2].T + entry.transform[:2, 2]
     return lookup
 
 
@@ -87,7 +90,11 @@ def effective(wrap: Wraps, lookup: Float[np.ndarray, "n 3 2"]) -> Wraps:
     repeat."""
     low, high = np.nanmin(lookup, axis=(0, 1)), np.nanmax(lookup, axis=(0, 1))
     inside = (low >= -OUTSIDE) & (high <= 1 + OUTSIDE)
-    return ("repeat" if inside[0] else wrap[0], "repeat" if inside[1] else wrap[1])
+
+    def shown(axis: int) -> Wrap:
+        return "repeat" if inside[axis] or wrap[axis] not in WORDS else wrap[axis]
+
+    return shown(0), shown(1)
 
 
 def framed(entry: RawMap) -> RawMap:
@@ -143,8 +150,8 @@ def _alike(entry: RawMap, plain: _Plain, uvs: Float[np.ndarray, "f 3 2"] | None,
     """Whether a map is looked up as the base map is."""
     mine, base = (uvs if e.uvs is None else e.uvs for e in (entry, plain.base))
     same_set = mine is base or (mine is not None and base is not None and np.array_equal(mine, base, equal_nan=True))
-    moves = [np.eye(3) if e.transform is None else e.transform for e in (entry, plain.base)]
-    if not same_set or not np.array_equal(*moves):
+    move, base_move = (np.eye(3) if e.transform is None else e.transform for e in (entry, plain.base))
+    if not same_set or not np.array_equal(move, base_move):
         return False
     lookup = looked_up(entry, uvs, rows)
     return lookup is not None and effective(entry.wrap, lookup) == plain.wrap

@@ -50,9 +50,10 @@ def prepare(
     check_positions(raw.positions, path)
     raw = plain_lookups(raw)
     authored = raw.uvs if raw.authored is None else raw.authored
-    work_from_user = _work_matrix(raw, path, up)
+    area = np.linalg.norm(area_vectors(raw.positions, raw.faces), axis=1)
+    work_from_user = _work_matrix(raw, area > 0, path, up)
     work = raw.positions @ work_from_user[:3, :3].T + work_from_user[:3, 3]
-    area = np.linalg.norm(area_vectors(work, raw.faces), axis=1)
+    area *= np.linalg.norm(work_from_user[0, :3]) ** 2
     if not (area > NO_AREA).any():
         raise refuse(
             path, f"{len(area)} faces, all without area", "at least one triangle with an area", "Export the mesh again"
@@ -92,12 +93,11 @@ def prepare(
     return Asset(name=path.stem, mesh=mesh, materials=materials, source=source)
 
 
-def _work_matrix(raw: Raw, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
+def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
     """Turns Z up to Y up where asked, and brings the sphere around the box of the vertices that faces with an area use
     to the unit sphere."""
     turn = Y_FROM_Z if up == "z" else np.eye(3)
-    seen = raw.faces[area_vectors(raw.positions, raw.faces).any(axis=1)]
-    used = raw.positions[np.unique(seen if len(seen) else raw.faces)] @ turn.T
+    used = raw.positions[np.unique(raw.faces[has_area] if has_area.any() else raw.faces)] @ turn.T
     centre = (used.min(axis=0) + used.max(axis=0)) / 2
     radius = float(np.linalg.norm(used - centre, axis=1).max())
     if radius <= 0:
@@ -334,7 +334,7 @@ def _placed(name: str, entry: RawMap, raw: Raw, mesh: Mesh, rows: np.ndarray, si
         return None
     wrap = effective(entry.wrap, lookup)
     entry = (framed(entry) if name == "normal" else entry).finished()
-    lookup = np.nan_to_num(lookup)
+    lookup = np.clip(np.nan_to_num(lookup), -1e6, 1e6)
     side = min(size, max(entry.values.shape[:2]))
     values, face = carry(entry.values, lookup, mesh.corner_uvs[rows], side, wrap)
     if name == "normal":
