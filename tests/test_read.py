@@ -377,9 +377,11 @@ BROKEN = {
     "e.ply": ply_ascii(["-1 0 1 2"]).encode(),
     "f.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quaternion x\nend_header\n",
     "g.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n",
+    "h.ply": ply_ascii(["2 0 1"]).replace("comment x", "comment TextureFile a.png").encode(),
     "a.stl": struct.pack("<80sI", b"", 3) + bytes(100),
     "b.stl": b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nendloop\nendfacet\nendsolid\n",
     "c.stl": b"",
+    "e.stl": b"solid a\nfacet\nvertex 0 0 0\n".ljust(34),  # as long as a binary one of -1 faces
     "d.stl": struct.pack("<80sI", b"", 1) + struct.pack("<12fH", *([float("nan")] * 12), 0),
     "a.off": b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
     "b.off": b"OFF\n3 1 0\n0 0 0\n1 0 0\n",

@@ -277,3 +277,10 @@ def test_a_broken_texture_does_not_refuse_the_mesh(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(b"\x76\x2f\x31\x01 nothing" if name == "a.exr" else b"8BPS nothing")
         asset = read_mesh(square(tmp_path, f"newmtl mat\nmap_Kd {name}\n"), uv="keep")
         assert asset.materials[0].albedo is None and any(f"{name} was left out" in n for n in asset.source.notes)
+
+
+def test_every_tile_is_a_reference(tmp_path: Path) -> None:
+    for tile in (1001, 1002, 1011):
+        quadrants(tmp_path / f"skin.{tile}.png")
+    path = square(tmp_path, "newmtl mat\nmap_Kd skin.<UDIM>.png\n")
+    assert [p.name for p in read_references(path)] == ["m.mtl", "skin.1001.png", "skin.1002.png", "skin.1011.png"]

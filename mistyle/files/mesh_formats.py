@@ -53,7 +53,7 @@ def read_stl(path: Path, max_faces: int) -> Raw:
     more = len(data) - (84 + 50 * count)
     plain = unmarked(data) if more else data
     text = re.match(rb"\s*solid\b", plain[:1024], re.IGNORECASE) and re.search(rb"\bfacet\b", plain, re.IGNORECASE)
-    if more == 0 or (not text and count > 0 and 0 < more <= MAX_PADDING):
+    if count >= 0 and (more == 0 or (count > 0 and not text and 0 < more <= MAX_PADDING)):
         too_many(count, max_faces, path)
         facet = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
         rows = np.frombuffer(data, facet, count, 84)

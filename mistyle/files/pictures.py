@@ -389,8 +389,11 @@ def _deep_tiff(
         return None
     if image.tag_v2.get(PLANES, 1) != 1:
         raise refuse(where, "a TIFF of 16 bits in separate planes", "pixels side by side", CONVERT)
-    known = image.mode in ("RGB", "RGBA")
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if known else None
+    try:
+        known = image.mode in ("RGB", "RGBA")
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if known else None
+    except cv2.error:  # what Pillow could read all the same
+        pixels = None
     if pixels is not None and pixels.dtype == np.uint16 and pixels.ndim == 3:
         values = np.asarray(pixels, np.uint16)[..., [2, 1, 0, 3][: pixels.shape[2]]]
         multiplied = image.tag_v2.get(EXTRA_SAMPLES) == (ASSOCIATED,)

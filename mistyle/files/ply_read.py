@@ -122,7 +122,7 @@ def _unrolled(counts: Int[np.ndarray, " s"], index: Int[np.ndarray, " c"]) -> In
 
 def _textured(raw: Raw, files: list[str], face: dict, polygon: Int[np.ndarray, " t"], path: Path) -> Raw:
     """The mesh with one material for every picture that its header names."""
-    if not files:
+    if not files or not len(raw.faces):
         return raw
     if raw.uvs is None:
         return replace(raw, notes=("Its header names a texture, but there are no texture coordinates for it.",))

@@ -38,9 +38,11 @@ def _of_library(library: Path, path: Path) -> list[Path]:
     for entry in read_library(library, path)[0].values():
         for key in NAMING & set(entry.values):
             file = statement(entry.values[key]).file
-            tile = tile_name(file, 1001)
+            first = tile_name(file, 1001)
             with suppress(InputRefused):
-                found += [named_file(library, entry.roots, tile or file)[0] or library]
+                target = named_file(library, entry.roots, first or file)[0]
+                if target is not None:
+                    found += [target] if first is None else target.parent.glob(target.name.replace("1001", "1???"))
     return found
 
 
@@ -49,7 +51,8 @@ def _of_ply(path: Path) -> list[Path]:
     found: list[Path] = []
     for name in texture_files(header):
         with suppress(InputRefused):
-            found += [named_file(path, mesh_folders(path), name)[0] or path]
+            target = named_file(path, mesh_folders(path), name)[0]
+            found += [] if target is None else [target]
     return found
 
 
