@@ -179,6 +179,16 @@ def test_neutral_statements_are_not_worth_a_note(tmp_path: Path) -> None:
     assert read_obj(square(tmp_path, mtl), 100).notes == ()
 
 
+KD = {"0.5": (0.5, 0.5, 0.5), "0.1 0.2 0.3": (0.1, 0.2, 0.3), "spectral a.rfl 1": (1, 1, 1)}
+
+
+@pytest.mark.parametrize("kd", KD)
+def test_colours_of_one_number_or_three(kd: str, tmp_path: Path) -> None:
+    raw = read_obj(square(tmp_path, f"newmtl mat\nKd {kd}\n"), 100)
+    assert raw.materials[0].albedo_factor == KD[kd]
+    assert raw.notes == (("Of m.mtl these statements were not read: Kd.",) if "spectral" in kd else ())
+
+
 STATEMENTS = {
     "wood.png": Statement("wood.png"),
     "-s 0.5 2 1 -o .25 0 0 a b.png": Statement("a b.png", (0.5, 2), (0.25, 0)),

@@ -170,11 +170,12 @@ def test_what_is_not_read_is_said(tmp_path: Path) -> None:
     inputs = "        int inputs:useSpecularWorkflow = 1\n        color3f inputs:specularColor = (1, 0, 0)\n"
     inputs += "        float inputs:metallic = 1\n        color3f inputs:emissiveColor = (0, 2, 0)\n"
     inputs += "        float inputs:clearcoat = 0.5\n        float inputs:opacity = 0.5\n"
-    found = read(tmp_path, plate(BOUND + "    float[] primvars:displayOpacity = [0.5]\n"), material(inputs))
+    see_through = "    float[] primvars:displayOpacity = [0.5]\n"
+    found = read(tmp_path, plate(BOUND + see_through), material(inputs))
     assert found.materials[0].metallic_factor == 0
     told = " ".join(found.notes)
     assert "specular workflow" in told and "emissiveColor and clearcoat and opacity of material 'M'" in told
-    assert "displayOpacity" in told
+    assert "displayOpacity" not in told and "displayOpacity was not read." in read(tmp_path, plate(see_through)).notes
     neutral = "        color3f inputs:emissiveColor = (0, 0, 0)\n        float inputs:opacity = 1\n"
     assert read(tmp_path, plate(BOUND), material(neutral)).notes == ()
 

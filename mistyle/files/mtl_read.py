@@ -97,7 +97,7 @@ def material(entry: Entry, budget: Budget) -> RawMaterial:
     named = {TEXTURES[k]: statement(v) for k, v in entry.values.items() if k in TEXTURES}
     bump = next((statement(entry.values[k]) for k in BUMPS if k in entry.values), None)
     textures = named | ({"bump": bump} if bump is not None else {})
-    colour = [1.0, 1.0, 1.0] if "albedo" in named else _numbers(entry, "kd", [1.0, 1.0, 1.0])
+    colour = [1.0, 1.0, 1.0] if "albedo" in named else _colour(entry)
     rough = 1.0 if "roughness" in named else _numbers(entry, "pr", [0.5])[0]
     metal = 1.0 if "metallic" in named else _numbers(entry, "pm", [0.0])[0]
     tiled = any(tile_name(texture.file, 1001) is not None for texture in textures.values())
@@ -119,7 +119,9 @@ def unread(entries: Sequence[Entry]) -> list[str]:
         if "map_d" in entry.values or any(_changes(entry, key) for key in OPACITY):
             notes.append(f"The opacity of material '{entry.name}' was not read.")
         for key in entry.values:
-            if key not in READ and key not in OPACITY and key != "map_d" and _changes(entry, key):
+            ignored = key not in READ and key not in OPACITY and key != "map_d" and _changes(entry, key)
+            odd = key == "kd" and "map_kd" not in entry.values and np.isnan(_numbers(entry, key, [np.nan])[0])
+            if ignored or odd:  # odd: a spectrum
                 left.setdefault(entry.library.name, {})[entry.spelled[key]] = None
     said = (f"Of {library} these statements were not read: {', '.join(keys)}." for library, keys in left.items())
     return [*notes, *said]
@@ -138,6 +140,12 @@ def _changes(entry: Entry, key: str) -> bool:
         return any(float(word) != NEUTRAL[key] for word in entry.values[key].split())
     except (KeyError, ValueError):
         return True
+
+
+def _colour(entry: Entry) -> list[float]:
+    """Kd: three numbers, or one for all."""
+    grey = _numbers(entry, "kd", [1.0])
+    return grey * 3 if len(entry.values.get("kd", "").split()) == 1 else _numbers(entry, "kd", [1.0] * 3)
 
 
 def _numbers(entry: Entry, key: str, default: list[float]) -> list[float]:
@@ -215,6 +223,7 @@ def _meant(name: str, said: Statement, pixels: np.ndarray, linear: bool, notes: 
     if name == "albedo" and (linear or said.space in LINEAR):
         kind, pixels = "data", np.clip(fractions(pixels), 0, 1)
     elif kind == "data":
+        pixels = np.clip(pixels, 0, 1) if linear else pixels
         pixels = _channel(linear_rows(pixels) if said.space in SRGB and said.space != "auto" else pixels, said, notes)
     if (said.base, said.gain) != (0, 1) and kind != "normal":
         pixels = np.clip(fractions(pixels) * np.float32(said.gain) + np.float32(said.base), 0, 1)

@@ -284,14 +284,18 @@ def _turned(normals: np.ndarray, linear: np.ndarray) -> Float[np.ndarray, "f 3 3
 def _bound(pxr: Any, prim: Any, shape: Polygons, number: Any, time: Any, notes: list[str]) -> Int[np.ndarray, " f"]:
     """The material of every triangle: that of its subset, else the mesh's own, else its display colour."""
     api = pxr.UsdShade.MaterialBindingAPI
-    shown = _display(pxr, prim, time, notes)
+    shown = _display(pxr, prim, time)
     of_polygon = np.full(len(shape.sizes), -1, np.int64)
     for subset in api(prim).GetMaterialBindSubsets():
         rows = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
         rows = rows[(rows >= 0) & (rows < len(of_polygon))]
         of_polygon[rows] = number(_material_of(pxr, subset.GetPrim(), notes), shown)
     if (of_polygon < 0).any():
-        of_polygon[of_polygon < 0] = number(_material_of(pxr, prim, notes), shown)
+        own = _material_of(pxr, prim, notes)
+        of_polygon[of_polygon < 0] = number(own, shown)
+        opacity = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity")
+        if not own and opacity and opacity.HasValue() and (np.array(opacity.Get(time), float) < 1).any():
+            notes.append("displayOpacity was not read.")
     return of_polygon[shape.polygon]
 
 
@@ -308,12 +312,9 @@ def _material_of(pxr: Any, prim: Any, notes: list[str]) -> Any:
     return found
 
 
-def _display(pxr: Any, prim: Any, time: Any, notes: list[str]) -> Found:
+def _display(pxr: Any, prim: Any, time: Any) -> Found:
     """What a mesh without a material shows: its display colour, by vertex where it has more than one."""
     primvars = pxr.UsdGeom.PrimvarsAPI(prim)
-    opacity = primvars.FindPrimvarWithInheritance("displayOpacity")
-    if opacity and opacity.HasValue() and (np.array(opacity.Get(time), float) < 1).any():
-        notes.append("displayOpacity was not read.")
     primvar = primvars.FindPrimvarWithInheritance("displayColor")
     values = _table(primvar, time) if primvar and primvar.HasValue() else None
     if values is None or values.shape[1] != 3:
