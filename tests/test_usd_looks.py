@@ -201,3 +201,23 @@ def test_each_material_has_its_own_coordinates(tmp_path: Path) -> None:
     found = read(tmp_path, body, material(inputs, shaders), other)
     assert found.uvs is not None and [found.materials[m].name for m in found.material] == ["M", "O"]
     assert found.uvs.tolist() == [UVS[[0, 1, 2]].tolist(), (UVS / 2)[[0, 2, 3]].tolist()]
+
+
+def test_maps_of_one_material_have_their_own_coordinates(tmp_path: Path) -> None:
+    """Roughness at another primvar, at which the picture stands upside down."""
+    pixels = np.full((8, 8, 3), 50, np.uint8)
+    pixels[:4] = 200  # above
+    Image.fromarray(pixels).save(tmp_path / "wood.png")
+    inputs, shaders = texture()
+    inputs += "        float inputs:roughness.connect = </R/M/T2.outputs:r>\n"
+    second = shaders.replace('"P"', '"P2"').replace('"T"', '"T2"').replace("/M/P.", "/M/P2.").replace('"st"', '"other"')
+    second = second.replace("float3 outputs:rgb", "float outputs:r")
+    body = plate(BOUND + primvar("other", "texCoord2f", UVS * [1, -1] + [0, 1], "vertex"))
+    path = write(tmp_path, body, material(inputs, shaders + second))
+    (found,) = read_mesh(path, uv="keep", size=8).materials
+    assert found.albedo is not None and found.roughness is not None
+    assert found.albedo[1, 4, 0] > found.albedo[6, 4, 0]
+    assert found.roughness[1, 4] == pytest.approx(50 / 255, abs=0.01)
+    assert found.roughness[6, 4] == pytest.approx(200 / 255, abs=0.01)
+    lost = read_mesh(write(tmp_path, plate(BOUND), material(inputs, shaders + second)), uv="keep", size=8)
+    assert lost.materials[0].roughness is None and any("roughness map" in note for note in lost.source.notes)

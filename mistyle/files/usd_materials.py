@@ -1,6 +1,7 @@
 """Materials of USD: UsdPreviewSurface, its constants, and its textures decoded when they are asked for."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,13 +41,28 @@ class Texture:
 
 @dataclass(frozen=True)
 class Found:
-    """A material, the primvar that its textures are looked up at (None: it has none), the primvar that is its albedo
-    (None: it is said otherwise), and the textures."""
+    """A material, the primvar that its first texture is looked up at (None: it has none), the primvar that is its
+    albedo (None: it is said otherwise), and the textures by map."""
 
     material: RawMaterial
     primvar: str | None
     colour: str | None = None
-    textures: tuple[Texture, ...] = ()
+    textures: Mapping[str, Texture] = field(default_factory=dict)
+
+    def others(self) -> dict[str, str]:
+        """The primvar of every map that is looked up at another than the first."""
+        return {kind: t.primvar for kind, t in self.textures.items() if t.primvar != self.primvar}
+
+
+def at_own_coordinates(found: Found, sets: Mapping[str, Float[np.ndarray, "f 3 2"]]) -> RawMaterial:
+    """The material whose maps are looked up at their own primvars; `sets` has the corners' coordinates by primvar."""
+    others = {kind: sets[name] for kind, name in found.others().items() if name in sets}
+    return replace(found.material, load=partial(_moved, found.material.load, others)) if others else found.material
+
+
+def _moved(load: Any, others: dict[str, np.ndarray], tile: int) -> tuple[Maps, tuple[str, ...]]:
+    maps, notes = load(tile)
+    return {k: replace(m, uvs=others[k]) if k in others else m for k, m in maps.items()}, notes
 
 
 def plain(name: str, albedo: tuple[float, float, float] = (1.0, 1.0, 1.0), colour: str | None = None) -> Found:
@@ -60,7 +76,9 @@ def outside(found: Found, uvs: Float[np.ndarray, "n 3 2"] | None) -> list[str]:
     notes = []
     if uvs is None or not np.isfinite(uvs).any():
         return notes
-    for texture in found.textures:
+    for texture in found.textures.values():
+        if texture.primvar != found.primvar:
+            continue
         matrix = np.eye(3) if texture.transform is None else texture.transform
         lookup = uvs.astype(np.float64) @ matrix[:2, :2].T + matrix[:2, 2]
         leaves = (np.nanmin(lookup, axis=(0, 1)) < -OUTSIDE) | (np.nanmax(lookup, axis=(0, 1)) > 1 + OUTSIDE)
@@ -102,11 +120,6 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
         )
         textures.pop("metallic", None)
         constants["metallic"] = 0.0
-    primvars = [t.primvar for t in textures.values()]
-    if len(set(primvars)) > 1:
-        other = sorted(kind for kind, t in textures.items() if t.primvar != primvars[0])
-        notes.append(f"Textures of material '{name}' use several UV sets; {', '.join(other)} was left out.")
-        textures = {kind: t for kind, t in textures.items() if t.primvar == primvars[0]}
     white = "albedo" in textures or colour is not None
     albedo = (1.0, 1.0, 1.0) if white else tuple(float(np.clip(c, 0, 1)) for c in constants["albedo"])
     tiled = any("<UDIM>" in t.file for t in textures.values())
@@ -118,7 +131,7 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
         1.0 if "roughness" in textures else float(np.clip(constants["roughness"], 0, 1)),
         1.0 if "metallic" in textures else float(np.clip(constants["metallic"], 0, 1)),
     )
-    return Found(made, primvars[0] if textures else None, colour, tuple(textures.values()))
+    return Found(made, next((t.primvar for t in textures.values()), None), colour, textures)
 
 
 def _differs(value: Any, neutral: float) -> bool:

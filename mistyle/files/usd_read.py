@@ -21,7 +21,7 @@ from mistyle.files.polygons import check_indices, check_positions, too_many, tri
 from mistyle.files.raw import Raw
 from mistyle.files.usd import library
 from mistyle.files.usd_layers import check_layers, said, textures_named
-from mistyle.files.usd_materials import Found, outside, plain, read_material
+from mistyle.files.usd_materials import Found, at_own_coordinates, outside, plain, read_material
 
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 UV_NAMES = ("st", "UVMap", "map1", "uv")
@@ -55,6 +55,7 @@ class _Piece:
     uvs: np.ndarray | None
     material: np.ndarray
     colours: np.ndarray | None
+    others: dict[str, np.ndarray]
 
 
 def open_stage(pxr: Any, path: Path) -> Any:
@@ -125,6 +126,9 @@ def _raw(pieces: list[_Piece], materials: list[Found], notes: list[str], path: P
 
     material, uvs = np.concatenate([p.material for p in pieces]), joined("uvs", 2)
     used = np.unique(material)
+    missing = [np.full((len(p.faces), 3, 2), np.nan, np.float32) for p in pieces]
+    names = dict.fromkeys(name for k in used for name in materials[k].others().values())
+    others = {n: np.concatenate([p.others.get(n, no) for p, no in zip(pieces, missing, strict=True)]) for n in names}
     notes += [note for k in used for note in outside(materials[k], None if uvs is None else uvs[material == k])]
     return Raw(
         kind="usd",
@@ -133,7 +137,7 @@ def _raw(pieces: list[_Piece], materials: list[Found], notes: list[str], path: P
         normals=joined("normals", 3),
         uvs=uvs,
         material=np.searchsorted(used, material),
-        materials=tuple(materials[k].material for k in used),
+        materials=tuple(at_own_coordinates(materials[k], others) for k in used),
         primitives=tuple(
             Primitive(-1, -1, -1, int(a), int(b), -1, -1, -1, int(f), p.name)
             for p, a, b, f in zip(pieces, starts[:-1], starts[1:], first, strict=True)
@@ -271,6 +275,7 @@ def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, n
         uvs=_uvs(pxr, mesh, shape, material, materials, time, notes),
         material=material,
         colours=_colours(pxr, mesh, shape, material, materials, time, notes),
+        others=_other_uvs(pxr, mesh, shape, material, materials, time, notes),
     )
 
 
@@ -363,6 +368,16 @@ def _uvs(pxr, mesh, shape: Polygons, material, materials: list[Found], time, not
             rows = np.isin(material, [k for k, m in enumerate(materials) if m.primvar == name])
             result[rows] = values[rows]
     return result
+
+
+def _other_uvs(pxr, mesh, shape, material, materials: list[Found], time, notes: list[str]) -> dict[str, np.ndarray]:
+    """The coordinates that maps of the triangles' materials have beside those of the first map, by primvar."""
+    found = {}
+    for name in dict.fromkeys(n for k in np.unique(material) for n in materials[k].others().values()):
+        primvar = pxr.UsdGeom.PrimvarsAPI(mesh).FindPrimvarWithInheritance(name)
+        if primvar and primvar.HasValue() and _is_pair(primvar):
+            found[name] = _spread(_table(primvar, time), primvar.GetInterpolation(), shape, 2, "UVs", notes)
+    return {name: values for name, values in found.items() if values is not None}
 
 
 def _colours(pxr, mesh, shape: Polygons, material, materials: list[Found], time, notes: list[str]) -> np.ndarray | None:
