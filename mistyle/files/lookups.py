@@ -38,7 +38,7 @@ def plain_lookups(raw: Raw) -> Raw:
     """The mesh with UVs at which its materials' base maps repeat: transforms applied, other wrap modes unrolled.
 
     A material's base map is its albedo, or the first map that it has. Maps that are looked up like the base map stay
-    texel by texel; the others keep their own lookup, which `placed` in files/prepare.py resamples. Materials of UDIM
+    texel by texel; the others keep their own lookup, which `_placed` in files/prepare.py resamples. Materials of UDIM
     tiles, whose UVs say which texture is meant, are left alone.
     """
     uvs, materials, notes = raw.uvs, list(raw.materials), list(raw.notes)
@@ -56,13 +56,10 @@ def plain_lookups(raw: Raw) -> Raw:
             continue
         plain = _Plain(base, wrap, _spans(lookup, wrap, base.values.shape[:2]))
         low, high = np.array(plain.spans).T
-        uvs = (
-            np.full((len(raw.faces), 3, 2), np.nan, np.float32)
-            if uvs is None
-            else uvs.copy()
-            if uvs is raw.uvs
-            else uvs
-        )
+        if uvs is None:
+            uvs = np.full((len(raw.faces), 3, 2), np.nan, np.float32)
+        elif uvs is raw.uvs:
+            uvs = uvs.copy()
         uvs[rows] = (lookup - low) / (high - low)
         materials[m] = replace(material, load=partial(_load, material.load, plain, raw.uvs, rows))
         notes += _notes(material, plain)

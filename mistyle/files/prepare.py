@@ -20,7 +20,7 @@ from mistyle.core.uvs import Layout, Verdict, arrange
 from mistyle.files.bounds import refuse
 from mistyle.files.lookups import effective, framed, looked_up, plain_lookups
 from mistyle.files.polygons import check_positions
-from mistyle.files.raw import Raw, RawMap
+from mistyle.files.raw import Extent, Raw, RawMap
 
 # Faces below this area in the unit sphere have none that anything could be computed from (float32 positions).
 NO_AREA = 1e-13
@@ -40,6 +40,46 @@ class _Plan:
     layout: Layout | None
     reason: str
     carried: bool = True
+
+
+def extent(raw: Raw, path: Path, uv: UnwrapMode, size: int) -> Extent:
+    """What `prepare` would make of a file, without unwrapping it; refuses what that refuses on the way."""
+    check_positions(raw.positions, path)
+    raw = plain_lookups(raw)
+    area = np.linalg.norm(area_vectors(raw.positions, raw.faces), axis=1)
+    points, unwrapped, sets, own = same_points(raw.positions), 0, 0, 0
+    for m, material in enumerate(raw.materials):
+        plan = _plan(raw, m, points, area, uv, path, [])
+        unwrapped += 0 if plan.layout is not None else len(_own(raw, plan.rows))
+        tiles = [1001] if plan.layout is None else np.unique(plan.layout.tile).tolist()
+        sets += len(tiles)
+        tinted = raw.colours is not None and not _one_colour(raw.colours[plan.rows])
+        for maps in (material.load(tile)[0] for tile in tiles):
+            sides = {name: _side(entry, raw, plan, size) for name, entry in maps.items()}
+            if tinted:
+                sides["albedo"] = _tinted_side(sides.get("albedo"), size)
+            channels = {name: 3 if name in ("albedo", "normal") else 1 for name in sides}
+            own += sum(4 * height * width * channels[name] for name, (height, width) in sides.items())
+    return Extent(len(raw.faces), unwrapped, sets, own)
+
+
+def _side(entry: RawMap, raw: Raw, plan: _Plan, size: int) -> tuple[int, int]:
+    """Height and width of a map in the asset: its own, or the square that `_placed` makes."""
+    height, width = entry.values.shape[:2]
+    if not plan.carried and _is_plain(entry, raw.uvs, plan.rows):
+        return height, width
+    side = min(size, max(height, width))
+    return side, side
+
+
+def _tinted_side(albedo: tuple[int, int] | None, size: int) -> tuple[int, int]:
+    """Height and width of an albedo with vertex colours in it."""
+    side = max((size, *(albedo or ())))
+    return side, side
+
+
+def _one_colour(colours: Float[np.ndarray, "f 3 3"]) -> bool:
+    return bool(np.ptp(colours, axis=(0, 1)).max() < ONE_COLOUR)
 
 
 def prepare(
@@ -317,13 +357,12 @@ def _tinted(
 ) -> tuple[Float[np.ndarray, "h2 w2 3"] | None, Float[np.ndarray, "3"]]:
     """Albedo and its factor, multiplied by the colours of the faces' corners. One colour for all goes into the factor,
     others into a texture of `size` texels along a side, or more where the albedo has more."""
-    low, high = colours.min(axis=(0, 1)), colours.max(axis=(0, 1))
-    if (high - low).max() < ONE_COLOUR:
-        return albedo, factor * (low + high) / 2
-    side = size if albedo is None else max(size, *albedo.shape[:2])
-    tint = carry_corners(colours, uvs, side)
+    if _one_colour(colours):
+        return albedo, factor * (colours.min(axis=(0, 1)) + colours.max(axis=(0, 1))) / 2
+    shape = _tinted_side(None if albedo is None else albedo.shape[:2], size)
+    tint = carry_corners(colours, uvs, shape[0])
     if albedo is not None:
-        tint *= resize(albedo, (side, side), "repeat")
+        tint *= resize(albedo, shape, "repeat")
     return tint, factor
 
 

@@ -109,6 +109,17 @@ class Raw:
 
 
 @dataclass(frozen=True)
+class Extent:
+    """How large the asset of a file will be: faces, those of them that will be unwrapped anew, texture sets, and bytes
+    of its own maps as float32."""
+
+    faces: int
+    unwrapped: int = 0
+    sets: int = 1
+    own: int = 0
+
+
+@dataclass(frozen=True)
 class Corners:
     """What several corners share, stored once: corner c of face f has `values[index[f, c]]`."""
 
