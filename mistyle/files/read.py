@@ -11,6 +11,7 @@ read here: it can name any file and plugin and is trusted like code.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,7 +22,7 @@ from mistyle.core.asset import Asset, Picture, Pixels
 from mistyle.files.bounds import refuse
 from mistyle.files.layers import Frame, frame_of
 from mistyle.files.pictures import picture_of
-from mistyle.files.raw import spelled
+from mistyle.files.raw import Extent, Raw, spelled
 from mistyle.files.reader_process import ask
 
 __all__ = [
@@ -32,6 +33,7 @@ __all__ = [
     "read_colmap",
     "read_colmap_points",
     "read_exr",
+    "read_extent",
     "read_frame",
     "read_gltf_alpha",
     "read_hdr",
@@ -76,6 +78,7 @@ def read_mesh(
     up: Literal["y", "z"] = "y",
     max_faces: int = 5_000_000,
     size: int = 2048,
+    lit: bool = False,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Asset:
     """A mesh file as an asset: vertex and face order as in the file, bounding sphere of radius 1, Y up.
@@ -85,24 +88,44 @@ def read_mesh(
     up        "z" turns a mesh modelled with Z up
     max_faces refuses larger meshes (and more than three times as many vertices)
     size      the atlas size that a new unwrapping's padding is meant for
+    lit       writing a glTF result takes KHR_materials_unlit from its painted materials
     progress  hears a share of 1; reading takes the first tenth, unwrapping most of the rest
 
     OBJ, PLY, STL, OFF, GLB, glTF and USD, each without merging or reordering vertices (STL, which repeats them, is
     joined and says so). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees
-    (glTF: flat, as it demands). One part per material and UDIM tile. Not read: morph targets (the base
-    shape is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression (refused).
+    (glTF: flat, as it demands). One part per material and UDIM tile. Texture transforms, wrap modes and vertex colours
+    are resolved: the maps repeat at the mesh's UVs, the albedo has the colours in it. Not read: morph targets (the base
+    shape is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression without a plain copy
+    (refused).
     """
+    from mistyle.files.prepare import prepare
+
     path = Path(path)
+    asset = prepare(_raw(path, max_faces), path, uv, up, size, progress)
+    return replace(asset, source=replace(asset.source, lit=lit)) if lit else asset
+
+
+def _raw(path: Path, max_faces: int) -> Raw:
+    """What the file says, checked."""
     kind = path.suffix.lower()
     if kind not in MESHES:
         found = f"a file ending in '{kind}'" if kind else "a file without an ending"
         raise refuse(path, found, f"one of {' '.join(MESHES)}", "Export the mesh as .glb or .obj")
     from mistyle.files.polygons import check_indices
-    from mistyle.files.prepare import prepare
 
     raw = spelled(ask("mesh", path, MESHES[kind], max_faces))
     check_indices(raw.faces, len(raw.positions), path, "vertex")
-    return prepare(raw, path, uv, up, size, progress)
+    return raw
+
+
+def read_extent(
+    path: Path, *, uv: Literal["keep", "new", "auto"] = "auto", max_faces: int = 5_000_000, size: int = 2048
+) -> Extent:
+    """How large the asset of `read_mesh` will be: its faces, texture sets and own maps; nothing is unwrapped."""
+    from mistyle.files.prepare import extent
+
+    path = Path(path)
+    return extent(_raw(path, max_faces), path, uv, size)
 
 
 def read_usd_files(path: Path) -> list[Path]:
