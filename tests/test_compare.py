@@ -155,6 +155,23 @@ def test_parts_and_data_windows(tmp_path, capsys, rng):
     assert record["rows"][0]["values"]["relmse"] == pytest.approx(expected, rel=1e-4)
 
 
+@pytest.mark.parametrize("window", ["display", "overlap"])
+def test_one_overscan_written_two_ways(window, tmp_path, capsys, rng):
+    """The same picture with its display window at another place: data from -4 or from 0."""
+    rgb = picture(rng)
+    height, width = rgb.shape[:2]
+    for name, at in (("a.exr", 0), ("b.exr", 4)):
+        corners = {"dataWindow": (at - 4, at - 4, at + width - 5, at + height - 5)}
+        corners["displayWindow"] = (at, at, at + width - 9, at + height - 9)
+        header = {k: (np.array(v[:2], np.int32), np.array(v[2:], np.int32)) for k, v in corners.items()}
+        channels = {c: np.ascontiguousarray(rgb[..., k]) for k, c in enumerate("RGB")}
+        OpenEXR.File([OpenEXR.Part(header, channels)]).write(str(tmp_path / name))
+    words = (tmp_path / "a.exr", tmp_path / "b.exr", "-o", tmp_path / "out", "--metrics", "relmse")
+    code, record, _ = run(capsys, *words, "--window", window)
+    expected = [width - 8, height - 8] if window == "display" else [width, height]
+    assert code == 0 and record["rows"][0]["values"]["relmse"] == 0 and record["rows"][0]["size"] == expected
+
+
 def test_straight_alpha_is_multiplied_in(tmp_path, capsys):
     """A PNG of linear 0.2140411 (sRGB 0.5) at alpha 0.5 is the EXR's premultiplied half of it."""
     png = np.full((16, 16, 4), 0.5, np.float32)

@@ -14,8 +14,9 @@ from PIL import Image
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
 from mistyle.files import bounds
-from mistyle.files.mesh_formats import read_off, read_ply, read_stl
+from mistyle.files.mesh_formats import read_off, read_stl
 from mistyle.files.obj_read import read_obj
+from mistyle.files.ply_read import read_ply
 from mistyle.files.polygons import fan, triangulate
 from mistyle.files.read import read_json, read_mesh
 
@@ -30,7 +31,7 @@ NASTY = {
     "capsule.obj": (10200, "capsule.mtl is not there"),
     "chair_model.obj": (12756, "repeats many times"),
     "empty.obj": "no faces",
-    "nancolor.obj": (12, "Vertex colours were not read"),
+    "nancolor.obj": (12, "were taken into its albedo"),
     "no_indices_3storybuilding.glb": (72, "has no UVs"),
     "notenoughindices.obj": (1, "fewer than three corners"),
     "obj_points.obj": "8 vertices and no faces",
@@ -376,9 +377,11 @@ BROKEN = {
     "e.ply": ply_ascii(["-1 0 1 2"]).encode(),
     "f.ply": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty quaternion x\nend_header\n",
     "g.ply": b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\n",
+    "h.ply": ply_ascii(["2 0 1"]).replace("comment x", "comment TextureFile a.png").encode(),
     "a.stl": struct.pack("<80sI", b"", 3) + bytes(100),
     "b.stl": b"solid a\nfacet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nendloop\nendfacet\nendsolid\n",
     "c.stl": b"",
+    "e.stl": b"solid a\nfacet\nvertex 0 0 0\n".ljust(34),  # as long as a binary one of -1 faces
     "d.stl": struct.pack("<80sI", b"", 1) + struct.pack("<12fH", *([float("nan")] * 12), 0),
     "a.off": b"OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n",
     "b.off": b"OFF\n3 1 0\n0 0 0\n1 0 0\n",

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+import tifffile
 from helpers import data
 from hypothesis import given
 from hypothesis import strategies as st
@@ -74,7 +75,7 @@ def test_alpha_palettes_and_grey(tmp_path: Path) -> None:
     assert shown.alpha is not None and np.array_equal(shown.alpha == 0, np.asarray(palette) == 0)
 
 
-def png16(pixels: np.ndarray) -> bytes:
+def png16(pixels: np.ndarray, profile: bytes | None = None) -> bytes:
     """A 16-bit PNG, written by hand."""
     height, width, channels = pixels.shape
     kind = {1: 0, 2: 4, 3: 2, 4: 6}[channels]
@@ -84,7 +85,9 @@ def png16(pixels: np.ndarray) -> bytes:
         return struct.pack(">I", len(content)) + name + content + struct.pack(">I", zlib.crc32(name + content))
 
     head = struct.pack(">IIBBBBB", width, height, 16, kind, 0, 0, 0)
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    colours = b"" if profile is None else chunk(b"iCCP", b"p\0\0" + zlib.compress(profile))
+    start = b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + colours
+    return start + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 4])
@@ -133,15 +136,15 @@ def test_profiles_and_cmyk_are_converted(tmp_path: Path) -> None:
     assert red.rgb[2, 2] == pytest.approx([1, 0, 0], abs=8 * STEP) and "CMYK" in red.notes[0]
 
 
-def wide_gamut() -> bytes:
-    """A minimal matrix profile: sRGB's primaries with red and green exchanged, gamma 1."""
+def wide_gamut(curve: bytes = b"curv\0\0\0\0\0\0\0\0") -> bytes:
+    """A minimal matrix profile: sRGB's primaries with red and green exchanged, gamma 1 or another curve."""
     columns = {b"rXYZ": (0.3851, 0.7169, 0.0971), b"gXYZ": (0.4361, 0.2225, 0.0139), b"bXYZ": (0.1431, 0.0606, 0.7141)}
     tags = {b"wtpt": (0.9642, 1.0, 0.8249), **columns}
     fixed = {k: b"XYZ \0\0\0\0" + struct.pack(">3i", *(round(x * 65536) for x in v)) for k, v in tags.items()}
     text = b"swapped\0"
     fixed[b"desc"] = b"desc\0\0\0\0" + struct.pack(">I", len(text)) + text + bytes(79)
     fixed[b"cprt"] = b"text\0\0\0\0none\0\0\0\0"
-    fixed[b"rTRC"] = fixed[b"gTRC"] = fixed[b"bTRC"] = b"curv\0\0\0\0\0\0\0\0"
+    fixed[b"rTRC"] = fixed[b"gTRC"] = fixed[b"bTRC"] = curve
     table, body = b"", b""
     start = 128 + 4 + 12 * len(fixed)
     for name, content in fixed.items():
@@ -163,6 +166,78 @@ def test_an_embedded_profile_changes_the_colours(tmp_path: Path) -> None:
     Image.fromarray(pixels).save(tmp_path / "a.png", icc_profile=wide_gamut())
     picture = read_picture(tmp_path / "a.png")
     assert picture.rgb[0, 0] == pytest.approx([0, 1, 0], abs=6 * STEP) and "'swapped'" in picture.notes[0]
+
+
+def parametric() -> bytes:
+    """`wide_gamut` with curves of sRGB's kind and other numbers: type 3, ((x + 0.1) / 1.1)^2, below 0.1 x / 4."""
+    numbers = struct.pack(">5i", *(round(x * 65536) for x in (2, 1 / 1.1, 0.1 / 1.1, 0.25, 0.1)))
+    return wide_gamut(b"para\0\0\0\0\0\3\0\0" + numbers)
+
+
+def tabled() -> bytes:
+    table = np.rint(np.linspace(0, 1, 257) ** 1.8 * 65535).astype(">u2").tobytes()
+    return wide_gamut(b"curv\0\0\0\0" + struct.pack(">I", 257) + table)
+
+
+PROFILES = [wide_gamut(), parametric(), tabled(), wide_gamut(b"curv\0\0\0\0\0\0\0\1\1\x80\0\0")]
+
+
+@pytest.mark.parametrize("profile", PROFILES, ids=["linear", "parametric", "table", "gamma 1.5"])
+def test_profiles_of_16_bits_as_those_of_8(profile: bytes, tmp_path: Path) -> None:
+    """The same values with the same profile are the same picture, in PNG and TIFF (littleCMS converts 8 bits)."""
+    values = colours(3, (24, 16))
+    Image.fromarray(values).save(tmp_path / "a.png", icc_profile=profile)
+    expected = read_picture(tmp_path / "a.png")
+    deep = values.astype(np.uint16) * 257
+    (tmp_path / "b.png").write_bytes(png16(deep, profile))
+    tifffile.imwrite(tmp_path / "b.tif", deep, photometric="rgb", iccprofile=profile)
+    for name in ("b.png", "b.tif"):
+        found = read_picture(tmp_path / name)
+        assert found.notes == expected.notes and "'swapped'" in found.notes[0]
+        assert found.rgb == pytest.approx(expected.rgb, abs=1.1 * STEP)
+        assert np.abs(found.rgb - expected.rgb).mean() < 0.3 * STEP
+
+
+def test_a_profile_of_16_bits_that_does_not_fit(tmp_path: Path) -> None:
+    deep = np.full((4, 4, 1), 30000, np.uint16)
+    for name, profile in (("a.png", wide_gamut()), ("b.png", b"junk"), ("c.png", wide_gamut()[:200])):
+        (tmp_path / name).write_bytes(png16(deep, profile))
+        picture = read_picture(tmp_path / name)
+        assert "could not be used" in picture.notes[0] and picture.rgb[0, 0] == pytest.approx([30000 / 65535] * 3)
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_tiff_of_16_bits(orientation: int, tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 65536, (4, 6, 3)).astype(np.uint16)
+    extra = [(274, "H", 1, orientation, True)]
+    tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="rgb", byteorder=">", extratags=extra)
+    tifffile.imwrite(tmp_path / "b.tif", (pixels >> 8).astype(np.uint8), photometric="rgb", extratags=extra)
+    for how in ("upright", "stored"):
+        deep, eight = (read_picture(tmp_path / name, how) for name in ("a.tif", "b.tif"))
+        assert np.array_equal(np.rint(deep.rgb * 65535) // 256, np.rint(eight.rgb * 255)) and deep.notes == eight.notes
+        assert len(np.unique(deep.rgb)) == len(np.unique(pixels))
+
+
+@pytest.mark.parametrize("kind", ["unassalpha", "assocalpha"])
+def test_alpha_of_tiff_of_16_bits(kind: str, tmp_path: Path) -> None:
+    straight = np.array([[[40000, 20000, 999, 32768], [65535, 1, 2, 65535]]], np.uint16)
+    stored = straight.copy()
+    if kind == "assocalpha":
+        stored[..., :3] = np.rint(straight[..., :3] * (straight[..., 3:] / 65535))
+    tifffile.imwrite(tmp_path / "a.tif", stored, photometric="rgb", extrasamples=[kind])
+    picture = read_picture(tmp_path / "a.tif")
+    assert picture.rgb == pytest.approx(straight[..., :3] / 65535, abs=2e-5)
+    assert picture.alpha == pytest.approx(straight[..., 3] / 65535, abs=1e-6)
+
+
+def test_what_is_cut_to_8_bits_is_said(tmp_path: Path) -> None:
+    pixels = np.random.default_rng(0).integers(0, 65536, (4, 6, 4)).astype(np.uint16)
+    tifffile.imwrite(tmp_path / "a.tif", pixels, photometric="separated")
+    assert "A TIFF with more than 8 bits a channel was read at 8 bits." in read_picture(tmp_path / "a.tif").notes
+    # Both decoders mix up planes that stand one after another.
+    tifffile.imwrite(tmp_path / "b.tif", np.moveaxis(pixels[..., :3], 2, 0), photometric="rgb", planarconfig="separate")
+    with pytest.raises(InputRefused, match="separate planes"):
+        read_picture(tmp_path / "b.tif")
 
 
 def test_animations_show_their_first_frame(tmp_path: Path) -> None:
@@ -304,6 +379,40 @@ def test_radiance_files(tmp_path: Path) -> None:
     path.write_bytes(b"hello")
     with pytest.raises(InputRefused, match="no Radiance header"):
         read_hdr(path)
+
+
+def runs(row: bytes) -> bytes:
+    """One component of a row, run-length encoded as Radiance has it."""
+    result, at = b"", 0
+    while at < len(row):
+        same = next((k for k in range(at, len(row)) if row[k] != row[at]), len(row)) - at
+        count = min(same, 127)
+        result += bytes([128 + count, row[at]]) if count > 2 else bytes([1, row[at]])
+        at += count if count > 2 else 1
+    return result
+
+
+@pytest.mark.parametrize("width", [3, 40])
+def test_radiance_files_of_xyz(width: int, tmp_path: Path) -> None:
+    """Rows that are plain and rows that are run-length encoded; white of D65 is (1, 1, 1)."""
+    quads = np.full((2, width, 4), (122, 128, 139, 129), np.uint8)
+    quads[:, width // 2 :] = (64, 32, 2, 130)
+    quads[1, 0] = 0
+    head = f"#?RADIANCE\nFORMAT=32-bit_rle_xyze\n\n-Y 2 +X {width}\n".encode()
+    marks = bytes([2, 2, 0, width])
+    coded = [marks + b"".join(runs(row[:, k].tobytes()) for k in range(4)) for row in quads]
+    rows = coded if width > 8 else [row.tobytes() for row in quads]
+    path = tmp_path / "a.hdr"
+    path.write_bytes(head + b"".join(rows))
+    found = read_hdr(path)
+    assert found[0, 0] == pytest.approx([1, 1, 1], abs=0.02) and found[1, 0].tolist() == [0, 0, 0]
+    x, y, z = np.array([64, 32, 2]) / 64
+    red, blue = 3.2406 * x - 1.5372 * y - 0.4986 * z, max(0.0557 * x - 0.204 * y + 1.057 * z, 0)
+    assert found[0, -1] == pytest.approx([red, 0, blue], rel=1e-3)
+    for cut in (1, 4, 5):
+        path.write_bytes((head + b"".join(rows))[:-cut])
+        with pytest.raises(InputRefused, match="XYZE"):
+            read_hdr(path)
 
 
 def test_a_real_environment_map() -> None:

@@ -4,7 +4,7 @@ Colours are linear Rec.709 as stored, premultiplied by alpha (EXR is; PNG and it
 here, in linear light). Nothing is resampled, tone-mapped or clipped, and NaN and infinities stay.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -39,6 +39,13 @@ class Layer:
     kind: Literal["colour", "data"]
     window: Window
     display: Window
+
+    def moved(self, x: int, y: int) -> "Layer":
+        """The same picture with both windows moved to the right and down."""
+        if (x, y) == (0, 0):
+            return self
+        data, shown = ((a + x, b + y, width, height) for a, b, width, height in (self.window, self.display))
+        return replace(self, window=data, display=shown)
 
     def values(self, window: Window | None = None) -> Float[np.ndarray, "h w c"]:
         """float32 values over `window` (None: the display window), zero where the file has no data."""

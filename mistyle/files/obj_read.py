@@ -1,7 +1,6 @@
-"""Wavefront OBJ and MTL, keeping vertex and face order, corner normals and UVs."""
+"""Wavefront OBJ, keeping vertex and face order, corner normals and UVs."""
 
 import re
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -9,38 +8,34 @@ from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive
 from mistyle.core.errors import InputRefused
-from mistyle.files.bounds import beside, read_bytes, refuse
-from mistyle.files.pictures import Budget, texture
+from mistyle.files.bounds import read_bytes, refuse
+from mistyle.files.colours import coloured, linear_colours
+from mistyle.files.mtl_read import Entry, material, read_library, unread
+from mistyle.files.nearby import decoded, mesh_folders, named_file, unmarked
+from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_positions, parse_numbers, too_many, triangulate
-from mistyle.files.raw import Maps, Raw, RawMap, RawMaterial, no_textures
-from mistyle.files.texels import Kind
+from mistyle.files.raw import Raw, RawMaterial, no_textures
 
-MAX_LIBRARY_BYTES = 16 << 20
 AGAIN = "Export the mesh again as OBJ with triangles or convex polygons"
-TEXTURES = {
-    b"map_kd": "albedo",
-    b"map_pr": "roughness",
-    b"map_pm": "metallic",
-    b"norm": "normal",
-}
 STATED = (b"usemtl", b"o", b"g")  # statements that hold for all faces until the next one
-# Options of a texture statement and how many values follow; the file name is what comes after them.
-OPTIONS = {b"-mm": 2, b"-o": 3, b"-s": 3, b"-t": 3, b"-blendu": 1, b"-blendv": 1, b"-boost": 1, b"-texres": 1}
-OPTIONS |= {b"-clamp": 1, b"-bm": 1, b"-imfchan": 1, b"-type": 1, b"-cc": 1}
+LINES = {b"l", b"p"}
+FREE_FORM = {b"vp", b"cstype", b"deg", b"bmat", b"step", b"curv", b"curv2", b"surf", b"parm", b"trim", b"hole", b"scrv"}
+FREE_FORM |= {b"sp", b"end", b"con", b"bzp", b"bsp", b"cdc", b"cdp", b"res"}
+# What says nothing about looks here: smoothing and merging groups, levels of detail, and rendering of old programs.
+WITHOUT_LOOKS = {b"s", b"mg", b"lod", b"bevel", b"c_interp", b"d_interp", b"ctech", b"stech", b"shadow_obj"}
+WITHOUT_LOOKS |= {b"trace_obj", b"maplib", b"usemap"}
 
 
 def read_obj(path: Path, max_faces: int) -> Raw:
-    """Polygons become fans around their first corner (concave ones are cut into ears), in file order. Lines, points and
-    free-form surfaces are left out; so are faces with fewer than three corners, with a note. Vertex colours are not
-    read."""
-    data = re.sub(rb"\\\r?\n", b" ", read_bytes(path))
+    """Polygons become fans around their first corner (concave ones are cut into ears), in file order. Lines, points,
+    free-form surfaces and faces with fewer than three corners are left out, with a note. Vertex colours (v x y z r g b)
+    are the albedo where there is no texture of it."""
+    data = re.sub(rb"\\\r?\n", b" ", unmarked(read_bytes(path)))
     lines, notes = _sorted_lines(data), []
     positions = _table(lines[b"v"], 3, path, "vertices")
     if len(lines[b"f"]) == 0:
         fix = "Export the mesh with its faces"
         raise refuse(path, f"{len(positions)} vertices and no faces", "at least one triangle", fix)
-    if max((len(line.split()) for line in lines[b"v"][:1]), default=3) >= 6:
-        notes.append("Vertex colours were not read.")
     too_many(len(positions), 3 * max_faces, path, "vertices")
     corners, sizes = _corners(lines, path, max_faces)
     small = int((sizes < 3).sum())
@@ -54,9 +49,12 @@ def read_obj(path: Path, max_faces: int) -> Raw:
     material, names = _stated(lines[b"usemtl"], lines[b"usemtl_at"], polygon)
     kind = b"o" if lines[b"o"] else b"g"
     thing, things = _stated(lines[kind], lines[kind + b"_at"], polygon)
-    library, said = _libraries(lines[b"mtllib"], path)
-    budget = Budget(path)
-    materials = tuple(library[n](budget) if n in library else _plain(n) for n in names)
+    materials, said = _materials(names, lines, path)
+    notes += said
+    colours = _colours(lines[b"v"], path)
+    if colours is not None:
+        colours, materials, said = coloured(colours[index[..., 0]], material, materials)
+        notes += said
     return Raw(
         kind="obj",
         positions=positions,
@@ -66,7 +64,8 @@ def read_obj(path: Path, max_faces: int) -> Raw:
         material=material,
         materials=materials,
         primitives=_runs(material, thing, things),
-        notes=(*notes, *said),
+        notes=(*notes, *_left_out(lines)),
+        colours=colours,
     )
 
 
@@ -76,14 +75,15 @@ def _plain(name: str) -> RawMaterial:
 
 def _sorted_lines(data: bytes) -> dict[bytes, list]:
     """The statements' arguments by keyword; `usemtl_at`, `o_at` and `g_at` hold the number of faces before each,
-    `counts` the numbers of v, vt and vn before each face (only where faces count backwards)."""
-    found: dict[bytes, list] = {k: [] for k in (b"v", b"vt", b"vn", b"f", b"mtllib", b"counts")}
+    `others` all other keywords, `counts` the numbers of v, vt and vn before each face (where faces count backwards)."""
+    found: dict[bytes, list] = {k: [] for k in (b"v", b"vt", b"vn", b"f", b"mtllib", b"counts", b"others")}
     found |= {k: [] for name in STATED for k in (name, name + b"_at")}
+    others: dict[bytes, None] = {}
     v, vt, vn, f = found[b"v"], found[b"vt"], found[b"vn"], found[b"f"]
     backwards = re.search(rb"^[ \t]*f[ \t][^\n]*-", data, re.MULTILINE) is not None
     for line in data.splitlines():
         parts = line.split(None, 1)
-        if len(parts) < 2:
+        if len(parts) < 2 or parts[0].startswith(b"#"):
             if parts and parts[0] in STATED:
                 found[parts[0]].append(b"")
                 found[parts[0] + b"_at"].append(len(f))
@@ -100,7 +100,9 @@ def _sorted_lines(data: bytes) -> dict[bytes, list]:
         elif keyword in STATED:
             found[keyword].append(rest.strip())
             found[keyword + b"_at"].append(len(f))
-    return found
+        else:
+            others[keyword] = None
+    return found | {b"others": list(others)}
 
 
 def _table(lines: list[bytes], width: int, path: Path, what: str) -> Float[np.ndarray, "n w"]:
@@ -117,6 +119,17 @@ def _table(lines: list[bytes], width: int, path: Path, what: str) -> Float[np.nd
     if short is not None:
         raise refuse(path, f"line {short + 1} of its {what} with {len(rows[short])} numbers", f"{width}", AGAIN)
     return parse_numbers(b" ".join(b" ".join(row) for row in rows), path, what).reshape(-1, width)
+
+
+def _colours(lines: list[bytes], path: Path) -> Float[np.ndarray, "v 3"] | None:
+    """Linear vertex colours, white for vertices that have none; None where no vertex has any."""
+    if max((line.count(b" ") + line.count(b"\t") for line in lines), default=0) < 5:
+        return None
+    rows = [line.partition(b"#")[0].split()[3:6] for line in lines]
+    if not any(len(row) == 3 for row in rows):
+        return None
+    text = b" ".join(b" ".join(row) if len(row) == 3 else b"nan nan nan" for row in rows)
+    return linear_colours(parse_numbers(text, path, "vertex colours").reshape(-1, 3))
 
 
 def _corners(
@@ -168,7 +181,7 @@ def _stated(
 ) -> tuple[Int[np.ndarray, " t"], list[str]]:
     """Material, object or group of every triangle, numbered in order of first use by a face."""
     starts_at = np.array([0, *starts])
-    text = ["", *(n.decode("utf-8", "replace") for n in names)]
+    text = ["", *decoded(*names)[0]]
     statement = np.searchsorted(starts_at, polygon, side="right") - 1
     numbers: dict[str, int] = {}
     seen = np.zeros(len(text), np.int64)
@@ -193,19 +206,23 @@ def _runs(material: Int[np.ndarray, " f"], thing: Int[np.ndarray, " f"], things:
 # --- materials ---
 
 
-def _libraries(names: list[bytes], path: Path) -> tuple[dict, tuple[str, ...]]:
-    """Material makers by name, from every library that can be read; notes about those that cannot."""
-    found, notes = {}, []
-    for name in dict.fromkeys(single for n in names for single in file_names(n.decode("utf-8", "replace"), path)):
+def library_files(names: list[bytes], path: Path) -> tuple[list[Path], list[str]]:
+    """The material libraries that statements name and that are there, and notes about the others."""
+    found: dict[Path, None] = {}
+    notes: list[str] = []
+    for name in dict.fromkeys(single for n in decoded(*names)[0] for single in file_names(n, path)):
         try:
-            target = beside(path, name)
-            if not target.is_file():
-                notes.append(f"Material library {name} is not there; its materials were read as plain.")
-                continue
-            found |= _library(read_bytes(target, MAX_LIBRARY_BYTES), target)
+            target, place = named_file(path, mesh_folders(path), name, picture=False)
         except InputRefused as error:
             notes.append(f"Material library {name} was left out: {error}")
-    return found, tuple(notes)
+            continue
+        if target is None:
+            notes.append(f"Material library {name} is not there; its materials were read as plain.")
+            continue
+        found[target] = None
+        if place is not None:
+            notes.append(f"Material library {name} was found by its name at {place}.")
+    return list(found), notes
 
 
 def file_names(statement: str, path: Path) -> list[str]:
@@ -215,81 +232,54 @@ def file_names(statement: str, path: Path) -> list[str]:
     return parts if several and not (path.parent / statement).is_file() else [statement]
 
 
-def _library(data: bytes, path: Path) -> dict:
-    entries: dict[str, dict[bytes, bytes]] = {}
-    current: dict[bytes, bytes] = {}
-    for line in data.splitlines():
-        parts = line.split(None, 1)
-        if len(parts) < 2 or parts[0].startswith(b"#"):
-            continue
-        if parts[0].lower() == b"newmtl":
-            current = entries.setdefault(parts[1].strip().decode("utf-8", "replace"), {})
-        else:
-            current[parts[0].lower()] = parts[1].strip()
-    return {name: partial(_material, name, entry, path) for name, entry in entries.items()}
-
-
-def _numbers(entry: dict[bytes, bytes], key: bytes, default: list[float]) -> list[float]:
-    try:
-        found = [float(x) for x in entry.get(key, b"").split()[: len(default)]]
-    except ValueError:
-        return default
-    return found if len(found) == len(default) and np.isfinite(found).all() else default
-
-
-def _material(name: str, entry: dict[bytes, bytes], path: Path, budget: Budget) -> RawMaterial:
-    """Kd counts where there is no map_Kd (many exporters write Kd 0 or 0.8 beside a texture), Pr and Pm likewise."""
-    files = {TEXTURES[key]: file_name(value) for key, value in entry.items() if key in TEXTURES}
-    colour = [1.0, 1.0, 1.0] if "albedo" in files else _numbers(entry, b"kd", [1.0, 1.0, 1.0])
-    rough = 1.0 if "roughness" in files else _numbers(entry, b"pr", [0.5])[0]
-    metal = 1.0 if "metallic" in files else _numbers(entry, b"pm", [0.0])[0]
-    tiled = any(_tile_name(file, 1001) is not None for file in files.values())
-    red, green, blue = (float(np.clip(c, 0, 1)) for c in colour)
-    return RawMaterial(
-        name,
-        partial(_load, files, path, budget),
-        (tiled or False) if files else None,
-        (red, green, blue),
-        float(np.clip(rough, 0, 1)),
-        float(np.clip(metal, 0, 1)),
-    )
-
-
-def file_name(statement: bytes) -> str:
-    """The file name behind a texture statement's options; it may hold spaces."""
-    rest = statement
-    while (parts := rest.split(None, 1)) and parts[0].lower() in OPTIONS and len(parts) == 2:
-        values = OPTIONS[parts[0].lower()]
-        rest = parts[1]
-        for k in range(values):
-            pieces = rest.split(None, 1)
-            if len(pieces) < 2 or (k > 0 and not re.fullmatch(rb"[-+.\deE]+", pieces[0])):
-                break
-            rest = pieces[1]
-    return rest.strip().decode("utf-8", "replace")
-
-
-def _tile_name(file: str, tile: int) -> str | None:
-    """The file of a UDIM tile, where the name marks tiles (<UDIM>, or 1001 between dots or underscores); else None."""
-    if "<UDIM>" in file:
-        return file.replace("<UDIM>", str(tile))
-    marked = r"(?<=[._])1001(?=[._][^/\\]*$)"
-    return re.sub(marked, str(tile), file) if re.search(marked, file) else None
-
-
-def _load(files: dict[str, str], path: Path, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
-    maps, notes = {}, []
-    for name, file in files.items():
-        wanted = _tile_name(file, tile) or file
+def _materials(names: list[str], lines: dict[bytes, list], path: Path) -> tuple[tuple[RawMaterial, ...], list[str]]:
+    """The material of every name that faces use ("" where none is stated), and notes."""
+    files, notes = library_files(lines[b"mtllib"], path)
+    library: dict[str, Entry] = {}
+    for file in files:
         try:
-            target = beside(path, wanted.replace("%", "%25"))
+            entries, said = read_library(file, path)
         except InputRefused as error:
-            notes.append(f"Texture {wanted} was left out: {error}")
+            notes.append(f"Material library {file.name} was left out: {error}")
             continue
-        if not target.is_file():
-            notes.append(f"Texture {wanted} is not there and was left out.")
-            continue
-        kind: Kind = "colour" if name == "albedo" else "normal" if name == "normal" else "data"
-        values = texture(read_bytes(target), str(target), budget)
-        maps[name] = RawMap(values[..., 0] if kind == "data" else values, kind=kind)
-    return maps, tuple(notes)
+        library |= entries
+        notes.extend(said)
+    used = [_entry_of(name, library, bool(lines[b"usemtl"]), notes) for name in names]
+    unknown = [name for name, entry in zip(names, used, strict=True) if entry is None and name]
+    if unknown:
+        shown = ", ".join(f"'{name}'" for name in unknown[:8]) + (" and others" if len(unknown) > 8 else "")
+        notes.append(f"No library has the material(s) {shown}; they were read as plain.")
+    if library and "" in names and used[names.index("")] is None:
+        notes.append("Some faces state no material (usemtl) and were read as plain.")
+    notes.extend(unread([entry for entry in used if entry is not None]))
+    budget = Budget(path)
+    made = (_plain(n) if entry is None else material(entry, budget) for n, entry in zip(names, used, strict=True))
+    return tuple(made), notes
+
+
+def _entry_of(name: str, library: dict[str, Entry], stated: bool, notes: list[str]) -> Entry | None:
+    """A name's material: its own, else the only one of that name in other letters, else the only one at all where the
+    file states none."""
+    if name in library:
+        return library[name]
+    alike = [entry for other, entry in library.items() if name and other.casefold() == name.casefold()]
+    if len(alike) == 1:
+        notes.append(f"Material '{name}' was taken for '{alike[0].name}' of its library.")
+        return alike[0]
+    if not stated and len(library) == 1:
+        (entry,) = library.values()
+        notes.append(f"No face states a material (usemtl): '{entry.name}', the only one of its library, was taken.")
+        return entry
+    return None
+
+
+def _left_out(lines: dict[bytes, list]) -> list[str]:
+    """Notes on statements that were not read."""
+    names = set(lines[b"others"])
+    notes = ["Lines and points were left out."] if names & LINES else []
+    notes += ["Free-form curves and surfaces were left out."] if names & FREE_FORM else []
+    unknown = sorted(names - LINES - FREE_FORM - WITHOUT_LOOKS)
+    if unknown:
+        shown = ", ".join(repr(name[:20].decode("ascii", "replace")) for name in unknown[:8])
+        notes.append(f"Statements that OBJ does not have were left out: {shown}.")
+    return notes

@@ -2,6 +2,7 @@
 
 import io
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ from jaxtyping import Float, Shaped
 from mistyle.core.asset import Picture, Pixels
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import MAX_PIXELS, MAX_TEXTURE_PIXELS, WORK_TEXTURE, read_bytes, refuse
+from mistyle.files.nearby import named_file
 from mistyle.files.texels import Kind, finished, fractions
 
 FORMATS = ("PNG", "JPEG", "WEBP", "TIFF", "BMP", "GIF", "AVIF", "TGA")
@@ -19,6 +21,7 @@ EXPECTED = "a PNG, JPEG, WebP, TIFF, BMP, GIF or TGA picture"
 CONVERT = "Save it as PNG or JPEG and try again"
 MAX_PICTURE_BYTES = 512 << 20
 ORIENTATION = 0x0112  # the tag of EXIF and TIFF: 1 upright, 2 mirrored, 3 turned by 180 degrees, ... 8
+BITS_PER_SAMPLE, PLANES, EXTRA_SAMPLES, ASSOCIATED = 258, 284, 338, 1  # TIFF 6.0; 1: colours are multiplied by alpha
 UNDONE_BY = {6: 8, 8: 6}  # the other orientations undo themselves
 
 
@@ -87,6 +90,42 @@ def texture(data: bytes, where: str, budget: Budget) -> Shaped[np.ndarray, "h w 
     image, notes = _open(data, where)
     budget.take(image.width * image.height)
     return _pixels(image, data, where, notes, managed=False)[0]
+
+
+def texture_file(path: Path, budget: Budget) -> tuple[Shaped[np.ndarray, "h w 3"], bool]:
+    """A mesh's texture in a file of its own, and whether its values are linear: EXR and Radiance files' are, in floats
+    without bounds; a single channel counts for all three."""
+    from mistyle.files import hdr
+
+    head = read_bytes(path, count=10)
+    if head[:4] == hdr.EXR_MAGIC:
+        height, width = hdr.size_of_exr(path)
+        budget.take(height * width)
+        return hdr.colour_of_exr(path), True
+    if head[:2] == b"#?":
+        pixels = hdr.read_hdr(path)
+        budget.take(pixels.shape[0] * pixels.shape[1])
+        return pixels, True
+    return texture(read_bytes(path, MAX_PICTURE_BYTES), str(path), budget), False
+
+
+def named_texture(
+    where: Path, roots: Sequence[Path], name: str, budget: Budget, notes: list[str]
+) -> tuple[Shaped[np.ndarray, "h w 3"], bool] | None:
+    """The `texture_file` that the file `where` names, relative to one of `roots` or found near them (files/nearby.py);
+    None, with a note, where there is none that can be used."""
+    try:
+        target, place = named_file(where, roots, name)
+        if target is None:
+            notes.append(f"Texture {name} is not there and was left out.")
+            return None
+        found = texture_file(target, budget)
+    except InputRefused as error:
+        notes.append(f"Texture {name} was left out: {error}")
+        return None
+    if place is not None:
+        notes.append(f"Texture {name} was found by its name at {place}.")
+    return found
 
 
 def decode(data: bytes, where: str, budget: Budget, kind: Kind, scale: float = 1.0) -> Float[np.ndarray, "h w 3"]:
@@ -219,9 +258,11 @@ def _pixels(
 ) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None]:
     """Encoded rgb and alpha (None where opaque), 8 or 16 bits, of a picture in whatever mode."""
     _load(image, where)
-    deep = _sixteen_bit(data, image, where)
+    deep = _sixteen_bit(data, image, where, notes)
     if deep is not None:
         rgb, alpha = deep
+        if managed:
+            rgb = _deep_srgb(image, rgb, where, notes)
     else:
         image, transparency = _plain(image, where, notes)
         alpha = None if transparency is None else np.asarray(transparency)
@@ -275,22 +316,54 @@ def _to_srgb(image: Any, where: str, notes: list[str]) -> Any:
             return image
         converted = ImageCms.profileToProfile(image, profile, ImageCms.createProfile("sRGB"), outputMode="RGB")
     except (ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
-        notes.append(f"The embedded colour profile could not be used ({_first(error)}); colours are taken as sRGB.")
+        notes.append(_unusable(error))
         return image
-    notes.append(f"Colours were converted from the embedded profile '{name[:60]}' to sRGB.")
+    notes.append(_converted(name))
     return converted
 
 
-def _sixteen_bit(
-    data: bytes, image: Any, where: str
-) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None] | None:
-    """Pictures with 16 bits a channel, which Pillow has as grey only or cuts to 8 bits; None for all others.
+def _deep_srgb(
+    image: Any, rgb: Shaped[np.ndarray, "h w 3"], where: str, notes: list[str]
+) -> Shaped[np.ndarray, "h w 3"]:
+    """As `_to_srgb`, for 16 bits a channel."""
+    from PIL import ImageCms
 
-    Their colour profile is not applied.
-    """
+    from mistyle.files.icc import Unusable, read_profile, to_srgb
+
+    data = image.info.get("icc_profile")
+    if not data:
+        return rgb
+    grey = image.mode.startswith(("I", "L"))
+    try:
+        name = ImageCms.getProfileDescription(ImageCms.ImageCmsProfile(io.BytesIO(data))).strip()
+        if "srgb" in name.lower() and not grey:
+            return rgb
+        converted = to_srgb(rgb, read_profile(data), grey)
+    except (Unusable, ImageCms.PyCMSError, OSError, ValueError, TypeError) as error:
+        notes.append(_unusable(error))
+        return rgb
+    notes.append(_converted(name))
+    return converted
+
+
+def _unusable(error: Exception) -> str:
+    return f"The embedded colour profile could not be used ({_first(error)}); colours are taken as sRGB."
+
+
+def _converted(name: str) -> str:
+    return f"Colours were converted from the embedded profile '{name[:60]}' to sRGB."
+
+
+def _sixteen_bit(
+    data: bytes, image: Any, where: str, notes: list[str]
+) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None] | None:
+    """Pictures with 16 bits a channel, which Pillow has as grey only or cuts to 8 bits; None for all others. As Pillow
+    has them: a TIFF upright, a PNG as stored."""
     if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
         grey = np.clip(np.asarray(image), 0, 65535).astype(np.uint16)
         return np.repeat(grey[..., None], 3, axis=2), None
+    if image.format == "TIFF":
+        return _deep_tiff(data, image, where, notes)
     png16 = data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) > 26 and data[24] == 16
     if not png16:
         return None
@@ -303,3 +376,43 @@ def _sixteen_bit(
     if values.shape[2] in (1, 2):
         return np.repeat(values[..., :1], 3, axis=2), values[..., 1] if values.shape[2] == 2 else None
     return values[..., 2::-1], values[..., 3] if values.shape[2] == 4 else None
+
+
+def _deep_tiff(
+    data: bytes, image: Any, where: str, notes: list[str]
+) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None] | None:
+    """An RGB TIFF of 16 bits a channel; None, with a note, where Pillow's 8 bits must do."""
+    import cv2
+
+    bits = image.tag_v2.get(BITS_PER_SAMPLE, 8)
+    if max(bits if isinstance(bits, tuple) else (bits,)) <= 8:
+        return None
+    if image.tag_v2.get(PLANES, 1) != 1:
+        raise refuse(where, "a TIFF of 16 bits in separate planes", "pixels side by side", CONVERT)
+    try:
+        known = image.mode in ("RGB", "RGBA")
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if known else None
+    except cv2.error:  # what Pillow could read all the same
+        pixels = None
+    if pixels is not None and pixels.dtype == np.uint16 and pixels.ndim == 3:
+        values = np.asarray(pixels, np.uint16)[..., [2, 1, 0, 3][: pixels.shape[2]]]
+        multiplied = image.tag_v2.get(EXTRA_SAMPLES) == (ASSOCIATED,)
+        eight, same = np.asarray(image), slice(3 if multiplied else 0, 4)  # Pillow divides colours by alpha itself
+        # Two decoders must agree on the high bytes, and so about which way is up.
+        if values.shape == eight.shape and np.array_equal((values // 256)[..., same], eight[..., same]):
+            return _straight(values, multiplied)
+    notes.append("A TIFF with more than 8 bits a channel was read at 8 bits.")
+    return None
+
+
+def _straight(
+    values: Shaped[np.ndarray, "h w c"], multiplied: bool
+) -> tuple[Shaped[np.ndarray, "h w 3"], Shaped[np.ndarray, "h w"] | None]:
+    """Colours and alpha of 16 bits; colours divided by alpha where the file has them multiplied."""
+    if values.shape[2] == 3:
+        return values, None
+    rgb, alpha = values[..., :3], values[..., 3]
+    if multiplied:
+        divided = rgb.astype(np.float32) * (np.float32(65535) / np.maximum(alpha, 1)[..., None].astype(np.float32))
+        rgb = np.rint(np.minimum(divided, 65535)).astype(np.uint16)
+    return rgb, alpha

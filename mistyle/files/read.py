@@ -1,8 +1,9 @@
 """The only reader of meshes and images: everything a user or a stranger hands in passes through here, bounded.
 
 What cannot be used is refused (core/errors.py InputRefused) with the file, what was found, what was expected and the
-fix. Nothing is fetched from a network, nothing outside a mesh's own folder is opened, and nothing is repaired in
-silence: what was changed on the way in is in `Source.notes` and `Picture.notes`.
+fix. Nothing is fetched from a network, nothing outside a mesh's own folder is opened but pictures in the folder
+`textures` beside it, and nothing is repaired in silence: what was changed on the way in is in `Source.notes` and
+`Picture.notes`.
 
 Files are opened and decoded in the reader process (files/reader_process.py), which has limits on memory and time and
 cannot write; here only the numbers that it found are put together. A Mitsuba scene of the user's (`--scene`) is not
@@ -52,7 +53,7 @@ __all__ = [
 
 MESHES = {
     ".obj": "mistyle.files.obj_read:read_obj",
-    ".ply": "mistyle.files.mesh_formats:read_ply",
+    ".ply": "mistyle.files.ply_read:read_ply",
     ".stl": "mistyle.files.mesh_formats:read_stl",
     ".off": "mistyle.files.mesh_formats:read_off",
     ".glb": "mistyle.files.gltf_read:read_gltf",
@@ -92,10 +93,10 @@ def read_mesh(
 
     OBJ, PLY, STL, OFF, GLB, glTF and USD, each without merging or reordering vertices (STL, which repeats them, is
     joined and says so). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees
-    (glTF: flat, as it demands). One part per material and UDIM tile. Texture transforms, wrap modes and glTF's vertex
-    colours are resolved: the maps repeat at the mesh's UVs, the albedo has the colours in it. Not read: vertex colours
-    of other formats, morph targets (the base shape is), animations (a skinned mesh comes in its bind pose), Draco and
-    meshopt compression without a plain copy (refused).
+    (glTF: flat, as it demands). One part per material and UDIM tile. Texture transforms, wrap modes and vertex colours
+    are resolved: the maps repeat at the mesh's UVs, the albedo has the colours in it. Not read: morph targets (the base
+    shape is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression without a plain copy
+    (refused).
     """
     from mistyle.files.prepare import prepare
 

@@ -35,7 +35,7 @@ PATIENCE = 4.0
 AGAIN = "Write it again, best with another program"
 WHOLE = "a file that can be decoded"
 # Modules of mistyle/files whose bounds (MAX_..., WORK_...) hold in the child as they stand here.
-BOUNDED = ("bounds", "pictures", "hdr", "obj_read", "polygons", "gltf_schema", "gltf_check", "colmap", "cameras")
+BOUNDED = ("bounds", "pictures", "hdr", "mtl_read", "polygons", "gltf_schema", "gltf_check", "colmap", "cameras")
 PIPE_BYTES = 1 << 20
 KEPT = 256 << 20  # bytes that the child may hold for the next file
 F_SETPIPE_SZ = 1031  # fcntl.h of Linux; Python has the name only since 3.10 and only there

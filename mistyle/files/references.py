@@ -1,43 +1,58 @@
 """Which other files a mesh file names: material libraries, textures, buffers, images."""
 
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import MAX_JSON_BYTES, beside, read_bytes
 from mistyle.files.gltf_check import parse_json
-from mistyle.files.obj_read import MAX_LIBRARY_BYTES, TEXTURES, file_name, file_names
+from mistyle.files.mtl_read import NAMING, read_library, statement, tile_name
+from mistyle.files.nearby import mesh_folders, named_file, unmarked
+from mistyle.files.obj_read import library_files
+from mistyle.files.ply_read import MAX_HEADER, texture_files
 
 
 def references(path: Path) -> list[Path]:
-    """The files that an .obj or .gltf file names, that exist and lie in its folder or below; others name none.
+    """The files that an .obj, .ply or .gltf file names, that exist and that its reader opens; others name none.
 
     A file that cannot be read names none: the reader refuses it, with the sentence that explains it.
     """
     kind = path.suffix.lower()
     try:
-        named = _of_obj(path) if kind == ".obj" else _of_gltf(path) if kind == ".gltf" else []
+        named = NAMED[kind](path) if kind in NAMED else []
     except InputRefused:
         return []
     return sorted({file for file in named if file.is_file()})
 
 
 def _of_obj(path: Path) -> list[Path]:
-    found: list[Path] = []
-    for line in read_bytes(path).splitlines():
-        words = line.split(None, 1)
-        if len(words) == 2 and words[0] == b"mtllib":
-            for name in file_names(words[1].strip().decode("utf-8", "replace"), path):
-                found += _inside(path, name)
-    return found + [texture for library in found if library.is_file() for texture in _of_library(library)]
+    words = (line.split(None, 1) for line in unmarked(read_bytes(path)).splitlines())
+    named = [line[1].strip() for line in words if len(line) == 2 and line[0] == b"mtllib"]
+    libraries = library_files(named, path)[0]
+    return libraries + [texture for library in libraries for texture in _of_library(library, path)]
 
 
-def _of_library(path: Path) -> list[Path]:
+def _of_library(library: Path, path: Path) -> list[Path]:
     found: list[Path] = []
-    for line in read_bytes(path, MAX_LIBRARY_BYTES).splitlines():
-        words = line.split(None, 1)
-        if len(words) == 2 and words[0].lower() in TEXTURES:
-            found += _inside(path, file_name(words[1].strip()).replace("%", "%25"))
+    for entry in read_library(library, path)[0].values():
+        for key in NAMING & set(entry.values):
+            file = statement(entry.values[key]).file
+            first = tile_name(file, 1001)
+            with suppress(InputRefused):
+                target = named_file(library, entry.roots, first or file)[0]
+                if target is not None:
+                    found += [target] if first is None else target.parent.glob(target.name.replace("1001", "1???"))
+    return found
+
+
+def _of_ply(path: Path) -> list[Path]:
+    header = read_bytes(path, count=MAX_HEADER).partition(b"end_header")[0]
+    found: list[Path] = []
+    for name in texture_files(header):
+        with suppress(InputRefused):
+            target = named_file(path, mesh_folders(path), name)[0]
+            found += [] if target is None else [target]
     return found
 
 
@@ -54,3 +69,6 @@ def _inside(path: Path, name: str) -> list[Path]:
         return [beside(path, name)]
     except InputRefused:
         return []
+
+
+NAMED = {".obj": _of_obj, ".ply": _of_ply, ".gltf": _of_gltf}

@@ -104,7 +104,7 @@ def _shapes(pxr: Any, source: Any, asset: Asset) -> dict[str, tuple[Primitive, P
 def _kept(pxr: Any, source: Any, asset: Asset, name: str, one: Primitive) -> str | None:
     """The primvar at which the asset's UVs stand in the file already; None where it has others."""
     found = uv_primvar(pxr, pxr.UsdGeom.Mesh(source.GetPrimAtPath(name)), [])
-    if asset.source.old_uvs is None or not found:
+    if asset.source.old_uvs is None or not found or "2" not in str(found.GetTypeName()):  # readers of two components
         return None
     step = asset.mesh.corner_uvs[one.start : one.stop] - asset.source.old_uvs[one.start : one.stop]
     # Moved by whole tiles: the texture repeats, the file's own UVs do.

@@ -1,6 +1,7 @@
 """Materials of USD: UsdPreviewSurface, its constants, and its textures decoded when they are asked for."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,12 +10,17 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused
+from mistyle.core.retexture import Wrap
 from mistyle.files.pictures import MAX_PICTURE_BYTES, Budget, decode
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 from mistyle.files.usd_layers import Place, bytes_of, locate, place_of
 
 CHANNELS = {"r": (0,), "g": (1,), "b": (2,), "rgb": (0, 1, 2), "a": ()}
 INPUTS = {"albedo": "diffuseColor", "roughness": "roughness", "metallic": "metallic", "normal": "normal"}
+WRAPS: dict[str, Wrap] = {"repeat": "repeat", "mirror": "mirror", "clamp": "clamp", "black": "clamp"}
+OUTSIDE = 1e-3  # UVs that leave the unit square by less show nothing of what lies there
+# Inputs that change how a surface looks and are not read, unless they have this value.
+UNREAD = {"emissiveColor": 0.0, "clearcoat": 0.0, "displacement": 0.0, "opacity": 1.0, "opacityThreshold": 0.0}
 DEFAULTS = {"albedo": (0.18, 0.18, 0.18), "roughness": 0.5, "metallic": 0.0}
 
 
@@ -30,19 +36,58 @@ class Texture:
     channel: str
     primvar: str
     transform: Float[np.ndarray, "3 3"] | None
+    wrap: tuple[str, str] = ("useMetadata", "useMetadata")
 
 
 @dataclass(frozen=True)
 class Found:
-    """A material, and the primvar that its textures are looked up at (None: it has none)."""
+    """A material, the primvar that its first texture is looked up at (None: it has none), the primvar that is its
+    albedo (None: it is said otherwise), and the textures by map."""
 
     material: RawMaterial
     primvar: str | None
+    colour: str | None = None
+    textures: Mapping[str, Texture] = field(default_factory=dict)
+
+    def others(self) -> dict[str, str]:
+        """The primvar of every map that is looked up at another than the first."""
+        return {kind: t.primvar for kind, t in self.textures.items() if t.primvar != self.primvar}
 
 
-def plain(name: str, colour: tuple[float, float, float] = (1.0, 1.0, 1.0)) -> Found:
-    """A material without textures."""
-    return Found(RawMaterial(name, no_textures, None, colour, 0.5, 0.0), None)
+def at_own_coordinates(found: Found, sets: Mapping[str, Float[np.ndarray, "f 3 2"]]) -> RawMaterial:
+    """The material whose maps are looked up at their own primvars; `sets` has the corners' coordinates by primvar."""
+    others = {kind: sets[name] for kind, name in found.others().items() if name in sets}
+    return replace(found.material, load=partial(_moved, found.material.load, others)) if others else found.material
+
+
+def _moved(load: Any, others: dict[str, np.ndarray], tile: int) -> tuple[Maps, tuple[str, ...]]:
+    maps, notes = load(tile)
+    return {k: replace(m, uvs=others[k]) if k in others else m for k, m in maps.items()}, notes
+
+
+def plain(name: str, albedo: tuple[float, float, float] = (1.0, 1.0, 1.0), colour: str | None = None) -> Found:
+    """A material without textures; `colour` is the primvar that is its albedo."""
+    return Found(RawMaterial(name, no_textures, None, albedo, 0.5, 0.0), None, colour)
+
+
+def outside(found: Found, uvs: Float[np.ndarray, "n 3 2"] | None) -> list[str]:
+    """Notes on textures that are looked up outside the unit square and are black there, as the file says or for want of
+    a wrap mode."""
+    notes = []
+    if uvs is None or not np.isfinite(uvs).any():
+        return notes
+    for texture in found.textures.values():
+        if texture.primvar != found.primvar:
+            continue
+        matrix = np.eye(3) if texture.transform is None else texture.transform
+        lookup = uvs.astype(np.float64) @ matrix[:2, :2].T + matrix[:2, 2]
+        leaves = (np.nanmin(lookup, axis=(0, 1)) < -OUTSIDE) | (np.nanmax(lookup, axis=(0, 1)) > 1 + OUTSIDE)
+        modes = {mode for mode, out in zip(texture.wrap, leaves, strict=True) if out}
+        if "black" in modes:
+            notes.append(f"Texture {texture.file} is black outside the unit square; its last texels were taken there.")
+        if modes - set(WRAPS):
+            notes.append(f"Texture {texture.file} has no wrap mode and was repeated outside the unit square.")
+    return notes
 
 
 def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any, notes: list[str]) -> Found:
@@ -54,21 +99,29 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
         return plain(name)
     textures: dict[str, Texture] = {}
     constants: dict[str, Any] = dict(DEFAULTS)
+    colour = None
     for kind, named in INPUTS.items():
         value = _source(pxr, surface.GetInput(named), time)
         if isinstance(value, Texture):
             textures[kind] = value
+        elif isinstance(value, Primvar):
+            if kind == "albedo" and value.kind.startswith("UsdPrimvarReader_") and value.name:
+                colour = value.name
+            else:
+                notes.append(f"The {named} of material '{name}' comes from a {value.kind}, which was not read.")
         elif value is not None and kind != "normal":
             constants[kind] = value
-    opacity = _source(pxr, surface.GetInput("opacity"), time)
-    if isinstance(opacity, Texture) or (opacity is not None and float(opacity) < 1):
-        notes.append(f"The opacity of material '{name}' was not read.")
-    primvars = [t.primvar for t in textures.values()]
-    if len(set(primvars)) > 1:
-        other = sorted(kind for kind, t in textures.items() if t.primvar != primvars[0])
-        notes.append(f"Textures of material '{name}' use several UV sets; {', '.join(other)} was left out.")
-        textures = {kind: t for kind, t in textures.items() if t.primvar == primvars[0]}
-    albedo = (1.0, 1.0, 1.0) if "albedo" in textures else tuple(float(np.clip(c, 0, 1)) for c in constants["albedo"])
+    unread = [said for said in UNREAD if _differs(_source(pxr, surface.GetInput(said), time), UNREAD[said])]
+    if unread:
+        notes.append(f"The {' and '.join(unread)} of material '{name}' was not read.")
+    if _source(pxr, surface.GetInput("useSpecularWorkflow"), time):
+        notes.append(
+            f"Material '{name}' has the specular workflow: it was read as not metallic, without specularColor."
+        )
+        textures.pop("metallic", None)
+        constants["metallic"] = 0.0
+    white = "albedo" in textures or colour is not None
+    albedo = (1.0, 1.0, 1.0) if white else tuple(float(np.clip(c, 0, 1)) for c in constants["albedo"])
     tiled = any("<UDIM>" in t.file for t in textures.values())
     made = RawMaterial(
         name,
@@ -78,11 +131,26 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
         1.0 if "roughness" in textures else float(np.clip(constants["roughness"], 0, 1)),
         1.0 if "metallic" in textures else float(np.clip(constants["metallic"], 0, 1)),
     )
-    return Found(made, primvars[0] if textures else None)
+    return Found(made, next((t.primvar for t in textures.values()), None), colour, textures)
+
+
+def _differs(value: Any, neutral: float) -> bool:
+    """Whether an input says anything but its neutral value."""
+    if value is None:
+        return False
+    return isinstance(value, Texture | Primvar) or bool((np.array(value, float) != neutral).any())
+
+
+@dataclass(frozen=True)
+class Primvar:
+    """An input that comes from a shader of another `kind` than a texture; `name`: the primvar that it reads."""
+
+    kind: str
+    name: str
 
 
 def _source(pxr: Any, given: Any, time: Any) -> Any:
-    """A constant, a Texture, or None where nothing is said."""
+    """A constant, a Texture, another shader as a Primvar, or None where nothing is said."""
     if not given:
         return None
     producing = given.GetValueProducingAttributes()
@@ -93,7 +161,9 @@ def _source(pxr: Any, given: Any, time: Any) -> Any:
     if not shader or not attribute.GetName().startswith("outputs:"):
         return attribute.Get(time)
     if shader.GetShaderId() != "UsdUVTexture":
-        return None
+        return Primvar(
+            str(shader.GetShaderId() or "shader of another kind"), str(_value(shader, "varname", time) or "")
+        )
     return _texture(pxr, shader, attribute.GetName().removeprefix("outputs:"), time)
 
 
@@ -105,9 +175,10 @@ def _texture(pxr: Any, shader: Any, channel: str, time: Any) -> Texture | None:
     layer = file.GetPropertyStack(time)[0].layer
     primvar, transform = _lookup(pxr, shader.GetInput("st"), time)
     space, scale, bias = (_value(shader, name, time) for name in ("sourceColorSpace", "scale", "bias"))
+    wrap = [str(_value(shader, name, time) or "useMetadata") for name in ("wrapS", "wrapT")]
     return Texture(
         asset.path, place_of(layer), str(space or "auto"), None if scale is None else tuple(scale),
-        None if bias is None else tuple(bias), channel, primvar, transform,
+        None if bias is None else tuple(bias), channel, primvar, transform, (wrap[0], wrap[1]),
     )  # fmt: skip
 
 
@@ -155,7 +226,8 @@ def _load(textures: dict[str, Texture], root: Path, budget: Budget, tile: int) -
             notes.append(f"Texture {name} was left out: {error}")
             continue
         if values is not None:
-            maps[kind] = RawMap(values, transform=texture.transform)
+            wrap = (WRAPS.get(texture.wrap[0], "repeat"), WRAPS.get(texture.wrap[1], "repeat"))
+            maps[kind] = RawMap(values, transform=texture.transform, wrap=wrap)
     return maps, tuple(notes)
 
 

@@ -5,6 +5,7 @@ the earliest. A subdivision surface comes as its control cage; of point instance
 its first instance stands, since all instances show the same texels.
 """
 
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ from mistyle.files.polygons import check_indices, check_positions, too_many, tri
 from mistyle.files.raw import Raw
 from mistyle.files.usd import library
 from mistyle.files.usd_layers import check_layers, said, textures_named
-from mistyle.files.usd_materials import Found, plain, read_material
+from mistyle.files.usd_materials import Found, at_own_coordinates, outside, plain, read_material
 
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 UV_NAMES = ("st", "UVMap", "map1", "uv")
@@ -53,6 +54,8 @@ class _Piece:
     normals: np.ndarray | None
     uvs: np.ndarray | None
     material: np.ndarray
+    colours: np.ndarray | None
+    others: dict[str, np.ndarray]
 
 
 def open_stage(pxr: Any, path: Path) -> Any:
@@ -85,13 +88,11 @@ def read_usd(path: Path, max_faces: int) -> Raw:
     materials: list[Found] = []
     budget, root = Budget(path), path.resolve().parent
 
-    def number(material: Any, colour: Any) -> int:
-        key = str(material.GetPath()) if material else f"displayColor {colour}"
+    def number(material: Any, shown: Found) -> int:
+        key = str(material.GetPath()) if material else f"{shown.material.albedo_factor} {shown.colour}"
         if key not in found:
             found[key] = len(materials)
-            materials.append(
-                read_material(pxr, material, root, budget, time, notes) if material else plain("material", colour)
-            )
+            materials.append(read_material(pxr, material, root, budget, time, notes) if material else shown)
         return found[key]
 
     user, pieces, faces = _user_matrix(pxr, stage, notes), [], 0
@@ -103,10 +104,10 @@ def read_usd(path: Path, max_faces: int) -> Raw:
             pieces.append(piece)
     if not pieces:
         raise refuse(path, "no mesh on its stage", "at least one visible UsdGeomMesh", "Export the mesh itself")
-    return _raw(pieces, [f.material for f in materials], notes, path)
+    return _raw(pieces, materials, notes, path)
 
 
-def _raw(pieces: list[_Piece], materials: list, notes: list[str], path: Path) -> Raw:
+def _raw(pieces: list[_Piece], materials: list[Found], notes: list[str], path: Path) -> Raw:
     starts = np.cumsum([0, *(len(p.faces) for p in pieces)])
     first = np.cumsum([0, *(len(p.positions) for p in pieces)])[:-1]
     twin, owners = np.arange(starts[-1]), {}
@@ -116,29 +117,34 @@ def _raw(pieces: list[_Piece], materials: list, notes: list[str], path: Path) ->
     if (twin != np.arange(len(twin))).any():
         notes.append("Instances of a mesh share their texels; the first one's are painted.")
 
-    def joined(name: str, width: int) -> np.ndarray | None:
+    def joined(name: str, width: int, missing: float = np.nan) -> np.ndarray | None:
         parts = [getattr(p, name) for p in pieces]
         if all(part is None for part in parts):
             return None
-        nothing = [np.full((len(p.faces), 3, width), np.nan, np.float32) for p in pieces]
+        nothing = [np.full((len(p.faces), 3, width), missing, np.float32) for p in pieces]
         return np.concatenate([no if part is None else part for part, no in zip(parts, nothing, strict=True)])
 
-    material = np.concatenate([p.material for p in pieces])
+    material, uvs = np.concatenate([p.material for p in pieces]), joined("uvs", 2)
     used = np.unique(material)
+    missing = [np.full((len(p.faces), 3, 2), np.nan, np.float32) for p in pieces]
+    names = dict.fromkeys(name for k in used for name in materials[k].others().values())
+    others = {n: np.concatenate([p.others.get(n, no) for p, no in zip(pieces, missing, strict=True)]) for n in names}
+    notes += [note for k in used for note in outside(materials[k], None if uvs is None else uvs[material == k])]
     return Raw(
         kind="usd",
         positions=np.concatenate([p.positions for p in pieces]),
         faces=np.concatenate([p.faces + f for p, f in zip(pieces, first, strict=True)]),
         normals=joined("normals", 3),
-        uvs=joined("uvs", 2),
+        uvs=uvs,
         material=np.searchsorted(used, material),
-        materials=tuple(materials[k] for k in used),
+        materials=tuple(at_own_coordinates(materials[k], others) for k in used),
         primitives=tuple(
             Primitive(-1, -1, -1, int(a), int(b), -1, -1, -1, int(f), p.name)
             for p, a, b, f in zip(pieces, starts[:-1], starts[1:], first, strict=True)
         ),
         twin=twin,
         notes=tuple(dict.fromkeys(notes)),
+        colours=joined("colours", 3, 1.0),
     )
 
 
@@ -258,8 +264,7 @@ def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, n
     if np.linalg.det(linear) < 0:
         shape = Polygons(shape.points, shape.sizes, shape.vertices, shape.corner[:, [0, 2, 1]], shape.polygon, True)
     positions = shape.points @ linear + matrix[3, :3]
-    material = _bound(pxr, prim, shape, number, time)
-    names = [materials[k].primvar for k in np.unique(material) if materials[k].primvar]
+    material = _bound(pxr, prim, shape, number, time, notes)
     normals = _normals(pxr, mesh, shape, time, notes)
     return _Piece(
         name=str(prim.GetPath()),
@@ -267,8 +272,10 @@ def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, n
         positions=positions,
         faces=shape.vertices[shape.corner],
         normals=None if normals is None else _turned(normals, linear),
-        uvs=_uvs(pxr, mesh, shape, names, time, notes),
+        uvs=_uvs(pxr, mesh, shape, material, materials, time, notes),
         material=material,
+        colours=_colours(pxr, mesh, shape, material, materials, time, notes),
+        others=_other_uvs(pxr, mesh, shape, material, materials, time, notes),
     )
 
 
@@ -279,19 +286,48 @@ def _turned(normals: np.ndarray, linear: np.ndarray) -> Float[np.ndarray, "f 3 3
     return (turned / np.where(length > 0, length, 1)).astype(np.float32)
 
 
-def _bound(pxr: Any, prim: Any, shape: Polygons, number: Any, time: Any) -> Int[np.ndarray, " f"]:
+def _bound(pxr: Any, prim: Any, shape: Polygons, number: Any, time: Any, notes: list[str]) -> Int[np.ndarray, " f"]:
     """The material of every triangle: that of its subset, else the mesh's own, else its display colour."""
     api = pxr.UsdShade.MaterialBindingAPI
-    shown = pxr.UsdGeom.Gprim(prim).GetDisplayColorAttr().Get(time)
-    colour = tuple(float(np.clip(c, 0, 1)) for c in shown[0]) if shown is not None and len(shown) else (1.0, 1.0, 1.0)
+    shown = _display(pxr, prim, time)
     of_polygon = np.full(len(shape.sizes), -1, np.int64)
     for subset in api(prim).GetMaterialBindSubsets():
         rows = np.array(subset.GetIndicesAttr().Get(time) or [], np.int64)
         rows = rows[(rows >= 0) & (rows < len(of_polygon))]
-        of_polygon[rows] = number(api(subset.GetPrim()).ComputeBoundMaterial()[0], colour)
+        of_polygon[rows] = number(_material_of(pxr, subset.GetPrim(), notes), shown)
     if (of_polygon < 0).any():
-        of_polygon[of_polygon < 0] = number(api(prim).ComputeBoundMaterial()[0], colour)
+        own = _material_of(pxr, prim, notes)
+        of_polygon[of_polygon < 0] = number(own, shown)
+        opacity = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity")
+        if not own and opacity and opacity.HasValue() and (np.array(opacity.Get(time), float) < 1).any():
+            notes.append("displayOpacity was not read.")
     return of_polygon[shape.polygon]
+
+
+def _material_of(pxr: Any, prim: Any, notes: list[str]) -> Any:
+    """The material bound for previews or for all purposes; where there is none, that for full renders."""
+    tokens = pxr.UsdShade.Tokens
+    binding = pxr.UsdShade.MaterialBindingAPI(prim)
+    found = binding.ComputeBoundMaterial(tokens.preview)[0]
+    if found:
+        return found
+    found = binding.ComputeBoundMaterial(tokens.full)[0]
+    if found:
+        notes.append("Materials that are bound for full renders alone were taken.")
+    return found
+
+
+def _display(pxr: Any, prim: Any, time: Any) -> Found:
+    """What a mesh without a material shows: its display colour, by vertex where it has more than one."""
+    primvars = pxr.UsdGeom.PrimvarsAPI(prim)
+    primvar = primvars.FindPrimvarWithInheritance("displayColor")
+    values = _table(primvar, time) if primvar and primvar.HasValue() else None
+    if values is None or values.shape[1] != 3:
+        return plain("material")
+    if len(values) > 1:
+        return plain("material", colour="displayColor")
+    red, green, blue = (float(c) for c in np.clip(np.nan_to_num(values[0], nan=1.0), 0, 1))
+    return plain("material", (red, green, blue))
 
 
 def _normals(pxr: Any, mesh: Any, shape: Polygons, time: Any, notes: list[str]) -> np.ndarray | None:
@@ -302,7 +338,7 @@ def _normals(pxr: Any, mesh: Any, shape: Polygons, time: Any, notes: list[str]) 
 
 
 def uv_primvar(pxr: Any, mesh: Any, wanted: list[str]) -> Any:
-    """The primvar to look textures up at: the materials' own, a usual name, else the first of two components."""
+    """The primvar to look textures up at: the materials' own, a usual name, else the first that holds coordinates."""
     primvars = pxr.UsdGeom.PrimvarsAPI(mesh)
     for name in (*wanted, *UV_NAMES):
         found = primvars.FindPrimvarWithInheritance(name)
@@ -314,14 +350,58 @@ def uv_primvar(pxr: Any, mesh: Any, wanted: list[str]) -> Any:
 
 
 def _is_pair(primvar: Any) -> bool:
-    return str(primvar.GetTypeName()) in ("texCoord2f[]", "texCoord2d[]", "texCoord2h[]", "float2[]", "double2[]")
+    """Whether its first two components can be texture coordinates (a third is for volumes)."""
+    return re.fullmatch(r"(texCoord|float|double|half)[23][fdh]?(\[\])?", str(primvar.GetTypeName())) is not None
 
 
-def _uvs(pxr, mesh, shape: Polygons, wanted: list[str], time, notes: list[str]) -> np.ndarray | None:
-    found = uv_primvar(pxr, mesh, wanted)
-    if not found:
+def _uvs(pxr, mesh, shape: Polygons, material, materials: list[Found], time, notes: list[str]) -> np.ndarray | None:
+    """Every triangle's corners at the primvar of its own material."""
+    result = None
+    for name in dict.fromkeys(materials[k].primvar for k in np.unique(material)):
+        found = uv_primvar(pxr, mesh, [name] if name else [])
+        if found and name and found.GetPrimvarName() != name:
+            notes.append(f"There are no texture coordinates '{name}' on a mesh; '{found.GetPrimvarName()}' were taken.")
+        table = _table(found, time) if found else None
+        values = _spread(table, found.GetInterpolation(), shape, 2, "UVs", notes) if found else None
+        if values is not None:
+            result = np.full(values.shape, np.nan, np.float32) if result is None else result
+            rows = np.isin(material, [k for k, m in enumerate(materials) if m.primvar == name])
+            result[rows] = values[rows]
+    return result
+
+
+def _other_uvs(pxr, mesh, shape, material, materials: list[Found], time, notes: list[str]) -> dict[str, np.ndarray]:
+    """The coordinates that maps of the triangles' materials have beside those of the first map, by primvar."""
+    found = {}
+    for name in dict.fromkeys(n for k in np.unique(material) for n in materials[k].others().values()):
+        primvar = pxr.UsdGeom.PrimvarsAPI(mesh).FindPrimvarWithInheritance(name)
+        if primvar and primvar.HasValue() and _is_pair(primvar):
+            found[name] = _spread(_table(primvar, time), primvar.GetInterpolation(), shape, 2, "UVs", notes)
+    return {name: values for name, values in found.items() if values is not None}
+
+
+def _colours(pxr, mesh, shape: Polygons, material, materials: list[Found], time, notes: list[str]) -> np.ndarray | None:
+    """Linear corner colours of the triangles whose material has a primvar as its albedo, white on the others; None
+    where none has."""
+    result = None
+    for name in dict.fromkeys(materials[k].colour for k in np.unique(material)):
+        primvar = pxr.UsdGeom.PrimvarsAPI(mesh).FindPrimvarWithInheritance(name) if name else None
+        if not primvar or not primvar.HasValue():
+            continue
+        values = _spread(_table(primvar, time), primvar.GetInterpolation(), shape, 3, f"{name} values", notes)
+        if values is not None:
+            result = np.ones_like(values) if result is None else result
+            rows = np.isin(material, [k for k, m in enumerate(materials) if m.colour == name])
+            result[rows] = np.clip(np.nan_to_num(values[rows], nan=1.0), 0, 1)
+    return result
+
+
+def _table(primvar: Any, time: Any) -> Float[np.ndarray, "n w"] | None:
+    """A primvar's values, its indices resolved, one row each; a single value is one row."""
+    values = primvar.ComputeFlattened(time) if primvar.GetTypeName().isArray else [primvar.Get(time)]
+    if values is None or len(values) == 0 or values[0] is None:
         return None
-    return _spread(found.ComputeFlattened(time), found.GetInterpolation(), shape, 2, "UVs", notes)
+    return np.array(values, np.float32).reshape(len(values), -1)
 
 
 def _spread(
@@ -330,7 +410,7 @@ def _spread(
     """A primvar's values at every triangle corner; None, with a note, where there are not as many as there must be."""
     if values is None or len(values) == 0:
         return None
-    table = np.array(values, np.float32).reshape(len(values), -1)
+    table = np.array(values, np.float32).reshape(len(values), -1)[:, : width if what == "UVs" else None]
     where = {
         "faceVarying": (len(shape.vertices), shape.corner),
         "vertex": (len(shape.points), shape.vertices[shape.corner]),

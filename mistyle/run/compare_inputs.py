@@ -138,8 +138,11 @@ def planes(
 ) -> Planes:
     """One layer of both frames over the same window. InputRefused where sizes, channels or colour spaces differ.
 
-    window  "display": the display window, which must be the same, zero where a file has no data (as OpenEXR means
-            it); "overlap": only the pixels that both files have, in absolute pixel coordinates
+    window  "display": the display window, which must have the same size, zero where a file has no data (as OpenEXR
+            means it); "overlap": only the pixels that both files have
+
+    Pixels of display windows of one size are matched from their top left corners, wherever those stand; of windows of
+    different sizes by absolute coordinates.
     mask    (h w) of the display window: pixels that count; None: all
     """
     a, b = _layer(reference, name), _layer(test, name)
@@ -149,6 +152,8 @@ def planes(
     if a.kind == "colour" and not np.allclose(reference.chromaticities, test.chromaticities, atol=1e-4):
         found, expected = (" ".join(f"{v:.4f}" for v in f.chromaticities) for f in (test, reference))
         raise InputRefused(f"{test.path}: found primaries {found}; expected {expected}. Convert one of them.")
+    if a.display[2:] == b.display[2:]:
+        b = b.moved(a.display[0] - b.display[0], a.display[1] - b.display[1])
     area = _window(a, b, reference, test, window)
     left, right = a.values(area), b.values(area)
     counted = np.ones(left.shape[:2], bool) if mask is None else _cut(mask, a.display, area, test.path)
@@ -166,10 +171,7 @@ def _window(a: Layer, b: Layer, reference: Frame, test: Frame, how: str) -> Wind
     if how == "display":
         if a.display == b.display:
             return a.display
-        same = a.display[2:] == b.display[2:]
-        found, expected = (
-            f"{w} x {h} at ({x}, {y})" if same else f"{w} x {h}" for x, y, w, h in (b.display, a.display)
-        )
+        found, expected = (f"{w} x {h}" for _, _, w, h in (b.display, a.display))
         raise InputRefused(
             f"{test.path}: found {found} pixels; expected {expected} as {reference.path} has. Nothing is resampled: "
             "render both at one size, or compare with --window overlap what the files have in common"

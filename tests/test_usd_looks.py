@@ -1,0 +1,223 @@
+"""What a USD file says about looks: bindings by purpose, wrap modes, primvars of every kind, display colours."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from mistyle.files.raw import Raw
+from mistyle.files.read import read_mesh
+from mistyle.files.usd_read import read_usd
+
+pxr = pytest.importorskip("pxr")
+
+COLOURS = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 0]], float)
+UVS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], float)
+TRIANGLES = [[0, 1, 2], [0, 2, 3]]  # of the polygon's corners
+API = 'prepend apiSchemas = ["MaterialBindingAPI"]'
+
+
+def listed(values: np.ndarray) -> str:
+    return "[" + ", ".join("(" + ", ".join(map(str, row)) + ")" for row in values.tolist()) + "]"
+
+
+def primvar(name: str, kind: str, values: np.ndarray, interpolation: str) -> str:
+    return f'    {kind}[] primvars:{name} = {listed(values)} ( interpolation = "{interpolation}" )\n'
+
+
+ST = primvar("st", "texCoord2f", UVS, "vertex")
+BOUND = "    rel material:binding = </R/M>\n"
+
+
+def plate(extra: str, uvs: str = ST) -> str:
+    return (
+        f'def Mesh "Q" ( {API} )\n{{\n    int[] faceVertexCounts = [4]\n    int[] faceVertexIndices = [0, 1, 2, 3]\n'
+        "    point3f[] points = [(-1, -1, 0), (1, -1, 0), (1, 1, 0), (-1, 1, 0)]\n"
+        f'    uniform token subdivisionScheme = "none"\n{uvs}{extra}}}\n'
+    )
+
+
+def material(inputs: str, shaders: str = "", name: str = "M") -> str:
+    return (
+        f'def Material "{name}"\n{{\n    token outputs:surface.connect = </R/{name}/S.outputs:surface>\n'
+        f'    def Shader "S"\n    {{\n        uniform token info:id = "UsdPreviewSurface"\n{inputs}'
+        f"        token outputs:surface\n    }}\n{shaders}}}\n"
+    )
+
+
+def texture(more: str = "") -> tuple[str, str]:
+    shaders = (
+        '    def Shader "P"\n    {\n        uniform token info:id = "UsdPrimvarReader_float2"\n'
+        '        string inputs:varname = "st"\n        float2 outputs:result\n    }\n'
+        '    def Shader "T"\n    {\n        uniform token info:id = "UsdUVTexture"\n'
+        f"        asset inputs:file = @wood.png@\n{more}"
+        "        float2 inputs:st.connect = </R/M/P.outputs:result>\n        float3 outputs:rgb\n    }\n"
+    )
+    return "        color3f inputs:diffuseColor.connect = </R/M/T.outputs:rgb>\n", shaders
+
+
+def read(folder: Path, *parts: str) -> Raw:
+    return read_usd(write(folder, *parts), 100)
+
+
+def write(folder: Path, *parts: str) -> Path:
+    path = folder / "a.usda"
+    head = '#usda 1.0\n(\n    defaultPrim = "R"\n    upAxis = "Y"\n    metersPerUnit = 1\n)\ndef Xform "R"\n{\n'
+    path.write_text(head + "".join(parts) + "}\n")
+    return path
+
+
+RED = material("        color3f inputs:diffuseColor = (0.8, 0.1, 0.1)\n")
+BLUE = material("        color3f inputs:diffuseColor = (0.1, 0.1, 0.8)\n", name="B")
+FOR_BLUE = "    rel material:binding:{} = </R/B>\n"
+
+
+@pytest.mark.parametrize(
+    ("bindings", "name"),
+    [
+        (BOUND, "M"),
+        (FOR_BLUE.format("full"), "B"),
+        (FOR_BLUE.format("preview"), "B"),
+        (BOUND + FOR_BLUE.format("preview"), "B"),
+        (BOUND + FOR_BLUE.format("full"), "M"),
+        ("", "material"),
+    ],
+)
+def test_bindings_by_purpose(bindings: str, name: str, tmp_path: Path) -> None:
+    found = read(tmp_path, plate(bindings), RED, BLUE)
+    assert [m.name for m in found.materials] == [name]
+    assert any("full renders alone" in note for note in found.notes) == (bindings == FOR_BLUE.format("full"))
+
+
+@pytest.mark.parametrize(
+    "kind",
+    ["texCoord2f", "texCoord2d", "texCoord2h", "texCoord3f", "texCoord3d", "float2", "float3", "half2", "double3"],
+)
+def test_coordinates_of_every_type(kind: str, tmp_path: Path) -> None:
+    values = UVS if "2" in kind else np.c_[UVS, np.full(4, 7.0)]
+    found = read(tmp_path, plate("", primvar("st", kind, values, "vertex")))
+    assert found.uvs is not None
+    assert found.uvs.tolist() == UVS[TRIANGLES].tolist()
+
+
+@pytest.mark.parametrize("interpolation", ["vertex", "varying", "faceVarying", "uniform", "constant"])
+def test_display_colours_of_every_interpolation(interpolation: str, tmp_path: Path) -> None:
+    values = COLOURS if interpolation not in ("uniform", "constant") else COLOURS[:1]
+    found = read(tmp_path, plate(primvar("displayColor", "color3f", values, interpolation)))
+    if len(values) == 1:
+        assert found.colours is None and found.materials[0].albedo_factor == (1, 0, 0)
+    else:
+        assert found.colours is not None and found.materials[0].albedo_factor == (1, 1, 1)
+        assert found.colours.tolist() == COLOURS[TRIANGLES].tolist()
+
+
+def test_indexed_and_inherited_display_colours(tmp_path: Path) -> None:
+    indexed = primvar("displayColor", "color3f", COLOURS[:2], "vertex")
+    indexed += "    int[] primvars:displayColor:indices = [0, 1, 1, 0]\n"
+    found = read(tmp_path, plate(indexed))
+    assert found.colours is not None
+    assert found.colours.tolist() == COLOURS[[0, 1, 1, 0]][TRIANGLES].tolist()
+    above = primvar("displayColor", "color3f", COLOURS[2:3], "constant")
+    assert read(tmp_path, above, plate("")).materials[0].albedo_factor == (0, 0, 1)
+
+
+def test_a_material_comes_before_the_display_colour(tmp_path: Path) -> None:
+    found = read(tmp_path, plate(BOUND + primvar("displayColor", "color3f", COLOURS, "vertex")), RED)
+    assert found.colours is None and found.materials[0].albedo_factor == pytest.approx((0.8, 0.1, 0.1))
+
+
+def test_a_material_may_read_its_colour_from_a_primvar(tmp_path: Path) -> None:
+    reader = '    def Shader "C"\n    {\n        uniform token info:id = "UsdPrimvarReader_float3"\n'
+    reader += '        string inputs:varname = "paint"\n        float3 outputs:result\n    }\n'
+    inputs = "        color3f inputs:diffuseColor.connect = </R/M/C.outputs:result>\n"
+    found = read(tmp_path, plate(BOUND + primvar("paint", "color3f", COLOURS, "faceVarying")), material(inputs, reader))
+    assert found.colours is not None and found.materials[0].albedo_factor == (1, 1, 1)
+    assert found.colours.tolist() == COLOURS[TRIANGLES].tolist()
+
+
+def test_display_colours_become_the_albedo(tmp_path: Path) -> None:
+    path = write(tmp_path, plate(primvar("displayColor", "color3f", COLOURS, "vertex")))
+    (found,) = read_mesh(path, uv="keep", size=32).materials
+    assert found.albedo is not None
+    corners = found.albedo[[-1, -1, 0, 0], [0, -1, -1, 0]]
+    assert corners == pytest.approx(COLOURS, abs=0.05)
+
+
+@pytest.mark.parametrize("mode", ["repeat", "mirror", "clamp", "black", "useMetadata", None])
+def test_wrap_modes(mode: str | None, tmp_path: Path) -> None:
+    """A texture of two columns, red and green, along u from 0 to 2."""
+    Image.fromarray(np.array([[[255, 0, 0], [0, 255, 0]]] * 2, np.uint8)).save(tmp_path / "wood.png")
+    said = "" if mode is None else f'        token inputs:wrapS = "{mode}"\n        token inputs:wrapT = "repeat"\n'
+    uvs = primvar("st", "texCoord2f", UVS * [2, 1], "vertex")
+    path = write(tmp_path, plate(BOUND, uvs), material(*texture(said)))
+    (entry,) = read_usd(path, 100).materials[0].load(1001)[0].values()
+    expected = {"mirror": "mirror", "clamp": "clamp", "black": "clamp"}.get(mode or "", "repeat")
+    assert entry.wrap == (expected, "repeat")
+    notes = " ".join(read_mesh(path).source.notes)
+    assert ("is black outside" in notes) == (mode == "black")
+    assert ("has no wrap mode" in notes) == (mode in ("useMetadata", None))
+
+
+def test_wrap_modes_say_nothing_inside_the_square(tmp_path: Path) -> None:
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "wood.png")
+    for mode in ("black", "mirror", "useMetadata"):
+        found = read(tmp_path, plate(BOUND), material(*texture(f'        token inputs:wrapS = "{mode}"\n')))
+        assert found.notes == ()
+
+
+def test_what_is_not_read_is_said(tmp_path: Path) -> None:
+    inputs = "        int inputs:useSpecularWorkflow = 1\n        color3f inputs:specularColor = (1, 0, 0)\n"
+    inputs += "        float inputs:metallic = 1\n        color3f inputs:emissiveColor = (0, 2, 0)\n"
+    inputs += "        float inputs:clearcoat = 0.5\n        float inputs:opacity = 0.5\n"
+    see_through = "    float[] primvars:displayOpacity = [0.5]\n"
+    found = read(tmp_path, plate(BOUND + see_through), material(inputs))
+    assert found.materials[0].metallic_factor == 0
+    told = " ".join(found.notes)
+    assert "specular workflow" in told and "emissiveColor and clearcoat and opacity of material 'M'" in told
+    assert "displayOpacity" not in told and "displayOpacity was not read." in read(tmp_path, plate(see_through)).notes
+    neutral = "        color3f inputs:emissiveColor = (0, 0, 0)\n        float inputs:opacity = 1\n"
+    assert read(tmp_path, plate(BOUND), material(neutral)).notes == ()
+
+
+def test_an_unknown_shader_is_said(tmp_path: Path) -> None:
+    inputs = "        color3f inputs:diffuseColor.connect = </R/M/X.outputs:rgb>\n"
+    shader = (
+        '    def Shader "X"\n    {\n        uniform token info:id = "ND_noise"\n        float3 outputs:rgb\n    }\n'
+    )
+    assert any("ND_noise" in note for note in read(tmp_path, plate(BOUND), material(inputs, shader)).notes)
+
+
+def test_each_material_has_its_own_coordinates(tmp_path: Path) -> None:
+    """A subset's texture is looked up at its own primvar, the rest of the mesh at another."""
+    Image.new("RGB", (2, 2), (255, 0, 0)).save(tmp_path / "wood.png")
+    inputs, shaders = texture()
+    other = material(inputs, shaders).replace('"st"', '"other"').replace("/R/M/", "/R/O/").replace('"M"', '"O"')
+    subset = f'    def GeomSubset "G" ( {API} )\n    {{\n        uniform token elementType = "face"\n'
+    subset += '        uniform token familyName = "materialBind"\n        int[] indices = [1]\n'
+    subset += "        rel material:binding = </R/O>\n    }\n"
+    body = plate(BOUND + primvar("other", "texCoord2f", UVS / 2, "vertex") + subset)
+    body = body.replace("[4]", "[3, 3]").replace("[0, 1, 2, 3]", "[0, 1, 2, 0, 2, 3]")
+    found = read(tmp_path, body, material(inputs, shaders), other)
+    assert found.uvs is not None and [found.materials[m].name for m in found.material] == ["M", "O"]
+    assert found.uvs.tolist() == [UVS[[0, 1, 2]].tolist(), (UVS / 2)[[0, 2, 3]].tolist()]
+
+
+def test_maps_of_one_material_have_their_own_coordinates(tmp_path: Path) -> None:
+    """Roughness at another primvar, at which the picture stands upside down."""
+    pixels = np.full((8, 8, 3), 50, np.uint8)
+    pixels[:4] = 200  # above
+    Image.fromarray(pixels).save(tmp_path / "wood.png")
+    inputs, shaders = texture()
+    inputs += "        float inputs:roughness.connect = </R/M/T2.outputs:r>\n"
+    second = shaders.replace('"P"', '"P2"').replace('"T"', '"T2"').replace("/M/P.", "/M/P2.").replace('"st"', '"other"')
+    second = second.replace("float3 outputs:rgb", "float outputs:r")
+    body = plate(BOUND + primvar("other", "texCoord2f", UVS * [1, -1] + [0, 1], "vertex"))
+    path = write(tmp_path, body, material(inputs, shaders + second))
+    (found,) = read_mesh(path, uv="keep", size=8).materials
+    assert found.albedo is not None and found.roughness is not None
+    assert found.albedo[1, 4, 0] > found.albedo[6, 4, 0]
+    assert found.roughness[1, 4] == pytest.approx(50 / 255, abs=0.01)
+    assert found.roughness[6, 4] == pytest.approx(200 / 255, abs=0.01)
+    lost = read_mesh(write(tmp_path, plate(BOUND), material(inputs, shaders + second)), uv="keep", size=8)
+    assert lost.materials[0].roughness is None and any("roughness map" in note for note in lost.source.notes)
