@@ -103,7 +103,7 @@ def test_every_map_of_every_part_has_a_file_and_room_for_its_temporary_name(name
 def test_the_temporary_name_of_the_longest_file_fits(monkeypatch, tmp_path):
     monkeypatch.setattr(socket, "gethostname", lambda: "h" * 64)
     path = tmp_path / ("x" * (names.WRITTEN - 5) + ".usda")
-    assert len(store._hidden(path, 10**6, "tmp", ".usda").name) <= names.FILE_NAME
+    assert len(store.hidden(path, 10**6, "tmp", ".usda").name) <= names.FILE_NAME
     store.atomic_write(path, b"1")
     assert path.read_bytes() == b"1"
     endings = [f"_{slot.map}.1001.{slot.ext}" for t in TARGETS.values() for slot in t.slots]
