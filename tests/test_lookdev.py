@@ -206,8 +206,8 @@ def test_long_captions_are_shortened():
 
 def test_turntables_are_files(tmp_path, rng):
     frames = [rng.random((24, 26, 4)).astype(np.float32) for _ in range(5)]
-    write_turn(tmp_path / "turn", frames)
-    first = (tmp_path / "turn.webp").read_bytes()
+    write_turn(tmp_path / "longer", frames)
+    first = (tmp_path / "longer.webp").read_bytes()
     write_turn(tmp_path / "turn", frames[:4])
     assert sorted(p.name for p in (tmp_path / "turn").iterdir()) == [f"{k:03}.png" for k in range(4)]
     back = np.asarray(Image.open(tmp_path / "turn" / "002.png"))
@@ -246,6 +246,7 @@ def test_a_sheet_from_the_command_line(tmp_path, ball, capsys):
     words = ["--size", "64", "--spp", "1", "--frame", "32", "--turntable", "3", "--date", "2026-01-02", "--json"]
     assert main(["lookdev", str(ball), "-o", str(out), *words]) == 0
     files = json.loads(capsys.readouterr().out)
+    assert isinstance(files.pop("notes"), list)
     assert set(files) == {"sheet", "exr", "turntable"} and all(Path(p).is_file() for p in files.values())
     planes = read_exr(out / "lookdev.exr")
     linear = np.stack([planes[c] for c in "RGB"], axis=-1).astype(np.float32)

@@ -109,6 +109,10 @@ def test_every_model_is_pinned():
     for model in MODELS.values():
         if model.name in LOOSE_MODELS:
             continue
+        if model.url:  # put in its place by hand: its hash, as far as it is known, is what holds it
+            assert model.url.startswith("https://") and model.licence
+            assert all(re.fullmatch(r"[0-9a-f]{8}|[0-9a-f]{64}", digest) for digest in model.sha256.values())
+            continue
         assert re.fullmatch(r"[0-9a-f]{40}", model.revision), f"{model.name}: {model.revision} can move"
         assert model.licence
         assert all(re.fullmatch(r"[0-9a-f]{64}", digest) for digest in model.sha256.values())

@@ -146,13 +146,13 @@ VERBS = {
 
 
 def planned(inputs: Path, out: Path) -> Path:
-    """A plan of one job, as `mistyle batch` resolves it, that lies beside the inputs and works in `out`."""
+    """A plan of one job, as `mistyle batch` resolves it, that lies beside `out` and works there."""
     from dataclasses import replace
 
     from mistyle.run.batch import Choices, planned
     from mistyle.run.batch_plan import write_plan
 
-    place = inputs.parent / f"plan of {out.name}"
+    place = out.parent / f"plan of {out.name}"
     if not (place / "plan.json").is_file():
         plan = planned(inputs / "jobs.toml", out, Choices(threads=2))
         told = json.loads(write_plan(replace(plan, out=place)).read_text())

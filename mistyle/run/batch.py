@@ -132,7 +132,7 @@ def _row(plan: Plan, index: int, job: Record, ended: engines.Ended | None) -> di
         state = "failed" if ended.code not in (75, 130) else "open"
     row: dict[str, Any] = {"name": job.name, "kind": job.kind, "state": state, "index": index}
     if state == "done":
-        row |= {k: told[k] for k in ("seconds", "peak_gb", "figures", "notes")}
+        row |= {k: told[k] for k in ("seconds", "peak_gb", "figures")} | {"notes": told.get("notes", [])}
     if state == "failed":
         code = ended.code if ended is not None else told.get("exit_code", 1)
         error = ended.why if ended is not None else ""
