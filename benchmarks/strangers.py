@@ -26,6 +26,8 @@ B 40 40 220, Y 230 220 40:
     grid       rows of colours, as strings of letters or as lists: the same for a finer grid, of each cell's middle half
     points     list of [x, y, colour]: the colour at x to the right and y down, as shares of the picture
     like       path of another case that must look the same: the mean difference is within the tolerance
+    lit        true: the picture was drawn under light; its brightness is matched first, by one factor. Sheen and shading
+               stay: a tolerance of 60, a third of what separates the letters, tells colours apart
     tolerance  of colours, in steps of 0..255 (default 12)
     distinct   least number of distinct colours in the picture
     size       [width, height] in pixels, of a picture or of a capture's first one
@@ -49,13 +51,14 @@ import numpy as np
 from benchmarks.common import finish, parser
 from benchmarks.strangers_seen import Seen, cells, read, run
 from mistyle.core.errors import UsageError
+from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.files.read import read_json
 
 EXPECTED = Path(__file__).with_name("strangers_expected.json")
 LETTERS = {"R": (220, 40, 40), "G": (40, 200, 40), "B": (40, 40, 220), "Y": (230, 220, 40)}
 COUNTS = ("materials", "faces", "pictures")
 COLOURS = {"quadrants", "grid", "points", "like", "distinct"}
-CHECKS = COLOURS | {"exit", "note", "tolerance", "size", "cameras", "values", "within", *COUNTS}
+CHECKS = COLOURS | {"exit", "note", "lit", "tolerance", "size", "cameras", "values", "within", *COUNTS}
 KEYS = CHECKS | {"read", "look", "map", "run", "show", "slow"}
 Entry = Mapping[str, Any]
 
@@ -117,28 +120,36 @@ def judge(folder: Path, name: str, cases: Mapping[str, Entry]) -> list[str]:
 
 def _colours(picture: np.ndarray, entry: Entry) -> list[str]:
     """What is wrong with the colours of a picture, (rows, columns, 3) 0..255."""
-    wrong, tolerance = [], entry.get("tolerance", 12)
-    grids = {"grid": entry.get("grid", [])}
-    if "quadrants" in entry:
-        first, second, third, fourth = entry["quadrants"]
-        grids["quadrants"] = [[first, second], [third, fourth]]
-    for name, rows in grids.items():
-        if not rows:
-            continue
-        right = np.array([[_colour(cell) for cell in row] for row in rows], float)
-        found = cells(picture, *right.shape[:2])
-        if np.abs(found - right).max() > tolerance:
-            wrong.append(f"expected {name} {_numbers(right)}, found {_numbers(found)}")
-    for x, y, colour in entry.get("points", []):
-        height, width = picture.shape[:2]
-        found = picture[min(int(y * height), height - 1), min(int(x * width), width - 1)]
-        if np.abs(found - _colour(colour)).max() > tolerance:
-            wrong.append(f"expected {_numbers(_colour(colour))} at ({x}, {y}), found {_numbers(found)}")
+    height, width = picture.shape[:2]
+    compared = {}
+    for name in ("quadrants", "grid"):
+        rows = entry.get(name, [])
+        if name == "quadrants" and rows:
+            rows = [rows[:2], rows[2:]]
+        if rows:
+            right = np.array([[_colour(cell) for cell in row] for row in rows])
+            compared[name] = right, cells(picture, *right.shape[:2])
+    if "points" in entry:
+        places = [(min(int(y * height), height - 1), min(int(x * width), width - 1)) for x, y, _ in entry["points"]]
+        right = np.array([_colour(colour) for _, _, colour in entry["points"]])
+        compared["points"] = right, np.array([picture[place] for place in places])
+    wrong = []
+    for name, (right, found) in compared.items():
+        levelled = _as_bright(found, right) if entry.get("lit") else found
+        if np.abs(levelled - right).max() > entry.get("tolerance", 12):
+            wrong.append(f"expected {name} {_numbers(right)}, found {_numbers(levelled)}")
     if "distinct" in entry:
         count = len(np.unique(np.rint(picture).reshape(-1, 3), axis=0))
         if count < entry["distinct"]:
             wrong.append(f"expected at least {entry['distinct']} distinct colours, found {count}")
     return wrong
+
+
+def _as_bright(found: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The found colours times one factor of linear light, so that they are as bright as the right ones together."""
+    linear = linear_from_srgb(found / 255)
+    factor = linear_from_srgb(right / 255).sum() / max(float(linear.sum()), 1e-9)
+    return srgb_from_linear(linear * factor) * 255
 
 
 def _alike(picture: np.ndarray, twin: Seen, name: str, tolerance: float) -> list[str]:
