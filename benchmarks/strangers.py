@@ -26,8 +26,8 @@ B 40 40 220, Y 230 220 40:
     grid       rows of colours, as strings of letters or as lists: the same for a finer grid, of each cell's middle half
     points     list of [x, y, colour]: the colour at x to the right and y down, as shares of the picture
     like       path of another case that must look the same: the mean difference is within the tolerance
-    lit        true: the picture was drawn under light; its brightness is matched first, by one factor. Sheen and shading
-               stay: a tolerance of 60, a third of what separates the letters, tells colours apart
+    lit        true: the picture was drawn under light; its brightness is matched first, by one factor. Sheen stays:
+               a tolerance of 60, a third of what separates the letters, tells them apart
     tolerance  of colours, in steps of 0..255 (default 12)
     distinct   least number of distinct colours in the picture
     size       [width, height] in pixels, of a picture or of a capture's first one
