@@ -17,12 +17,17 @@ T = TypeVar("T")
 
 def arguments(description: str, argv: list[str] | None = None) -> argparse.Namespace:
     """The options that every benchmark has: --quick and --json FILE."""
-    parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--quick", action="store_true", help="small sizes, only to see that it works")
-    parser.add_argument(
+    return parser(description).parse_args(argv)
+
+
+def parser(description: str) -> argparse.ArgumentParser:
+    """A parser of the options that every benchmark has, for benchmarks that have more."""
+    options = argparse.ArgumentParser(description=description)
+    options.add_argument("--quick", action="store_true", help="small sizes, only to see that it works")
+    options.add_argument(
         "--json", type=Path, metavar="FILE", help="also write the figures as JSON ('-': to stdout only)"
     )
-    return parser.parse_args(argv)
+    return options
 
 
 def timed(figures: dict[str, float], name: str, work: Callable[[], T]) -> T:
