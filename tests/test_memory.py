@@ -13,6 +13,7 @@ from mistyle.core import memory
 from mistyle.core.maps import Texels
 from mistyle.files.records import load_record, save_record
 
+BLOCK = 48_000_000
 FREED = """
 import ctypes, resource
 from mistyle.core import memory

@@ -158,9 +158,9 @@ class _Job:
         counts = mask & (np.array(shown)[..., 3] > SOLID)
         clean = np.ascontiguousarray(np.where(counts[..., None], rgb, 0), np.float32)
         wide = self.mi.TensorXb(aligned(np.broadcast_to(counts[..., None], clean.shape), bool))
-        return shown, scene_grad.Sight(
-            sensor, self.mi.TensorXf(aligned(clean)), wide, None, max(float(counts.mean()), 1e-9)
-        )
+        share = max(float(counts.mean()), 1e-9)
+        # The weights are the relative loss's, which a polish does not take.
+        return shown, scene_grad.Sight(sensor, self.mi.TensorXf(aligned(clean)), wide, None, share)
 
     def gradient(self, values, k: int, spp: tuple[int, int], seeds: tuple[int, int]):
         """Loss of picture k and its gradient by key."""
