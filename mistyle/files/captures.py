@@ -183,7 +183,7 @@ def reading_notes(path: Path, shots: Sequence[Shot]) -> tuple[str, ...]:
         applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
         if applied:
             notes.append(
-                f"{' and '.join(applied)} of {file.name} {'was' if len(applied) == 1 else 'were'} undone: the cameras stand in the space of the "
+                f"{' and '.join(applied)} of {file.name} were undone: the cameras stand in the space of the "
                 "reconstruction. A mesh in nerfstudio's own space needs --align."
             )
     return tuple(notes)
