@@ -238,7 +238,6 @@ def test_a_file_that_takes_too_long_is_refused(tmp_path: Path, monkeypatch: pyte
         read_mesh(path)
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the address space")
 LITTLE = """
 import sys
 from pathlib import Path
@@ -258,6 +257,7 @@ assert read_picture(path).rgb.shape == (3000, 3000, 3)
 """
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux limits the address space")
 def test_a_file_that_takes_too_much_memory_is_refused(tmp_path: Path):
     """In a process of its own: what ran before in this one decides with how much its reader begins."""
     write_png(tmp_path / "a.png", np.zeros((3000, 3000, 3), np.float32))
