@@ -24,6 +24,7 @@ from mistyle.files.store import (
     COUNTER,
     DONE,
     LOCK,
+    atomic_folder,
     atomic_write,
     clean_leftovers,
     flush_all,
@@ -294,24 +295,15 @@ def put_folder(
     `written(target)` names those files. Of a merged folder they are replaced or go, and all others stay as they are.
     UsageError where a file that is not ours has the name of a new one.
     """
-    target, count = real(target), next(COUNTER)
-    temporary = hidden(target, count, "tmp")
-    with faults.told(target):
-        target.parent.mkdir(parents=True, exist_ok=True)
-        clean_leftovers(target.parent, name=target.name)
-        temporary.mkdir()
-    try:
-        with faults.told(target, temporary):
-            fill(temporary)
-            flush_all(temporary)
-            old = written(target) if target.is_dir() else set()
-            if not os.path.lexists(target) or _only(target, old):
-                swap(temporary, target, hidden(target, count, "old"))
-                flush_folder(target.parent)
-            else:
-                _lay_into(temporary, target, old, overwrite)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
+
+    def put(new: Path, place: Path, aside: Path) -> None:
+        old = written(place) if place.is_dir() else set()
+        if not os.path.lexists(place) or _only(place, old):
+            swap(new, place, aside)
+        else:
+            _lay_into(new, place, old, overwrite)
+
+    atomic_folder(target, fill, put)
 
 
 def _lay_into(temporary: Path, target: Path, old: set[str], overwrite: bool) -> None:

@@ -52,14 +52,17 @@ def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
             temporary.unlink(missing_ok=True)
 
 
-def atomic_folder(target: Path, write: Callable[[Path], None]) -> None:
+def atomic_folder(
+    target: Path, write: Callable[[Path], object], put: Callable[[Path, Path, Path], None] | None = None
+) -> None:
     """Fill a new folder by `write(folder)` and put it at `target`, in the place of an older one, when it is complete.
 
     For folders that are mistyle's alone (checkpoints): all that an older one holds goes. Folders in which a user may
     have files are `output.put_folder`'s and `output.replace_files`'s.
 
     The older folder stays until then. Between the two renames of the swap `target` is absent for an instant; a run
-    killed just there is mended by the next call (or the next Keeper) for the same place.
+    killed just there is mended by the next call (or the next Keeper) for the same place. `put(new, target, old)` may
+    bring the new folder in otherwise than by `swap`.
     """
     target = Path(os.path.realpath(target))  # a link to a folder elsewhere stays a link
     count = next(COUNTER)
@@ -72,7 +75,7 @@ def atomic_folder(target: Path, write: Callable[[Path], None]) -> None:
         with faults.told(target, temporary):
             write(temporary)
             flush_all(temporary)
-            swap(temporary, target, old)
+            (put or swap)(temporary, target, old)
             flush_folder(target.parent)
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
