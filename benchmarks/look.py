@@ -1,0 +1,166 @@
+"""How the embedded stylizer looks: light in the albedo, and what blind viewers chose. `python -m benchmarks.look [VERB]`
+
+figures   paints every style on every mesh with HEAD and measures the light in the albedo: `light.*`
+sheets    paints them with HEAD and with --against COMMIT, and builds sheets for blind viewers with their key
+score     compares viewers' answers with the key: `chosen.ship.KIND`, `chosen.style.KIND`, `chosen.shape.KIND`,
+          `odd_one_out`, `chosen.ebsynth.KIND` (KIND: oil, structured)
+styles    writes the style pictures that are made here
+Without a verb: figures, and the score of the answers in this folder. What was painted once is taken from --cache.
+"""
+
+import argparse
+import json
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks import common, look_light, look_paint, look_score, look_sheets, look_styles
+
+HERE = Path(__file__).resolve().parent
+KEY, ANSWERS = HERE / "look_key.json", HERE / "look_answers.json"
+MESHES = {"spot": "spot.obj", "bunny": "stanford-bunny.obj", "teapot": "teapot.obj"}
+QUICK_OPTIONS = ("--samples", "5000", "--atlas", "256")
+VERBS = ("figures", "sheets", "score", "styles")
+
+
+def options(argv: Sequence[str] | None) -> argparse.Namespace:
+    """The command line."""
+    made = common.parser(__doc__ or "")
+    made.formatter_class = argparse.RawDescriptionHelpFormatter
+    made.add_argument("verb", nargs="?", choices=VERBS)
+    made.add_argument("--styles", metavar="A,B", help=f"which of {', '.join(look_styles.KINDS)} (default all)")
+    made.add_argument("--meshes", metavar="A,B", help=f"which of {', '.join(MESHES)} (default all)")
+    made.add_argument("--presets", default=None, metavar="A,B", help="figures: draft; sheets: draft,standard")
+    made.add_argument("--against", metavar="COMMIT", help="sheets: the other candidate; figures: measure it too")
+    made.add_argument("--whole", action="store_true", help="whole jobs with their fit, not the paint alone (slow)")
+    made.add_argument("--set", action="append", default=[], metavar="K=V", help="a setting of HEAD's jobs, to try it")
+    made.add_argument("--tests", default="choice,odd", help="which sheets: choice, odd")
+    made.add_argument("--out", type=Path, metavar="DIR", help="where sheets and key.json, or styles, are written")
+    made.add_argument("--seed", type=int, default=0, help="of the sheets' shuffle")
+    made.add_argument("--key", type=Path, default=KEY, metavar="FILE", help="score: the key (default: in this folder)")
+    made.add_argument("--answers", type=Path, default=ANSWERS, metavar="FILE", help="score: the answers")
+    made.add_argument("--cache", type=Path, default=Path(tempfile.gettempdir()) / "mistyle-look", metavar="DIR")
+    return made.parse_args(argv)
+
+
+def chosen_names(text: str | None, known: Sequence[str], what: str) -> list[str]:
+    """Names of a list such as "a,b"; all where there is none. SystemExit at an unknown one."""
+    names = list(known) if text is None else [name for name in text.split(",") if name]
+    wrong = [name for name in names if name not in known]
+    if wrong:
+        raise SystemExit(f"--{what}: there is no '{wrong[0]}'; choose among {', '.join(known)}")
+    return names
+
+
+def pieces(chosen: argparse.Namespace, presets: Sequence[str]) -> list[look_paint.Piece]:
+    """Every style on every mesh with every preset, style after style."""
+    styles = chosen_names(chosen.styles, list(look_styles.KINDS), "styles")
+    meshes = chosen_names(chosen.meshes, list(MESHES), "meshes")
+    more: tuple[str, ...] = () if chosen.whole else look_paint.PAINT_ONLY
+    if chosen.quick:
+        styles, meshes, presets = (styles if chosen.styles else styles[:1]), meshes[:1], presets[:1]
+        more += QUICK_OPTIONS
+    files = {style: look_styles.file_of(style, chosen.cache / "styles") for style in styles}
+    folder = look_paint.DATA / "meshes" / "plain"
+    return [
+        look_paint.Piece(style, mesh, preset, files[style], folder / MESHES[mesh], more)
+        for style in styles
+        for mesh in meshes
+        for preset in presets
+    ]
+
+
+def with_settings(found: Sequence[look_paint.Piece], pairs: Sequence[str]) -> list[look_paint.Piece]:
+    """The pieces with further settings, which only HEAD's jobs get."""
+    more = tuple(word for pair in pairs for word in ("--set", pair))
+    return [look_paint.Piece(**vars(piece) | {"options": piece.options + more}) for piece in found]
+
+
+def start_engines() -> None:
+    """The renderer, as a job starts it."""
+    from mistyle.run.settings import Settings
+    from mistyle.run.start import start_engines
+
+    start_engines(Settings())
+
+
+def figures(chosen: argparse.Namespace) -> dict[str, float]:
+    """`light.*` of HEAD, and as `light.other.*` of the other commit where one is named."""
+    # The light is in the painting, not in what the fit does to it; an atlas of 1,024 is fine enough to tell.
+    found = pieces(chosen, chosen_presets(chosen, "draft"))
+    start_engines()
+    trees = [(look_paint.this_tree(), with_settings(found, chosen.set), "light.")]
+    if chosen.against:
+        trees.append((look_paint.tree_at(chosen.against, chosen.cache), list(found), "light.other."))
+    result: dict[str, float] = {}
+    for tree, these, stem in trees:
+        glbs = look_paint.painted(tree, these, chosen.cache)
+        lights: dict[str, list[Any]] = {}
+        for piece, glb in zip(these, glbs, strict=True):
+            light = look_light.light_of(glb)
+            lights.setdefault(piece.style, []).append(light)
+            if light.ratio is not None:
+                result[f"{stem}ratio.{piece.style}.{piece.mesh}.{piece.preset}"] = light.ratio
+        mean = look_light.mean_light(list(lights.values()))
+        result |= {name.replace("light.", stem, 1): value for name, value in mean.items()}
+    return result
+
+
+def chosen_presets(chosen: argparse.Namespace, default: str) -> list[str]:
+    """The presets, as given or by default."""
+    return chosen_names(chosen.presets or default, ["draft", "standard", "fine", "demo"], "presets")
+
+
+def sheets(chosen: argparse.Namespace) -> dict[str, float]:
+    """Paint, light and write the sheets and key.json into --out; counts them."""
+    if not chosen.against or not chosen.out:
+        raise SystemExit("sheets: name the other candidate with --against COMMIT, and a folder with --out DIR")
+    tests = chosen_names(chosen.tests, ["choice", "odd"], "tests")
+    found = pieces(chosen, chosen_presets(chosen, "draft,standard"))
+    start_engines()
+    ours, theirs = look_paint.this_tree(), look_paint.tree_at(chosen.against, chosen.cache)
+    our_glbs = look_paint.painted(ours, with_settings(found, chosen.set), chosen.cache)
+    their_glbs = look_paint.painted(theirs, found, chosen.cache) if "choice" in tests else our_glbs
+    lines = []
+    for piece, mine, other in zip(found, our_glbs, their_glbs, strict=True):
+        kind = look_styles.KINDS[piece.style]
+        if "choice" in tests:
+            lines.append(look_sheets.build_choice(piece, kind, mine, other, chosen.out / "sheets", chosen.seed))
+        if "odd" in tests:
+            lines.append(look_sheets.build_odd(piece, kind, mine, chosen.out / "sheets", chosen.seed))
+        print(f"sheets of {piece.label}", file=sys.stderr)
+    about = {"head": ours.digest, "against": theirs.name, "seed": chosen.seed, "set": chosen.set}
+    look_sheets.write_key(chosen.out / "key.json", lines, **about)
+    return {"sheets": float(len(lines))}
+
+
+def score(chosen: argparse.Namespace) -> dict[str, float]:
+    """`chosen.*` and `odd_one_out` of the answers."""
+    return look_score.score(look_score.read_json(chosen.key), look_score.read_json(chosen.answers))
+
+
+def styles(chosen: argparse.Namespace) -> dict[str, float]:
+    """Write the made style pictures into --out."""
+    if not chosen.out:
+        raise SystemExit("styles: name a folder with --out DIR")
+    names = [n for n in chosen_names(chosen.styles, list(look_styles.KINDS), "styles") if n in look_styles.MADE]
+    return {"styles": float(len([look_styles.file_of(name, chosen.out) for name in names]))}
+
+
+def main(argv: Sequence[str] | None = None) -> None:
+    chosen = options(argv)
+    if chosen.verb is not None:
+        common.finish(globals()[chosen.verb](chosen), chosen.json)
+        return
+    result = figures(chosen)
+    if chosen.key.exists() and chosen.answers.exists():
+        result |= score(chosen)
+    else:
+        print(f"no answers yet: {json.dumps(str(chosen.answers))} and its key are not there", file=sys.stderr)
+    common.finish(result, chosen.json)
+
+
+if __name__ == "__main__":
+    main()

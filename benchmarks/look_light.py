@@ -1,0 +1,124 @@
+"""Pictures of painted assets for `benchmarks.look`: under real light, without light, and their figures."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache as once
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.look_paint import DATA
+from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
+
+HDRIS = ("venice_sunset_1k.hdr", "studio_small_03_1k.hdr")
+SIDES = ((35.0, 15.0), (215.0, -12.0))  # azimuth, elevation; the second shows the underside
+SIZE, SPP = 372, 32
+GROUND = (0.35, 0.35, 0.35)  # linear, behind the asset
+ATLAS = 1024
+
+
+@once
+def sky(name: str) -> Any:
+    """An environment, exposed so that a grey ball in it has a mean luminance of 0.18."""
+    from mistyle.files.read import read_radiance
+    from mistyle.render.lookdev import light_rig
+    from mistyle.render.sheet import Rig, exposed
+
+    return exposed(Rig(name, light_rig(str(DATA / "hdri" / name), read_radiance)[0])).light
+
+
+def lit(glb: Path, size: int = SIZE, spp: int = SPP) -> list[np.ndarray]:
+    """The asset under every environment from every side, (size, size, 3) uint8 sRGB; kept beside the GLB."""
+    kept = glb.with_name(f"{glb.name}.lit-{size}-{spp}.npy")
+    if not kept.exists():
+        from mistyle.files.read import read_mesh
+        from mistyle.render.sheet import Stage
+
+        stage = Stage(read_mesh(glb))
+        drawn = [stage.picture(*side, sky(name), size, spp) for name in HDRIS for side in SIDES]
+        np.save(kept, np.stack([encoded(picture) for picture in drawn]))
+    return list(np.load(kept))
+
+
+def encoded(picture: np.ndarray) -> np.ndarray:
+    """A linear premultiplied picture with alpha, over GROUND, as uint8 sRGB."""
+    from mistyle.core.image import srgb_from_linear
+    from mistyle.render.sheet import over
+
+    return np.round(255 * srgb_from_linear(np.clip(over(picture, GROUND), 0, 1))).astype(np.uint8)
+
+
+def light_of(glb: Path) -> BakedLight:
+    """What the albedo of a kept GLB says about light, over all its texels."""
+    from mistyle.core.mesh import face_areas
+    from mistyle.files.read import read_mesh
+    from mistyle.render.draw import tracer
+    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.stages.texels import rasterise, start_maps
+
+    asset = read_mesh(glb)
+    traced, areas, found = tracer(asset.mesh), face_areas(asset.mesh).astype(np.float64), []
+    for part, material in enumerate(asset.materials):
+        texels = rasterise(asset.mesh, part, ATLAS)
+        at = texels.covered
+        albedo = start_maps(material, texels, ATLAS).albedo[at]
+        openness = ambient_occlusion(traced, texels.position[at], texels.normal[at])
+        found.append((albedo, texels.normal[at], openness, texel_areas(texels.face[at], areas)))
+    return baked_light(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+
+
+def mean_light(lights: Sequence[Sequence[BakedLight]]) -> dict[str, float]:
+    """The figures of `light.*` from what was measured, style by style, each on every mesh.
+
+    ratio_mean    geometric mean of up/down over the styles (of a style: over its meshes)
+    ratio_spread  the same of the ratio or its inverse, whichever is above 1: opposite ratios do not cancel
+    ratio_worst   the style furthest from 1, as a factor above 1
+    correlation   the largest of the mean sizes of the four correlations
+    """
+    logs = [[np.log(one.ratio) for one in style if one.ratio is not None] for style in lights]
+    styles = np.array([np.mean(values) for values in logs if values])
+    sizes = np.array([[[abs(v) for v in (a.x, a.y, a.z, a.openness)] for a in style] for style in lights])
+    means = sizes.reshape(-1, 4).mean(axis=0)
+    figures = {
+        "light.ratio_mean": float(np.exp(styles.mean())),
+        "light.ratio_spread": float(np.exp(np.abs(styles).mean())),
+        "light.ratio_worst": float(np.exp(np.abs(styles).max())),
+        "light.correlation": float(means.max()),
+    }
+    return figures | {f"light.correlation.{n}": float(v) for n, v in zip(("x", "y", "z", "openness"), means, strict=True)}
+
+
+def piece_of_asset(glb: Path, unit: float, pixels: int, seed: int) -> np.ndarray:
+    """A flat, wholly visible piece of the asset's surface without light: (pixels, pixels, 3) sRGB 0..1.
+
+    `unit` is the side of a pixel on the surface, in working units. Of many places chosen by the seed the flattest few
+    count, and of those one is taken.
+    """
+    from mistyle.core.camera import look_at
+    from mistyle.core.image import srgb_from_linear
+    from mistyle.core.maps import flat_maps
+    from mistyle.core.mesh import face_areas, face_normals
+    from mistyle.files.read import read_mesh
+    from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.lookdev import material_maps
+    from mistyle.render.unlit import unlit
+
+    asset, rng, distance = read_mesh(glb), np.random.default_rng(seed), 4.0
+    mesh, traced, tries = asset.mesh, tracer(asset.mesh), []
+    areas, normals = face_areas(mesh).astype(np.float64), face_normals(mesh)
+    for face in rng.choice(len(mesh.faces), 60, p=areas / areas.sum()):
+        target, normal = mesh.positions[mesh.faces[face]].mean(axis=0), normals[face]
+        fov = float(np.degrees(2 * np.arctan(unit * pixels / 2 / distance)))
+        camera = look_at((target + distance * normal).tolist(), target.tolist(), fov=fov, size=(pixels, pixels))
+        hits = gbuffer(traced, camera)
+        near = np.abs(hits.depth - distance) < unit * pixels
+        facing = np.where(hits.mask & near, hits.normal @ normal, -1.0)
+        tries.append((float(np.percentile(facing, 2)), len(tries), camera))
+    best = sorted(tries, key=lambda one: (-one[0], one[1]))[:8]
+    camera = best[int(rng.integers(len(best)))][2]
+    albedos = [material_maps(material).albedo for material in asset.materials]
+    maps = [replace(flat_maps(len(albedo)), albedo=albedo) for albedo in albedos]
+    rgb, _ = unlit(traced, maps, [camera], fine=4)[0]
+    return srgb_from_linear(np.clip(rgb, 0, 1))
+
