@@ -14,6 +14,7 @@ from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
 HDRIS = ("venice_sunset_1k.hdr", "studio_small_03_1k.hdr")
 SIDES = ((35.0, 15.0), (215.0, -12.0))  # azimuth, elevation; the second shows the underside
 SIZE, SPP = 372, 32
+DISTANCE, MARGIN = 4.5, 1.06  # of the camera from the middle, and of the picture around the object
 GROUND = (0.35, 0.35, 0.35)  # linear, behind the asset
 ATLAS = 1024
 
@@ -33,12 +34,32 @@ def lit(glb: Path, size: int = SIZE, spp: int = SPP) -> list[np.ndarray]:
     kept = glb.with_name(f"{glb.name}.lit-{size}-{spp}.npy")
     if not kept.exists():
         from mistyle.files.read import read_mesh
-        from mistyle.render.sheet import Stage
+        from mistyle.render.lookdev import asset_scene, asset_shapes, drawn
 
-        stage = Stage(read_mesh(glb))
-        drawn = [stage.picture(*side, sky(name), size, spp) for name in HDRIS for side in SIDES]
-        np.save(kept, np.stack([encoded(picture) for picture in drawn]))
+        asset, pictures = read_mesh(glb), []
+        shapes = asset_shapes(asset)
+        for name in HDRIS:
+            for azimuth, elevation in SIDES:
+                camera = close_camera(asset.mesh.positions, azimuth, elevation, size)
+                # The light stands still about the camera: the asset is turned, not the photographer.
+                light = replace(sky(name), turn=sky(name).turn + azimuth)
+                pictures.append(encoded(drawn(asset_scene(shapes, camera, (light,), "path"), 0, spp, 0)))
+        np.save(kept, np.stack(pictures))
     return list(np.load(kept))
+
+
+def close_camera(positions: np.ndarray, azimuth: float, elevation: float, size: int) -> Any:
+    """A camera on the orbit of radius DISTANCE, aimed and zoomed so that the object fills the picture."""
+    from mistyle.core.camera import look_at, orbit
+
+    far = orbit(azimuth, elevation, distance=DISTANCE, fov=30.0, size=(size, size))
+    eye, axes = far.position, far.world_from_cam[:3, :3]
+    target = (positions.min(axis=0) + positions.max(axis=0)) / 2
+    seen = (positions - eye) @ axes
+    middle = (target - eye) @ axes
+    reach = np.abs(seen[:, :2] / seen[:, 2:] - middle[:2] / middle[2]).max()
+    fov = float(np.degrees(2 * np.arctan(reach * MARGIN)))
+    return look_at(eye.tolist(), target.tolist(), fov=fov, size=(size, size))
 
 
 def encoded(picture: np.ndarray) -> np.ndarray:
