@@ -1,4 +1,6 @@
-"""How the embedded stylizer looks: light in the albedo, and what blind viewers chose. `python -m benchmarks.look [VERB]`
+"""How the embedded stylizer looks: light in the albedo, and the choices of blind viewers.
+
+`python -m benchmarks.look [VERB]`
 
 figures   paints every style on every mesh with HEAD and measures the light in the albedo: `light.*`
 sheets    paints them with HEAD and with --against COMMIT, and builds sheets for blind viewers with their key

@@ -107,7 +107,9 @@ def mean_light(lights: Sequence[Sequence[BakedLight]]) -> dict[str, float]:
         "light.ratio_worst": float(np.exp(np.abs(styles).max())),
         "light.correlation": float(means.max()),
     }
-    return figures | {f"light.correlation.{n}": float(v) for n, v in zip(("x", "y", "z", "openness"), means, strict=True)}
+    return figures | {
+        f"light.correlation.{n}": float(v) for n, v in zip(("x", "y", "z", "openness"), means, strict=True)
+    }
 
 
 def piece_of_asset(glb: Path, unit: float, pixels: int, seed: int) -> np.ndarray:
@@ -142,4 +144,3 @@ def piece_of_asset(glb: Path, unit: float, pixels: int, seed: int) -> np.ndarray
     maps = [replace(flat_maps(len(albedo)), albedo=albedo) for albedo in albedos]
     rgb, _ = unlit(traced, maps, [camera], fine=4)[0]
     return srgb_from_linear(np.clip(rgb, 0, 1))
-

@@ -79,7 +79,8 @@ def stained_glass() -> np.ndarray:
     inside = np.where(region == 1, 0, np.where((region == 2) | (region == 3), 300 + ray, cell))
     label = region * 1000 + inside
     palettes = {
-        0: "1d3f9a 2a5fc0 1b2f78 3b82cf 5a3a9e", 1: "ffd84a", 2: "ffb52e f79a1e ffc840", 3: "f0702a e2552e f58a3c d8402e",
+        0: "1d3f9a 2a5fc0 1b2f78 3b82cf 5a3a9e", 1: "ffd84a",
+        2: "ffb52e f79a1e ffc840", 3: "f0702a e2552e f58a3c d8402e",
         4: "6a3f8c 83509a 56347e", 5: "14713f 1f8a4c 0f5a38 3aa055", 6: "2fb4c8 1f95b5 58cad0 1b7fa5",
         7: "9fb52c b9c43a 7d9a24 c79a2a c0392b",
     }  # fmt: skip
@@ -213,16 +214,24 @@ def tartan() -> np.ndarray:
     return eight(np.where(over[..., None], warp[i], weft[j]) * shade[..., None] * 1.08)
 
 
-# Left halves of eight sprites, mirrored; letters index PALETTE.
+# Left halves of eight sprites, 16 rows each, mirrored; letters index PALETTE.
 SPRITES = """
-......kk ....kkkk ...kgggg ..kgGGgg ..kgGggg .kggGggw .kgggggk .kgggggk .kgrgggg .kggggkk ..kggggg ..kgGggg ...kgggg ...kkgkg ..kkk.kk ........
-........ ....kkkk ...krrrr ..krrRRr .krrwwrr .krwwwrr krrwwrrr krrrrrrr krrrrwwr kkrrrwwr .kkkkkkk ...ksskk ...kssss ...kSsss ....kkkk ........
-........ ........ ...kkkkk ..kBbbbb ..kBbbbb ..kkkkkk ..kyyykk ..kbbbkk ..kBbbky ..kBbbky ..kBbbbk ..kBbbbb ..kBBBBB ..kkkkkk ........ ........
-........ ........ ..kkk... .krrrk.. krrwrrk. krwrrrrk krwrrrrr krrrrrrr .krrrrrr ..krrrrr ...krrrr ....krrr .....krr ......kr .......k ........
-.......k ......kG .....kGG ....kGgg .....kGG ....kGGg ...kGggg ....kGGg ...kGGgg ..kGgggg .kkkkkkk ......kB ......kB ......kb ......kk ........
-.....kkk ....kBBB ...kBbbb ...kBsss ...kssks ...kssks ...kssss ....kssr ..kkkkss .kuuUkkk .kuuUuUU .ksskuuU .kkkkuuu ...kBBkk ...kBBk. ...kkkk.
-........ ......kk .....kyy ....kyYY ...kyYyy ...kyYyk ...kyYyk ...kyYyk ...kyYyk ...kyYyy ....kyYY .....kyy ......kk ........ ........ ........
-........ .kk..... kwwk.... kwwwkkkk .kkwwwww ..kwkkww ..kwkkww ..kwwwwk ...kwwww ....kwkw ....kkkk ........ .kk...kk kwwkkkww .kwwwwkk ..kkkk..
+......kk ....kkkk ...kgggg ..kgGGgg ..kgGggg .kggGggw .kgggggk .kgggggk
+.kgrgggg .kggggkk ..kggggg ..kgGggg ...kgggg ...kkgkg ..kkk.kk ........
+........ ....kkkk ...krrrr ..krrRRr .krrwwrr .krwwwrr krrwwrrr krrrrrrr
+krrrrwwr kkrrrwwr .kkkkkkk ...ksskk ...kssss ...kSsss ....kkkk ........
+........ ........ ...kkkkk ..kBbbbb ..kBbbbb ..kkkkkk ..kyyykk ..kbbbkk
+..kBbbky ..kBbbky ..kBbbbk ..kBbbbb ..kBBBBB ..kkkkkk ........ ........
+........ ........ ..kkk... .krrrk.. krrwrrk. krwrrrrk krwrrrrr krrrrrrr
+.krrrrrr ..krrrrr ...krrrr ....krrr .....krr ......kr .......k ........
+.......k ......kG .....kGG ....kGgg .....kGG ....kGGg ...kGggg ....kGGg
+...kGGgg ..kGgggg .kkkkkkk ......kB ......kB ......kb ......kk ........
+.....kkk ....kBBB ...kBbbb ...kBsss ...kssks ...kssks ...kssss ....kssr
+..kkkkss .kuuUkkk .kuuUuUU .ksskuuU .kkkkuuu ...kBBkk ...kBBk. ...kkkk.
+........ ......kk .....kyy ....kyYY ...kyYyy ...kyYyk ...kyYyk ...kyYyk
+...kyYyk ...kyYyy ....kyYY .....kyy ......kk ........ ........ ........
+........ .kk..... kwwk.... kwwwkkkk .kkwwwww ..kwkkww ..kwkkww ..kwwwwk
+...kwwww ....kwkw ....kkkk ........ .kk...kk kwwkkkww .kwwwwkk ..kkkk..
 """
 PALETTE = {
     "k": "1a1c2c", "w": "f4f4f4", "g": "38b764", "G": "257179", "r": "e43b44", "R": "ff9a8a", "s": "eab98a",
@@ -231,9 +240,10 @@ PALETTE = {
 
 
 def sprites() -> np.ndarray:
-    """A sheet of 8 by 8 tiles of 16 pixels, each 8 pixels of the picture wide: creatures, fruit, walls, water, grass."""
+    """A sheet of 8 by 8 tiles of 16 pixels, each 8 pixels of the picture wide: figures before walls, water, grass."""
     rng, tiles = np.random.default_rng(21), []
-    figures = [line.split() for line in SPRITES.strip().splitlines()]
+    words = SPRITES.split()
+    figures = [words[k : k + 16] for k in range(0, len(words), 16)]
     makers = [grass, bricks, water, planks]
     for k in range(64):
         row, column = divmod(k, 8)

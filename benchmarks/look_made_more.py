@@ -40,7 +40,11 @@ def halftone() -> np.ndarray:
         tower = (x >= left) & (x < left + width) & (y > top)
         ink = (blue, rgb("6a2c91"), black)[rng.integers(3)]
         lit = (((x - left) * 42 % 1) < 0.5) & (((y - top) * 30 % 1) < 0.5) & (y > top + 0.02) & (x > left + 0.012)
-        paper = np.where((dots < 0.4)[..., None], ink, white) if rng.random() < 0.45 else np.broadcast_to(ink, picture.shape)
+        paper = (
+            np.where((dots < 0.4)[..., None], ink, white)
+            if rng.random() < 0.45
+            else np.broadcast_to(ink, picture.shape)
+        )
         picture = np.where(tower[..., None], np.where((lit & tower)[..., None], yellow, paper), picture)
         label[tower] = 100 + int(1000 * left)
         left += width
@@ -100,20 +104,20 @@ def cross_hatching() -> np.ndarray:
     edges = np.zeros(label.shape, np.uint8)
     edges[:, :-1] |= label[:, :-1] != label[:, 1:]
     edges[:-1] |= label[:-1] != label[1:]
-    shift = [2.2 * fine * noise(side, 14, rng) for _ in range(2)]
+    shift = [np.float32(2.2 * fine) * noise(side, 14, rng).astype(np.float32) for _ in range(2)]
     rows, columns = np.mgrid[:side, :side].astype(np.float32)
     for offset in (0.0, 3.0):
-        moved = cv2.remap(
-            cv2.dilate(edges, np.ones((4, 4), np.uint8)) * 255,
-            (columns + shift[0] + offset).astype(np.float32), (rows + shift[1] + offset).astype(np.float32), cv2.INTER_LINEAR,
-        )  # fmt: skip
+        x, y = (base + drift + np.float32(offset) for base, drift in zip((columns, rows), shift, strict=True))
+        moved = cv2.remap(cv2.dilate(edges, np.ones((4, 4), np.uint8)) * 255, x, y, cv2.INTER_LINEAR)
         ink = np.maximum(ink, moved)
     drawn = cv2.resize(ink, (SIDE, SIDE), interpolation=cv2.INTER_AREA)[..., None] / 255
     paper = rgb("f6f0e2") * (1 + 0.012 * noise(SIDE, 220, rng) + 0.01 * noise(SIDE, 5, rng))[..., None]
     return eight(paper * (1 - drawn) + rgb("1b1a22") * drawn)
 
 
-def hatch(ink: np.ndarray, tone: np.ndarray, turn: float, darker: float, pitch: float, rng: np.random.Generator) -> None:
+def hatch(
+    ink: np.ndarray, tone: np.ndarray, turn: float, darker: float, pitch: float, rng: np.random.Generator
+) -> None:
     """Draw strokes along one direction where the tone is darker than `darker`, in place."""
     side, along, across = len(ink), np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
     reach = side * 0.75
@@ -144,7 +148,11 @@ def river_park(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     ripple = 0.5 + 0.5 * np.sin(120 * y + 4 * np.sin(9 * x))
     colour[water] = (rgb("3f7fb5") + ripple[..., None] * (rgb("8fc0dc") - rgb("3f7fb5")))[water]
     for cx, size in ((0.22, 0.09), (0.4, 0.06), (0.58, 0.075)):
-        sail = (y < 0.43) & (y > 0.43 - 1.9 * size) & (np.abs(x - cx) < size * 0.55 * (y - 0.43 + 1.9 * size) / (1.9 * size))
+        sail = (
+            (y < 0.43)
+            & (y > 0.43 - 1.9 * size)
+            & (np.abs(x - cx) < size * 0.55 * (y - 0.43 + 1.9 * size) / (1.9 * size))
+        )
         colour[sail] = rgb("fff6e6")
         colour[(np.abs(y - 0.437) < 0.008) & (np.abs(x - cx) < size * 0.7)] = rgb("7a3b2e")
     lawn = y > 0.58 + 0.18 * (x - 0.5) ** 2 - 0.12 * x
@@ -164,7 +172,7 @@ def river_park(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def pointillism() -> np.ndarray:
-    """The park in dabs of unmixed colour: each place has dots of its own hue, of neighbours of it, and of its opposite."""
+    """The park in dabs of unmixed colour: dots of each place's hue, of its neighbours, and a few of its opposite."""
     rng, fine = np.random.default_rng(2), 2
     side = SIDE * fine
     colours = river_park(*grid(512))
@@ -182,7 +190,9 @@ def pointillism() -> np.ndarray:
             size = radius * fine * rng.uniform(0.75, 1.2) * 0.8
             centre = (int(place[0] * side), int(place[1] * side))
             axes = (int(size * 1.15), int(size * 0.9))
-            cv2.ellipse(picture, centre, axes, float(rng.uniform(0, 180)), 0, 360, [int(v) for v in dab], -1, cv2.LINE_AA)
+            cv2.ellipse(
+                picture, centre, axes, float(rng.uniform(0, 180)), 0, 360, [int(v) for v in dab], -1, cv2.LINE_AA
+            )
     canvas = 1 + 0.02 * noise(SIDE, 250, rng)
     return eight(cv2.resize(picture, (SIDE, SIDE), interpolation=cv2.INTER_AREA) * canvas[..., None])
 
@@ -196,8 +206,10 @@ def watercolour() -> np.ndarray:
     sun = 0.075 - np.hypot(u - 0.72, v - 0.14)
     areas = [
         (0.25 - v, "4f8fc9", 0.5), (np.minimum(v - 0.04, 0.16 - np.abs(u - 0.35) * 0.3 - v), "8fb6d8", 0.35),
-        (np.minimum(v - ridge[0], ridge[2] - v), "7d74b8", 0.7), (np.minimum(v - ridge[1], ridge[2] + 0.01 - v), "3d8a74", 0.8),
-        (np.minimum(v - 0.63, 0.8 - v), "2f79a8", 0.75), (np.minimum(v - 0.7 - 0.03 * np.sin(9 * u), 0.76 - v), "1f4f86", 0.5),
+        (np.minimum(v - ridge[0], ridge[2] - v), "7d74b8", 0.7),
+        (np.minimum(v - ridge[1], ridge[2] + 0.01 - v), "3d8a74", 0.8),
+        (np.minimum(v - 0.63, 0.8 - v), "2f79a8", 0.75),
+        (np.minimum(v - 0.7 - 0.03 * np.sin(9 * u), 0.76 - v), "1f4f86", 0.5),
         (v - 0.79 - 0.05 * np.sin(4 * u), "8aa53a", 0.75), (v - 0.9 - 0.04 * np.sin(7 * u + 1), "3f6b2f", 0.7),
     ]  # fmt: skip
     near_u, near_v = x + 0.25 * warp[0], y + 0.25 * warp[1]

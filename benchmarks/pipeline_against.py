@@ -72,7 +72,7 @@ def six_materials(folder: Path) -> Path:
 
 
 def placed(source: Path, number: int, before: np.ndarray) -> tuple[list[str], np.ndarray]:
-    """The lines of an OBJ of unit size in its place, indices counted on from `before`, and how many v, vt, vn it has."""
+    """The lines of an OBJ, of unit size, in its place, indices counted from `before`; and its numbers of v, vt, vn."""
     statements = [line.split() for line in source.read_text().splitlines() if line.strip()]
     points = np.array([[float(x) for x in s[1:4]] for s in statements if s[0] == "v"])
     low, high = points.min(axis=0), points.max(axis=0)
