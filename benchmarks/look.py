@@ -18,7 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from benchmarks import common, look_light, look_paint, look_score, look_sheets, look_styles
+from benchmarks import common, look_light, look_paint, look_peer, look_score, look_sheets, look_styles
 
 HERE = Path(__file__).resolve().parent
 KEY, ANSWERS = HERE / "look_key.json", HERE / "look_answers.json"
@@ -38,7 +38,8 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     made.add_argument("--against", metavar="COMMIT", help="sheets: the other candidate; figures: measure it too")
     made.add_argument("--whole", action="store_true", help="whole jobs with their fit, not the paint alone (slow)")
     made.add_argument("--set", action="append", default=[], metavar="K=V", help="a setting of HEAD's jobs, to try it")
-    made.add_argument("--tests", default="choice,odd", help="which sheets: choice, odd")
+    made.add_argument("--tests", default="choice,odd", help="which sheets: choice, odd, ebsynth")
+    made.add_argument("--ebsynth", type=Path, metavar="PROGRAM", help="for sheets of ebsynth (see look_peer.py)")
     made.add_argument("--out", type=Path, metavar="DIR", help="where sheets and key.json, or styles, are written")
     made.add_argument("--seed", type=int, default=0, help="of the sheets' shuffle")
     made.add_argument("--key", type=Path, default=KEY, metavar="FILE", help="score: the key (default: in this folder)")
@@ -119,23 +120,34 @@ def sheets(chosen: argparse.Namespace) -> dict[str, float]:
     """Paint, light and write the sheets and key.json into --out; counts them."""
     if not chosen.against or not chosen.out:
         raise SystemExit("sheets: name the other candidate with --against COMMIT, and a folder with --out DIR")
-    tests = chosen_names(chosen.tests, ["choice", "odd"], "tests")
+    tests = chosen_names(chosen.tests, ["choice", "odd", "ebsynth"], "tests")
+    if "ebsynth" in tests and not chosen.ebsynth:
+        raise SystemExit(
+            "sheets of ebsynth need its program: --ebsynth PROGRAM (look_peer.py says where it comes from)"
+        )
     found = pieces(chosen, chosen_presets(chosen, "draft,standard"))
     start_engines()
     ours, theirs = look_paint.this_tree(), look_paint.tree_at(chosen.against, chosen.cache)
     our_glbs = look_paint.painted(ours, with_settings(found, chosen.set), chosen.cache)
     their_glbs = look_paint.painted(theirs, found, chosen.cache) if "choice" in tests else our_glbs
-    lines = []
+    lines, spent = [], []
     for piece, mine, other in zip(found, our_glbs, their_glbs, strict=True):
         kind = look_styles.KINDS[piece.style]
         if "choice" in tests:
             lines.append(look_sheets.build_choice(piece, kind, mine, other, chosen.out / "sheets", chosen.seed))
         if "odd" in tests:
             lines.append(look_sheets.build_odd(piece, kind, mine, chosen.out / "sheets", chosen.seed))
+        if "ebsynth" in tests:
+            peer = look_peer.baked_peer(chosen.ebsynth, piece, chosen.cache, chosen.quick)
+            lines.append(
+                look_sheets.build_choice(piece, kind, mine, peer, chosen.out / "sheets", chosen.seed, "ebsynth")
+            )
+            spent.append(look_paint.about(mine)["cpu"] / look_paint.about(peer)["cpu"])
         print(f"sheets of {piece.label}", file=sys.stderr)
     about = {"head": ours.digest, "against": theirs.name, "seed": chosen.seed, "set": chosen.set}
     look_sheets.write_key(chosen.out / "key.json", lines, **about)
-    return {"sheets": float(len(lines))}
+    ratio = {"ebsynth.cpu_ratio": sum(spent) / len(spent)} if spent else {}
+    return {"sheets": float(len(lines))} | ratio
 
 
 def score(chosen: argparse.Namespace) -> dict[str, float]:

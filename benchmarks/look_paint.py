@@ -145,6 +145,7 @@ def run_jobs(tree: Tree, jobs: Sequence[dict[str, object]], folder: Path) -> Non
         raise SystemExit(f"painting at {tree.name} failed:\n{log.read_text()[-2000:]}")
 
 
-def pixel_of(glb: Path) -> float | None:
-    """One pixel of the painting on the surface of a kept GLB, in working units; None where its run did not say."""
-    return json.loads(glb.with_name(glb.name + ".json").read_text())["pixel"]
+def about(glb: Path) -> dict[str, float | None]:
+    """What is known of a kept GLB: `pixel`, one of the painting's on the surface, in working units (None where its run
+    did not say), and `cpu`, processor seconds of its job."""
+    return json.loads(glb.with_name(glb.name + ".json").read_text())

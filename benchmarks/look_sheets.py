@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 
 from benchmarks.look_light import lit, piece_of_asset
-from benchmarks.look_paint import Piece, pixel_of, sha256
+from benchmarks.look_paint import Piece, about, sha256
 
 WIDTH, BAND = 1488, 26  # pixels of a sheet, and of a line with a letter
 PAINTING = 420  # most rows of the painting
@@ -100,7 +100,7 @@ def cuts(painting: np.ndarray, count: int, rng: np.random.Generator) -> list[np.
 def odd(painting: np.ndarray, glb: Path, seed: int) -> tuple[np.ndarray, str]:
     """The sheet of the odd one out, and its letter."""
     rng = np.random.default_rng(seed)
-    pixel = pixel_of(glb)
+    pixel = about(glb)["pixel"]
     if pixel is None:
         raise SystemExit(f"{glb}: its run did not say how large the painting lies on the surface")
     kept = min(max(painting.shape[:2]), 2048)  # the stylizer keeps no more
@@ -121,26 +121,28 @@ def write(path: Path, picture: np.ndarray) -> str:
     return sha256(path)
 
 
-def build_choice(piece: Piece, kind: str, ours: Path, theirs: Path, out: Path, seed: int) -> dict[str, Any]:
-    """Write the sheet of a choice; returns its line of the key."""
-    name = name_of("choice", piece.style, piece.mesh, piece.preset, str(seed))
+def build_choice(
+    piece: Piece, kind: str, ours: Path, theirs: Path, out: Path, seed: int, test: str = "choice"
+) -> dict[str, Any]:
+    """Write the sheet of a choice; returns its line of the key. `test` says against whom: "choice" or "ebsynth"."""
+    name = name_of(test, piece.style, piece.mesh, piece.preset, str(seed))
     pictures = {"head": lit(ours), "other": lit(theirs)}
     order = ("other", "head") if flipped(name, seed) else ("head", "other")
     sheet = choice(read(piece.style_file), *(pictures[who] for who in order))
-    about = {"test": "choice", "style": piece.style, "kind": kind, "mesh": piece.mesh, "preset": piece.preset}
-    return about | {"name": name, "A": order[0], "B": order[1], "sha256": write(out / f"{name}.png", sheet)}
+    known = {"test": test, "style": piece.style, "kind": kind, "mesh": piece.mesh, "preset": piece.preset}
+    return known | {"name": name, "A": order[0], "B": order[1], "sha256": write(out / f"{name}.png", sheet)}
 
 
 def build_odd(piece: Piece, kind: str, ours: Path, out: Path, seed: int) -> dict[str, Any]:
     """Write the sheet of the odd one out; returns its line of the key."""
     name = name_of("odd", piece.style, piece.mesh, piece.preset, str(seed))
     sheet, letter = odd(read(piece.style_file), ours, seed + int(name, 16) % 2**31)
-    about = {"test": "odd", "style": piece.style, "kind": kind, "mesh": piece.mesh, "preset": piece.preset}
-    return about | {"name": name, "odd": letter, "sha256": write(out / f"{name}.png", sheet)}
+    known = {"test": "odd", "style": piece.style, "kind": kind, "mesh": piece.mesh, "preset": piece.preset}
+    return known | {"name": name, "odd": letter, "sha256": write(out / f"{name}.png", sheet)}
 
 
-def write_key(path: Path, lines: Sequence[Mapping[str, Any]], **about: Any) -> None:
+def write_key(path: Path, lines: Sequence[Mapping[str, Any]], **made_of: Any) -> None:
     """The key: what the sheets were made of, and one line a sheet, by name."""
     sheets = {line["name"]: {k: v for k, v in line.items() if k != "name"} for line in lines}
-    text = json.dumps({**about, "sheets": dict(sorted(sheets.items()))}, indent=1)
+    text = json.dumps({**made_of, "sheets": dict(sorted(sheets.items()))}, indent=1)
     path.write_text(text + "\n", encoding="utf-8")

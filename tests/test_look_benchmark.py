@@ -122,7 +122,7 @@ def test_the_key_is_read_as_it_was_written(tmp_path, monkeypatch):
 
 
 def test_the_odd_one_stands_where_the_key_says(tmp_path, monkeypatch):
-    monkeypatch.setattr(look_sheets, "pixel_of", lambda glb: 0.01)
+    monkeypatch.setattr(look_sheets, "about", lambda glb: {"pixel": 0.01})
     sides = []
 
     def black(glb, unit, pixels, seed):
