@@ -1,9 +1,9 @@
 """EbSynth as a candidate of `benchmarks.look sheets`: view after view, then baked onto the mesh.
 
 EbSynth gets the colour and the detail guide of our stylizer, as in `benchmarks.consistency_peer`, and its own way to
-consistency: a third guide, from the painting to what earlier views show, carried into the view. Where they show
-nothing that guide is the colour guide. The views are those of the paper's rig; `mistyle bake` lays them on the mesh.
-Its time counts from the mesh's file to the GLB, unwrapping and drawing of views included.
+consistency: a third guide, from the painting to what earlier views show, carried into the view. A first pass without
+that guide fills it where they show nothing; its time counts too. The views are those of the paper's rig, and `mistyle
+bake` lays them on the mesh. Time counts from the mesh's file to the GLB, unwrapping and drawing of views included.
 """
 
 import contextlib
@@ -14,6 +14,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,7 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     """Stylize every view with EbSynth, each after the ones before it, and leave them in `folder`/views."""
     from benchmarks.consistency_scene import guided
     from mistyle.core.camera import RigSettings, rig
+    from mistyle.core.image import linear_from_srgb
     from mistyle.files.read import read_mesh, read_picture
     from mistyle.files.views import write_views
     from mistyle.render.draw import draw_views as drawn
@@ -66,45 +68,45 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     finished, lifted, warping = [], [], WarpSettings()
     strokes = settings.surface.relief * float(band.std())
     for k, view in enumerate(views):
-        wanted = {"colour": colour[k], "detail": grey(strokes * detail[k]), "before": before(lifted, view, colour[k])}
-        finished.append(stylized(program, folder, view, wanted, f"{settings.surface.detail:g}"))
+        wanted = {"colour": colour[k], "detail": grey(strokes * detail[k])}
+        paint = partial(stylized, program, folder, view.mask, detail=f"{settings.surface.detail:g}")
+        picture = paint(wanted)
+        if lifted:
+            picture = paint(wanted | {"before": before(lifted, view, picture)})
+        shown = linear_from_srgb(picture) * view.coverage[..., None]
+        finished.append(replace(view, rgb=np.where(view.mask[..., None], shown, 0).astype(np.float32)))
         lifted.append(lift(finished[-1], warping))
         print(f"EbSynth: view {k + 1} of {len(views)}", file=sys.stderr)
     write_views(folder / "views", finished, ())
 
 
-def before(lifted: Sequence[Any], view: Any, colour: np.ndarray) -> np.ndarray:
-    """What earlier views show in this one, encoded; the colour guide where they show nothing."""
+def before(lifted: Sequence[Any], view: Any, picture: np.ndarray) -> np.ndarray:
+    """What earlier views show in this one, encoded; where they show nothing, `picture`, which was made without them."""
     from mistyle.core.image import srgb_from_linear
     from mistyle.stages.lift import WarpSettings
     from mistyle.stages.warp import composite
 
-    if not lifted:
-        return colour
     prior = composite(lifted, view, WarpSettings())
-    return np.where(prior.known[..., None], srgb_from_linear(np.clip(prior.rgb, 0, 1)), colour).astype(np.float32)
+    return np.where(prior.known[..., None], srgb_from_linear(np.clip(prior.rgb, 0, 1)), picture).astype(np.float32)
 
 
-def stylized(program: Path, folder: Path, view: Any, wanted: dict[str, np.ndarray], detail: str) -> Any:
-    """The view as EbSynth paints it after the guides."""
-    from mistyle.core.image import linear_from_srgb, nearest_fill
+def stylized(program: Path, folder: Path, mask: np.ndarray, wanted: dict[str, np.ndarray], detail: str) -> np.ndarray:
+    """What EbSynth paints after the guides, encoded sRGB."""
+    from mistyle.core.image import nearest_fill
     from mistyle.files.read import read_picture
 
-    # It knows no mask: guides that end in black would draw dark strokes over the silhouette.
-    for name, picture in wanted.items():
-        save(folder / f"{name}.png", nearest_fill(picture, view.mask))
     sources = {
         "colour": ("source_colour", "1"),
         "detail": ("source_detail", detail),
-        "before": ("style", f"{PREVIOUS:g}"),
+        "before": ("style", f"{PREVIOUS}"),
     }
     command = [str(program.resolve()), "-style", "style.png", "-output", "out.png", "-backend", "cpu"]
-    for name, (source, weight) in sources.items():
-        command += ["-guide", f"{source}.png", f"{name}.png", "-weight", weight]
+    for name, picture in wanted.items():
+        # It knows no mask: guides that end in black would draw dark strokes over the silhouette.
+        save(folder / f"{name}.png", nearest_fill(picture, mask))
+        command += ["-guide", f"{sources[name][0]}.png", f"{name}.png", "-weight", sources[name][1]]
     subprocess.run(command, cwd=folder, check=True, stdout=subprocess.DEVNULL)
-    picture = linear_from_srgb(read_picture(folder / "out.png").rgb)
-    shown = np.where(view.mask[..., None], picture * view.coverage[..., None], 0).astype(np.float32)
-    return replace(view, rgb=shown)
+    return read_picture(folder / "out.png").rgb
 
 
 def bake(mesh: Path, folder: Path, atlas: int) -> Path:

@@ -1,12 +1,13 @@
 """The benchmark of looks: its made styles, its sheets and key, and how answers are scored."""
 
 import json
+import sys
 
 import cv2
 import numpy as np
 import pytest
 
-from benchmarks import look, look_light, look_paint, look_score, look_sheets, look_styles
+from benchmarks import look, look_light, look_paint, look_peer, look_score, look_sheets, look_styles
 from benchmarks.look_paint import Piece, Tree
 from benchmarks.pipeline_against import Took, compared, of_reports, placed
 from mistyle.measure.baked_light import BakedLight
@@ -231,3 +232,33 @@ def test_objects_are_placed_side_by_side(tmp_path):
     points = np.array([[float(x) for x in line.split()[1:]] for line in lines if line.startswith("v ")])
     np.testing.assert_allclose(points.max(axis=0) + points.min(axis=0), [2.2, 0, 2.2], atol=1e-6)
     assert np.ptp(points, axis=0).max() == pytest.approx(1) and not any("mtllib" in line for line in lines)
+
+
+# Instead of EbSynth: answers with the target of the last guide, and fails where a source is not of the style's size.
+EBSYNTH = """#!{python}
+import sys
+from PIL import Image
+words = sys.argv[1:]
+guides = [k for k, word in enumerate(words) if word == "-guide"]
+size = Image.open(words[words.index("-style") + 1]).size
+assert all(Image.open(words[k + 1]).size == size and words[k + 3] == "-weight" for k in guides)
+Image.open(words[guides[-1] + 2]).save(words[words.index("-output") + 1])
+"""
+
+
+def test_the_peer_is_given_the_guides_without_a_silhouette(tmp_path):
+    program = tmp_path / "ebsynth"
+    program.write_text(EBSYNTH.format(python=sys.executable))
+    program.chmod(0o755)
+    for name in ("style", "source_colour", "source_detail"):
+        look_peer.save(tmp_path / f"{name}.png", np.full((20, 30, 3), 0.5))
+    mask = np.zeros((16, 16), bool)
+    mask[4:12, 4:12] = True
+    colour, earlier = (
+        np.where(mask[..., None], value, 0).astype(np.float32) * np.ones(3, np.float32) for value in (0.2, 0.8)
+    )
+    wanted = {"colour": colour, "detail": look_peer.grey(np.zeros((16, 16)))}
+    assert np.abs(look_peer.stylized(program, tmp_path, mask, wanted, "4") - 0.5).max() < 0.01
+    found = look_peer.stylized(program, tmp_path, mask, wanted | {"before": earlier}, "4")
+    # The guide goes on beyond the mesh: no black border.
+    assert np.abs(found - 0.8).max() < 0.01
