@@ -27,7 +27,7 @@ from mistyle.surface.settings import SurfaceSettings
 
 __all__ = ["inputs"]
 RADIUS = 0.9
-SETTINGS = SurfaceSettings(samples=3000, style_scale=0.7)
+SETTINGS = SurfaceSettings(samples=3000, stroke_scale=0.7)
 
 
 def ball_mesh() -> Mesh:

@@ -533,7 +533,7 @@ def test_detail_puts_dark_strokes_into_hollows(dj):
 def test_strokes_keep_their_size_when_samples_change():
     sizes = [synthesis.finest_size(SurfaceSettings(samples=n)) for n in (15_625, 62_500, 250_000)]
     assert sizes == [128, 256, 512]  # the painting spans as many spacings as it has pixels; spacing falls as sqrt(1/n)
-    assert synthesis.finest_size(SurfaceSettings(style_scale=2.0)) == 1024
+    assert synthesis.finest_size(SurfaceSettings(stroke_scale=2.0)) == 1024
     assert [synthesis.level_count(SurfaceSettings(samples=n)) for n in (1000, 62_500, 250_000, 1_000_000)] == [
         2,
         4,

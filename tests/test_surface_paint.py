@@ -80,7 +80,7 @@ def test_middle_tones_tell_a_woodcut_from_a_painting(rng):
 @pytest.fixture(scope="module")
 def ball(dj):  # noqa: F811
     """A hierarchy on the dented ball with its details."""
-    settings = SurfaceSettings(samples=6000, levels=6, style_scale=2.0)
+    settings = SurfaceSettings(samples=6000, levels=6, stroke_scale=2.0)
     levels = synthesis.hierarchy(dented_ball(), settings, 0, dj)
     tone, cavity = guides.tones(levels, np.ones(len(levels[-2].directed), np.float32), 0.0)
     return settings, levels, tone, cavity
@@ -267,7 +267,7 @@ def test_strokes_of_one_size_on_meshes_of_any_size():
     mesh = dented_ball()
     small, settings = asset_of(mesh), SurfaceSettings()
     twice = replace(small, source=replace(small.source, work_from_user=np.diag([0.5, 0.5, 0.5, 1]).astype(np.float32)))
-    scales = [coat.scaled(settings, each, 0.1).style_scale for each in (small, twice)]
+    scales = [coat.scaled(settings, each, 0.1).stroke_scale for each in (small, twice)]
     assert scales[0] == pytest.approx(2 * scales[1])
     # The picture then spans 32 strokes: its pixels on the finest level times the samples' spacing.
     surface = coat.scaled(settings, small, 0.1)
@@ -354,8 +354,8 @@ def test_lengths_and_variations():
         with pytest.raises(argparse.ArgumentTypeError, match="3cm"):
             options.length(wrong)
     made = variations.variations(Settings(seed=5), 4)
-    assert [m.settings.seed for m in made] == [5, 6, 7, 8] and made[0].settings.surface.style_scale == 1
-    assert len({m.label for m in made}) == 4 and made[1].settings.surface.style_scale != 1
+    assert [m.settings.seed for m in made] == [5, 6, 7, 8] and made[0].settings.surface.stroke_scale == 1
+    assert len({m.label for m in made}) == 4 and made[1].settings.surface.stroke_scale != 1
     tiles = [np.full((3, 5, 3), k / 10, np.float32) for k in range(3)]
     sheet_of = variations.arranged(tiles)
     assert (

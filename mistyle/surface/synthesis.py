@@ -26,19 +26,21 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.mesh import Mesh
 from mistyle.surface import kernels, style
+from mistyle.surface.chosen import settled
 from mistyle.surface.glaze import glaze
 from mistyle.surface.guides import Content, Guide, Occlusion, guides
 from mistyle.surface.linefield import Course, directions, line_field
 from mistyle.surface.lookup import Solution, solution
 from mistyle.surface.pieces import too_far
 from mistyle.surface.samples import Level, nearest, sample_normals, spread, with_tables
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.surface.settings import PlainSettings, ResolvedSettings, SurfaceSettings
 
 __all__ = ["SurfaceSettings", "hierarchy", "solve", "synthesise"]
 
 LINE_POINTS = 7_500
-FULL_SIZE = 512  # long side of the painting on the finest level at 250,000 samples and style_scale 1
-LEAST_SIZE = 24  # and the least on the coarsest level
+FULL_SIZE = 512  # long side of the painting on the finest level at 250,000 samples and stroke_scale 1
+LEAST_SIZE = 16  # and the least on the coarsest level
+LEAST_SAMPLES = 64  # on the coarsest level
 ROUNDS = (10, 8, 6, 6, 6)  # searches and votes from the coarsest level on; further levels take the last
 FINE_ROUNDS = 4  # on levels beyond the fifth
 SWEEPS = 3  # passes of the coherent search in each round
@@ -73,7 +75,7 @@ class Pins:
 def solve(
     mesh: Mesh,
     picture_rgb: Float[np.ndarray, "h w 3"],
-    settings: SurfaceSettings,
+    settings: SurfaceSettings | ResolvedSettings,
     seed: int,
     occlusion: Occlusion,
     progress: Callable[[float], None] = lambda done: None,
@@ -91,6 +93,7 @@ def solve(
     picture. It copies pieces of the painting: recognisable objects in it (a star, an eye) may appear on the surface.
     """
     dj = kernels.module(device)
+    settings = settled(picture_rgb, alpha, settings)
     begun = lambda done: progress(0.25 * done)  # noqa: E731
     painting, levels, wanted = prepared(mesh, picture_rgb, settings, seed, occlusion, begun, alpha, content, course, dj)
     progress(0.35)
@@ -102,7 +105,7 @@ def solve(
 def prepared(
     mesh: Mesh,
     picture_rgb: Float[np.ndarray, "h w 3"],
-    settings: SurfaceSettings,
+    settings: ResolvedSettings,
     seed: int,
     occlusion: Occlusion,
     progress: Callable[[float], None],
@@ -120,23 +123,24 @@ def prepared(
     return painting, levels, wanted
 
 
-def level_count(settings: SurfaceSettings) -> int:
-    """Levels for this many samples: one per factor of four, fewer where the coarsest painting would be too small."""
-    count = max(2, settings.levels + round(float(np.log(settings.samples / 250_000) / np.log(4))))
-    while count > 2 and finest_size(settings) / 2 ** (count - 1) < LEAST_SIZE:
-        count -= 1
-    return count
+def level_count(settings: ResolvedSettings) -> int:
+    """Levels for these samples and strokes: one more per doubling of the painting's size in samples, so that the
+    coarsest level sees the same share of it; fewer where its painting or its samples would be too few."""
+    size = finest_size(settings)
+    count = settings.levels + round(float(np.log2(size / FULL_SIZE)))
+    fewest = int(np.log2(settings.samples / LEAST_SAMPLES) / 2) + 1
+    return max(2, min(count, fewest, int(np.log2(size / LEAST_SIZE)) + 1))
 
 
-def finest_size(settings: SurfaceSettings) -> float:
+def finest_size(settings: PlainSettings) -> float:
     """Long side of the painting on the finest level: one pixel a sample, so strokes keep their size on the surface."""
     least, most = 32, style.LONGEST
-    return float(np.clip(FULL_SIZE * np.sqrt(settings.samples / 250_000) * settings.style_scale, least, most))
+    return float(np.clip(FULL_SIZE * np.sqrt(settings.samples / 250_000) * settings.stroke_scale, least, most))
 
 
 def hierarchy(
     mesh: Mesh,
-    settings: SurfaceSettings,
+    settings: ResolvedSettings,
     seed: int,
     dj: ModuleType,
     progress: Callable[[float], None] = lambda done: None,
@@ -161,7 +165,7 @@ def synthesise(
     levels: Sequence[Level],
     wanted: Sequence[Guide],
     painting: style.Painting,
-    settings: SurfaceSettings,
+    settings: ResolvedSettings,
     seed: int,
     dj: ModuleType,
     progress: Callable[[float], None] = lambda done: None,
@@ -220,7 +224,7 @@ def paint_level(
     pages: style.Pages,
     start: Choice | None,
     rounds: int,
-    settings: SurfaceSettings,
+    settings: ResolvedSettings,
     rng: np.random.Generator,
     dj: ModuleType,
     pins: Pins | None = None,
@@ -277,7 +281,7 @@ def ends_of_pieces(level: Level, pages: style.Pages, choice: Choice, largest: fl
     return kernels.Ends(kernels.floats(dj, far.astype(np.float32)), kernels.floats(dj, np.array([around])))
 
 
-def guide_weights(settings: SurfaceSettings, pages: style.Pages) -> Float[np.ndarray, " 5"]:
+def guide_weights(settings: ResolvedSettings, pages: style.Pages) -> Float[np.ndarray, " 5"]:
     """Square roots of the weights of colour (L, a, b) and stroke direction (2), by which descriptors are multiplied.
 
     Where a painting has two tones only, its large-area colour is all that says where strokes are: it counts more.
@@ -298,7 +302,7 @@ def described_pages(pages: style.Pages, guide_scale: Float[np.ndarray, " 5"]) ->
 
 
 def described_guide(
-    guide: Guide, pages: style.Pages, settings: SurfaceSettings, guide_scale: Float[np.ndarray, " 5"]
+    guide: Guide, pages: style.Pages, settings: ResolvedSettings, guide_scale: Float[np.ndarray, " 5"]
 ) -> tuple[Float[np.ndarray, "n 24"], Float[np.ndarray, " n"]]:
     """What every sample asks for, its patch left empty, and how much the band matters to it."""
     out = np.zeros((len(guide.detail), kernels.WIDTH), np.float32)
