@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from helpers import fixed_surface
 from test_surface import plain_cost, plane_level, small_search
 
 from mistyle.render import device
 from mistyle.surface import guides, kernels, pieces, style, synthesis
-from mistyle.surface.settings import SurfaceSettings
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_a_picture_laid_down_whole_is_broken_up_where_that_is_wanted(dj):
     guide = guides.Guide(colour=pages.broad[there], detail=none, directed=none)
 
     def widths(largest: float) -> np.ndarray:
-        settings = SurfaceSettings(largest_piece=largest)
+        settings = fixed_surface(largest_piece=largest)
         rng = np.random.default_rng(0)
         found = synthesis.paint_level(level, guide, pages, start, 6, settings, rng, dj)
         label = pieces.labels(level, pages, found.page, found.x, found.y)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from helpers import data
+from helpers import data, fixed_surface
 from scipy.spatial import KDTree
 
 from mistyle.backends import STYLIZERS
@@ -91,7 +91,7 @@ def dj():
     return kernels.module("llvm")
 
 
-SMALL = SurfaceSettings(samples=2500)
+SMALL = fixed_surface(samples=2500)
 
 
 @pytest.fixture(scope="module")
@@ -466,7 +466,7 @@ def test_patches_of_samples_and_pixels_are_described_alike(dj, rng):
 
 def test_constant_painting_gives_a_constant_colour():
     grey = np.full((20, 30, 3), 0.4, np.float32)
-    solution = synthesis.solve(dented_ball(), grey, SurfaceSettings(samples=800), 0, open_sky)
+    solution = synthesis.solve(dented_ball(), grey, fixed_surface(samples=800), 0, open_sky)
     np.testing.assert_allclose(lookup.colour(solution, solution.positions, solution.normals), 0.4, atol=1e-6)
 
 
@@ -475,7 +475,7 @@ def test_colours_are_mixtures_of_neighbouring_pixels():
     rng = np.random.default_rng(4)
     red = cv2.resize((rng.random((12, 12)) > 0.5).astype(np.float32), (96, 96), interpolation=cv2.INTER_NEAREST)
     painting = np.stack([red, np.zeros_like(red), 1 - red], axis=2)
-    solution = synthesis.solve(dented_ball(), painting, SurfaceSettings(samples=1500), 0, open_sky)
+    solution = synthesis.solve(dented_ball(), painting, fixed_surface(samples=1500), 0, open_sky)
     colour = lookup.colour(solution, solution.positions, solution.normals)
     np.testing.assert_allclose(colour.sum(axis=1), 1, atol=1e-5)
     assert colour[:, 1].max() == 0 and 0.2 < colour[:, 0].mean() < 0.8
@@ -486,7 +486,7 @@ def test_transparent_parts_are_never_used():
     painting = strokes()
     alpha = np.ones(painting.shape[:2], np.float32)
     painting[:, :60], alpha[:, :60] = [1.0, 0.0, 1.0], 0
-    solution = synthesis.solve(dented_ball(), painting, SurfaceSettings(samples=1500), 0, open_sky, alpha=alpha)
+    solution = synthesis.solve(dented_ball(), painting, fixed_surface(samples=1500), 0, open_sky, alpha=alpha)
     assert solution.centre[:, 0].min() > 60
     colour = lookup.colour(solution, solution.positions, solution.normals)
     assert (np.abs(colour - [1.0, 0.0, 1.0]).max(axis=1) > 0.2).all()
@@ -518,7 +518,7 @@ def test_detail_puts_dark_strokes_into_hollows(dj):
     mesh, painting = dented_ball(), strokes()
     correlation = {}
     for weight in (0.0, 4.0):
-        settings = SurfaceSettings(samples=3000, detail=weight, palette=0.3)
+        settings = fixed_surface(samples=3000, detail=weight, palette=0.3)
         solution = synthesis.solve(mesh, painting, settings, 0, open_sky)
         levels = synthesis.hierarchy(mesh, settings, 0, dj)
         tone, cavity = guides.tones(levels, np.ones(len(levels[-2].directed), np.float32), 0.0)
@@ -531,10 +531,10 @@ def test_detail_puts_dark_strokes_into_hollows(dj):
 
 
 def test_strokes_keep_their_size_when_samples_change():
-    sizes = [synthesis.finest_size(SurfaceSettings(samples=n)) for n in (15_625, 62_500, 250_000)]
+    sizes = [synthesis.finest_size(fixed_surface(samples=n)) for n in (15_625, 62_500, 250_000)]
     assert sizes == [128, 256, 512]  # the painting spans as many spacings as it has pixels; spacing falls as sqrt(1/n)
-    assert synthesis.finest_size(SurfaceSettings(stroke_scale=2.0)) == 1024
-    assert [synthesis.level_count(SurfaceSettings(samples=n)) for n in (1000, 62_500, 250_000, 1_000_000)] == [
+    assert synthesis.finest_size(fixed_surface(stroke_scale=2.0)) == 1024
+    assert [synthesis.level_count(fixed_surface(samples=n)) for n in (1000, 62_500, 250_000, 1_000_000)] == [
         2,
         4,
         5,
@@ -550,7 +550,7 @@ def test_strokes_keep_their_size_when_samples_change():
 def test_any_picture_will_do(picture):
     prepared = style.prepare(picture)
     assert min(prepared.opaque.shape) >= 8 and max(prepared.opaque.shape) <= 3 * min(prepared.opaque.shape) + 8
-    solution = synthesis.solve(sheet(), picture, SurfaceSettings(samples=600), 0, open_sky)
+    solution = synthesis.solve(sheet(), picture, fixed_surface(samples=600), 0, open_sky)
     assert np.isfinite(lookup.colour(solution, solution.positions, solution.normals)).all()
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import fixed_surface
 from scipy.spatial import KDTree
 from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, spread_on, strokes  # noqa: F401
 
@@ -80,7 +81,7 @@ def test_middle_tones_tell_a_woodcut_from_a_painting(rng):
 @pytest.fixture(scope="module")
 def ball(dj):  # noqa: F811
     """A hierarchy on the dented ball with its details."""
-    settings = SurfaceSettings(samples=6000, levels=6, stroke_scale=2.0)
+    settings = fixed_surface(samples=6000, levels=6, stroke_scale=2.0)
     levels = synthesis.hierarchy(dented_ball(), settings, 0, dj)
     tone, cavity = guides.tones(levels, np.ones(len(levels[-2].directed), np.float32), 0.0)
     return settings, levels, tone, cavity
@@ -225,7 +226,7 @@ def test_content_of_a_texture_rules_the_tone(painted_sheet, dj):  # noqa: F811
     mesh, texels, maps = painted_sheet
     found = coat.content([texels], [maps])
     assert found is not None and coat.content([texels], [flat_maps(32)]) is None
-    settings = SurfaceSettings(samples=2500, keep_content=1.0)
+    settings = fixed_surface(samples=2500, keep_content=1.0)
     levels = synthesis.hierarchy(mesh, settings, 0, dj)
     palette = np.random.default_rng(0).random((500, 3)).astype(np.float32) * [1, 0.2, 0.2]
     light = {}
@@ -378,7 +379,7 @@ def many_parts() -> object:
 
 @pytest.mark.parametrize("shape", [box(1.2, 1.2, 0.001), many_parts(), sheet(2)], ids=["wall", "parts", "two-faces"])
 def test_any_mesh_will_do(shape):
-    settings = SurfaceSettings(samples=700)
+    settings = fixed_surface(samples=700)
     solution = synthesis.solve(shape, strokes(), settings, 0, open_sky)
     corners = shape.positions[shape.faces].mean(axis=1)
     normals = np.cross(*(np.diff(shape.positions[shape.faces], axis=1).transpose(1, 0, 2)))

@@ -280,6 +280,7 @@ def as_toml(settings: BaseModel) -> str:
         if prefix:
             lines.extend(["", f"[{prefix}]"])
         lines.extend(f"{key} = {_toml_value(value)}" for key, value in leaves.items())
+        lines.extend(f"# {key} is not set" for key, value in values.items() if value is None)
         for key, value in values.items():
             if isinstance(value, dict):
                 table(value, f"{prefix}.{key}" if prefix else key)

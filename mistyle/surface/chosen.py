@@ -74,8 +74,11 @@ def settled(
     rgb: Float[np.ndarray, "h w 3"],
     alpha: Float[np.ndarray, "h w"] | None,
     settings: SurfaceSettings | ResolvedSettings,
+    reading: StyleReading | None = None,
 ) -> ResolvedSettings:
-    """The settings with every choice made; the picture (encoded sRGB) is read only where one is open."""
+    """The settings with every choice made; reads the picture (encoded sRGB) where one is open and no reading given."""
     if isinstance(settings, ResolvedSettings):
         return settings
-    return resolved(settings, read_style(rgb, alpha) if is_open(settings) else None)
+    if reading is None and is_open(settings):
+        reading = read_style(rgb, alpha)
+    return resolved(settings, reading)

@@ -7,7 +7,7 @@ from mistyle.surface import style
 
 LARGEST_GRID = 32  # picture pixels along an art pixel
 STEP = 0.04  # difference of neighbouring pixels (Lab / 100) that is a step
-ON_GRID = 0.85  # share of the steps' size that lies on the lines of a grid
+ON_GRID = 0.85  # share of the steps' squares that lies on the lines of a grid
 HARD = 0.35  # share of steps that are one pixel wide, where every picture pixel is an art pixel
 FEW_COLOURS = 256
 COVERED = 0.97  # share of the pixels that the most common colours make up
@@ -28,7 +28,8 @@ def pixel_grid(rgb: Float[np.ndarray, "h w 3"]) -> tuple[int, int]:
 
 def grid_along(step: Float[np.ndarray, "h w"], axis: int) -> int:
     """The largest period at which nearly all steps along an axis lie on the lines of one grid; 0 or 1 where none."""
-    strength = np.where(step > STEP, step, 0).sum(axis=1 - axis)
+    # Squares: what a JPEG leaves beside an edge is small.
+    strength = np.where(step > STEP, step**2, 0).sum(axis=1 - axis)
     total = float(strength.sum())
     if total == 0:
         return 0

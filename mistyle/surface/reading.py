@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from mistyle.surface import edges, style
 
@@ -43,7 +43,8 @@ class StyleReading:
     directions    dominant directions of lines, degrees counter-clockwise from the picture's x axis, 0..180
     rectilinear   how much of the contrast runs along two axes at right angles
     border        what is not picture on each side (top, left, bottom, right), shares of the height or width
-    lettering     where lettering, cartouches and signatures are, or None where none was found surely
+
+    Lettering, cartouches and signatures are not found: `coat.style_mask` takes them out.
     """
 
     unit: float
@@ -55,7 +56,6 @@ class StyleReading:
     directions: tuple[float, ...]
     rectilinear: float
     border: style.Crop
-    lettering: Bool[np.ndarray, "h w"] | None
 
 
 def read_style(rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] | None = None) -> StyleReading:
@@ -86,7 +86,6 @@ def read_style(rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] 
         directions=directions,
         rectilinear=rectilinear,
         border=border,
-        lettering=None,
     )
 
 
