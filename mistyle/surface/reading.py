@@ -24,6 +24,8 @@ PERIOD = 5.33  # wavelength, in blurs, at which the difference of two such blurs
 PROMINENT = 0.04  # share by which a maximum over scales stands out
 LOCAL = 4.0  # blurs above which the composition begins
 LARGEST_UNIT = 0.35  # in long sides
+RAYS = 24  # directions, 7.5 degrees apart, along which it is looked for
+ALL_BUT = 0.8  # of the clearest peak: among peaks as clear as this the nearest is the period
 PERIODIC = 0.12  # rise of the autocorrelation from its first dip to the next peak that counts as a period
 ANGLES = 36
 STANDS_OUT = 1.6  # times the mean of the histogram of directions
@@ -120,13 +122,15 @@ def structural_unit(lab: Float[np.ndarray, "h w 3"]) -> tuple[float, float]:
     """Width of the unit in long sides, and its clarity (0..1).
 
     The scale (Lindeberg 1998) is the first at which the contrast between one blur and the next has a maximum. Where the
-    autocorrelation of what is finer than a few such scales has a clear peak, its lag is the unit, along an axis or on
-    average over all directions.
+    autocorrelation of what is finer than a few such scales has a clear peak, its lag is the unit, along some direction
+    or on average over all.
     """
     long = max(lab.shape[:2])
     sigma, clarity = first_scale(lab)
     fine = lab[..., 0] - style.blurred(lab[..., 0], LOCAL * sigma)
-    lag, rise = max((first_peak(curve) for curve in correlations(fine, long)), key=lambda one: one[1])
+    found = [first_peak(curve) for curve in correlations(fine, long)]
+    rise = max(one[1] for one in found)
+    lag = min(one[0] for one in found if one[1] >= ALL_BUT * rise)
     unit = lag if rise >= PERIODIC else PERIOD * sigma
     return float(np.clip(unit / long, 1 / long, LARGEST_UNIT)), clarity
 
@@ -150,20 +154,17 @@ def first_scale(lab: Float[np.ndarray, "h w 3"]) -> tuple[float, float]:
 
 
 def correlations(fine: Float[np.ndarray, "h w"], long: int) -> list[Float[np.ndarray, " n"]]:
-    """Autocorrelation over the lag in pixels: on average over all directions, across, and down."""
+    """Autocorrelation over the lag in pixels: on average over all directions, and along RAYS of them."""
     fine = fine * np.outer(np.hanning(fine.shape[0]), np.hanning(fine.shape[1]))
     shape = [cv2.getOptimalDFTSize(2 * n) for n in fine.shape]
     table = np.fft.irfft2(np.abs(np.fft.rfft2(fine, shape)) ** 2, shape)
     reach = max(4, min(int(LARGEST_UNIT * long), min(fine.shape) // 2))
     table = np.roll(table, (reach, reach), (0, 1))[: 2 * reach + 1, : 2 * reach + 1]
-    table = table / max(float(table[reach, reach]), 1e-12)
-    y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
-    ring = np.rint(np.hypot(y, x)).astype(int).ravel()
-    return [
-        (np.bincount(ring, table.ravel()) / np.bincount(ring))[: reach + 1],
-        table[reach, reach:],
-        table[reach:, reach],
-    ]
+    table = (table / max(float(table[reach, reach]), 1e-12)).astype(np.float32)
+    angle, lag = np.pi * np.arange(RAYS)[:, None] / RAYS, np.arange(reach + 1)
+    x, y = (reach + turn(angle) * lag for turn in (np.cos, np.sin))
+    rays = cv2.remap(table, x.astype(np.float32), y.astype(np.float32), cv2.INTER_LINEAR)
+    return [rays.mean(axis=0), *rays]
 
 
 def first_peak(curve: Float[np.ndarray, " n"]) -> tuple[int, float]:

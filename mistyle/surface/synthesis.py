@@ -40,7 +40,7 @@ __all__ = ["SurfaceSettings", "hierarchy", "solve", "synthesise"]
 LINE_POINTS = 7_500
 FULL_SIZE = 512  # long side of the painting on the finest level at 250,000 samples and stroke_scale 1
 LEAST_SIZE = 16  # and the least on the coarsest level
-LEAST_SAMPLES = 64  # on the coarsest level
+LEAST_SAMPLES = 48  # on the coarsest level
 ROUNDS = (10, 8, 6, 6, 6)  # searches and votes from the coarsest level on; further levels take the last
 FINE_ROUNDS = 4  # on levels beyond the fifth
 SWEEPS = 3  # passes of the coherent search in each round
@@ -155,7 +155,7 @@ def hierarchy(
     levels = []
     for index in range(count):
         share = 4.0 ** (index - count + 1)
-        points = spread(mesh, normals, max(64, round(settings.samples * share)), rng, dj)
+        points = spread(mesh, normals, max(LEAST_SAMPLES, round(settings.samples * share)), rng, dj)
         levels.append(with_tables(points, *directions(field, points), dj))
         progress(0.15 + 0.85 * share)
     return levels
