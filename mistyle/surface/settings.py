@@ -27,7 +27,7 @@ class PlainSettings(BaseModel):
         description="contrast of those strokes, in standard deviations of the painting's own",
     )
     glaze: float = Field(
-        default=0.8,
+        default=0.0,
         ge=0.0,
         le=1.0,
         description="share of what the strokes still lack in light and dark that is laid over them, where the painting "
@@ -68,11 +68,18 @@ class PlainSettings(BaseModel):
         default="curvature",
         description="what strokes follow: the form, the vertical, or level lines around the object",
     )
+    form: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="how much sky light and openness are painted into the albedo, for hand-painted looks; 0 keeps "
+        "light out of it: parts take colours of their own, creases and ridges take strokes",
+    )
     bake_light: float = Field(
         default=0.0,
         ge=0.0,
         le=1.0,
-        description="share of a fixed key light in the tone; 0 keeps light out of the albedo",
+        description="share of a fixed key light, against the sky's, in the light that `form` paints",
     )
 
 
@@ -99,8 +106,8 @@ class SurfaceSettings(PlainSettings):
     )
     detail: Detail | None = Field(
         default=None,
-        description="how strongly cavities and ridges demand dark and light strokes; unset: from the painting "
-        "(4, down to 1 for flat ones)",
+        description="how strongly creases and ridges demand dark and light strokes; unset: from the painting "
+        "(4, down to 3 for flat ones)",
     )
     palette: Palette | None = Field(
         default=None,
@@ -110,7 +117,7 @@ class SurfaceSettings(PlainSettings):
     stroke_coherence: Coherence | None = Field(
         default=None,
         description="price of leaving a stroke: higher copies larger pieces of the painting; unset: from the painting "
-        "(0.03 for brushwork, up to 0.05 for graphic ones)",
+        "(0.08 for brushwork, up to 0.12 for graphic ones)",
     )
     look_up: LookUp | None = Field(
         default=None,

@@ -5,12 +5,14 @@ energy of StyLit (Fiser et al. 2016). A sample s has a 5x5 patch of neighbours i
 place p (page, x, y) of the painting with the least
 
     |D_p - D_s|^2 + detail w(s) (band_p - relief std(band) d_s)^2 + variety use(p) / wanted use(p)
-        + stroke_coherence * sum over 4 neighbours of [1 if on another page, else min(jump^2, 4) / 4]
+        + stroke_coherence * sum over 4 neighbours of seam [1 if on another page, else min(jump^2, 4) / 4]
 
 (about neighbours at which a copied piece has got too large, staying near costs instead: surface/pieces.py), where D
 joins 16 principal components of the patch (Lab / 100, over 5), the large-area colour (weights 1, 0.6, 0.6 times
 `palette`, five times that for paintings of two tones) and the stroke direction (`orientation`); d_s is the detail
-guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance in pixels from where the neighbour's picture would go on.
+guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance in pixels from where the neighbour's picture would go on, and seam
+(0.3 to 1) how different the neighbour's picture, gone on with, and p look there: after the seam cost of graph-cut
+textures (Kwatra et al. 2003).
 
 The search is deterministic: all places are tried for all samples on the coarse levels; on every level a sample tries
 to go on with its neighbours' pictures (coherent search, Ashikhmin 2001) and a fixed set of steps about its own place.
@@ -31,7 +33,7 @@ from mistyle.surface.glaze import glaze
 from mistyle.surface.guides import Content, Guide, Occlusion, guides
 from mistyle.surface.linefield import Course, directions, line_field
 from mistyle.surface.lookup import Solution, solution
-from mistyle.surface.pieces import too_far
+from mistyle.surface.pieces import labels, too_far
 from mistyle.surface.samples import Level, nearest, sample_normals, spread, with_tables
 from mistyle.surface.settings import PlainSettings, ResolvedSettings, SurfaceSettings
 
@@ -99,7 +101,9 @@ def solve(
     progress(0.35)
     choice, book = synthesise(levels, wanted, painting, settings, seed, dj, lambda done: progress(0.35 + 0.65 * done))
     laid = glaze(levels, wanted[-1], book.lab[pixels(book, choice), 0], book, settings)
-    return solution(levels[-1], choice.page, choice.x, choice.y, book.size, painting.rgb, laid)
+    piece = labels(levels[-1], book, choice.page, choice.x, choice.y)
+    kinds = {"borders": settings.borders, "look_up": settings.look_up}
+    return solution(levels[-1], choice.page, choice.x, choice.y, book.size, painting.rgb, laid, piece, **kinds)
 
 
 def prepared(
@@ -119,7 +123,7 @@ def prepared(
     levels = hierarchy(mesh, settings, seed, dj, progress, course)
     rng = np.random.default_rng([seed, 2])
     palette = style.palette(painting, settings.liveliness, rng, settings.palette_mix)
-    wanted = guides(levels, palette, occlusion, settings.bake_light, rng, content, settings.keep_content)
+    wanted = guides(levels, palette, occlusion, settings, rng, content)
     return painting, levels, wanted
 
 
@@ -250,7 +254,8 @@ def paint_level(
         origin=kernels.whole(dj, pages.origin),
     )
     weight = kernels.floats(dj, band_weight)
-    prices = kernels.floats(dj, np.array([settings.stroke_coherence, settings.variety]))
+    typical = float(described[pages.allowed, : kernels.SEEN].var(axis=0).sum())
+    prices = kernels.floats(dj, np.array([settings.stroke_coherence, settings.variety, 1 / max(typical, 1e-6)]))
     place = on_device(dj, start)
     complete = min(rounds, int(ALL_PAIRS // (len(asked) * len(described))))
     for turn in range(rounds):
