@@ -187,6 +187,15 @@ def test_the_coarsest_level_sees_the_same_share_of_the_painting_at_every_stroke_
     assert levels[1] == levels[0] + 1
 
 
+def test_a_piece_copied_once_is_no_overuse_where_the_surface_shows_a_part_of_the_picture():
+    book = style.pages(style.prepare(noise((200, 200))), 200, 0.0)
+    row, column = np.mgrid[50:90, 50:90].reshape(2, -1).astype(np.float32)
+    page = np.zeros(len(row), np.int32)
+    once = synthesis.usage(book, synthesis.Choice(page, column, row)).reshape(200, 200)
+    twice = synthesis.usage(book, synthesis.Choice(page, column, 50 + np.floor(row / 2 - 25))).reshape(200, 200)
+    assert once[60:80, 60:80] == pytest.approx(1) and twice[55:65, 60:80] == pytest.approx(2)
+
+
 REAL = {
     "mosaic_ducks.jpg": lambda r: 0.02 < r.unit < 0.06 and graphic(r) > 0.8,
     "pixelart_rpg_urban.png": lambda r: r.pixel_grid == (1, 1) and abs(r.unit * 432 - 16) < 2,

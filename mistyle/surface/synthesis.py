@@ -388,10 +388,13 @@ def pixels(pages: style.Pages, choice: Choice) -> Int[np.ndarray, " n"]:
 
 
 def usage(pages: style.Pages, choice: Choice) -> Float[np.ndarray, " k"]:
-    """How often each pixel of the unturned picture is in use, over its 5x5 neighbourhood; 1 is as often as wanted."""
+    """How often each pixel of the unturned picture is in use, over its 5x5 neighbourhood; 1 is as often as wanted.
+
+    A surface smaller than the picture (wide strokes) shows a part of it: once a pixel is not too often there.
+    """
     height, width = pages.size
     count = np.bincount(pages.origin[pixels(pages, choice)], minlength=height * width).reshape(height, width)
-    mean = len(choice.page) / (height * width)
+    mean = max(len(choice.page) / (height * width), 1.0)
     around = cv2.blur(count.astype(np.float32), (5, 5), borderType=cv2.BORDER_CONSTANT) / np.float32(mean)
     return around.reshape(-1) / np.maximum(pages.wanted, LEAST_WANTED)
 
