@@ -69,11 +69,15 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
     from mistyle.render.draw import draw_views
     from mistyle.run.start import start_engines
     from mistyle.stages.texels import rasterise
+    from mistyle.surface.chosen import settled
+    from mistyle.surface.settings import SurfaceSettings
 
     layers = {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}
     settings = resolve(None, None, layers)
     start_engines(settings)
     asset, picture = read_mesh(mesh, size=atlas), read_picture(style)
+    surface = SurfaceSettings(**settled(picture.rgb, picture.alpha, settings.surface).model_dump())
+    settings = settings.model_copy(update={"surface": surface})
     views = draw_views(asset.mesh, None, cameras(resolution), "paper_views", 8, settings.seed)
     colour, detail, painting = guided(asset, picture, settings, views)
     scene = Scene(

@@ -22,7 +22,7 @@ from mistyle.run.variations import tile
 
 ROOT = Path(__file__).resolve().parents[1]
 STRIPS: dict[str, tuple[dict[str, Any], ...]] = {
-    "stroke_scale": tuple({"style_scale": v} for v in (0.5, 1.0, 2.0, 3.0)),
+    "stroke_scale": tuple({"stroke_scale": v} for v in (0.5, 1.0, 2.0, 3.0)),
     "detail": ({"detail": 0.0, "glaze": 0.0}, {"detail": 2.0, "glaze": 0.3}, {}, {"detail": 12.0, "relief": 4.0}),
     "strength": tuple({"stroke_coherence": v} for v in (0.0, 0.01, 0.02, 0.04)),
     "palette": ({"palette": 0.02}, {}, {"palette": 4.0}, {"palette_mix": 1.0}),

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from helpers import fixed_surface
 from test_mvst import disagreement
 from test_pipeline import TINY, hashes, inputs, job
 from test_warp import at, see
@@ -23,11 +24,10 @@ from mistyle.run.stages import Job
 from mistyle.stages.mvst import SweepSettings, sweep
 from mistyle.surface import view_samples
 from mistyle.surface.samples import GRID
-from mistyle.surface.settings import SurfaceSettings
 
 __all__ = ["inputs"]
 RADIUS = 0.9
-SETTINGS = SurfaceSettings(samples=3000, style_scale=0.7)
+SETTINGS = fixed_surface(samples=3000, stroke_scale=0.7)
 
 
 def ball_mesh() -> Mesh:

@@ -2,11 +2,11 @@
 
 import numpy as np
 import pytest
+from helpers import fixed_surface
 from test_surface import plain_cost, plane_level, small_search
 
 from mistyle.render import device
 from mistyle.surface import guides, kernels, pieces, style, synthesis
-from mistyle.surface.settings import SurfaceSettings
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def test_near_the_end_of_a_piece_the_search_pays_for_staying(dj, rng):
     table = kernels.tables(dj, level.neighbours, level.turned, level.offsets)
     use = synthesis.usage(pages, start)
     wanted = kernels.Wanted(kernels.floats(dj, asked), kernels.floats(dj, weight))
-    prices, place = kernels.floats(dj, np.array([0.005, 0.003])), synthesis.on_device(dj, start)
+    prices, place = kernels.floats(dj, np.array([0.005, 0.003, 1 / 2.0])), synthesis.on_device(dj, start)
 
     def found(end: np.ndarray):
         ends = kernels.Ends(kernels.floats(dj, end.astype(np.float32)), kernels.floats(dj, np.array([6.0])))
@@ -89,12 +89,12 @@ def test_a_picture_laid_down_whole_is_broken_up_where_that_is_wanted(dj):
     guide = guides.Guide(colour=pages.broad[there], detail=none, directed=none)
 
     def widths(largest: float) -> np.ndarray:
-        settings = SurfaceSettings(largest_piece=largest)
+        settings = fixed_surface(largest_piece=largest, stroke_coherence=0.1)
         rng = np.random.default_rng(0)
         found = synthesis.paint_level(level, guide, pages, start, 6, settings, rng, dj)
         label = pieces.labels(level, pages, found.page, found.x, found.y)
         return 2 * pieces.reach(label, pieces.on_picture(pages, synthesis.pixels(pages, found)))
 
     whole, broken = widths(1.0), widths(0.2)
-    assert np.quantile(whole, 0.9) > 0.4 and whole.max() > 0.9
+    assert np.quantile(whole, 0.9) > 0.4 and whole.max() > 0.85  # 0.9 would be all of it
     assert np.quantile(broken, 0.9) < 0.2 and broken.max() < 0.3

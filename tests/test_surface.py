@@ -6,7 +6,7 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-from helpers import data
+from helpers import data, fixed_surface
 from scipy.spatial import KDTree
 
 from mistyle.backends import STYLIZERS
@@ -14,7 +14,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.render import device
 from mistyle.render.occlusion import ambient_occlusion
-from mistyle.surface import guides, kernels, linefield, lookup, samples, style, synthesis
+from mistyle.surface import creases, guides, kernels, linefield, lookup, samples, style, synthesis
 from mistyle.surface.settings import SurfaceSettings
 
 
@@ -91,7 +91,7 @@ def dj():
     return kernels.module("llvm")
 
 
-SMALL = SurfaceSettings(samples=2500)
+SMALL = fixed_surface(samples=2500)
 
 
 @pytest.fixture(scope="module")
@@ -221,6 +221,9 @@ def test_thin_wall_does_not_mix_its_sides(dj):
         (0.5, 0.5),
         painting,
         0 * centre[:, 0],
+        zero,
+        8.0,
+        False,
     )
     rng = np.random.default_rng(3)
     xy = rng.uniform(-0.55, 0.55, (500, 2))
@@ -254,7 +257,8 @@ def test_transport_reproduces_the_palette(rng):
     palette = np.concatenate([rng.normal([0.3, 0.1, -0.3], 0.05, (3000, 3)), rng.normal([0.8, 0, 0.3], 0.1, (1500, 3))])
     points = spread_on(dented_ball(), 6000)
     tone = 0.5 + 0.5 * points.normals[:, 1]
-    field = guides.colour_field(points, tone, np.ones(len(tone), bool), palette, rng)
+    places = np.stack([tone, points.positions[:, 0], points.positions[:, 2]], axis=1).astype(np.float32)
+    field = guides.colour_field(tone, places, np.ones(len(tone), bool), palette, rng)
     share = np.linspace(0.02, 0.98, 25)
     for direction in np.concatenate([np.eye(3), rng.normal(size=(5, 3))]):
         got, wanted = np.quantile(field @ direction, share), np.quantile(palette @ direction, share)
@@ -268,7 +272,7 @@ def test_hidden_places_take_no_share_of_the_palette(rng):
     points = spread_on(dented_ball(), 3000)
     palette = rng.normal([0.5, 0, 0], [0.2, 0.1, 0.1], (2000, 3))
     shown = points.normals[:, 1] > 0
-    field = guides.colour_field(points, points.normals[:, 1], shown, palette, rng)
+    field = guides.colour_field(points.normals[:, 1], points.normals[:, [1, 0, 2]], shown, palette, rng)
     np.testing.assert_allclose(np.median(field[shown, 0]), np.median(palette[:, 0]), atol=0.01)
     assert field[~shown, 0].min() >= field[shown, 0].min()
 
@@ -302,6 +306,37 @@ def test_pages_and_solution_agree_on_quarter_turns(dj, turn):
         np.testing.assert_allclose(lookup.colour(made, p, far.normals), page[y + v, x + u], atol=2e-3)
 
 
+def plain_weights(square: np.ndarray, piece: np.ndarray, crisp: float) -> np.ndarray:
+    """Weights of eight samples, piece by piece: the piece's share of the votes to the power `crisp`, and within it the
+    nearest; the four largest count."""
+    votes, weight = np.exp(-(square - square[0]) / (2 * 0.9**2)), np.zeros(8)
+    for label in np.unique(piece):
+        mine = piece == label
+        near = np.exp(-(square[mine] - square[mine].min()) / (2 * 0.25**2))
+        weight[mine] = near / near.sum() * (votes[mine].sum() / votes.sum()) ** crisp
+    weight[np.argsort(-weight)[4:]] = 0
+    return weight / weight.sum()
+
+
+def test_a_border_between_pieces_is_smooth_and_crisp():
+    rng = np.random.default_rng(0)
+    at = np.stack(np.meshgrid(np.arange(12.0), np.arange(12.0)), -1).reshape(-1, 2) + rng.uniform(-0.3, 0.3, (144, 2))
+    piece = (at[:, 0] + 0.8 * (np.arange(144) % 2) > 6).astype(np.int32)  # a zigzag about x = 5.6
+    query = np.stack(np.meshgrid(np.linspace(3, 8, 101), np.linspace(3, 8, 40)), -1).reshape(-1, 2)
+    distance = np.linalg.norm(query[:, None] - at, axis=2)
+    index = np.argsort(distance, axis=1)[:, :8]
+    near = np.take_along_axis(distance, index, axis=1)
+    roughness = {}
+    for crisp in (2.0, 8.0):
+        chosen, weight = lookup.blended(near, index, piece, crisp)
+        share = (weight * piece[chosen]).sum(axis=1).reshape(40, 101)
+        roughness[crisp] = float(((share > 0.1) & (share < 0.9)).mean())
+        voted = (share > 0.5).argmax(axis=1)
+    single = (piece[index[:, 0]].reshape(40, 101) > 0).argmax(axis=1)
+    assert np.abs(np.diff(voted)).mean() < 0.6 * np.abs(np.diff(single)).mean()
+    assert roughness[8.0] < 0.5 * roughness[2.0]
+
+
 def test_lookup_agrees_with_the_plain_formula(painted, rng):
     mesh, _, solution = painted
     face = rng.integers(0, len(mesh.faces), 300)
@@ -310,13 +345,16 @@ def test_lookup_agrees_with_the_plain_formula(painted, rng):
     n = samples.unit(np.einsum("nk,nkc->nc", bary, mesh.corner_normals[face])).astype(np.float32)
     h, across = solution.spacing, np.cross(solution.tangent, solution.normals)
     square = ((p[:, None] - solution.positions) ** 2).sum(2) + 9 * h**2 * ((n[:, None] - solution.normals) ** 2).sum(2)
-    nearest = np.argsort(square, axis=1)[:, :3]
-    best = np.take_along_axis(square, nearest, axis=1)
-    weight = np.exp(-(best - best[:, :1]) / (2 * (0.25 * h) ** 2))
-    weight /= weight.sum(axis=1, keepdims=True)
+    nearest = np.argsort(square, axis=1)[:, :8]
+    weight = np.array(
+        [
+            plain_weights(s / h**2, solution.piece[j], solution.crisp)
+            for s, j in zip([s[j] for s, j in zip(square, nearest, strict=True)], nearest, strict=True)
+        ]
+    )
     expected = np.zeros((300, 3))
     size, sharp = solution.painting.shape[:2], style.for_bilinear(solution.painting)
-    for k in range(3):
+    for k in range(8):
         j = nearest[:, k]
         step = p - solution.positions[j]
         u, v = (step * solution.tangent[j]).sum(1) / h, (step * across[j]).sum(1) / h
@@ -386,7 +424,7 @@ def small_search(dj, rng):
     return level, pages, described, asked, weight, start, book
 
 
-def plain_cost(level, pages, described, asked, weight, use, choice, at, coherence, variety):
+def plain_cost(level, pages, described, asked, weight, use, choice, at, coherence, variety, full=2.0):
     """The search cost of places `at`, neighbours standing at `choice`; see mistyle.surface.synthesis."""
     pixel = pages.starts[at.page] + np.rint(at.y).astype(int) * pages.shapes[at.page, 1] + np.rint(at.x).astype(int)
     gap = asked - described[pixel]
@@ -399,7 +437,12 @@ def plain_cost(level, pages, described, asked, weight, use, choice, at, coherenc
         x, y = np.where(turned, width - 1 - x, x), np.where(turned, height - 1 - y, y)
         page = np.where(turned, (page + 2) % 4, page)
         jump = np.minimum((x - at.x) ** 2 + (y - at.y) ** 2, 4) / 4
-        cost = cost + coherence * np.where(page == at.page, jump, 1)
+        height, width = pages.shapes[page].T
+        column, row = np.rint(np.clip(x, 2, width - 3)).astype(int), np.rint(np.clip(y, 2, height - 3)).astype(int)
+        other = described[pages.starts[page] + row * width + column]
+        apart = ((described[pixel] - other)[:, :8] ** 2).sum(axis=1)
+        seam = 0.3 + 0.7 * np.minimum(apart / full, 1)
+        cost = cost + coherence * seam * np.where(page == at.page, jump, 1)
     return cost
 
 
@@ -408,7 +451,7 @@ def test_search_lowers_the_cost_it_states(dj, rng):
     table = kernels.tables(dj, level.neighbours, level.turned, level.offsets)
     use = synthesis.usage(pages, start)
     wanted = kernels.Wanted(kernels.floats(dj, asked), kernels.floats(dj, weight))
-    prices = kernels.floats(dj, np.array([0.005, 0.003]))
+    prices = kernels.floats(dj, np.array([0.005, 0.003, 1 / 2.0]))
     place = synthesis.on_device(dj, start)
     cost, found = kernels.search(dj, table, book, place, wanted, kernels.floats(dj, use), prices, None)
     found = synthesis.on_host(found)
@@ -466,7 +509,7 @@ def test_patches_of_samples_and_pixels_are_described_alike(dj, rng):
 
 def test_constant_painting_gives_a_constant_colour():
     grey = np.full((20, 30, 3), 0.4, np.float32)
-    solution = synthesis.solve(dented_ball(), grey, SurfaceSettings(samples=800), 0, open_sky)
+    solution = synthesis.solve(dented_ball(), grey, fixed_surface(samples=800), 0, open_sky)
     np.testing.assert_allclose(lookup.colour(solution, solution.positions, solution.normals), 0.4, atol=1e-6)
 
 
@@ -475,7 +518,7 @@ def test_colours_are_mixtures_of_neighbouring_pixels():
     rng = np.random.default_rng(4)
     red = cv2.resize((rng.random((12, 12)) > 0.5).astype(np.float32), (96, 96), interpolation=cv2.INTER_NEAREST)
     painting = np.stack([red, np.zeros_like(red), 1 - red], axis=2)
-    solution = synthesis.solve(dented_ball(), painting, SurfaceSettings(samples=1500), 0, open_sky)
+    solution = synthesis.solve(dented_ball(), painting, fixed_surface(samples=1500), 0, open_sky)
     colour = lookup.colour(solution, solution.positions, solution.normals)
     np.testing.assert_allclose(colour.sum(axis=1), 1, atol=1e-5)
     assert colour[:, 1].max() == 0 and 0.2 < colour[:, 0].mean() < 0.8
@@ -486,7 +529,7 @@ def test_transparent_parts_are_never_used():
     painting = strokes()
     alpha = np.ones(painting.shape[:2], np.float32)
     painting[:, :60], alpha[:, :60] = [1.0, 0.0, 1.0], 0
-    solution = synthesis.solve(dented_ball(), painting, SurfaceSettings(samples=1500), 0, open_sky, alpha=alpha)
+    solution = synthesis.solve(dented_ball(), painting, fixed_surface(samples=1500), 0, open_sky, alpha=alpha)
     assert solution.centre[:, 0].min() > 60
     colour = lookup.colour(solution, solution.positions, solution.normals)
     assert (np.abs(colour - [1.0, 0.0, 1.0]).max(axis=1) > 0.2).all()
@@ -516,25 +559,24 @@ def test_solution_survives_saving(painted, tmp_path):
 
 def test_detail_puts_dark_strokes_into_hollows(dj):
     mesh, painting = dented_ball(), strokes()
-    correlation = {}
+    darker = {}
     for weight in (0.0, 4.0):
-        settings = SurfaceSettings(samples=3000, detail=weight, palette=0.3)
+        settings = fixed_surface(samples=3000, detail=weight, palette=0.3)
         solution = synthesis.solve(mesh, painting, settings, 0, open_sky)
         levels = synthesis.hierarchy(mesh, settings, 0, dj)
-        tone, cavity = guides.tones(levels, np.ones(len(levels[-2].directed), np.float32), 0.0)
-        wanted = guides.detail(levels, tone, cavity)[-1]
+        wanted, depth = creases.creases(levels)[-1], creases.cavity_of(levels[-1])
         colour = lookup.colour(solution, solution.positions, solution.normals, footprint=2 * solution.spacing)
-        correlation[weight] = np.corrcoef(wanted, colour.mean(axis=1))[0, 1]
-        hollow = cavity[-1] > 0.3
-        assert wanted[hollow].mean() < -0.2 < 0.2 < wanted[cavity[-1] < -0.3].mean()
-    assert correlation[4.0] > 0.5 and correlation[4.0] > correlation[0.0] + 0.1
+        darker[weight] = colour.mean() - colour[wanted < -0.8].mean()
+        sunk, raised = depth > np.percentile(depth, 97), depth < np.percentile(depth, 3)
+        assert wanted[sunk].mean() < -0.3 and wanted[raised].mean() > 0 and np.mean(np.abs(wanted) < 0.3) > 0.5
+    assert darker[4.0] > 0.08 and darker[4.0] > darker[0.0] + 0.05
 
 
 def test_strokes_keep_their_size_when_samples_change():
-    sizes = [synthesis.finest_size(SurfaceSettings(samples=n)) for n in (15_625, 62_500, 250_000)]
+    sizes = [synthesis.finest_size(fixed_surface(samples=n)) for n in (15_625, 62_500, 250_000)]
     assert sizes == [128, 256, 512]  # the painting spans as many spacings as it has pixels; spacing falls as sqrt(1/n)
-    assert synthesis.finest_size(SurfaceSettings(style_scale=2.0)) == 1024
-    assert [synthesis.level_count(SurfaceSettings(samples=n)) for n in (1000, 62_500, 250_000, 1_000_000)] == [
+    assert synthesis.finest_size(fixed_surface(stroke_scale=2.0)) == 1024
+    assert [synthesis.level_count(fixed_surface(samples=n)) for n in (1000, 62_500, 250_000, 1_000_000)] == [
         2,
         4,
         5,
@@ -550,7 +592,7 @@ def test_strokes_keep_their_size_when_samples_change():
 def test_any_picture_will_do(picture):
     prepared = style.prepare(picture)
     assert min(prepared.opaque.shape) >= 8 and max(prepared.opaque.shape) <= 3 * min(prepared.opaque.shape) + 8
-    solution = synthesis.solve(sheet(), picture, SurfaceSettings(samples=600), 0, open_sky)
+    solution = synthesis.solve(sheet(), picture, fixed_surface(samples=600), 0, open_sky)
     assert np.isfinite(lookup.colour(solution, solution.positions, solution.normals)).all()
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from helpers import fixed_surface
 from scipy.spatial import KDTree
 from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, spread_on, strokes  # noqa: F401
 
@@ -80,7 +81,7 @@ def test_middle_tones_tell_a_woodcut_from_a_painting(rng):
 @pytest.fixture(scope="module")
 def ball(dj):  # noqa: F811
     """A hierarchy on the dented ball with its details."""
-    settings = SurfaceSettings(samples=6000, levels=6, style_scale=2.0)
+    settings = fixed_surface(samples=6000, levels=6, stroke_scale=2.0, glaze=0.8)
     levels = synthesis.hierarchy(dented_ball(), settings, 0, dj)
     tone, cavity = guides.tones(levels, np.ones(len(levels[-2].directed), np.float32), 0.0)
     return settings, levels, tone, cavity
@@ -166,7 +167,7 @@ def ramp_solution(turn):
     up, tangent = np.array([[0, 1, 0]], np.float32), np.array([[0.6, 0, 0.8]], np.float32)
     centre, turns = np.full((1, 2), 100, np.float32), np.array([turn], np.int32)
     zero = np.zeros(1, np.float32)
-    return lookup.Solution(0 * up, up, tangent, turns, centre, 0.05, (2.0, 2.0), picture, zero)
+    return lookup.Solution(0 * up, up, tangent, turns, centre, 0.05, (2.0, 2.0), picture, zero, turns * 0, 8.0, False)
 
 
 @pytest.mark.parametrize("turn", [0, 1, 2, 3])
@@ -223,16 +224,19 @@ def painted_sheet():
 
 def test_content_of_a_texture_rules_the_tone(painted_sheet, dj):  # noqa: F811
     mesh, texels, maps = painted_sheet
-    found = coat.content([texels], [maps])
+    striped = maps.albedo.copy()
+    striped[:, np.arange(32) // 8 % 2 == 0], striped[:, np.arange(32) // 8 % 2 == 1] = 0.02, 0.5
+    found = coat.content([texels], [replace(maps, albedo=striped)])
     assert found is not None and coat.content([texels], [flat_maps(32)]) is None
-    settings = SurfaceSettings(samples=2500, keep_content=1.0)
+    settings = fixed_surface(samples=2500, keep_content=1.0)
     levels = synthesis.hierarchy(mesh, settings, 0, dj)
     palette = np.random.default_rng(0).random((500, 3)).astype(np.float32) * [1, 0.2, 0.2]
     light = {}
     for keep in (0.0, 1.0):
-        made = guides.guides(levels, palette, open_sky, 0.0, np.random.default_rng(1), found, keep)
-        left = levels[-1].points.positions[:, 0] < 0
-        light[keep] = made[-1].colour[~left, 0].mean() - made[-1].colour[left, 0].mean()
+        chosen = settings.model_copy(update={"keep_content": keep})
+        made = guides.guides(levels, palette, open_sky, chosen, np.random.default_rng(1), found)
+        dark = np.floor((levels[-1].points.positions[:, 0] / 1.4 + 0.5) * 4) % 2 == 0
+        light[keep] = made[-1].colour[~dark, 0].mean() - made[-1].colour[dark, 0].mean()
     assert light[1.0] > 0.3 > abs(light[0.0])
 
 
@@ -267,7 +271,7 @@ def test_strokes_of_one_size_on_meshes_of_any_size():
     mesh = dented_ball()
     small, settings = asset_of(mesh), SurfaceSettings()
     twice = replace(small, source=replace(small.source, work_from_user=np.diag([0.5, 0.5, 0.5, 1]).astype(np.float32)))
-    scales = [coat.scaled(settings, each, 0.1).style_scale for each in (small, twice)]
+    scales = [coat.scaled(settings, each, 0.1).stroke_scale for each in (small, twice)]
     assert scales[0] == pytest.approx(2 * scales[1])
     # The picture then spans 32 strokes: its pixels on the finest level times the samples' spacing.
     surface = coat.scaled(settings, small, 0.1)
@@ -354,8 +358,8 @@ def test_lengths_and_variations():
         with pytest.raises(argparse.ArgumentTypeError, match="3cm"):
             options.length(wrong)
     made = variations.variations(Settings(seed=5), 4)
-    assert [m.settings.seed for m in made] == [5, 6, 7, 8] and made[0].settings.surface.style_scale == 1
-    assert len({m.label for m in made}) == 4 and made[1].settings.surface.style_scale != 1
+    assert [m.settings.seed for m in made] == [5, 6, 7, 8] and made[0].settings.surface.stroke_scale == 1
+    assert len({m.label for m in made}) == 4 and made[1].settings.surface.stroke_scale != 1
     tiles = [np.full((3, 5, 3), k / 10, np.float32) for k in range(3)]
     sheet_of = variations.arranged(tiles)
     assert (
@@ -378,7 +382,7 @@ def many_parts() -> object:
 
 @pytest.mark.parametrize("shape", [box(1.2, 1.2, 0.001), many_parts(), sheet(2)], ids=["wall", "parts", "two-faces"])
 def test_any_mesh_will_do(shape):
-    settings = SurfaceSettings(samples=700)
+    settings = fixed_surface(samples=700)
     solution = synthesis.solve(shape, strokes(), settings, 0, open_sky)
     corners = shape.positions[shape.faces].mean(axis=1)
     normals = np.cross(*(np.diff(shape.positions[shape.faces], axis=1).transpose(1, 0, 2)))

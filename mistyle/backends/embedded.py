@@ -10,7 +10,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.surface.guides import Content, Occlusion
 from mistyle.surface.linefield import Course
 from mistyle.surface.lookup import Solution
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.surface.settings import ResolvedSettings, SurfaceSettings
 
 
 def array_module() -> str:
@@ -32,7 +32,7 @@ def open_sky(mesh: Mesh, seed: int) -> Occlusion:
 def solve_surface(
     mesh: Mesh,
     style: Picture,
-    settings: SurfaceSettings,
+    settings: SurfaceSettings | ResolvedSettings,
     seed: int = 0,
     progress: Callable[[float], None] = lambda done: None,
     *,

@@ -11,13 +11,13 @@ from mistyle.core.view import Prior, View
 from mistyle.stages.mvst import Stylizer
 from mistyle.surface.guides import Content
 from mistyle.surface.linefield import Course
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.surface.settings import ResolvedSettings, SurfaceSettings
 
 
 def stylizer(
     mesh: Mesh,
     style: Picture,
-    settings: SurfaceSettings,
+    settings: SurfaceSettings | ResolvedSettings,
     seed: int = 0,
     progress: Callable[[float], None] = lambda done: None,
     *,

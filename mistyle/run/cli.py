@@ -237,7 +237,7 @@ OPTIONS = {
     "atlas": "atlas.size",
     "stylizer": "stylizer",
     "samples": "surface.samples",
-    "stroke_scale": "surface.style_scale",
+    "stroke_scale": "surface.stroke_scale",
     **PAINT_OPTIONS,
     **GENERATIVE_OPTIONS,
     **DELIVERY_OPTIONS,

@@ -19,6 +19,7 @@ from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, eight_bit, in_bands, kind_in_step, kind_of_maps
 from mistyle.run.stages import RETOUCH, STAGES
+from mistyle.run.style_look import look_facts
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
 from mistyle.stages.fit_judge import undone_where
@@ -166,6 +167,7 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         + " Paint one over in stylized/, run the same command again, and it goes into the texture.",
         "4.1.3",
         shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.stylized),
+        facts=look_facts(made.looks),
         columns=8,
     )
     parts, longest = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True)), Sizes().of(kind_in_step(3))

@@ -27,6 +27,7 @@ from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import STAGES, Job, Run, claim_run
 from mistyle.run.start import draw, lay_out, read, start_engines
+from mistyle.run.style_look import StyleLook, style_looks
 
 
 @dataclass(frozen=True)
@@ -43,6 +44,7 @@ class Made:
     fit: Any
     repaired: Repaired
     folder: Path
+    looks: tuple[StyleLook, ...] = ()
 
 
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
@@ -94,6 +96,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     look_again(*size_of(asset))
     atlas = run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
     views = views_stage(run, asset, atlas)
+    looks = style_looks(style, run.job.style.name, s, run.progress)
     baked, stylized = painted_stages(run, asset, style, atlas, views)
     painted = ["bake", "stylized"]
     if "stylized" in run.edited:
@@ -119,7 +122,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
-    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder)
+    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks)
 
 
 def retouched_stage(

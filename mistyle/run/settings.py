@@ -158,6 +158,9 @@ PRESETS: dict[str, dict[str, Any]] = {
 PRESETS["demo"] = PRESETS["draft"] | {"surface": {"samples": 150_000}, "atlas": {"size": 2048}}
 
 
+# Settings by their earlier names.
+RENAMED = {"surface.style_scale": "surface.stroke_scale"}
+
 Root = TypeVar("Root", bound=BaseModel)
 
 
@@ -214,6 +217,8 @@ def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
         first = error.errors()[0]
         path = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
+            if path in RENAMED:
+                raise UsageError(f"{origin}: '{path}' is now called '{RENAMED[path]}'; write that") from None
             near = difflib.get_close_matches(path, known_keys(root), n=1, cutoff=0.5)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UsageError(f"{origin}: there is no setting '{path}'{hint} (--print-config lists all)") from None
@@ -275,6 +280,7 @@ def as_toml(settings: BaseModel) -> str:
         if prefix:
             lines.extend(["", f"[{prefix}]"])
         lines.extend(f"{key} = {_toml_value(value)}" for key, value in leaves.items())
+        lines.extend(f"# {key} is not set" for key, value in values.items() if value is None)
         for key, value in values.items():
             if isinstance(value, dict):
                 table(value, f"{prefix}.{key}" if prefix else key)

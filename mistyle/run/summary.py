@@ -47,6 +47,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
     }
     record = summary | {
         "inputs": {"mesh": job.mesh.name, "style": job.style.name},
+        "style": [look.record() for look in made.looks],
         "seed": job.settings.seed,
         "settings": job.settings.model_dump(mode="json"),
         "versions": versions(),

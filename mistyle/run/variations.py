@@ -35,8 +35,8 @@ def variations(settings: Settings, count: int) -> list[Variation]:
     result = []
     for k in range(count):
         factor = STROKES[(k // 2 + 1) % len(STROKES)] if k % 2 else 1.0
-        scale = float(np.clip(settings.surface.style_scale * factor, 0.1, 10))
-        surface = {"samples": min(settings.surface.samples, SAMPLES), "style_scale": scale}
+        scale = float(np.clip(settings.surface.stroke_scale * factor, 0.1, 10))
+        surface = {"samples": min(settings.surface.samples, SAMPLES), "stroke_scale": scale}
         changed: Mapping[str, Any] = {
             "seed": settings.seed + k,
             "surface": settings.surface.model_copy(update=surface),

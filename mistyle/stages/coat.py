@@ -48,7 +48,7 @@ def masked_style(style: Picture, mask: Path | None) -> Picture:
 
 
 def scaled(surface: SurfaceSettings, asset: Asset, stroke_size: float | None) -> SurfaceSettings:
-    """`style_scale` such that a stroke (a 32nd of the picture) is `stroke_size` of the mesh's own units wide.
+    """`stroke_scale` such that a stroke (a 32nd of the picture) is `stroke_size` of the mesh's own units wide.
 
     Refused where that is beyond what the number of samples can show.
     """
@@ -62,8 +62,8 @@ def scaled(surface: SurfaceSettings, asset: Asset, stroke_size: float | None) ->
     per_unit = float(np.cbrt(abs(np.linalg.det(asset.source.work_from_user[:3, :3]))))
 
     def stroke(scale: float) -> float:
-        """Width of a stroke in the mesh's units at a style_scale, as far as that is possible."""
-        size = finest_size(surface.model_copy(update={"style_scale": scale}))
+        """Width of a stroke in the mesh's units at a stroke_scale, as far as that is possible."""
+        size = finest_size(surface.model_copy(update={"stroke_scale": scale}))
         return float(size * spacing / PICTURE_STROKES / per_unit)
 
     scale = stroke_size / stroke(1.0)
@@ -72,7 +72,7 @@ def scaled(surface: SurfaceSettings, asset: Asset, stroke_size: float | None) ->
             f"strokes of {stroke_size:g} on this mesh would be {scale:.3g} times the usual size; choose from "
             f"{stroke(0.1):.3g} to {stroke(10):.3g} (in the mesh's own units) with {surface.samples} samples"
         )
-    return surface.model_copy(update={"style_scale": scale})
+    return surface.model_copy(update={"stroke_scale": scale})
 
 
 def slot_masks(

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from mistyle.surface import style
 from mistyle.surface.guides import Guide
 from mistyle.surface.samples import Level, carry, drop, smooth
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.surface.settings import PlainSettings
 
 THICKEST = 0.12  # lightness (Lab / 100) that a glaze adds or takes at most
 
@@ -22,7 +22,7 @@ def glaze(
     guide: Guide,
     lightness: Float[np.ndarray, " n"],
     pages: style.Pages,
-    settings: SurfaceSettings,
+    settings: PlainSettings,
 ) -> Float[np.ndarray, " n"]:
     """What to add to the `lightness` (Lab / 100) of the finest level's samples; zero for paintings of two tones.
 

@@ -1,7 +1,8 @@
 """What every place of the surface asks of the painting: how light, which colour, and where dark and light must be.
 
-All of it comes from the shape alone and is the same from every side: light from above, openness (ambient occlusion),
-cavities and ridges. The painting answers with its own range of values.
+All of it comes from the shape alone and is the same from every side: places that follow its parts, creases and ridges.
+Light from above and openness (ambient occlusion) count as far as `form` says. The painting answers with its own range
+of values.
 """
 
 from collections.abc import Callable, Sequence
@@ -10,15 +11,18 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.surface.creases import LEAST_RELIEF, bounded, cavity_of, creases
 from mistyle.surface.linefield import KEY
+from mistyle.surface.places import light, place_fields, without
 from mistyle.surface.samples import Level, Points, carry, drop, smooth, workers
+from mistyle.surface.settings import PlainSettings
 
 Occlusion = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Content = Callable[[np.ndarray, np.ndarray], np.ndarray]  # positions, normals -> lightness 0..1 of the asset's texture
 ROTATIONS = 30
 LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, while colours are transported
-UNDULATION = 0.02  # low waves added to the tone, so that flat areas of equal tone get areas of colour and not noise
-LEAST_RELIEF = 0.03  # mean height of a 5x5 neighbourhood, in spacings, that counts as a full hollow or ridge
+FIELD_POINTS = 6_000  # samples at most on which the places are found
+MIDDLE, SPREAD = 0.5, 0.22  # mean and standard deviation of the tone of places
 LEAST_DETAIL = 0.05  # difference of tone between two smoothings that counts as full detail
 CONVEX = 0.4  # how much of a ridge or bulge counts, against a hollow
 LEAST_CONTENT = 0.02  # standard deviation of a texture's lightness from which on it counts in full
@@ -39,44 +43,49 @@ def guides(
     levels: Sequence[Level],
     palette: Float[np.ndarray, "m 3"],
     occlusion: Occlusion,
-    bake_light: float,
+    settings: PlainSettings,
     rng: np.random.Generator,
     content: Content | None = None,
-    keep: float = 0.0,
 ) -> list[Guide]:
     """Guides of all levels, coarse to fine. `palette` is Lab/100 of the blurred painting, a few thousand colours.
 
-    `content` is the lightness of a texture that the surface has already; `keep` is its share in tone and detail.
+    `content` is the lightness of a texture that the surface has already; `settings.keep_content` is its share in tone
+    and detail, `settings.form` that of sky light and openness.
     """
     middle = max(len(levels) - 2, 0)
     base = levels[middle].points
     openness = smooth(levels[middle], occlusion(base.positions, base.normals).astype(np.float32), 1)
-    tone, cavity = tones(levels, openness, bake_light)
-    if content is not None and keep > 0:
+    fields = places(levels, base, openness)
+    tone = [carry(base, MIDDLE + SPREAD * fields[:, 0], level.points) for level in levels]
+    details = creases(levels)
+    if settings.form > 0:
+        lit, cavity = tones(levels, openness, settings.bake_light)
+        tone = mixed(tone, lit, settings.form)
+        details = mixed(details, detail(levels, lit, cavity), settings.form)
+    if content is not None and settings.keep_content > 0:
         found = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
-        tone, cavity = with_content(tone, cavity, found, keep)
-    details = detail(levels, tone, cavity)
+        tone, details = with_content(levels, tone, details, found, settings.keep_content)
     shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
-    colour = colour_field(base, tone[middle], shown, palette, rng)
+    colour = colour_field(tone[middle], fields, shown, palette, rng)
     return [
         Guide(carry(base, colour, level.points), wanted, level.directed)
         for level, wanted in zip(levels, details, strict=True)
     ]
 
 
-def cavity_of(level: Level) -> Float[np.ndarray, " n"]:
-    """Mean height of the neighbourhood over the tangent plane, in spacings: positive in hollows."""
-    height = np.zeros(len(level.directed), np.float32)
-    positions, normals = level.points.positions, level.points.normals
-    own = (positions * normals).sum(axis=1)
-    for k in range(level.neighbours.shape[1]):
-        height += (positions[level.neighbours[:, k]] * normals).sum(axis=1) - own
-    return height / np.float32(level.neighbours.shape[1] * level.points.spacing)
+def mixed(
+    first: Sequence[Float[np.ndarray, " _"]], second: Sequence[Float[np.ndarray, " _"]], share: float
+) -> list[Float[np.ndarray, " _"]]:
+    """Level by level, the share of the second laid over the first."""
+    return [(1 - share) * a + share * b for a, b in zip(first, second, strict=True)]
 
 
-def bounded(values: Float[np.ndarray, " n"], share: float, least: float, limit: float) -> Float[np.ndarray, " n"]:
-    """Values divided by that percentile of their size (at least `least`), cut at +-limit."""
-    return np.clip(values / max(float(np.percentile(np.abs(values), share)), least), -limit, limit)
+def places(levels: Sequence[Level], base: Points, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """`place_fields` at the points of `base`, found on the finest level that is small enough."""
+    small = next((level for level in reversed(levels) if len(level.directed) <= FIELD_POINTS), levels[0])
+    found = carry(small.points, place_fields(small, drop(base, openness, small.points)), base)
+    rest = without(found, light(base.normals, openness))
+    return (rest / np.maximum(rest.std(axis=0), 1e-9)).astype(np.float32)
 
 
 def tones(
@@ -110,20 +119,20 @@ def tones(
 
 
 def with_content(
+    levels: Sequence[Level],
     tone: Sequence[Float[np.ndarray, " _"]],
-    cavity: Sequence[Float[np.ndarray, " _"]],
+    details: Sequence[Float[np.ndarray, " _"]],
     content: Sequence[Float[np.ndarray, " _"]],
     keep: float,
 ) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
-    """Tone and cavity with the share `keep` given over to the lightness of the asset's own texture, at its contrast.
+    """Tone and details with the share `keep` given over to the lightness of the asset's own texture, at its contrast.
 
     The texture's lightness is brought to the tone's mean; a texture of one colour says nothing and changes nothing.
     """
-    spread = float(content[-1].std())
-    said = keep * min(spread / LEAST_CONTENT, 1.0)
-    middle, own = float(content[-1].mean()), float(tone[-1].mean())
-    mixed = [(1 - said) * t + said * (c - middle + own) for t, c in zip(tone, content, strict=True)]
-    return mixed, [(1 - said) * c for c in cavity]
+    share = keep * min(float(content[-1].std()) / LEAST_CONTENT, 1.0)
+    shift = np.float32(tone[-1].mean() - content[-1].mean())
+    own = [lightness + shift for lightness in content]
+    return mixed(tone, own, share), mixed(details, detail(levels, own, [0 * c for c in own]), share)
 
 
 def detail(
@@ -141,16 +150,6 @@ def detail(
     finest = np.clip(0.6 * small + 0.8 * large, -1.6, 1.6).astype(np.float32)
     softened = smooth(fine, finest, 1)
     return [drop(fine.points, softened, level.points) for level in levels[:-1]] + [finest]
-
-
-def solid_waves(
-    positions: Float[np.ndarray, "n 3"], frequency: float, rng: np.random.Generator
-) -> Float[np.ndarray, " n"]:
-    """A sum of six plane waves in random directions: smooth noise through space, standard deviation sqrt(3)."""
-    direction = rng.normal(size=(6, 3))
-    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    phase = rng.random(6) * 2 * np.pi
-    return np.cos(positions.astype(np.float64) @ direction.T * frequency + phase).sum(axis=1)
 
 
 def normal_scores(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -171,8 +170,8 @@ def at_quantiles(values: Float[np.ndarray, " n"], of: Float[np.ndarray, " m"]) -
 
 
 def colour_field(
-    points: Points,
     tone: Float[np.ndarray, " n"],
+    fields: Float[np.ndarray, "n 3"],
     shown: Bool[np.ndarray, " n"],
     palette: Float[np.ndarray, "m 3"],
     rng: np.random.Generator,
@@ -180,29 +179,25 @@ def colour_field(
     """A smooth colour (Lab/100) at every point; over those `shown` the palette keeps its own proportions.
 
     Optimal transport by iterated one-dimensional transport along rotated axes (Pitie, Kokaram and Dahyot 2007), from
-    a description of the place (tone, height, side) to the palette: light places get light colours, and what lies
-    together on the surface gets colours that lie together in the palette. The others (the inside of a
-    pot and what it stands on would take most of the dark colours) get the colour of the shown point most like them.
+    a description of the place (its tone and the second and third of `fields`) to the palette: light places get light
+    colours, and what lies together on the surface gets colours that lie together in the palette. The others (the inside
+    of a pot and what it stands on) take no share; each gets the colour of the shown point most like it.
     """
     from scipy.spatial import KDTree
 
-    positions, normals = points.positions.astype(np.float64), points.normals.astype(np.float64)
     seen = np.flatnonzero(shown) if shown.any() else np.arange(len(tone))
     mean, spread = palette.mean(axis=0), palette.std(axis=0)
-    light = tone + UNDULATION * solid_waves(positions, 3.0, rng)
-    height = positions[:, 1] + 0.5 * normals[:, 1] + 0.12 * solid_waves(positions, 4.0, rng)
-    side = normals[:, 0] + 0.25 * solid_waves(positions, 5.0, rng)
     place = np.stack(
         [
-            at_quantiles(light[seen], palette[:, 0]),
-            normal_scores(height[seen]) * spread[1] + mean[1],
-            normal_scores(side[seen]) * spread[2] + mean[2],
+            at_quantiles(tone[seen], palette[:, 0]),
+            normal_scores(fields[seen, 1]) * spread[1] + mean[1],
+            normal_scores(fields[seen, 2]) * spread[2] + mean[2],
         ],
         axis=1,
     )
     scale = np.array([np.clip(LIGHTNESS_LEAD * spread[1:].mean() / max(spread[0], 1e-6), 0.25, 4.0), 1.0, 1.0])
     colours = transport(place * scale, palette * scale, rng) / scale
-    features = np.stack([light, height, side], axis=1)
+    features = np.stack([tone / SPREAD, fields[:, 1], fields[:, 2]], axis=1)
     alike = KDTree(features[seen]).query(features, workers=workers())[1]
     return colours[alike].astype(np.float32)
 

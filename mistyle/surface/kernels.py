@@ -23,6 +23,8 @@ BORDER = 2  # half a patch: centres keep this far from a page's edge
 SIGMA = 1.6  # of the vote's Gaussian, in samples
 FOLLOW = (7, 11, 13, 17, 2, 10, 14, 22)  # table entries at distance 1 and 2 along the axes, whose place is continued
 BESIDE = (7, 11, 13, 17)  # table entries of the four nearest neighbours
+SEEN = 8  # leading patch components by which a seam is seen
+HIDDEN_SEAM = 0.3  # share of the price of leaving a stroke that is due where both pictures show the same
 STAY = 0.1  # price of going on with a piece that is as large as it may get: more than any place is better than another
 PROBES = np.array(
     [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1), (0, 3), (0, -3), (3, 0), (-3, 0)], np.float32
@@ -291,7 +293,8 @@ def search(
     """One round: every sample takes the best of its own place, those its neighbours suggest, and fixed steps about it.
 
     `use` says per pixel of the unturned picture how often it is taken (1 = average). `prices` is flat
-    (coherence, variety). `also` offers one more place per sample (from `exhaustive`). Returns costs and places.
+    (coherence, variety, one over the squared difference of patches that makes a seam count in full). `also` offers one
+    more place per sample (from `exhaustive`). Returns costs and places.
     """
     import drjit as dr
 
@@ -300,6 +303,7 @@ def search(
     band_weight = dr.gather(dj.Float, wanted.band_weight, i)
     coherence, variety = dr.gather(dj.Float, prices, dj.UInt(0)), dr.gather(dj.Float, prices, dj.UInt(1))
     beside = [continued(dj, table, book, place, i * 25 + slot) for slot in BESIDE]
+    seam = dr.gather(dj.Float, prices, dj.UInt(2))
     end = (
         [dr.gather(dj.Float, ends.sample, dr.gather(dj.UInt, table.neighbour, i * 25 + s) & ~TURNED) for s in BESIDE]
         if ends
@@ -311,19 +315,31 @@ def search(
         width, height = dr.gather(dj.Float, book.width, page), dr.gather(dj.Float, book.height, page)
         return dr.clip(x, BORDER, width - 1 - BORDER), dr.clip(y, BORDER, height - 1 - BORDER)
 
-    def cost(page: Any, x: Any, y: Any) -> Any:
+    def pixel_at(page: Any, x: Any, y: Any) -> Any:
         row = dj.UInt(dr.gather(dj.Float, book.width, page))
-        pixel = dr.gather(dj.UInt, book.start, page) + dj.UInt(dr.round(y)) * row + dj.UInt(dr.round(x))
+        return dr.gather(dj.UInt, book.start, page) + dj.UInt(dr.round(y)) * row + dj.UInt(dr.round(x))
+
+    def leading(pixel: Any) -> list[Any]:
+        return [dr.gather(dj.Array4f, book.descriptor, pixel * (WIDTH // 4) + k) for k in range(SEEN // 4)]
+
+    shown = [leading(pixel_at(page, *inside(page, u, v))) for page, u, v in beside]
+
+    def cost(page: Any, x: Any, y: Any) -> Any:
+        pixel = pixel_at(page, x, y)
         total = variety * dr.gather(dj.Float, use, dr.gather(dj.UInt, book.origin, pixel))
+        own = leading(pixel)
         for k in range(WIDTH // 4):
-            gap = target[k] - dr.gather(dj.Array4f, book.descriptor, pixel * (WIDTH // 4) + k)
+            here = own[k] if k < len(own) else dr.gather(dj.Array4f, book.descriptor, pixel * (WIDTH // 4) + k)
+            gap = target[k] - here
             if k < LINEAR // 4:
                 total += dr.squared_norm(gap)
             else:
                 total += dr.square(gap[0]) + band_weight * dr.square(gap[1])
         for k, (other, u, v) in enumerate(beside):
             away = dr.square(u - x) + dr.square(v - y)
-            price = coherence * dr.select(other == page, dr.minimum(away, 4) / 4, 1)
+            apart = sum((dr.squared_norm(a - b) for a, b in zip(own, shown[k], strict=True)), start=dj.Float(0))
+            visible = HIDDEN_SEAM + (1 - HIDDEN_SEAM) * dr.minimum(apart * seam, 1)
+            price = coherence * visible * dr.select(other == page, dr.minimum(away, 4) / 4, 1)
             if ends is not None:
                 near = dr.select(other == page, dr.maximum(1 - away / around, 0), 0)
                 price = dr.select(end[k] > 0, STAY * near, price)

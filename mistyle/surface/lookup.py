@@ -13,8 +13,11 @@ from mistyle.surface import relief as reliefs
 from mistyle.surface.samples import Level, as_points, lifted, workers
 
 CHUNK = 1 << 19
-BLEND = 0.25  # of the Gaussian between the nearest samples, in spacings
-NEAREST = 3
+BLEND = 0.25  # of the Gaussian between the nearest samples of a piece, in spacings
+AROUND = 8  # samples that vote on which piece of the painting a point belongs to
+VOTE = 0.9  # of the vote's Gaussian, in spacings
+NEAREST = 4  # samples whose pictures are blended
+CRISP = {"cut": 8.0, "blend": 2.0}  # power of a piece's share of the votes, by kind of border
 
 
 @dataclass(frozen=True)
@@ -29,6 +32,9 @@ class Solution:
     scale               pixels of the painting per spacing, along its x and y
     painting            encoded sRGB, 0..1
     glaze               what is added to the painting's lightness at this sample (Lab / 100), smooth over the surface
+    piece               which samples go on with one another's picture: equal numbers
+    crisp               power of a piece's share of the votes about a point, at borders of pieces
+    whole_pixels        the painting's pixels are squares of one colour (no bilinear look-up)
     """
 
     positions: Float[np.ndarray, "n 3"]
@@ -40,6 +46,9 @@ class Solution:
     scale: tuple[float, float]
     painting: Float[np.ndarray, "h w 3"]
     glaze: Float[np.ndarray, " n"]
+    piece: Int[np.ndarray, " n"]
+    crisp: float
+    whole_pixels: bool
 
 
 @dataclass(frozen=True)
@@ -65,6 +74,10 @@ def solution(
     size: tuple[int, int],
     painting: Float[np.ndarray, "h w 3"],
     glaze: Float[np.ndarray, " n"] | None = None,
+    piece: Int[np.ndarray, " n"] | None = None,
+    *,
+    borders: str = "cut",
+    look_up: str = "bilinear",
 ) -> Solution:
     """A solution from places on the turned pages of a smaller painting of `size` (height, width)."""
     height, width = size
@@ -83,6 +96,9 @@ def solution(
         scale=scale,
         painting=painting,
         glaze=np.zeros(len(page), np.float32) if glaze is None else glaze,
+        piece=np.zeros(len(page), np.int32) if piece is None else piece.astype(np.int32),
+        crisp=CRISP[borders],
+        whole_pixels=look_up == "nearest",
     )
 
 
@@ -146,19 +162,49 @@ def looked_up(
     pixel = solution.spacing / max(solution.scale)  # one pixel of the painting on the surface
     if footprint > pixel:
         picture = style.blurred(picture, 0.4 * footprint / pixel)
-    picture = style.for_bilinear(picture)
+    if not solution.whole_pixels:
+        picture = style.for_bilinear(picture)
     across = np.cross(solution.tangent, solution.normals)
     per_unit = np.array(solution.scale) / solution.spacing
     canvas = on_canvas(
         dj, solution.positions, solution.tangent, across, solution.turn, solution.centre, per_unit, picture
     )
+    whole_pixels = solution.whole_pixels and footprint <= pixel
     for low in range(0, len(positions), CHUNK):
         p, n = positions[low : low + CHUNK], normals[low : low + CHUNK]
-        count = min(NEAREST, len(solution.positions))
+        count = min(AROUND, len(solution.positions))
         distance, index = tree.query(lifted(p, n, solution.spacing), k=np.arange(1, count + 1), workers=workers())
-        weight = np.exp(-(distance**2 - distance[:, :1] ** 2) / (2 * (BLEND * solution.spacing) ** 2))
-        weight /= weight.sum(axis=1, keepdims=True)
-        yield slice(low, low + len(p)), paint(dj, canvas, p, index, weight, slopes), index, weight
+        index, weight = blended(distance / solution.spacing, index, solution.piece, solution.crisp)
+        yield slice(low, low + len(p)), paint(dj, canvas, p, index, weight, slopes, whole_pixels), index, weight
+
+
+def blended(
+    distance: Float[np.ndarray, "n k"], index: Int[np.ndarray, "n k"], piece: Int[np.ndarray, " m"], crisp: float
+) -> tuple[Int[np.ndarray, "n j"], Float[np.ndarray, "n j"]]:
+    """Which of the nearest samples (distances in spacings, ascending) show at a point, and their weights.
+
+    The samples about a point vote on its piece of the painting, so that a border between pieces is a smooth line and
+    not the zigzag of single samples; within a piece the nearest sample shows.
+    """
+    keep = min(NEAREST, distance.shape[1])
+    near = distance**2 - distance[:, :1] ** 2
+    weight = np.exp(-near / (2 * BLEND**2))
+    label = piece[index]
+    mixed = np.flatnonzero((label != label[:, :1]).any(axis=1))
+    if len(mixed):
+        label, near = label[mixed], near[mixed]
+        votes = np.exp(-near / (2 * VOTE**2))
+        same = label[:, :, None] == label[:, None, :]
+        share = np.einsum("nij,nj->ni", same, votes) / votes.sum(axis=1, keepdims=True)
+        first = np.where(same, near[:, None, :], np.inf).min(axis=2)
+        within = np.exp(-(near - first) / (2 * BLEND**2))
+        weight[mixed] = within / np.einsum("nij,nj->ni", same, within) * share**crisp
+        order = np.argsort(-weight[mixed], axis=1, kind="stable")
+        index = index.copy()
+        index[mixed] = np.take_along_axis(index[mixed], order, axis=1)
+        weight[mixed] = np.take_along_axis(weight[mixed], order, axis=1)
+    index, weight = index[:, :keep], weight[:, :keep]
+    return index, weight / weight.sum(axis=1, keepdims=True)
 
 
 def on_canvas(
@@ -194,10 +240,12 @@ def paint(
     index: Int[np.ndarray, "n k"],
     weight: Float[np.ndarray, "n k"],
     slopes: bool = False,
+    whole_pixels: bool = False,
 ) -> Float[np.ndarray, "n 4"]:
-    """Blend what the samples `index` show at `positions`: bilinear in the painting, coordinates kept inside it.
+    """Blend what the samples `index` show at `positions`: bilinear in the painting, or whole pixels.
 
-    Three channels and 0; with `slopes` the first two as a vector in the world and the third.
+    Coordinates are kept inside it. Three channels and 0; with `slopes` the first two as a vector in the world and the
+    third.
     """
     import drjit as dr
 
@@ -218,6 +266,8 @@ def paint(
         centre = dr.gather(dj.Array2f, canvas.centre, j)
         x = dr.clip(centre[0] + right * canvas.scale[0] - 0.5, 0, canvas.width - 1)
         y = dr.clip(centre[1] + down * canvas.scale[1] - 0.5, 0, canvas.height - 1)
+        if whole_pixels:
+            x, y = dr.round(x), dr.round(y)
         left, top = dr.floor(x), dr.floor(y)
         row = dj.UInt(canvas.width)
         next_x = dj.UInt(dr.minimum(left + 1, canvas.width - 1))
@@ -252,5 +302,11 @@ def to_arrays(solution: Solution) -> dict[str, np.ndarray]:
 def from_arrays(arrays: dict[str, np.ndarray]) -> Solution:
     """The inverse of `to_arrays`, bit for bit."""
     x, y = arrays["scale"]
-    names = ("positions", "normals", "tangent", "turn", "centre", "painting", "glaze")
-    return Solution(**{n: arrays[n] for n in names}, spacing=float(arrays["spacing"]), scale=(float(x), float(y)))
+    names = ("positions", "normals", "tangent", "turn", "centre", "painting", "glaze", "piece")
+    return Solution(
+        **{n: arrays[n] for n in names},
+        spacing=float(arrays["spacing"]),
+        scale=(float(x), float(y)),
+        crisp=float(arrays["crisp"]),
+        whole_pixels=bool(arrays["whole_pixels"]),
+    )

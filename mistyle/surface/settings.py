@@ -1,33 +1,24 @@
 """What a user may choose about the painting of the surface."""
 
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 
-class SurfaceSettings(BaseModel):
-    """The embedded stylizer's choices. Weights belong to the cost of `mistyle.surface.synthesis`."""
+class PlainSettings(BaseModel):
+    """The embedded stylizer's choices that do not depend on the painting."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     samples: int = Field(
         default=250_000, ge=500, le=4_000_000, description="surface samples asked for on the finest level"
     )
-    levels: int = Field(
-        default=5,
-        ge=2,
-        le=8,
-        description="levels of the hierarchy at 250,000 samples; one more or less per factor of four",
-    )
-    style_scale: float = Field(
+    stroke_scale: float = Field(
         default=1.0,
         ge=0.1,
         le=10.0,
         description="stroke size: 2 paints with strokes twice as wide, whatever `samples` says",
-    )
-    detail: float = Field(
-        default=4.0, ge=0.0, le=16.0, description="how strongly cavities and ridges demand dark and light strokes"
     )
     relief: float = Field(
         default=1.7,
@@ -36,7 +27,7 @@ class SurfaceSettings(BaseModel):
         description="contrast of those strokes, in standard deviations of the painting's own",
     )
     glaze: float = Field(
-        default=0.8,
+        default=0.0,
         ge=0.0,
         le=1.0,
         description="share of what the strokes still lack in light and dark that is laid over them, where the painting "
@@ -47,9 +38,6 @@ class SurfaceSettings(BaseModel):
         ge=0.0,
         le=1.0,
         description="how much the light and dark of the asset's own texture count, against those of its shape",
-    )
-    palette: float = Field(
-        default=0.2, ge=0.0, le=8.0, description="how strictly a place takes the colour that optimal transport gave it"
     )
     liveliness: float = Field(
         default=0.8,
@@ -62,12 +50,6 @@ class SurfaceSettings(BaseModel):
         ge=0.0,
         le=1.0,
         description="0 leaves colours the areas they have in the painting, 1 gives rare ones as much as common ones",
-    )
-    stroke_coherence: float = Field(
-        default=0.01,
-        ge=0.0,
-        le=0.05,
-        description="price of leaving a stroke: higher copies larger pieces of the painting",
     )
     largest_piece: float = Field(
         default=1.0,
@@ -86,15 +68,83 @@ class SurfaceSettings(BaseModel):
         default="curvature",
         description="what strokes follow: the form, the vertical, or level lines around the object",
     )
+    form: float = Field(
+        default=0.0,
+        ge=0.0,
+        le=1.0,
+        description="how much sky light and openness are painted into the albedo, for hand-painted looks; 0 keeps "
+        "light out of it: parts take colours of their own, creases and ridges take strokes",
+    )
     bake_light: float = Field(
         default=0.0,
         ge=0.0,
         le=1.0,
-        description="share of a fixed key light in the tone; 0 keeps light out of the albedo",
+        description="share of a fixed key light, against the sky's, in the light that `form` paints",
     )
-    crop: float = Field(
-        default=0.0, ge=0.0, le=0.4, description="share of the picture left out along each border (frames, signatures)"
+
+
+Levels = Annotated[int, Field(ge=2, le=8)]
+Detail = Annotated[float, Field(ge=0.0, le=16.0)]
+Palette = Annotated[float, Field(ge=0.0, le=8.0)]
+Coherence = Annotated[float, Field(ge=0.0, le=0.2)]
+LookUp = Literal["nearest", "bilinear"]
+Borders = Literal["cut", "blend"]
+Share = Annotated[float, Field(ge=0.0, le=0.4)]
+Crop = Share | tuple[Share, Share, Share, Share]
+
+
+class SurfaceSettings(PlainSettings):
+    """The embedded stylizer's choices. Weights belong to the cost of `mistyle.surface.synthesis`.
+
+    What is None is read from the painting (`mistyle.surface.chosen.resolved`).
+    """
+
+    levels: Levels | None = Field(
+        default=None,
+        description="levels of the hierarchy at 250,000 samples; one more or less per factor of four of the samples or "
+        "two of the strokes; unset: from the painting (5, or 6 for large units)",
     )
+    detail: Detail | None = Field(
+        default=None,
+        description="how strongly creases and ridges demand dark and light strokes; unset: from the painting "
+        "(4, down to 3 for flat ones)",
+    )
+    palette: Palette | None = Field(
+        default=None,
+        description="how strictly a place takes the colour that optimal transport gave it; unset: from the painting "
+        "(0.2, down to 0.05 for graphic ones)",
+    )
+    stroke_coherence: Coherence | None = Field(
+        default=None,
+        description="price of leaving a stroke: higher copies larger pieces of the painting; unset: from the painting "
+        "(0.08 for brushwork, up to 0.12 for graphic ones)",
+    )
+    look_up: LookUp | None = Field(
+        default=None,
+        description="how pixels of the painting are looked up; unset: nearest for pixel art, else bilinear",
+    )
+    borders: Borders | None = Field(
+        default=None,
+        description="how pieces of the painting meet: cut along an edge, or blended; unset: cut for graphic paintings, "
+        "else blend",
+    )
+    crop: Crop | None = Field(
+        default=None,
+        description="share of the picture left out along each border (frames, paper), or four of them: top, left, "
+        "bottom, right; unset: the borders that the picture shows",
+    )
+
+
+class ResolvedSettings(PlainSettings):
+    """`SurfaceSettings` with every choice made."""
+
+    levels: Levels
+    detail: Detail
+    palette: Palette
+    stroke_coherence: Coherence
+    look_up: LookUp
+    borders: Borders
+    crop: tuple[Share, Share, Share, Share]
 
 
 class CoatSettings(BaseModel):
@@ -116,7 +166,7 @@ class CoatSettings(BaseModel):
     stroke_size: float | None = Field(
         default=None,
         gt=0,
-        description="width of a stroke in the mesh's own units, a 32nd of the picture's long side; sets style_scale",
+        description="width of a stroke in the mesh's own units, a 32nd of the picture's long side; sets stroke_scale",
     )
     height: float | None = Field(
         default=None,

@@ -19,6 +19,8 @@ PALETTE_SIZE = 256
 PALETTE_COLOURS = 20_000
 TWO_TONED = 0.95  # share of the variance of lightness between two tones from which on a painting has no others
 RARITY_CELL = 0.05  # Lab / 100
+Crop = tuple[float, float, float, float]  # top, left, bottom, right, in shares of the height or width
+UNCROPPED: Crop = (0.0, 0.0, 0.0, 0.0)
 RAREST = 0.01  # share of the most common colour's pixels below which a colour is no rarer
 
 
@@ -74,24 +76,39 @@ def lightened(rgb: Float[np.ndarray, "n 3"], by: Float[np.ndarray, " n"]) -> Flo
     return np.clip(cv2.cvtColor(lab[None] * np.float32(100), cv2.COLOR_Lab2RGB)[0], 0, 1)
 
 
-def prepare(
-    rgb: Float[np.ndarray, "h w 3"], crop: float = 0.0, alpha: Float[np.ndarray, "h w"] | None = None
-) -> Painting:
-    """A painting fit for synthesis: cropped, at most 2048 px long, at least 8 px and a third of its length wide.
+def inside(shape: tuple[int, ...], crop: Crop) -> tuple[slice, slice]:
+    """The rows and columns that a crop leaves; at least one of each."""
+    spans = []
+    for axis in (0, 1):
+        first, last = int(shape[axis] * crop[axis]), shape[axis] - int(shape[axis] * crop[axis + 2])
+        spans.append(slice(first, max(last, first + 1)))
+    return spans[0], spans[1]
 
-    Transparent pixels take the colour of the nearest opaque one. Refuses a picture without any usable pixel.
-    """
+
+def filled(
+    rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] | None
+) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """The picture within 0..1, transparent pixels with the colour of the nearest opaque one, and which are opaque."""
     size = f"the style picture ({rgb.shape[1]} x {rgb.shape[0]})"
     if rgb.size == 0 or not np.isfinite(rgb).all():
         raise InputRefused(f"{size} is empty or holds NaN or infinite values; use another one")
-    top, left = int(rgb.shape[0] * crop), int(rgb.shape[1] * crop)
-    window = (slice(top, rgb.shape[0] - top), slice(left, rgb.shape[1] - left))
-    picture = np.clip(rgb[window], 0, 1).astype(np.float32)
-    opaque = np.ones(picture.shape[:2], bool) if alpha is None else alpha[window] > 0.5
+    picture = np.clip(rgb, 0, 1).astype(np.float32)
+    opaque = np.ones(picture.shape[:2], bool) if alpha is None else alpha > 0.5
     if not opaque.any():
         raise InputRefused(f"{size} is transparent everywhere; a picture with opaque parts is needed")
-    if not opaque.all():
-        picture = nearest_fill(picture, opaque)
+    return (picture if opaque.all() else nearest_fill(picture, opaque)), opaque
+
+
+def prepare(
+    rgb: Float[np.ndarray, "h w 3"], crop: Crop = UNCROPPED, alpha: Float[np.ndarray, "h w"] | None = None
+) -> Painting:
+    """A painting fit for synthesis: cropped (shares at the top, left, bottom, right), at most 2048 px long, at least
+    8 px and a third of its length wide.
+
+    Transparent pixels take the colour of the nearest opaque one. Refuses a picture without any usable pixel.
+    """
+    window = inside(rgb.shape, crop)
+    picture, opaque = filled(rgb[window], None if alpha is None else alpha[window])
     long = max(picture.shape[:2])
     if long > LONGEST:
         size = long_side(picture.shape[:2], LONGEST)

@@ -5,12 +5,14 @@ energy of StyLit (Fiser et al. 2016). A sample s has a 5x5 patch of neighbours i
 place p (page, x, y) of the painting with the least
 
     |D_p - D_s|^2 + detail w(s) (band_p - relief std(band) d_s)^2 + variety use(p) / wanted use(p)
-        + stroke_coherence * sum over 4 neighbours of [1 if on another page, else min(jump^2, 4) / 4]
+        + stroke_coherence * sum over 4 neighbours of seam [1 if on another page, else min(jump^2, 4) / 4]
 
 (about neighbours at which a copied piece has got too large, staying near costs instead: surface/pieces.py), where D
 joins 16 principal components of the patch (Lab / 100, over 5), the large-area colour (weights 1, 0.6, 0.6 times
 `palette`, five times that for paintings of two tones) and the stroke direction (`orientation`); d_s is the detail
-guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance in pixels from where the neighbour's picture would go on.
+guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance in pixels from where the neighbour's picture would go on, and seam
+(0.3 to 1) how different the neighbour's picture, gone on with, and p look there: after the seam cost of graph-cut
+textures (Kwatra et al. 2003).
 
 The search is deterministic: all places are tried for all samples on the coarse levels; on every level a sample tries
 to go on with its neighbours' pictures (coherent search, Ashikhmin 2001) and a fixed set of steps about its own place.
@@ -26,19 +28,21 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.mesh import Mesh
 from mistyle.surface import kernels, style
+from mistyle.surface.chosen import settled
 from mistyle.surface.glaze import glaze
 from mistyle.surface.guides import Content, Guide, Occlusion, guides
 from mistyle.surface.linefield import Course, directions, line_field
 from mistyle.surface.lookup import Solution, solution
-from mistyle.surface.pieces import too_far
+from mistyle.surface.pieces import labels, too_far
 from mistyle.surface.samples import Level, nearest, sample_normals, spread, with_tables
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.surface.settings import PlainSettings, ResolvedSettings, SurfaceSettings
 
 __all__ = ["SurfaceSettings", "hierarchy", "solve", "synthesise"]
 
 LINE_POINTS = 7_500
-FULL_SIZE = 512  # long side of the painting on the finest level at 250,000 samples and style_scale 1
-LEAST_SIZE = 24  # and the least on the coarsest level
+FULL_SIZE = 512  # long side of the painting on the finest level at 250,000 samples and stroke_scale 1
+LEAST_SIZE = 16  # and the least on the coarsest level
+LEAST_SAMPLES = 48  # on the coarsest level
 ROUNDS = (10, 8, 6, 6, 6)  # searches and votes from the coarsest level on; further levels take the last
 FINE_ROUNDS = 4  # on levels beyond the fifth
 SWEEPS = 3  # passes of the coherent search in each round
@@ -73,7 +77,7 @@ class Pins:
 def solve(
     mesh: Mesh,
     picture_rgb: Float[np.ndarray, "h w 3"],
-    settings: SurfaceSettings,
+    settings: SurfaceSettings | ResolvedSettings,
     seed: int,
     occlusion: Occlusion,
     progress: Callable[[float], None] = lambda done: None,
@@ -91,18 +95,21 @@ def solve(
     picture. It copies pieces of the painting: recognisable objects in it (a star, an eye) may appear on the surface.
     """
     dj = kernels.module(device)
+    settings = settled(picture_rgb, alpha, settings)
     begun = lambda done: progress(0.25 * done)  # noqa: E731
     painting, levels, wanted = prepared(mesh, picture_rgb, settings, seed, occlusion, begun, alpha, content, course, dj)
     progress(0.35)
     choice, book = synthesise(levels, wanted, painting, settings, seed, dj, lambda done: progress(0.35 + 0.65 * done))
     laid = glaze(levels, wanted[-1], book.lab[pixels(book, choice), 0], book, settings)
-    return solution(levels[-1], choice.page, choice.x, choice.y, book.size, painting.rgb, laid)
+    piece = labels(levels[-1], book, choice.page, choice.x, choice.y)
+    kinds = {"borders": settings.borders, "look_up": settings.look_up}
+    return solution(levels[-1], choice.page, choice.x, choice.y, book.size, painting.rgb, laid, piece, **kinds)
 
 
 def prepared(
     mesh: Mesh,
     picture_rgb: Float[np.ndarray, "h w 3"],
-    settings: SurfaceSettings,
+    settings: ResolvedSettings,
     seed: int,
     occlusion: Occlusion,
     progress: Callable[[float], None],
@@ -116,27 +123,28 @@ def prepared(
     levels = hierarchy(mesh, settings, seed, dj, progress, course)
     rng = np.random.default_rng([seed, 2])
     palette = style.palette(painting, settings.liveliness, rng, settings.palette_mix)
-    wanted = guides(levels, palette, occlusion, settings.bake_light, rng, content, settings.keep_content)
+    wanted = guides(levels, palette, occlusion, settings, rng, content)
     return painting, levels, wanted
 
 
-def level_count(settings: SurfaceSettings) -> int:
-    """Levels for this many samples: one per factor of four, fewer where the coarsest painting would be too small."""
-    count = max(2, settings.levels + round(float(np.log(settings.samples / 250_000) / np.log(4))))
-    while count > 2 and finest_size(settings) / 2 ** (count - 1) < LEAST_SIZE:
-        count -= 1
-    return count
+def level_count(settings: ResolvedSettings) -> int:
+    """Levels for these samples and strokes: one more per doubling of the painting's size in samples, so that the
+    coarsest level sees the same share of it; fewer where its painting or its samples would be too few."""
+    size = finest_size(settings)
+    count = settings.levels + round(float(np.log2(size / FULL_SIZE)))
+    fewest = int(np.log2(settings.samples / LEAST_SAMPLES) / 2) + 1
+    return max(2, min(count, fewest, int(np.log2(size / LEAST_SIZE)) + 1))
 
 
-def finest_size(settings: SurfaceSettings) -> float:
+def finest_size(settings: PlainSettings) -> float:
     """Long side of the painting on the finest level: one pixel a sample, so strokes keep their size on the surface."""
     least, most = 32, style.LONGEST
-    return float(np.clip(FULL_SIZE * np.sqrt(settings.samples / 250_000) * settings.style_scale, least, most))
+    return float(np.clip(FULL_SIZE * np.sqrt(settings.samples / 250_000) * settings.stroke_scale, least, most))
 
 
 def hierarchy(
     mesh: Mesh,
-    settings: SurfaceSettings,
+    settings: ResolvedSettings,
     seed: int,
     dj: ModuleType,
     progress: Callable[[float], None] = lambda done: None,
@@ -151,7 +159,7 @@ def hierarchy(
     levels = []
     for index in range(count):
         share = 4.0 ** (index - count + 1)
-        points = spread(mesh, normals, max(64, round(settings.samples * share)), rng, dj)
+        points = spread(mesh, normals, max(LEAST_SAMPLES, round(settings.samples * share)), rng, dj)
         levels.append(with_tables(points, *directions(field, points), dj))
         progress(0.15 + 0.85 * share)
     return levels
@@ -161,7 +169,7 @@ def synthesise(
     levels: Sequence[Level],
     wanted: Sequence[Guide],
     painting: style.Painting,
-    settings: SurfaceSettings,
+    settings: ResolvedSettings,
     seed: int,
     dj: ModuleType,
     progress: Callable[[float], None] = lambda done: None,
@@ -220,7 +228,7 @@ def paint_level(
     pages: style.Pages,
     start: Choice | None,
     rounds: int,
-    settings: SurfaceSettings,
+    settings: ResolvedSettings,
     rng: np.random.Generator,
     dj: ModuleType,
     pins: Pins | None = None,
@@ -246,7 +254,8 @@ def paint_level(
         origin=kernels.whole(dj, pages.origin),
     )
     weight = kernels.floats(dj, band_weight)
-    prices = kernels.floats(dj, np.array([settings.stroke_coherence, settings.variety]))
+    typical = float(described[pages.allowed, : kernels.SEEN].var(axis=0).sum())
+    prices = kernels.floats(dj, np.array([settings.stroke_coherence, settings.variety, 1 / max(typical, 1e-6)]))
     place = on_device(dj, start)
     complete = min(rounds, int(ALL_PAIRS // (len(asked) * len(described))))
     for turn in range(rounds):
@@ -277,7 +286,7 @@ def ends_of_pieces(level: Level, pages: style.Pages, choice: Choice, largest: fl
     return kernels.Ends(kernels.floats(dj, far.astype(np.float32)), kernels.floats(dj, np.array([around])))
 
 
-def guide_weights(settings: SurfaceSettings, pages: style.Pages) -> Float[np.ndarray, " 5"]:
+def guide_weights(settings: ResolvedSettings, pages: style.Pages) -> Float[np.ndarray, " 5"]:
     """Square roots of the weights of colour (L, a, b) and stroke direction (2), by which descriptors are multiplied.
 
     Where a painting has two tones only, its large-area colour is all that says where strokes are: it counts more.
@@ -298,7 +307,7 @@ def described_pages(pages: style.Pages, guide_scale: Float[np.ndarray, " 5"]) ->
 
 
 def described_guide(
-    guide: Guide, pages: style.Pages, settings: SurfaceSettings, guide_scale: Float[np.ndarray, " 5"]
+    guide: Guide, pages: style.Pages, settings: ResolvedSettings, guide_scale: Float[np.ndarray, " 5"]
 ) -> tuple[Float[np.ndarray, "n 24"], Float[np.ndarray, " n"]]:
     """What every sample asks for, its patch left empty, and how much the band matters to it."""
     out = np.zeros((len(guide.detail), kernels.WIDTH), np.float32)
@@ -379,10 +388,13 @@ def pixels(pages: style.Pages, choice: Choice) -> Int[np.ndarray, " n"]:
 
 
 def usage(pages: style.Pages, choice: Choice) -> Float[np.ndarray, " k"]:
-    """How often each pixel of the unturned picture is in use, over its 5x5 neighbourhood; 1 is as often as wanted."""
+    """How often each pixel of the unturned picture is in use, over its 5x5 neighbourhood; 1 is as often as wanted.
+
+    A surface smaller than the picture (wide strokes) shows a part of it: once a pixel is not too often there.
+    """
     height, width = pages.size
     count = np.bincount(pages.origin[pixels(pages, choice)], minlength=height * width).reshape(height, width)
-    mean = len(choice.page) / (height * width)
+    mean = max(len(choice.page) / (height * width), 1.0)
     around = cv2.blur(count.astype(np.float32), (5, 5), borderType=cv2.BORDER_CONSTANT) / np.float32(mean)
     return around.reshape(-1) / np.maximum(pages.wanted, LEAST_WANTED)
 

@@ -17,10 +17,11 @@ from mistyle.core.image import distance_to, gaussian, srgb_from_linear
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
 from mistyle.surface import kernels, lookup, style
+from mistyle.surface.chosen import settled
 from mistyle.surface.guides import Content, Guide, Occlusion
 from mistyle.surface.linefield import Course
 from mistyle.surface.samples import CENTRE, GRID, Level, Points, as_points, carry, drop, unit
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.surface.settings import ResolvedSettings, SurfaceSettings
 from mistyle.surface.synthesis import Pins, prepared, synthesise
 
 STEEP = 4.0  # depth per width of a surface seen at 76 degrees
@@ -40,7 +41,7 @@ class Ground:
     levels: tuple[Level, ...]
     wanted: tuple[Guide, ...]
     painting: style.Painting
-    settings: SurfaceSettings
+    settings: ResolvedSettings
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Sheet:
 def ground(
     mesh: Mesh,
     picture_rgb: Float[np.ndarray, "h w 3"],
-    settings: SurfaceSettings,
+    settings: SurfaceSettings | ResolvedSettings,
     seed: int,
     occlusion: Occlusion,
     progress: Callable[[float], None] = lambda done: None,
@@ -73,6 +74,7 @@ def ground(
 ) -> Ground:
     """The guides of `mesh` for a painting (encoded sRGB, 0..1); as in `mistyle.surface.synthesis.solve`."""
     dj = kernels.module(device)
+    settings = settled(picture_rgb, alpha, settings)
     painting, levels, wanted = prepared(
         mesh, picture_rgb, settings, seed, occlusion, progress, alpha, content, course, dj
     )
@@ -115,10 +117,10 @@ def footprint(view: View) -> float:
     return float(np.median(view.depth[view.mask])) / view.camera.focal
 
 
-def at_same_size(base: Ground, sheet: Sheet, view: View) -> SurfaceSettings:
+def at_same_size(base: Ground, sheet: Sheet, view: View) -> ResolvedSettings:
     """The settings with which strokes are as large as on the mesh's own samples, whose spacing is no whole pixels."""
     ratio = sheet.side * footprint(view) / base.levels[-1].points.spacing
-    return base.settings.model_copy(update={"style_scale": base.settings.style_scale * ratio})
+    return base.settings.model_copy(update={"stroke_scale": base.settings.stroke_scale * ratio})
 
 
 def flat_positions(view: View, pixels: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:

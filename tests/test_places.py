@@ -1,0 +1,70 @@
+"""Places on the surface: parts take colours of their own, and nothing in them is explained by a light."""
+
+import numpy as np
+import pytest
+
+from mistyle.surface import creases, kernels, places, samples, synthesis
+from tests.test_surface import dented_ball, fixed_surface, mesh_of, open_sky, strokes
+
+
+@pytest.fixture(scope="module")
+def dj():
+    return kernels.module("llvm")
+
+
+@pytest.fixture(scope="module")
+def ball_levels(dj):
+    return synthesis.hierarchy(dented_ball(), fixed_surface(samples=6000, levels=4), 0, dj)
+
+
+def test_no_light_explains_the_places(ball_levels):
+    level = ball_levels[-1]
+    openness = np.random.default_rng(0).random(len(level.directed)).astype(np.float32)
+    fields = places.place_fields(level, openness)
+    explained = np.concatenate([level.points.normals, openness[:, None]], axis=1)
+    for field in fields.T:
+        assert field.std() == pytest.approx(1, abs=1e-3)
+        assert max(abs(np.corrcoef(field, column)[0, 1]) for column in explained.T) < 1e-3
+        up, down = level.points.normals[:, 1] > 0.5, level.points.normals[:, 1] < -0.5
+        assert abs(field[up].mean() - field[down].mean()) < 0.05
+    assert np.abs(np.corrcoef(fields.T) - np.eye(3)).max() < 0.7  # three different fields
+
+
+def test_vibrations_step_where_the_surface_is_narrow(dj):
+    # Two balls that touch in a narrow neck: the lowest vibration has one sign on each.
+    turn, height = np.meshgrid(np.arange(48) * 2 * np.pi / 48, np.linspace(-1.95, 1.95, 80))
+    radius = np.sqrt(np.maximum(1 - (np.abs(height) - 1) ** 2, 0.01))
+    positions = np.stack([radius * np.cos(turn), height, radius * np.sin(turn)], -1).reshape(-1, 3) / 2
+    quads = [
+        (r * 48 + c, r * 48 + (c + 1) % 48, (r + 1) * 48 + c, (r + 1) * 48 + (c + 1) % 48)
+        for r in range(79)
+        for c in range(48)
+    ]
+    faces = np.array([face for a, b, c, d in quads for face in ((a, c, b), (b, c, d))])
+    mesh = mesh_of(positions, faces, positions - np.sign(positions[:, 1:2]) * np.array([0, 0.5, 0]))
+    points = samples.spread(mesh, samples.sample_normals(mesh), 3000, np.random.default_rng(0), dj)
+    tangent = samples.unit(np.cross(points.normals, [0.3, 0.5, 0.8])).astype(np.float32)
+    level = samples.with_tables(points, tangent, np.ones(len(tangent), np.float32), dj)
+    first = places.vibrations(level, 4)[:, 0]
+    upper = points.positions[:, 1] > 0
+    assert np.mean((first > 0) == upper) > 0.98 or np.mean((first > 0) == ~upper) > 0.98
+    assert np.abs(first).min() > 0.1 * np.abs(first).max() or np.percentile(np.abs(first), 5) > 0.5
+
+
+def test_the_painting_of_a_ball_holds_no_light():
+    from mistyle.surface import lookup
+
+    ratio = {}
+    for form in (0.0, 1.0):
+        chosen = fixed_surface(samples=6000, form=form)
+        made = synthesis.solve(dented_ball(), strokes(), chosen, 0, open_sky)
+        light = lookup.colour(made, made.positions, made.normals, footprint=made.spacing).mean(axis=1)
+        up, down = made.normals[:, 1] > 0.5, made.normals[:, 1] < -0.5
+        ratio[form] = light[up].mean() / light[down].mean()
+    assert 0.8 < ratio[0.0] < 1.25 and ratio[1.0] > 1.5 * ratio[0.0]
+
+
+def test_creases_are_few(ball_levels):
+    asked = creases.creases(ball_levels)
+    assert [len(a) for a in asked] == [len(level.directed) for level in ball_levels]
+    assert asked[-1].min() < -0.8 and np.mean(np.abs(asked[-1]) < 0.3) > 0.6
