@@ -8,7 +8,8 @@ import numpy as np
 from sculpt import spline, turn
 
 Shell = tuple[np.ndarray, np.ndarray]  # vertices (v, 3), counter-clockwise faces (f, 3)
-SIDES = 24
+SIDES = 14
+RIBS = 25  # rings of an arm, four a rib
 
 
 def from_quads(vertices: np.ndarray, quads: np.ndarray) -> Shell:
@@ -28,8 +29,8 @@ def grid_quads(rows: int, columns: int) -> np.ndarray:
 def box(half, radius: float, at=(0, 0, 0), rotation: np.ndarray | None = None) -> Shell:
     """A rounded box of half sizes `half`."""
     half = np.asarray(half, float)
-    bends = radius * (1 - np.tan(np.radians([45, 30, 15, 0])))
-    cuts = [np.unique(np.round(np.concatenate([bends - h, [0], h - bends]), 9)) for h in half]
+    bends = radius * (1 - np.tan(np.radians([45, 22.5, 0] if radius > 0.03 else [45, 0])))
+    cuts = [np.unique(np.round(np.concatenate([bends - h, h - bends]), 9)) for h in half]
     vertices, quads, count = [], [], 0
     for axis in range(3):
         a, b = (axis + 1) % 3, (axis + 2) % 3
@@ -67,7 +68,7 @@ def lathe(profile, at=(0, 0, 0), rotation: np.ndarray | None = None, sides: int 
 
 def drum(radius: float, length: float, bevel: float) -> list[tuple[float, float]]:
     """Profile of a disc with rounded rims that lies between heights 0 and `length`."""
-    bend = np.radians(np.linspace(0, 90, 4))
+    bend = np.radians(np.linspace(0, 90, 3))
     low = [(radius - bevel + bevel * np.sin(a), bevel - bevel * np.cos(a)) for a in bend]
     return [(0, 0), *low, *[(r, length - h) for r, h in reversed(low)], (0, length)]
 
@@ -79,17 +80,17 @@ def ball(radius: float, rows: int = 11) -> list[tuple[float, float]]:
 
 def bellows(radius: float, length: float, folds: int) -> list[tuple[float, float]]:
     """Profile of a pleated tube."""
-    t = np.linspace(0, 1, 6 * folds + 1)
+    t = np.linspace(0, 1, 4 * folds + 1)
     ring = radius * (1 - 0.16 * np.abs(np.cos(np.pi * folds * t)) ** 0.7)
     return [(0, 0), *zip(ring, t * length, strict=True), (0, length)]
 
 
-def hose(knots, sides: int = 14, samples: int = 28, closed: bool = False) -> Shell:
+def hose(knots, sides: int = 14, samples: int = 20, closed: bool = False) -> Shell:
     """A bent tube through `knots` (x, y, z, radius), with rounded ends, or joined into a ring."""
     knots = np.asarray(knots, float)
     curve = spline(np.vstack([knots, knots[:2]]) if closed else knots, samples)
     if closed:
-        curve = spline(np.vstack([knots[-1:], knots, knots[:2]]), 20 * (len(knots) + 2) + 1)[20 : 20 * (len(knots) + 1)]
+        curve = spline(np.vstack([knots[-1:], knots, knots[:2]]), 3 * (len(knots) + 2) + 1)[3 : 3 * (len(knots) + 1)]
     line, radius = curve[:, :3], curve[:, 3]
     along = np.roll(line, -1, 0) - np.roll(line, 1, 0) if closed else np.gradient(line, axis=0)
     along /= np.linalg.norm(along, axis=1, keepdims=True)
@@ -134,7 +135,7 @@ def legs() -> list[Shell]:
         shells += [
             box((0.092, 0.058, 0.150), 0.040, (x, 0.058, 0.035 + forward)),
             lathe(drum(0.082, 0.05, 0.018), (x, 0.100, forward)),
-            lathe(bellows(0.070, 0.215, 6), (x, 0.140, forward * 0.7)),
+            lathe(bellows(0.070, 0.215, 4), (x, 0.140, forward * 0.7)),
         ]
     return shells
 
@@ -160,7 +161,7 @@ def trunk() -> list[Shell]:
     for side in (-1, 1):
         a = np.linspace(0, 2 * np.pi, 9)[:-1]
         ring = np.stack([side * (0.070 + 0.058 * np.cos(a)), 0.690 + 0.050 * np.sin(a), 0 * a - 0.290, 0 * a + 0.019], 1)
-        shells.append(hose(ring, 10, closed=True))
+        shells.append(hose(ring, 8, closed=True))
     return shells
 
 
@@ -185,10 +186,10 @@ def skull() -> list[Shell]:
     for x in np.linspace(-0.084, 0.084, 4):
         shells.append(on(box((0.0195, 0.027, 0.014), 0.008, (x, -0.085, 0.182))))
     spring = [(0, 0), (0.075, 0), (0.080, 0.010), (0.062, 0.028), (0.034, 0.034)]
-    t = np.linspace(0, 1, 25)
+    t = np.linspace(0, 1, 17)
     spring += [(0.021 + 0.008 * np.cos(2 * np.pi * 4 * s), 0.036 + 0.115 * s) for s in t]
-    shells.append(on(lathe([*spring, (0, 0.152)], (0, 0.155, 0), sides=18)))
-    shells.append(on(lathe(ball(0.056), (0, 0.350, 0), sides=18)))
+    shells.append(on(lathe([*spring, (0, 0.152)], (0, 0.155, 0), sides=14)))
+    shells.append(on(lathe(ball(0.056), (0, 0.350, 0), sides=14)))
     return shells
 
 
@@ -201,8 +202,8 @@ def arm(side: int, raised: bool) -> list[Shell]:
     else:
         path = [(0.0, 0, 0), (0.09, -0.045, 0.01), (0.135, -0.160, 0.035), (0.125, -0.270, 0.095), (0.115, -0.325, 0.150)]
         turned = turn(x=-46, z=0) @ turn(x=180)
-    line = spline([(x * side, y, z, 0.05) for x, y, z in path], 57)
-    line[:, 3] = 0.050 * (1 - 0.17 * np.abs(np.cos(np.pi * np.arange(57) / 6)) ** 0.7)
+    line = spline([(x * side, y, z, 0.05) for x, y, z in path], RIBS)
+    line[:, 3] = 0.050 * (1 - 0.17 * np.abs(np.cos(np.pi * np.arange(RIBS) / 4)) ** 0.7)
     line[:, :3] += shoulder
     hand = line[-1, :3]
 
@@ -211,14 +212,14 @@ def arm(side: int, raised: bool) -> list[Shell]:
 
     shells = [
         lathe(drum(0.092, 0.058, 0.022), shoulder - [0.018 * side, 0, 0], LEFT if side > 0 else RIGHT),
-        hose(line, 14, 57),
+        hose(line, 10, RIBS),
         on(lathe([(0, -0.02), (0.058, -0.02), (0.064, -0.008), (0.072, 0.060), (0.080, 0.068), (0.080, 0.084),
                   (0.070, 0.092), (0, 0.094)], sides=20)),
     ]  # fmt: skip
     for angle in (0, 120, 240):
         finger = [(0.038, 0.080, 0, 0.022), (0.082, 0.118, 0, 0.022), (0.092, 0.165, 0, 0.020), (0.060, 0.205, 0, 0.014)]
         spun = turn(y=angle + (90 if side > 0 else 30))
-        vertices, faces = hose(finger, 10, 13)
+        vertices, faces = hose(finger, 8, 6)
         shells.append(on((vertices @ spun.T, faces)))
     return shells
 
