@@ -23,16 +23,14 @@ LAMP_RADIANCE, LAMP_SHARPNESS, SKY_RADIANCE = 12.0, 30.0, 0.16
 UNDER_LAMP = "oil"
 
 
-def lamp_map(azimuth: float, rows: int = 96) -> np.ndarray:
-    """A sky (rows, 2 rows, 3), linear, latitude-longitude, +Y up: a soft lamp 35 degrees high at `azimuth` (degrees about
-    +Y, 0 at +Z) over an even, dim surrounding."""
-    theta = (np.arange(rows) + 0.5)[:, None] / rows * np.pi
-    # Column 0 is -Z, the middle +Z, as in scenes/studio_lights.exr.
-    phi = (np.arange(2 * rows) + 0.5)[None] / (2 * rows) * 2 * np.pi - np.pi
-    way = np.stack(np.broadcast_arrays(np.sin(theta) * np.sin(phi), np.cos(theta), np.sin(theta) * np.cos(phi)), -1)
+def lamp_map(azimuth: float, rows: int = 97) -> np.ndarray:
+    """A sky (rows, 2 rows, 3), linear, latitude-longitude: a soft lamp 35 degrees high at `azimuth` (degrees about +Y, 0
+    at +Z, 90 at +X) over even, dim surroundings."""
+    from mistyle.core.light import environment_directions
+
     a, e = np.radians(azimuth), np.radians(35)
     towards = np.array([np.cos(e) * np.sin(a), np.sin(e), np.cos(e) * np.cos(a)])
-    lamp = LAMP_RADIANCE * np.exp(LAMP_SHARPNESS * (way @ towards - 1))
+    lamp = LAMP_RADIANCE * np.exp(LAMP_SHARPNESS * (environment_directions(rows, 2 * rows) @ towards - 1))
     return (SKY_RADIANCE + lamp[..., None] * [1.0, 0.95, 0.86]).astype(np.float32)
 
 
