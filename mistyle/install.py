@@ -163,10 +163,10 @@ def _debian(python: Path, venv: Path) -> Iterator[list[str]]:
 
 # torch, whose build depends on the machine
 
-# torch 2.13.0 for Linux with the packages of CUDA that constraints.txt pins: the sums of their wheels' sizes, packed and
+# torch 2.13.0 for Linux with the packages of CUDA that constraints.txt pins: sums of their wheels' sizes, packed and
 # unpacked, as the registry and the wheels' own directories have them. A new pin needs new numbers.
 CUDA_FETCH_BYTES, CUDA_DISK_BYTES = 2.7e9, 4.7e9
-CUDA_SIZE = f"{CUDA_FETCH_BYTES / 1e9:.1f} GB to fetch with its CUDA packages, {CUDA_DISK_BYTES / 1e9:.1f} GB on the disk"
+CUDA_SIZE = f"{CUDA_FETCH_BYTES / 1e9:.1f} GB to fetch with its packages, {CUDA_DISK_BYTES / 1e9:.1f} GB on the disk"
 
 
 def install_torch(python: Path, venv: Path) -> None:
@@ -195,8 +195,8 @@ def _check_room(venv: Path, needed: float, what: str) -> None:
     free = shutil.disk_usage(venv).free
     if free < needed:
         raise SetupError(
-            f"{venv} has {free / 1e9:.1f} GB of free disk space, {what} needs {needed / 1e9:.1f} GB; make room and run the "
-            "same command again"
+            f"{venv} has {free / 1e9:.1f} GB of free disk space, {what} needs {needed / 1e9:.1f} GB; make room and run "
+            "the same command again"
         )
 
 

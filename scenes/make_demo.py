@@ -1,11 +1,11 @@
-"""Make the demo's meshes and paintings: `python scenes/make_demo.py [NAME ...]`, three minutes, the same bytes each time.
+"""Make the demo's meshes and paintings: `python scenes/make_demo.py [NAME ...]`, the same bytes each time.
 `python scenes/make_demo.py overview` paints the meshes with all four and draws the README's picture (overview.py).
 
 NAME             what it makes
 
-mesh             demo.obj: a young elephant with a bird on its back: distance functions (elephant.py), marching cubes, decimation,
-                 Newton steps back onto the surface, normals from the distance function's gradient, xatlas charts
-                 turned right-handed
+mesh             demo.obj: a young elephant with a bird on its back: distance functions (elephant.py), marching cubes,
+                 decimation, Newton steps back onto the surface, normals from the distance function's gradient, xatlas
+                 charts turned right-handed
 robot            robot.obj: a tin toy robot of closed shells (robot.py), xatlas charts turned right-handed
 style            demo_style.png: an evening over the sea, painted stroke by stroke (sunset.py composes, paint.py paints)
 mosaic           demo_mosaic.jpg: two fish in stone and glass (mosaic.py)

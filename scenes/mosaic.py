@@ -171,7 +171,9 @@ def compose(size: tuple[int, int], seed: int) -> Plan:
     board.lay(np.ones(size, bool), SKY, far * 800)
     board.lay(np.abs(board.y - 0.585 + 0.02 * np.sin(5 * board.x)) < 0.075, HAZE, board.y * 800)
     sun(board, at, 0.098)
-    hills = 0.575 - 0.085 * np.exp(-(((board.x - 0.22) / 0.16) ** 2)) - 0.055 * np.exp(-(((board.x - 0.52) / 0.12) ** 2))
+    hills = (
+        0.575 - 0.085 * np.exp(-(((board.x - 0.22) / 0.16) ** 2)) - 0.055 * np.exp(-(((board.x - 0.52) / 0.12) ** 2))
+    )
     board.lay((board.y > hills) & (board.y < 0.70), VIOLET, (board.y - hills) * 800)
     waves(board)
     fish(board, (0.40, 0.345), 0.60, -24, False, (DEEP, TEAL, GOLD, RED))

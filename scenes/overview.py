@@ -1,8 +1,8 @@
 """The README's picture: `python scenes/make_demo.py overview`.
 
 Upper rows: the demo's four paintings, each above the mesh that wears it, under the studio's softboxes. Lower row: one
-asset under a lamp that goes round it, from four sides. The surface is painted by the demo's own settings, with the relief
-and gloss that the painting gives, and without the fit.
+asset under a lamp that goes round it, from four sides. The surface is painted by the demo's own settings, with the
+relief and gloss that the painting gives, and without the fit.
 """
 
 from pathlib import Path
@@ -24,8 +24,8 @@ UNDER_LAMP = "oil"
 
 
 def lamp_map(azimuth: float, rows: int = 97) -> np.ndarray:
-    """A sky (rows, 2 rows, 3), linear, latitude-longitude: a soft lamp 35 degrees high at `azimuth` (degrees about +Y, 0
-    at +Z, 90 at +X) over even, dim surroundings."""
+    """A sky (rows, 2 rows, 3), linear, latitude-longitude: a soft lamp 35 degrees high at `azimuth` (degrees about +Y,
+    0 at +Z, 90 at +X) over even, dim surroundings."""
     from mistyle.core.light import environment_directions
 
     a, e = np.radians(azimuth), np.radians(35)
@@ -83,8 +83,9 @@ def write(path: Path) -> None:
     """Paint, draw and write the JPEG, in the best quality below LARGEST bytes."""
     import io
 
-    from mistyle.run.demo import MESHES, PAINTINGS
     from PIL import Image
+
+    from mistyle.run.demo import MESHES, PAINTINGS
 
     above, middle, below = [], [], []
     for name, painting in PAINTINGS.items():

@@ -150,7 +150,15 @@ def trunk() -> list[Shell]:
         box((0.0075, 0.033, 0.008), 0.0055, (-0.072, 0.722, 0.222), turn(z=-32)),
     ]  # fmt: skip
     for k, y in enumerate((0.765, 0.695, 0.625)):
-        dome = [(0, 0), (0.034, 0), (0.038, 0.006), (0.036, 0.018 + 0.004 * k), (0.024, 0.034), (0.010, 0.040), (0, 0.041)]
+        dome = [
+            (0, 0),
+            (0.034, 0),
+            (0.038, 0.006),
+            (0.036, 0.018 + 0.004 * k),
+            (0.024, 0.034),
+            (0.010, 0.040),
+            (0, 0.041),
+        ]
         shells.append(lathe(dome, (0.105, y, 0.196), FRONT, 16))
     shells.append(box((0.072, 0.014, 0.012), 0.010, (-0.085, 0.575, 0.202)))
     for x in (-0.226, 0.226):
@@ -160,7 +168,9 @@ def trunk() -> list[Shell]:
     shells.append(lathe(drum(0.028, 0.130, 0.010), (0, 0.690, -0.170), BACK, 14))
     for side in (-1, 1):
         a = np.linspace(0, 2 * np.pi, 9)[:-1]
-        ring = np.stack([side * (0.070 + 0.058 * np.cos(a)), 0.690 + 0.050 * np.sin(a), 0 * a - 0.290, 0 * a + 0.019], 1)
+        ring = np.stack(
+            [side * (0.070 + 0.058 * np.cos(a)), 0.690 + 0.050 * np.sin(a), 0 * a - 0.290, 0 * a + 0.019], 1
+        )
         shells.append(hose(ring, 8, closed=True))
     return shells
 
@@ -200,7 +210,13 @@ def arm(side: int, raised: bool) -> list[Shell]:
         path = [(0.0, 0, 0), (0.10, -0.015, 0.015), (0.20, 0.045, 0.035), (0.235, 0.170, 0.045), (0.225, 0.270, 0.050)]
         turned = turn(z=4 * side)
     else:
-        path = [(0.0, 0, 0), (0.09, -0.045, 0.01), (0.135, -0.160, 0.035), (0.125, -0.270, 0.095), (0.115, -0.325, 0.150)]
+        path = [
+            (0.0, 0, 0),
+            (0.09, -0.045, 0.01),
+            (0.135, -0.160, 0.035),
+            (0.125, -0.270, 0.095),
+            (0.115, -0.325, 0.150),
+        ]
         turned = turn(x=-46, z=0) @ turn(x=180)
     line = spline([(x * side, y, z, 0.05) for x, y, z in path], RIBS)
     line[:, 3] = 0.050 * (1 - 0.17 * np.abs(np.cos(np.pi * np.arange(RIBS) / 4)) ** 0.7)
@@ -217,7 +233,12 @@ def arm(side: int, raised: bool) -> list[Shell]:
                   (0.070, 0.092), (0, 0.094)], sides=20)),
     ]  # fmt: skip
     for angle in (0, 120, 240):
-        finger = [(0.038, 0.080, 0, 0.022), (0.082, 0.118, 0, 0.022), (0.092, 0.165, 0, 0.020), (0.060, 0.205, 0, 0.014)]
+        finger = [
+            (0.038, 0.080, 0, 0.022),
+            (0.082, 0.118, 0, 0.022),
+            (0.092, 0.165, 0, 0.020),
+            (0.060, 0.205, 0, 0.014),
+        ]
         spun = turn(y=angle + (90 if side > 0 else 30))
         vertices, faces = hose(finger, 8, 6)
         shells.append(on((vertices @ spun.T, faces)))

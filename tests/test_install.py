@@ -181,8 +181,8 @@ def test_which_torch_is_tried_first(gpu, system, first, ways):
 
 @pytest.mark.parametrize(("gpu", "way"), [(True, 0), (False, -1)])
 def test_the_size_of_the_cuda_build_is_told_before_it_is_fetched(tmp_path, monkeypatch, capsys, gpu, way):
-    """2.7 GB and 4.7 GB belong to the pinned torch; where only that build is to be had the lines come before pip runs."""
-    sizes = "2.7 GB to fetch with its CUDA packages, 4.7 GB on the disk"
+    """2.7 GB and 4.7 GB belong to the pinned torch; the line comes before pip runs."""
+    sizes = "2.7 GB to fetch with its packages, 4.7 GB on the disk"
     assert "torch==2.13.0\n" in install.CONSTRAINTS.read_text(), "a new torch has other sizes: CUDA_FETCH_BYTES"
     words, arguments = install.torch_ways("2.13.0", gpu, "linux")[way]
     assert sizes in words and "+cpu" not in arguments[-1]

@@ -15,7 +15,9 @@ def turned_form(profile, sides=40):
     """A surface of revolution about +Y: (radius, height) knots; its ends are closed by fans."""
     radius, height = np.array(profile, float).T
     around = np.arange(sides) * 2 * np.pi / sides
-    p = np.stack([np.outer(radius, np.sin(around)), np.repeat(height[:, None], sides, 1), np.outer(radius, np.cos(around))])
+    p = np.stack(
+        [np.outer(radius, np.sin(around)), np.repeat(height[:, None], sides, 1), np.outer(radius, np.cos(around))]
+    )
     p = np.concatenate([p.reshape(3, -1).T, [[0, height[0], 0], [0, height[-1], 0]]])
     faces, n = [], len(radius) * sides
     for i in range(sides):

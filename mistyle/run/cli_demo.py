@@ -36,7 +36,7 @@ def add_demo(verbs: Any, add_options: Callable[[argparse.ArgumentParser], None])
     verb.add_argument("--style", dest="painting", choices=list(PAINTINGS), help=f"{words} (default {DEFAULT})")
     pairs = ", ".join(f"{p.mesh} for {name}" for name, p in PAINTINGS.items())
     verb.add_argument("--mesh", choices=list(MESHES), help=f"the mesh to paint (default: {pairs})")
-    verb.add_argument("--all", action="store_true", help="all four paintings: a run folder each in OUT, and OUT/demo.png")
+    verb.add_argument("--all", action="store_true", help="all four paintings: OUT/STYLE/ for each, and OUT/demo.png")
     return verb
 
 
