@@ -163,6 +163,11 @@ def _debian(python: Path, venv: Path) -> Iterator[list[str]]:
 
 # torch, whose build depends on the machine
 
+# torch 2.13.0 for Linux with the packages of CUDA that constraints.txt pins: sums of their wheels' sizes, packed and
+# unpacked, as the registry and the wheels' own directories have them. A new pin needs new numbers.
+CUDA_FETCH_BYTES, CUDA_DISK_BYTES = 2.7e9, 4.7e9
+CUDA_SIZE = f"{CUDA_FETCH_BYTES / 1e9:.1f} GB to fetch with its packages, {CUDA_DISK_BYTES / 1e9:.1f} GB on the disk"
+
 
 def install_torch(python: Path, venv: Path) -> None:
     """The pinned torch: on a machine with an NVIDIA GPU the CUDA build, else one without gigabytes of CUDA packages.
@@ -178,21 +183,33 @@ def install_torch(python: Path, venv: Path) -> None:
     failure = ""
     for where, arguments in torch_ways(pin[1], nvidia(), sys.platform):
         say(f"installing torch {pin[1]} ({where})")
+        if sys.platform == "linux" and "+cpu" not in arguments[-1]:
+            _check_room(venv, CUDA_DISK_BYTES, "the CUDA build of torch")
         failure = pip(python, venv, "--no-deps", *arguments)
         if not failure:
             return
     raise SetupError(failure)
 
 
+def _check_room(venv: Path, needed: float, what: str) -> None:
+    free = shutil.disk_usage(venv).free
+    if free < needed:
+        raise SetupError(
+            f"{venv} has {free / 1e9:.1f} GB of free disk space, {what} needs {needed / 1e9:.1f} GB; make room and run "
+            "the same command again"
+        )
+
+
 def torch_ways(version: str, gpu: bool, system: str) -> list[tuple[str, list[str]]]:
     """What to try in turn: a few words, and pip's arguments."""
-    heavy = "; no CPU build was found, this one brings 3 GB of CUDA packages along" if system == "linux" else ""
+    heavy = f"; no CPU build was found, so this is the CUDA build: {CUDA_SIZE}" if system == "linux" else ""
     plain = (f"the plain registry{heavy}", [f"torch=={version}"])
     if gpu and system == "win32":
         return [("PyTorch's CUDA wheels", ["--index-url", CUDA_WHEELS, f"torch=={version}"]), plain]
     if gpu:
         # Three signs: exactly this string, so that a CPU build (2.13.0+cpu) in a configured folder is not taken.
-        return [("an NVIDIA GPU answers: the CUDA build", [f"torch==={version}"]), ("any build", [f"torch=={version}"])]
+        found = f"an NVIDIA GPU answers, so this is the CUDA build: {CUDA_SIZE}"
+        return [(found, [f"torch==={version}"]), ("any build", [f"torch=={version}"])]
     if system != "linux":
         return [plain]
     quick, cpu = ["--retries", "1", "--timeout", "20"], f"torch=={version}+cpu"

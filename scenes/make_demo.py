@@ -1,11 +1,18 @@
-"""Make the demo's mesh and style: `python scenes/make_demo.py [mesh|style]`, two minutes, the same bytes each time.
+"""Make the demo's meshes and paintings: `python scenes/make_demo.py [NAME ...]`, the same bytes each time.
+`python scenes/make_demo.py overview` paints the meshes with all four and draws the README's picture (overview.py).
 
-demo.obj         a young elephant with a bird on its back: distance functions (elephant.py), marching cubes, decimation,
-                 Newton steps back onto the surface, normals from the distance function's gradient, xatlas charts
-                 turned right-handed
-demo_style.png   an evening over the sea, painted stroke by stroke (sunset.py composes, paint.py paints)
+NAME             what it makes
 
-Both are made from nothing but these scripts and are dedicated to the public domain (CC0 1.0).
+mesh             demo.obj: a young elephant with a bird on its back: distance functions (elephant.py), marching cubes,
+                 decimation, Newton steps back onto the surface, normals from the distance function's gradient, xatlas
+                 charts turned right-handed
+robot            robot.obj: a tin toy robot of closed shells (robot.py), xatlas charts turned right-handed
+style            demo_style.png: an evening over the sea, painted stroke by stroke (sunset.py composes, paint.py paints)
+mosaic           demo_mosaic.jpg: two fish in stone and glass (mosaic.py)
+hatched          demo_hatched.png: a still life drawn with a pen (hatched.py)
+pixel            demo_pixel.png: a castle by the water, cell by cell (pixels.py)
+
+All are made from nothing but these scripts and are dedicated to the public domain (CC0 1.0).
 """
 
 import sys
@@ -17,12 +24,17 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE), str(HERE.parent)]
 
 import elephant  # noqa: E402
+import hatched  # noqa: E402
+import mosaic  # noqa: E402
+import pixels  # noqa: E402
+import robot  # noqa: E402
 import sculpt  # noqa: E402
 import sunset  # noqa: E402
 
 FACES = 15_000
 CELL = 0.011
 SOFTEN = 0.6
+TITLES = {"demo": "a young elephant with a bird on its back", "robot": "a tin toy robot that waves"}
 
 
 def largest_part(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -126,12 +138,14 @@ def sculpture() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return vertices - [0, vertices[:, 1].min(), 0], faces, normals
 
 
-def obj_text(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, corner_uvs: np.ndarray) -> str:
-    """Wavefront OBJ with shared positions and normals and one vt per distinct (vertex, uv)."""
+def obj_text(mesh: tuple[np.ndarray, np.ndarray, np.ndarray], corner_uvs: np.ndarray, names: tuple[str, str]) -> str:
+    """Wavefront OBJ with shared positions and normals and one vt per distinct (vertex, uv). `mesh` is positions (v, 3),
+    faces (f, 3) and unit normals (v, 3); `names` are the MTL file's stem and the material."""
+    vertices, faces, normals = mesh
     corners = np.concatenate([faces.reshape(-1, 1), np.round(corner_uvs.reshape(-1, 2) * 1e5).astype(np.int64)], axis=1)
     unique, index = np.unique(corners, axis=0, return_inverse=True)
-    lines = ["# mistyle demo: a young elephant with a bird on its back, by scenes/make_demo.py. CC0 1.0."]
-    lines += ["mtllib demo.mtl", "o elephant", "usemtl elephant"]
+    lines = [f"# mistyle demo: {TITLES[names[0]]}, by scenes/make_demo.py. CC0 1.0."]
+    lines += [f"mtllib {names[0]}.mtl", f"o {names[1]}", f"usemtl {names[1]}"]
     lines += [f"v {x:.5f} {y:.5f} {z:.5f}" for x, y, z in vertices]
     lines += [f"vt {u / 1e5:.5f} {v / 1e5:.5f}" for _, u, v in unique]
     lines += [f"vn {x:.4f} {y:.4f} {z:.4f}" for x, y, z in normals]
@@ -142,14 +156,13 @@ def obj_text(vertices: np.ndarray, faces: np.ndarray, normals: np.ndarray, corne
     return "\n".join(lines) + "\n"
 
 
-def make_mesh() -> None:
-    """Write demo.obj and demo.mtl."""
+def write_mesh(stem: str, material: str, mesh: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
+    """Unwrap a mesh; write `stem`.obj and `stem`.mtl."""
     from mistyle.core.unwrap import unwrap
 
-    vertices, faces, normals = sculpture()
-    (uvs,) = unwrap([(vertices, faces)])
-    (HERE / "demo.obj").write_text(obj_text(vertices, faces, normals, uvs), encoding="ascii", newline="\n")
-    (HERE / "demo.mtl").write_text("newmtl elephant\nKd 0.5 0.5 0.5\n", encoding="ascii", newline="\n")
+    (uvs,) = unwrap([(mesh[0], mesh[1])])
+    (HERE / f"{stem}.obj").write_text(obj_text(mesh, uvs, (stem, material)), encoding="ascii", newline="\n")
+    (HERE / f"{stem}.mtl").write_text(f"newmtl {material}\nKd 0.5 0.5 0.5\n", encoding="ascii", newline="\n")
 
 
 def make_style() -> None:
@@ -160,7 +173,47 @@ def make_style() -> None:
     Image.fromarray(picture).save(HERE / "demo_style.png", optimize=True)
 
 
+def make_mosaic() -> None:
+    """Write demo_mosaic.jpg."""
+    from PIL import Image
+
+    Image.fromarray(mosaic.painting()).save(HERE / "demo_mosaic.jpg", quality=80, optimize=True)
+
+
+def make_hatched() -> None:
+    """Write demo_hatched.png: 12 tones between ink and paper hold a pen drawing."""
+    from PIL import Image
+
+    few = Image.fromarray(hatched.painting()).quantize(12, Image.Quantize.MEDIANCUT, dither=Image.Dither.NONE)
+    few.save(HERE / "demo_hatched.png", optimize=True)
+
+
+def make_pixel() -> None:
+    """Write demo_pixel.png, with a palette: every cell keeps its colour exactly."""
+    from PIL import Image
+
+    picture = Image.fromarray(pixels.painting())
+    picture.quantize(len(pixels.PALETTE), dither=Image.Dither.NONE).save(HERE / "demo_pixel.png", optimize=True)
+
+
+def make_overview() -> None:
+    """Write demo_overview.jpg."""
+    import overview
+
+    overview.write(HERE / "demo_overview.jpg")
+
+
+MAKERS = {
+    "mesh": lambda: write_mesh("demo", "elephant", sculpture()),
+    "robot": lambda: write_mesh("robot", "robot", robot.robot()),
+    "style": make_style,
+    "mosaic": make_mosaic,
+    "hatched": make_hatched,
+    "pixel": make_pixel,
+    "overview": make_overview,
+}
+
+
 if __name__ == "__main__":
-    wanted = sys.argv[1:] or ["mesh", "style"]
-    for name in wanted:
-        {"mesh": make_mesh, "style": make_style}[name]()
+    for name in sys.argv[1:] or [name for name in MAKERS if name != "overview"]:
+        MAKERS[name]()

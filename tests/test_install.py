@@ -2,6 +2,7 @@
 
 import hashlib
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -176,6 +177,38 @@ def test_which_torch_is_tried_first(gpu, system, first, ways):
     assert tries[0][-1] == first
     assert len(tries) == ways
     assert tries[-1][-1] == "torch==2.13.0", "the plain registry is the last resort"
+
+
+@pytest.mark.parametrize(("gpu", "way"), [(True, 0), (False, -1)])
+def test_the_size_of_the_cuda_build_is_told_before_it_is_fetched(tmp_path, monkeypatch, capsys, gpu, way):
+    """2.7 GB and 4.7 GB belong to the pinned torch; the line comes before pip runs."""
+    sizes = "2.7 GB to fetch with its packages, 4.7 GB on the disk"
+    assert "torch==2.13.0\n" in install.CONSTRAINTS.read_text(), "a new torch has other sizes: CUDA_FETCH_BYTES"
+    words, arguments = install.torch_ways("2.13.0", gpu, "linux")[way]
+    assert sizes in words and "+cpu" not in arguments[-1]
+    others = [w for w, a in install.torch_ways("2.13.0", False, "linux") if "+cpu" in a[-1]]
+    assert len(others) == 2 and not any("CUDA" in w for w in others)
+    told = []
+
+    def pip(python: Path, venv: Path, *arguments: str) -> str:
+        told.append((arguments[-1], capsys.readouterr().err))
+        return "not there" if "+cpu" in arguments[-1] else ""
+
+    monkeypatch.setattr(install, "pip", pip)
+    monkeypatch.setattr(install, "nvidia", lambda: gpu)
+    monkeypatch.setattr(sys, "platform", "linux")
+    install.install_torch(tmp_path / "bin/python", tmp_path)
+    assert sizes in told[-1][1] and "+cpu" not in told[-1][0]
+    assert not any(sizes in said for _, said in told[:-1])
+
+
+def test_the_cuda_build_is_not_begun_on_a_disk_without_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(install, "pip", lambda *_: pytest.fail("pip ran"))
+    monkeypatch.setattr(install, "nvidia", lambda: True)
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(install.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10e9, 6e9, 4e9))
+    with pytest.raises(bootstrap.SetupError, match=r"4\.0 GB of free disk space.*needs 4\.7 GB; make room"):
+        install.install_torch(tmp_path / "bin/python", tmp_path)
 
 
 def test_configured_wheels_come_before_pytorchs_own(tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from mistyle.core.normals import area_vectors, crease_normals, same_points, usab
 from mistyle.core.raster import fragments
 from mistyle.core.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
 from mistyle.core.unwrap import unwrap
+from mistyle.core.upright import lies_on_its_side
 from mistyle.core.uvs import Layout, Verdict, arrange
 from mistyle.files.bounds import refuse
 from mistyle.files.lookups import effective, framed, looked_up, plain_lookups
@@ -28,6 +29,7 @@ ONE_COLOUR = 1 / 512  # vertex colours that differ by less (linear) are one
 TORN = "faces that share texels have different vertex colours"
 MAX_TORN = 0.05  # two faces may give a texel vertex colours that differ so far (linear)
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
+SIDEWAYS = "The mesh seems to lie on its side: it is tallest along z and its base is there. --up z turns it upright."
 UnwrapMode = Literal["keep", "new", "auto"]
 
 
@@ -100,6 +102,8 @@ def prepare(
         )
     points = same_points(raw.positions)
     notes = list(raw.notes) + ([f"The mesh was {TURNED}, as asked."] if up == "z" else [])
+    if up == "y" and lies_on_its_side(raw.positions, raw.faces):
+        notes.append(SIDEWAYS)
     normals = _normals(raw, work, points, work_from_user, notes)
     plans = [_plan(raw, m, points, area, uv, path, notes) for m in range(len(raw.materials))]
     progress(0.1)

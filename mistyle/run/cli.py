@@ -16,6 +16,7 @@ from mistyle.core.errors import UsageError
 from mistyle.run import exits
 from mistyle.run.cli_batch import add_batch
 from mistyle.run.cli_compare import add_compare, add_converge
+from mistyle.run.cli_demo import add_demo, demo
 from mistyle.run.cli_export import add_export, add_verify
 from mistyle.run.cli_fit import add_fit
 from mistyle.run.cli_lookdev import add_lookdev, add_view
@@ -167,13 +168,13 @@ def _add_stylize(verbs: Any) -> None:
 
 
 def _add_demo(verbs: Any) -> None:
-    verb = verbs.add_parser("demo", help="run the main job on a mesh and a painting that come with mistyle")
-    verb.add_argument("-o", "--out", type=Path, default=Path("mistyle-demo"), help="run folder (default mistyle-demo)")
-    add_job_options(verb)
-    add_mesh_options(verb)
-    _add_view_options(verb)
-    _add_style_options(verb)
-    verb.set_defaults(command=_demo)
+    def add_options(verb: argparse.ArgumentParser) -> None:
+        add_job_options(verb)
+        add_mesh_options(verb)
+        _add_view_options(verb)
+        _add_style_options(verb)
+
+    add_demo(verbs, add_options).set_defaults(command=_demo)
 
 
 def _add_render(verbs: Any) -> None:
@@ -286,11 +287,7 @@ def _tell_plan(options: argparse.Namespace, estimate: dict[str, Any]) -> int:
 
 
 def _demo(options: argparse.Namespace) -> int:
-    from mistyle.core.paths import scenes
-
-    if options.print_config:
-        return _print_config(options)
-    return _run_job(options, scenes() / "demo.obj", scenes() / "demo_style.png", "demo", asset_name(options, "demo"))
+    return _print_config(options) if options.print_config else demo(options, _job, _run_job)
 
 
 def _print_config(options: argparse.Namespace) -> int:
@@ -300,15 +297,21 @@ def _print_config(options: argparse.Namespace) -> int:
     return 0
 
 
-def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
+def _job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> Any:
+    from mistyle.run.stages import Job
+
     settings = _settings(options, preset)
     called = name or asset_name(options, mesh.stem, style.stem)
+    return Job(mesh, style, options.out, settings, called, options.redo_from, options.overwrite)
+
+
+def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
     from mistyle.run.pipeline import stylize
     from mistyle.run.plan import plan
     from mistyle.run.progress import Progress
-    from mistyle.run.stages import Job
 
-    job = Job(mesh, style, options.out, settings, called, options.redo_from, options.overwrite)
+    job = _job(options, mesh, style, preset, name)
+    settings = job.settings
     if options.dry_run:
         return _tell_plan(options, plan(job))
     progress = Progress()
