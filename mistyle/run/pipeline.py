@@ -182,8 +182,13 @@ def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:
 
     s = run.job.settings
     inputs = [s.rig, s.rig.file, s.draw, s.draw.scene, s.seed]
-    folder = run.stage("views", ["texels"], inputs, lambda f, r: draw(f, asset, atlas.start, s, r, run.progress.note))
-    return read_views(folder)
+    # The embedded stylizer paints the surface: of the views it reads depth, normals and masks.
+    read = s.stylizer != "embedded"
+
+    def write(folder: Path, report: Report) -> None:
+        draw(folder, asset, atlas.start, s, report, run.progress.note, read)
+
+    return read_views(run.stage("views", ["texels"], [*inputs, read], write))
 
 
 def fit(
