@@ -225,7 +225,9 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
         total = np.zeros((*camera.size, 4), np.float32)
         for k in range(times):
             # Seeds of passes must not meet those of a neighbouring seed: an odd step visits every number once.
-            total += np.array(mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32), dtype=np.float32)
+            total += np.array(
+                mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32), dtype=np.float32
+            )
         return total / np.float32(times)
 
     yield from map(drawn, cameras)

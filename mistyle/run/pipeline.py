@@ -147,8 +147,8 @@ def masks_stage(run: Run, asset: Asset, atlas: Atlas, baked: Baked, fitted: Any)
 
     def write(folder: Path, report: Report) -> None:
         for part, (stem, texels) in enumerate(zip(stems, atlas.texels, strict=True)):
-            looks = fitted.struggle[part], fitted.touched[part]
-            write_mask(folder / f"{stem}.png", struggle_mask(*looks, baked.seen[part], texels, s.repair))
+            looks, agreed = (fitted.struggle[part], fitted.touched[part]), fitted.agreed[part]
+            write_mask(folder / f"{stem}.png", struggle_mask(*looks, baked.seen[part], texels, s.repair, agreed))
 
     folder = run.stage("masks", ["fit"], [s.repair, run.job.name], write)
     return [read_mask(folder / f"{m}.png", t.covered) & t.covered for m, t in zip(stems, atlas.texels, strict=True)]
@@ -245,7 +245,8 @@ def repair(
     if network is not None:
         del network, again
         release(settings)
-    maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
+        # The weight-free inpainter takes the painting again, to which phase 1 has fitted normal and roughness already.
+        maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
     if settings.coat.protect is not None:
         own = [painted_mask(settings.coat.protect, texels) for texels in atlas.texels]
         maps = [protected(m, start, mask) for m, start, mask in zip(maps, atlas.start, own, strict=True)]
