@@ -27,7 +27,6 @@ from mistyle.stages.mvst import SweepSettings
 from mistyle.stages.texels import AtlasSettings
 from mistyle.surface.settings import CoatSettings, SurfaceSettings
 
-
 READ_SAMPLES = 8  # per pixel of a view that a stylizer reads
 
 

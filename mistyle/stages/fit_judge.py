@@ -73,14 +73,15 @@ def bench(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[V
         other = _nearest(targets, k)
         views.append(_window(targets[k], px[0], size))
         neighbours.append(_window(targets[other], px_from_world(targets[other].camera, point)[0][0], size))
-    surfaces = [tuple(deferred.trace(traced, [v.camera], tangents) for v in pair) for pair in zip(views, neighbours)]
+    pairs = list(zip(views, neighbours, strict=True))
+    surfaces = [tuple(deferred.trace(traced, [each.camera], tangents) for each in pair) for pair in pairs]
     masks = [view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1) for view in views]
     pictures = [srgb_from_linear(np.nan_to_num(view.rgb)) for view in views]
     return Bench(
         traced,
         tuple(views),
         tuple(surfaces),
-        tuple(overlap(*pair) for pair in zip(views, neighbours, strict=True)),
+        tuple(overlap(*pair) for pair in pairs),
         tuple(masks),
         tuple(metrics.detail(*each) for each in zip(pictures, masks, strict=True)),
         metrics.StyleReference(masks, pictures, masks),
