@@ -43,7 +43,7 @@ class Bench:
 
     traced: Any
     views: tuple[View, ...]
-    surfaces: tuple[tuple[Any, Any], ...]
+    surfaces: tuple[tuple[Any, ...], ...]
     shared: tuple[Overlap, ...]
     masks: tuple[Bool[np.ndarray, "h w"], ...]
     details: tuple[Float[np.ndarray, "h w"], ...]
