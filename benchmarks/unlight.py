@@ -43,7 +43,7 @@ def measured(asset: Any, style: Picture, settings: Settings, shown: str) -> tupl
     views = views_of(asset, truth, settings.rig.resolution)
     if shown == "lit":
         matt = [replace(m, roughness=np.ones_like(m.roughness)) for m in truth]
-        views = draw_views(asset.mesh, matt, [v.camera for v in views], spp=settings.draw.spp)
+        views = draw_views(asset.mesh, matt, [v.camera for v in views], spp=settings.draw.samples())
     painted = [as_painted(view) for view in views]
     found = [sweep.bake(asset, views, painted, atlas, settings, silent, lit) for lit in (False, True)]
     seen = atlas.texels[0].covered & (found[0].seen[0] > 0)

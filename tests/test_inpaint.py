@@ -266,3 +266,13 @@ def test_growing_is_deterministic_and_ignores_what_lies_under_the_hole(rng):
     first, second = grow(albedo, hole, texels), grow(other, hole, texels)
     assert first[hole & texels.covered].tobytes() == second[hole & texels.covered].tobytes()
     assert (first >= 0).all() and (first <= 1).all()
+
+
+def test_a_large_gradient_that_all_looks_agree_on_is_no_contradiction():
+    seen, texels = np.ones((1, 5), np.int32), texels_of(np.array([[0, 0, 0, 0, 0]]))
+    gradient, looks = np.array([[1, 1, 1, 9, 9]], np.float32), seen.astype(np.float32)
+    # The fourth is pulled one way by all its looks, the fifth to and fro; the first contradicts itself, but faintly.
+    agreed = np.array([[0.1, 1, 1, 9, 2.7]], np.float32)
+    assert struggle_mask(gradient, looks, seen, texels, BARE, agreed).tolist() == [[False] * 4 + [True]]
+    paper = BARE.model_copy(update={"agreement": 1.0})
+    assert struggle_mask(gradient, looks, seen, texels, paper, agreed).tolist() == [[False] * 3 + [True] * 2]

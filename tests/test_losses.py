@@ -54,6 +54,14 @@ def test_sliced_wasserstein_by_hand_along_one_axis():
     assert float(losses.sliced_wasserstein(a, b, Axis(np.random.PCG64(0)), projections=1)) == pytest.approx(0.125)
 
 
+def test_sliced_wasserstein_sorts_negative_numbers_and_ties_in_their_places(rng):
+    rows = torch.from_numpy((np.round(rng.normal(size=(3, 500)), 1) + 0.0).astype(np.float32))
+    rows[0, :4] = torch.tensor([0.0, -0.0, -1e30, 1e-40])
+    expected = rows.sort(dim=1, stable=True)
+    assert torch.equal(rows.gather(1, losses._order(rows)), expected.values)
+    assert torch.equal(losses._order(rows)[1:], expected.indices[1:])
+
+
 def test_sliced_wasserstein_draws_equal_numbers_and_pulls_colours_together(rng):
     mine = torch.full((300, 3), 0.2, requires_grad=True)
     theirs = torch.full((1000, 3), 0.6)

@@ -400,3 +400,18 @@ def test_a_scene_with_an_exr_loads_on_one_thread():
         "import drjit as dr; scene.read_template('studio', turn=0, floor=-1); assert dr.thread_count() == 1"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+
+
+def test_a_template_that_does_not_follow_the_camera_is_loaded_once_and_gives_the_same_picture(monkeypatch):
+    assert [scene.follows_camera(name) for name in TEMPLATES] == [False, True, False, True, False]
+    ball, cameras = sphere(12), [orbit(angle, 10, distance=4.0, fov=30.0, size=(24, 24)) for angle in (0, 90, 200)]
+    loads: list[int] = []
+    load = scene.read_template
+    monkeypatch.setattr(scene, "read_template", lambda *a, **k: (loads.append(1), load(*a, **k))[1])
+    once = draw.pictures(ball, None, cameras, "paper_views", spp=4)
+    assert len(loads) == 1
+    monkeypatch.setattr(scene, "follows_camera", lambda template: True)
+    each = draw.pictures(ball, None, cameras, "paper_views", spp=4)
+    assert len(loads) == 4
+    for one, other in zip(once, each, strict=True):
+        assert np.array_equal(one, other)

@@ -72,3 +72,10 @@ def test_every_known_key_can_be_printed():
     assert {"seed", "fit.iterations1", "atlas.size"} <= set(known_keys(Settings))
     assert len(known_keys(Settings)) == len(set(known_keys(Settings)))
     assert Settings() == resolve("standard", None, {}, {}) or PRESETS["standard"]
+
+
+def test_views_take_the_samples_that_their_use_needs():
+    from mistyle.run.settings import DrawSettings
+
+    assert (DrawSettings().samples(read=False), DrawSettings().samples()) == (1, 8)
+    assert (DrawSettings(spp=3).samples(read=False), DrawSettings(spp=3).samples()) == (3, 3)

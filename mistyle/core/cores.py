@@ -18,6 +18,9 @@ def use_threads(count: int) -> None:
     A product of matrices has other last digits at another count, and a BLAS left alone takes all cores, however many
     shards share them. Dr.Jit has its own count: `render/device.use`.
     """
+    # torch waits for its threads by spinning, for milliseconds after each operation, on cores that Dr.Jit's threads and
+    # other jobs need: most of a fit's processor time. Its OpenMP reads this when it is loaded; a user's choice stays.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     import cv2
     import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS, which could not be told later)
     import torch

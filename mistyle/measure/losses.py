@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 import torch
 import torch.nn.functional as functional
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from mistyle.measure.features import Features
 
@@ -289,9 +289,20 @@ def sliced_wasserstein(
     directions /= np.linalg.norm(directions, axis=0)
     axes = torch.from_numpy(directions).to(render)
     a, b = (_draw(pixels, count, rng) @ axes for pixels in (render, target))
-    # Sorted along memory: strided it takes three times as long.
-    a, b = (values.T.contiguous().sort(dim=1).values for values in (a, b))
-    return functional.mse_loss(a, b)
+    a, b = a.T.contiguous(), b.T.contiguous()
+    return functional.mse_loss(a.gather(1, _order(a)), b.gather(1, _order(b)))
+
+
+def _order(rows: Float[torch.Tensor, "k n"]) -> Int[torch.Tensor, "k n"]:
+    """The stable order that sorts each row.
+
+    NumPy sorts whole numbers ten times faster than torch sorts with places: each is the value's bits, so turned that
+    they rise with it, above its place.
+    """
+    bits = np.ascontiguousarray(rows.detach().cpu().numpy(), np.float32).view(np.int32)
+    rising = bits ^ ((bits >> 31) & 0x7FFFFFFF)
+    keys = np.sort((rising.astype(np.int64) << 32) | np.arange(rows.shape[1]), axis=1)
+    return torch.from_numpy(keys & 0xFFFFFFFF).to(rows.device)
 
 
 def _draw(pixels: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:

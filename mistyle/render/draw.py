@@ -96,11 +96,11 @@ def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
 
 def _directions(camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Unit world directions through the pixel centres, row by row, and their cosine with the optical axis."""
-    px = pixel_centres(camera.size).reshape(-1, 2)
-    xy = (px - np.asarray(camera.centre)) / camera.focal
-    cosines = 1 / np.sqrt(1 + (xy**2).sum(axis=1))
-    local = np.concatenate([xy * cosines[:, None], cosines[:, None]], axis=1)
-    return (local @ camera.world_from_cam[:3, :3].T).astype(np.float32), cosines.astype(np.float32)
+    x, y = ((pixel_centres(camera.size).reshape(-1, 2) - np.asarray(camera.centre)) / camera.focal).T
+    cosines = 1 / np.sqrt(1 + x * x + y * y)
+    # Written out: a product with so small a matrix spends its time on waking the BLAS's threads.
+    rows = [(a * x + b * y + c) * cosines for a, b, c in camera.world_from_cam[:3, :3]]
+    return np.stack(rows, axis=1).astype(np.float32), cosines.astype(np.float32)
 
 
 def draw_views(
@@ -197,7 +197,7 @@ def pictures(
 
 
 def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
-    """Render camera after camera; the object is loaded once, the template around it is placed anew for each."""
+    """Render camera after camera; the object is loaded once, a template that follows the camera anew for each."""
     import mitsuba as mi
 
     device.use()
@@ -209,17 +209,25 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
     del chosen
     memory.let_go()
 
-    def drawn(camera):
-        # A function, so that its scene goes before the next comes: where two live, other kernels have to be compiled.
+    def loaded(camera):
         described = scenery.scene_dict(
             mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes
         )
-        scene = mi.load_dict(described, optimize=False)
+        return mi.load_dict(described, optimize=False)
+
+    standing = loaded(cameras[0]) if cameras and not scenery.follows_camera(template) else None
+
+    def drawn(camera):
+        # A function, so that its scene goes before the next comes: where two live, other kernels have to be compiled.
+        scene = loaded(camera) if standing is None else standing
+        sensor = scene.sensors()[0] if standing is None else mi.load_dict(scenery.sensor_dict(camera, spp, seed))
         times, each = scenery.passes(spp)
         total = np.zeros((*camera.size, 4), np.float32)
         for k in range(times):
             # Seeds of passes must not meet those of a neighbouring seed: an odd step visits every number once.
-            total += np.array(mi.render(scene, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32), dtype=np.float32)
+            total += np.array(
+                mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32), dtype=np.float32
+            )
         return total / np.float32(times)
 
     yield from map(drawn, cameras)

@@ -241,6 +241,13 @@ def template_path(template: str | Path) -> Path:
     return path
 
 
+def follows_camera(template: str | Path) -> bool:
+    """Whether what a template puts around the object hangs on the camera: turned with it, moved with it, or left out
+    where it looks from below."""
+    text = template_path(template).read_text(encoding="utf-8", errors="replace")
+    return bool(re.search(r'<default\s+name="turn"|id="(camera_|floor)|<include', text))
+
+
 def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | None = None, **wanted: float) -> Any:
     """Load a template; of `hdri` and `wanted` (turn, floor) only what the file declares as `<default>` is passed on.
 

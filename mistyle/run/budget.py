@@ -207,7 +207,7 @@ def render_counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 
     from mistyle.render.scene import passes
 
     pictures = rig_pixels(settings)
-    lanes = max(pictures, default=0) * passes(settings.draw.spp)[1]
+    lanes = max(pictures, default=0) * passes(settings.draw.samples())[1]
     return Counts(0, sum(pictures), face=faces, own=own, lane=lanes)
 
 

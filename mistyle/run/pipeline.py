@@ -150,8 +150,8 @@ def masks_stage(run: Run, asset: Asset, atlas: Atlas, baked: Baked, fitted: Any)
 
     def write(folder: Path, report: Report) -> None:
         for part, (stem, texels) in enumerate(zip(stems, atlas.texels, strict=True)):
-            looks = fitted.struggle[part], fitted.touched[part]
-            write_mask(folder / f"{stem}.png", struggle_mask(*looks, baked.seen[part], texels, s.repair))
+            looks, agreed = (fitted.struggle[part], fitted.touched[part]), fitted.agreed[part]
+            write_mask(folder / f"{stem}.png", struggle_mask(*looks, baked.seen[part], texels, s.repair, agreed))
 
     folder = run.stage("masks", ["fit"], [s.repair, run.job.name], write)
     return [read_mask(folder / f"{m}.png", t.covered) & t.covered for m, t in zip(stems, atlas.texels, strict=True)]
@@ -185,8 +185,13 @@ def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:
 
     s = run.job.settings
     inputs = [s.rig, s.rig.file, s.draw, s.draw.scene, s.seed]
-    folder = run.stage("views", ["texels"], inputs, lambda f, r: draw(f, asset, atlas.start, s, r, run.progress.note))
-    return read_views(folder)
+    # The embedded stylizer paints the surface: of the views it reads depth, normals and masks.
+    read = s.stylizer != "embedded"
+
+    def write(folder: Path, report: Report) -> None:
+        draw(folder, asset, atlas.start, s, report, run.progress.note, read)
+
+    return read_views(run.stage("views", ["texels"], [*inputs, read], write))
 
 
 def fit(
@@ -243,7 +248,8 @@ def repair(
     if network is not None:
         del network, again
         release(settings)
-    maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
+        # The weight-free inpainter takes the painting again, to which phase 1 has fitted normal and roughness already.
+        maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
     if settings.coat.protect is not None:
         own = [painted_mask(settings.coat.protect, texels) for texels in atlas.texels]
         maps = [protected(m, start, mask) for m, start, mask in zip(maps, atlas.start, own, strict=True)]

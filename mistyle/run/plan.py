@@ -86,7 +86,7 @@ def plan(job: Job) -> dict[str, Any]:
     seconds = {
         "mesh": _reading(extent),
         "texels": texels * PER_TEXEL,
-        "views": pixels * (s.draw.spp * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
+        "views": pixels * (s.draw.samples(s.stylizer != "embedded") * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
         "surface": s.surface.samples * PER_SURFACE_SAMPLE,
         "bake": 2 * texels * PER_TEXEL + pixels * PER_VIEW_PIXEL,
         "stylized": 2 * pixels * PER_VIEW_PIXEL,
@@ -115,7 +115,7 @@ def plan_render(mesh: Path, out: Path, settings: Settings) -> dict[str, Any]:
     pixels = count(settings).view
     seconds = {
         "mesh": _reading(extent),
-        "views": 2 + pixels * (settings.draw.spp * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
+        "views": 2 + pixels * (settings.draw.samples() * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
     }
     job = Job(mesh, mesh, out, settings, mesh.stem)
     return {

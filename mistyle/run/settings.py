@@ -27,6 +27,8 @@ from mistyle.stages.mvst import SweepSettings
 from mistyle.stages.texels import AtlasSettings
 from mistyle.surface.settings import CoatSettings, SurfaceSettings
 
+READ_SAMPLES = 8  # per pixel of a view that a stylizer reads
+
 
 class ReadSettings(BaseModel):
     """How the mesh is read."""
@@ -46,11 +48,20 @@ class DrawSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    spp: int = Field(default=8, ge=1, le=65536, description="samples per pixel of the rendered views")
+    spp: int = Field(
+        default=0,
+        ge=0,
+        le=65536,
+        description="samples per pixel of the rendered views; 0: 8 where a stylizer reads their colours, else 1",
+    )
     scene: Path | None = Field(
         default=None, description="a Mitsuba scene with a shape called 'object' in place of scenes/paper_views.xml"
     )
     paper_files: bool = Field(default=False, description="also write the 8-bit depth maps and Canny edges of the paper")
+
+    def samples(self, read: bool = True) -> int:
+        """Samples per pixel of views whose colours are `read` by what comes next, or are for people only."""
+        return self.spp or (READ_SAMPLES if read else 1)
 
 
 class ReportSettings(BaseModel):
@@ -111,7 +122,6 @@ class Settings(BaseModel):
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "rig": {"resolution": 512},
-        "draw": {"spp": 4},
         "surface": {"samples": 80_000},
         "atlas": {"size": 1024},
         "fit": {"iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},
@@ -150,6 +160,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "tv_from": "style",
             "judge": False,
         },
+        "repair": {"agreement": 1.0},
         "train": {"loss_mode": "sum"},
         "diffusion": {"content": "per-view"},
     },

@@ -81,16 +81,23 @@ def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> li
 
 
 def draw(
-    folder: Path, asset: Asset, maps: Sequence[Maps], settings: Settings, report: Report, say: Callable[[str], None]
+    folder: Path,
+    asset: Asset,
+    maps: Sequence[Maps],
+    settings: Settings,
+    report: Report,
+    say: Callable[[str], None],
+    read: bool = True,
 ) -> None:
-    """Render the views and write them with their cameras and lights."""
+    """Render the views and write them with their cameras and lights; `read` says whether anything reads their
+    colours."""
     from mistyle.core.light import lights
     from mistyle.files.views import write_views
     from mistyle.render.draw import draw_views
 
     template = settings.draw.scene or "paper_views"
     cameras = cameras_of(settings, asset.mesh, say)
-    views = draw_views(asset.mesh, maps, cameras, template, settings.draw.spp, settings.seed, report)
+    views = draw_views(asset.mesh, maps, cameras, template, settings.draw.samples(read), settings.seed, report)
     # What lit these very views, so that they can be fitted to.
     write_views(folder, views, lights(str(template)), paper_files=settings.draw.paper_files)
 

@@ -169,7 +169,7 @@ def bare_shape(asset: Asset, views: Sequence[View], settings: Settings) -> list[
     white = [flat_maps(2, albedo=0.8, roughness=1.0) for _ in asset.mesh.parts]
     cameras = [view.camera for view in views]
     template = settings.draw.scene or "paper_views"
-    drawn = draw_views(asset.mesh, white, cameras, template, settings.draw.spp, settings.seed)
+    drawn = draw_views(asset.mesh, white, cameras, template, settings.draw.samples(), settings.seed)
     return [luminance(view.rgb) for view in drawn]
 
 

@@ -58,6 +58,8 @@ class Fit:
     kept      whether each phase that ran was kept
     figures   by "phase.figure": (before, after)
     notes     sentences for the report
+    agreed    |sum| of the same gradients with their signs (mean over rgb): as large as `struggle` where all steps pull
+              a texel one way, near 0 where they contradict one another
     """
 
     maps: tuple[Maps, ...]
@@ -67,6 +69,7 @@ class Fit:
     kept: dict[str, bool]
     figures: dict[str, tuple[float, float]]
     notes: tuple[str, ...]
+    agreed: tuple[Float[np.ndarray, "h w"], ...] = ()
 
 
 def two_phase(
@@ -97,7 +100,7 @@ def two_phase(
         maps = [replace(m, metallic=np.zeros_like(m.metallic)) for m in maps]
     nothing = tuple(np.zeros(m.roughness.shape, np.float32) for m in maps)
     if settings.refine == "off" or not any(view.mask.any() for view in targets):
-        return Fit(tuple(maps), nothing, nothing, {}, {}, {}, ())
+        return Fit(tuple(maps), nothing, nothing, {}, {}, {}, (), nothing)
     world = _world(mesh, targets, settings)
     shrink = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
     table = fit_table.build(maps, texels, shrink, only)
@@ -105,7 +108,7 @@ def two_phase(
     phases = _phases(settings, phase1_lights or lights("phase1"), targets, style, unlit is not None)
     judge = fit_judge.bench(world.traced, world.tangents, targets) if settings.judge else None
     total, done = max(sum(phase.iterations for phase in phases), 1), 0
-    fit = Fit(tuple(maps), nothing, nothing, {}, {}, {}, ())
+    fit = Fit(tuple(maps), nothing, nothing, {}, {}, {}, (), nothing)
     for phase, rng in zip(phases, np.random.default_rng(seed).spawn(len(phases)), strict=True):
         if phase.iterations:
             share = (done / total, phase.iterations / total)
@@ -147,6 +150,7 @@ def _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share
         maps=after if kept else fit.maps,
         struggle=tuple(fit_table.spread(table, maps, run.struggle)),
         touched=tuple(fit_table.spread(table, maps, run.touched)),
+        agreed=tuple(fit_table.spread(table, maps, np.abs(run.pulled).mean(axis=1))),
         trace=fit.trace | {f"{phase.name}.{name}": values for name, values in run.trace.items()},
         kept=fit.kept | {phase.name: kept},
         figures=figures,

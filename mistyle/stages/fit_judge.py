@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from mistyle.core import memory
 from mistyle.core.camera import Camera, px_from_world, world_from_px, zoom
@@ -20,6 +20,7 @@ from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.core.light import Directional, Lights, direction_in_world
 from mistyle.core.maps import Maps, rows_of
 from mistyle.core.view import View
+from mistyle.measure.overlap import Overlap
 from mistyle.stages.texels import BAND_TEXELS
 
 VIEWS = 6
@@ -33,17 +34,28 @@ HIGHER_IS_BETTER = {"detail": True, "style": False, "views": False}
 
 @dataclass(frozen=True)
 class Bench:
-    """Windows of views to judge by, each with the window of a neighbouring view that shows the same place."""
+    """Windows of views to judge by, each with the window of a neighbouring view that shows the same place.
+
+    What does not hang on the maps is found once: the windows' `surfaces` and those of the neighbours (traced), which
+    places a window shares with its neighbour, the band-pass lightness (`details`) of the target within its mask, and
+    the statistics of all targets (`style`).
+    """
 
     traced: Any
-    tangents: Float[np.ndarray, "f 3 4"]
     views: tuple[View, ...]
-    neighbours: tuple[View, ...]
+    surfaces: tuple[tuple[Any, ...], ...]
+    shared: tuple[Overlap, ...]
+    masks: tuple[Bool[np.ndarray, "h w"], ...]
+    details: tuple[Float[np.ndarray, "h w"], ...]
+    style: Any
     shaders: dict[bool, Any]
 
 
 def bench(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[View]) -> Bench:
     """Windows of up to VIEWS evenly chosen targets, about the middle of what they see; WINDOW pixels at most."""
+    from mistyle.measure import metrics
+    from mistyle.measure.overlap import overlap
+    from mistyle.render import deferred
     from mistyle.render.seam import Shader
 
     count = min(VIEWS, len(targets))
@@ -61,11 +73,18 @@ def bench(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[V
         other = _nearest(targets, k)
         views.append(_window(targets[k], px[0], size))
         neighbours.append(_window(targets[other], px_from_world(targets[other].camera, point)[0][0], size))
+    pairs = list(zip(views, neighbours, strict=True))
+    surfaces = [tuple(deferred.trace(traced, [each.camera], tangents) for each in pair) for pair in pairs]
+    masks = [view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1) for view in views]
+    pictures = [srgb_from_linear(np.nan_to_num(view.rgb)) for view in views]
     return Bench(
         traced,
-        tangents,
         tuple(views),
-        tuple(neighbours),
+        tuple(surfaces),
+        tuple(overlap(*pair) for pair in pairs),
+        tuple(masks),
+        tuple(metrics.detail(*each) for each in zip(pictures, masks, strict=True)),
+        metrics.StyleReference(masks, pictures, masks),
         {gloss: Shader((size, size), gloss=gloss) for gloss in (True, False)},
     )
 
@@ -76,22 +95,21 @@ def figures(where: Bench, maps: Sequence[Maps], lights: Lights, *, gloss: bool =
 
     lit = any(isinstance(light, Directional) for light in lights)
     table = _tables(maps)
-    encoded, targets, masks, errors = [], [], [], []
-    for view, other in zip(where.views, where.neighbours, strict=True):
+    encoded, errors = [], []
+    for view, surfaces, shared in zip(where.views, where.surfaces, where.shared, strict=True):
         # Both under the lights of the first camera, or their shading would differ.
         fixed = _fixed(lights, view.camera)
-        first, second = (_draw(where, table, each.camera, fixed, gloss) for each in (view, other))
+        first, second = (_draw(where, table, surface, fixed, gloss) for surface in surfaces)
         mine, theirs = srgb_from_linear(first), srgb_from_linear(second)
         contrast = float(np.abs(metrics.detail(mine, view.mask))[view.mask].mean())
-        errors.append(metrics.warp_error(view, other, mine, theirs) / max(contrast, 1e-3))
+        errors.append(metrics.shared_error(shared, mine, theirs) / max(contrast, 1e-3))
         encoded.append(srgb_from_linear(_exposed(first, view)) if lit else mine)
-        targets.append(srgb_from_linear(np.nan_to_num(view.rgb)))
-        masks.append(view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1))
-    details = [metrics.detail_correlation(*each) for each in zip(encoded, targets, masks, strict=True)]
+    compared = zip(encoded, where.details, where.masks, strict=True)
+    details = [metrics.band_correlation(metrics.detail(mine, mask), theirs, mask) for mine, theirs, mask in compared]
     usable = [error for error in errors if np.isfinite(error)]
     return {
         "detail": float(np.mean([d for d in details if np.isfinite(d)] or [0.0])),
-        "style": metrics.style_distance(encoded, masks, targets, masks),
+        "style": where.style.distance(encoded),
         "views": float(np.mean(usable or [0.0])),
     }
 
@@ -147,12 +165,11 @@ def _tables(maps: Sequence[Maps]) -> tuple[list[tuple[int, int]], Float[np.ndarr
     return sizes, table
 
 
-def _draw(where: Bench, table: tuple, camera: Camera, lights: Lights, gloss: bool) -> Float[np.ndarray, "h w 3"]:
+def _draw(where: Bench, table: tuple, surface: Any, lights: Lights, gloss: bool) -> Float[np.ndarray, "h w 3"]:
     import torch
 
     from mistyle.render import deferred, seam
 
-    surface = deferred.trace(where.traced, [camera], where.tangents)
     sizes, values = table
     pixels = torch.from_numpy(seam.bilinear(values, seam.taps(surface, sizes)))
     lit = deferred.light(where.traced, surface, lights, shadows=False)

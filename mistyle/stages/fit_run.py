@@ -89,6 +89,7 @@ class Run:
         self.beam = 0
         self.struggle = np.zeros(len(table.still), np.float32)
         self.touched = np.zeros(len(table.still), np.float32)
+        self.pulled = np.zeros((len(table.still), 3), np.float32)
         table.forget()
 
     def step(self, iteration: int) -> str:
@@ -107,6 +108,7 @@ class Run:
         if "albedo" in gradients and self.phase.iterations - iteration <= self.settings.struggle_window:
             self.struggle[texels] += np.abs(pure["albedo"]) @ np.full(3, 1 / 3, np.float32)
             self.touched[texels] += looks
+            self.pulled[texels] += pure["albedo"]
         share = iteration / max(self.phase.iterations, 1)
         decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * share))
         for name, gradient in gradients.items():

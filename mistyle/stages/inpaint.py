@@ -32,6 +32,13 @@ class RepairSettings(BaseModel):
         le=10,
         description="a texel struggles above mean + this many standard deviations (the paper's 0.5)",
     )
+    agreement: float = Field(
+        default=0.3,
+        ge=0,
+        le=1,
+        description="and only where the views contradict one another: |sum| of the gradients at most this share of "
+        "the sum of |gradients|; 1: wherever the gradients are large (the paper)",
+    )
     dilation: float = Field(
         default=0.004, ge=0, le=0.1, description="radius of the mask's max-pooling as a share of the atlas's side"
     )
@@ -57,9 +64,14 @@ def struggle_mask(
     seen: Int[np.ndarray, "h w"],
     texels: Texels,
     settings: RepairSettings,
+    agreed: Float[np.ndarray, "h w"] | None = None,
 ) -> Bool[np.ndarray, "h w"]:
     """The texels to paint again: those around which the mean |gradient| of a look exceeds mean + 0.5 std over the
-    texels that were looked at, and those that no view sees; dilated by max-pooling inside their islands.
+    texels that were looked at while its looks contradict one another, and those that no view sees; dilated by
+    max-pooling inside their islands.
+
+    A large gradient alone is the mark of contrast and of a fit that was not run to its end: it pulls the same way in
+    all views, and more steps would mend it. `agreed` (`Fit.agreed`) tells the two apart; None leaves it out.
 
     "Around" is a Gaussian of `settings.smooth`: single texels' gradients are noise, and thresholded one by one they lie
     scattered over everything, which the dilation then joins. `accumulated` is the sum of absolute albedo gradients over
@@ -76,6 +88,9 @@ def struggle_mask(
         total, times = (gaussian(np.where(looked, a, 0).astype(np.float32), side) for a in (accumulated, looks))
         average = total[looked].astype(np.float64) / np.maximum(times[looked], least)
         struggling[looked] = average > average.mean() + settings.deviations * average.std()
+        if agreed is not None and settings.agreement < 1:
+            one_way = gaussian(np.where(looked, agreed, 0).astype(np.float32), side)[looked]
+            struggling[looked] &= one_way <= settings.agreement * total[looked]
     return dilate_within(struggling, texels.island, radius(settings.dilation, texels.covered.shape[1]))
 
 
