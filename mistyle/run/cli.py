@@ -25,11 +25,13 @@ from mistyle.run.options import (
     DELIVERY_OPTIONS,
     NAME_HELP,
     PAINT_OPTIONS,
+    REPORT_OPTIONS,
     add_delivery_options,
     add_job_options,
     add_memory_option,
     add_mesh_options,
     add_paint_options,
+    add_report_option,
     asset_name,
     examples,
     said_settings,
@@ -129,6 +131,7 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     )
     _add_dry_run(verb)
     add_memory_option(verb)
+    add_report_option(verb)
     add_delivery_options(verb)
 
 
@@ -152,6 +155,7 @@ def _add_stylize(verbs: Any) -> None:
             mistyle stylize bunny.obj starry_night.jpg -o out/ --from fit --set fit.iterations2=100
             mistyle stylize chair.usda wave.jpg -o out/ --formats glb,usd --target houdini
             mistyle stylize chair.glb wave.jpg -o out/ --target unreal,blender --name '{mesh}_{style}_v{v:03}'
+            mistyle stylize bunny.obj starry_night.jpg -o out/ --report none
             mistyle stylize --preset paper --print-config > job.toml
             """
         ),
@@ -241,6 +245,7 @@ OPTIONS = {
     **PAINT_OPTIONS,
     **GENERATIVE_OPTIONS,
     **DELIVERY_OPTIONS,
+    **REPORT_OPTIONS,
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",
@@ -324,6 +329,8 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
         print(json.dumps(summary))
     else:
         for label in ("asset", "textures", "report", "picture", "views", "stylized"):
+            if label not in summary:
+                continue
             print(f"{label:<9} {summary[label]}", file=sys.stderr)
     progress.tell_notes()
     return 0

@@ -69,15 +69,17 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
         start_engines(job.settings)
         made = _stages(run, files, style, look_again)
         progress.note(*made.asset.source.notes, *style.notes, *made.fit.notes)
-        from mistyle.run.pages import job_report
-
-        run.stage(
-            "report",
-            ["asset"],
-            [job.settings.report, job.name],
-            lambda folder, r: job_report(folder, made, progress, r),
-        )
+        if job.settings.report.detail != "none":
+            report_stage(run, made, progress)
         return deliver(job, progress) | write_summary(made, run)
+
+
+def report_stage(run: Run, made: Made, progress: Progress) -> None:
+    """The page and the pictures that show a person what was made."""
+    from mistyle.run.pages import job_report
+
+    inputs = [run.job.settings.report, run.job.name]
+    run.stage("report", ["asset"], inputs, lambda folder, r: job_report(folder, made, progress, r))
 
 
 def inputs_of(job: Job) -> list[Path]:
