@@ -18,7 +18,7 @@ from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting
 from mistyle.run.report_draw import draw, shown
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
-from mistyle.run.stages import RETOUCH, STAGES
+from mistyle.run.stages import FIRST, RETOUCH, STAGES
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
 from mistyle.stages.fit_judge import undone_where
@@ -54,7 +54,9 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         steps=steps(made, Shot(before, "as baked"), Shot(after, "after fit and repair")),
         maps=map_sets(made),
         model=page_model(made.folder / f"{made.job.name}.glb"),
-        timings=tuple(Timing((STAGES | RETOUCH)[k], v, k in progress.reused) for k, v in progress.seconds.items()),
+        timings=tuple(
+            Timing((STAGES | RETOUCH | FIRST)[k], v, k in progress.reused) for k, v in progress.seconds.items()
+        ),
         figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k.split(".")[-1]]) for k, v in figures(made).items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),

@@ -18,6 +18,7 @@ from mistyle.files.textures import part_stems
 from mistyle.run import asset_files
 from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
+from mistyle.run.first_asset import write_first
 from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import fit_settings, inpainter_inputs, opaque, release, texture_inpainter
 from mistyle.run.inputs import input_files
@@ -117,7 +118,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
         sets = zip(atlas.texels, repaired.maps, strict=True)
         write_asset(folder, run.job, asset, sets, report, edited)
 
-    folder, edited = asset_stage(run, ["repair"], write)
+    folder, edited = asset_stage(run, ["repair"], write, {"painted": run.keys["bake"]})
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
@@ -164,7 +165,9 @@ def painted_stages(
     if s.stylizer != "embedded":
         from mistyle.run.sweep import swept_stages
 
-        return swept_stages(run, asset, style, atlas, views)
+        swept = swept_stages(run, asset, style, atlas, views)
+        write_first(run, asset, atlas, swept[0])
+        return swept
     coats = run.record(
         "surface",
         ["texels"],
@@ -174,6 +177,7 @@ def painted_stages(
     baked = run.record(
         "bake", ["views", "surface"], [s.bake, s.fit.refine, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
     )
+    write_first(run, asset, atlas, baked)
     stylized = stylized_stage(run, asset, baked, views)
     return baked, stylized
 
