@@ -84,9 +84,9 @@ class Keeper:
         An older result of the stage is replaced only once the new one is complete; when `write` raises, or the disk
         is full (MistyleError), the older one stays and nothing else does. What a user did there is not lost: an older
         result with changed files is set aside like a broken one, and files that the stage had not written stay.
-        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them, and the
-        sentences that `notes()` gives after `write`, and what else is said `about` the result. UsageError where a file that the stage did not write has the name
-        of one that it writes now.
+        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them, the sentences
+        that `notes()` gives after `write`, and what else is said `about` the result. UsageError where a file that the
+        stage did not write has the name of one that it writes now.
         """
         target = self.root / _checked(stage)
         self._check_lock()

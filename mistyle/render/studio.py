@@ -311,7 +311,7 @@ def _material(look: tuple[Any, ...], part: Any, uv: Any, valid: Any) -> tuple[An
 def _bilinear(
     kind: Any, table: Any, start: Any, height: Any, width: Any, uv: Any, valid: Any, unpacked: Any = lambda row: row
 ) -> Any:
-    """The value of a page of `height` x `width` at uv in [0, 1), whose v points down as Mitsuba's does; pages repeat."""
+    """The value of a page of `height` x `width` at uv in [0, 1), its v down as Mitsuba has it; pages repeat."""
     import drjit as dr
     import mitsuba as mi
 

@@ -127,6 +127,12 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     verb.add_argument(
+        "--preview",
+        action="store_true",
+        help="only paint, without fit and repair: four views and the maps on one sheet, OUT/preview/preview.png; the "
+        "same command without it goes on from there",
+    )
+    verb.add_argument(
         "--variations", type=int, metavar="N", help="only try N seeds and stroke sizes, quickly, on one contact sheet"
     )
     _add_dry_run(verb)
@@ -149,6 +155,7 @@ def _add_stylize(verbs: Any) -> None:
             """
             mistyle stylize bunny.obj starry_night.jpg -o out/
             mistyle stylize chair.glb great_wave.jpg -o out/ --preset draft --atlas 1024
+            mistyle stylize spot.obj great_wave.jpg -o out/ --preview
             mistyle stylize spot.obj great_wave.jpg -o out/ --variations 4
             mistyle stylize chair.glb great_wave.jpg -o out/ --style seat=gold.jpg --stroke-size 3cm
             mistyle stylize helmet.glb woodcut.jpg -o out/ --uv keep --metallic keep --refine normal-roughness
@@ -317,6 +324,15 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     if options.dry_run:
         return _tell_plan(options, plan(job))
     progress = Progress()
+    if options.preview and options.variations:
+        raise UsageError("--preview and --variations: give one of them; --variations shows several paintings")
+    if options.preview:
+        from mistyle.run.preview import preview
+
+        made = preview(job, progress)
+        print(json.dumps(made) if options.json else f"preview   {made['preview']}")
+        progress.tell_notes()
+        return 0
     if options.variations:
         from mistyle.run.variations import sheet
 
@@ -329,9 +345,8 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
         print(json.dumps(summary))
     else:
         for label in ("asset", "textures", "report", "picture", "views", "stylized"):
-            if label not in summary:
-                continue
-            print(f"{label:<9} {summary[label]}", file=sys.stderr)
+            if label in summary:
+                print(f"{label:<9} {summary[label]}", file=sys.stderr)
     progress.tell_notes()
     return 0
 

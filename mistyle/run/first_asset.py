@@ -1,7 +1,7 @@
 """The asset as soon as it is painted and baked: written and announced before fit and repair, which then replace it.
 
-It stands where the finished asset will stand, whole, and says what it is: in `asset/done.json` ("first"), in the asset's
-list of files and in the GLB (provenance), and in `run.json` ("finished": false).
+It stands where the finished asset will stand, whole, and says what it is: in `asset/done.json` ("first"), in its list
+of files and in the GLB (provenance), and in `run.json` ("finished": false).
 """
 
 import time

@@ -37,8 +37,8 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
 
 
 def material_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html`, `overview.png` and, where the report is to be full, `beauty.png` and the
-    turntable into `folder`."""
+    """Draw the pictures and write `index.html` and `overview.png` into `folder`; for a full report `beauty.png` and the
+    turntable too."""
     from mistyle.files.images import write_png
 
     settings, maps = made.job.settings, made.recovered.maps

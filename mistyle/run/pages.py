@@ -25,8 +25,8 @@ from mistyle.stages.fit_judge import undone_where
 
 
 def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html` and `overview.png` (mesh, style, result) into `folder`; where the report
-    is to be full, `beauty.png` (path-traced) and the turntable's frames, `turntable/*.png` and `turntable.webp`, too."""
+    """Draw the pictures and write `index.html` and `overview.png` (mesh, style, result) into `folder`; for a full
+    report `beauty.png` (path-traced) and the turntable's frames, `turntable/*.png` and `turntable.webp`, too."""
     from mistyle.files.images import write_png
 
     settings = made.job.settings
@@ -41,6 +41,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         folder / "overview.png", side_by_side([bare, made.style.rgb, after if drawn.traced is None else drawn.traced])
     )
     report(0.8)
+    named = STAGES | RETOUCH | FIRST
     page = Report(
         title=made.job.name,
         mesh=made.job.mesh.name,
@@ -54,9 +55,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         steps=steps(made, Shot(before, "as baked"), Shot(after, "after fit and repair")),
         maps=map_sets(made),
         model=page_model(made.folder / f"{made.job.name}.glb"),
-        timings=tuple(
-            Timing((STAGES | RETOUCH | FIRST)[k], v, k in progress.reused) for k, v in progress.seconds.items()
-        ),
+        timings=tuple(Timing(named[k], v, k in progress.reused) for k, v in progress.seconds.items()),
         figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k.split(".")[-1]]) for k, v in figures(made).items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),

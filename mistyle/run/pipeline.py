@@ -23,11 +23,11 @@ from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import fit_settings, inpainter_inputs, opaque, release, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
-from mistyle.run.painting import bake, check_coat, coat, coat_files, stylized_stage, unlit_views
+from mistyle.run.painting import bake, check_coat, coat_files, stylized_stage, surface_stage, unlit_views
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import STAGES, Job, Run, claim_run
-from mistyle.run.start import draw, lay_out, read, start_engines
+from mistyle.run.start import draw, mesh_stage, start_engines, texels_stage
 
 
 @dataclass(frozen=True)
@@ -91,11 +91,9 @@ def inputs_of(job: Job) -> list[Path]:
 
 def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> Made:
     s, seed = run.job.settings, run.job.settings.seed
-    asset = run.record(
-        "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)
-    )
+    asset = mesh_stage(run, files)
     look_again(*size_of(asset))
-    atlas = run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
+    atlas = texels_stage(run, asset)
     views = views_stage(run, asset, atlas)
     baked, stylized = painted_stages(run, asset, style, atlas, views)
     painted = ["bake", "stylized"]
@@ -161,19 +159,14 @@ def painted_stages(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
 ) -> tuple[Baked, list[View]]:
     """From the style to the painted texture and its views: the stages 'surface', 'bake' and 'stylized'."""
-    s, seed = run.job.settings, run.job.settings.seed
+    s = run.job.settings
     if s.stylizer != "embedded":
         from mistyle.run.sweep import swept_stages
 
         swept = swept_stages(run, asset, style, atlas, views)
         write_first(run, asset, atlas, swept[0])
         return swept
-    coats = run.record(
-        "surface",
-        ["texels"],
-        [style.rgb, style.alpha, s.surface, s.coat, coat_files(s.coat), seed],
-        lambda r: coat(asset, style, atlas, s, r),
-    )
+    coats = surface_stage(run, asset, style, atlas)
     baked = run.record(
         "bake", ["views", "surface"], [s.bake, s.fit.refine, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
     )

@@ -49,9 +49,11 @@ MATERIAL_STAGES = {
     "scene": "write the Mitsuba scene",
     "report": "write the report",
 }
+# Those of `mistyle stylize --preview`.
+PREVIEW_STAGES = {name: STAGES[name] for name in ("mesh", "texels", "surface")} | {"preview": "draw the preview"}
 # These stand in the run folder itself, for people; the others in work/.
 NOTHING: Mapping[str, Any] = MappingProxyType({})
-VISIBLE = ("views", "stylized", "masks", "asset", "scene", "report")
+VISIBLE = ("views", "stylized", "masks", "asset", "scene", "report", "preview")
 
 
 @dataclass(frozen=True)

@@ -33,6 +33,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
     seconds = merged_seconds(path, run)
     summary = {
         "name": job.name,
+        "finished": True,
         "asset": str(job.out / "asset" / f"{job.name}.glb"),
         "textures": str(job.out / "asset" / "textures"),
         **report_files(job),

@@ -18,7 +18,8 @@ Frame = Float[np.ndarray, "h w 4"] | UInt8[np.ndarray, "h w 4"]
 
 
 def write_turn(place: Path, frames: Sequence[Frame], mp4: bool = False) -> list[Path]:
-    """Write straight sRGB frames with alpha (0..1, or 8 bits) as `place`/000.png …, `place`.webp and, if asked for, `place`.mp4.
+    """Write straight sRGB frames with alpha (0..1, or 8 bits) as `place`/000.png …, `place`.webp and, with `mp4`,
+    `place`.mp4.
 
     `place` is new: frames of an earlier turn are not removed here.
 
