@@ -74,7 +74,9 @@ def _resized(radiance: Float[np.ndarray, "h w 3"], rows: int) -> Float[np.ndarra
 def _filtered(radiance: Float[np.ndarray, "h w 3"], alpha: float) -> Float[np.ndarray, "h w 3"]:
     """The map of mean radiance under a GGX lobe of `alpha` that is seen along its axis."""
     import drjit as dr
-    import mitsuba as mi
+    import mitsuba
+
+    mi: Any = mitsuba  # its type stubs know one variant only
 
     height, width = radiance.shape[:2]
     # Rows lie at both poles: those stand for half a band.
@@ -125,7 +127,9 @@ class Studio:
 
     def __init__(self, traced: Tracer, light: np.ndarray, sky: Sky, looks: Sequence[Sequence[Maps]]) -> None:
         """`light` is `prefiltered`; `looks` are one `Maps` per texture set each; sets of a look may differ in size."""
-        import mitsuba as mi
+        import mitsuba
+
+        mi: Any = mitsuba  # its type stubs know one variant only
 
         device.use()
         self._traced, self._mesh = traced, traced.mesh
@@ -137,7 +141,9 @@ class Studio:
 
     def _uploaded(self, look: Sequence[Maps]) -> tuple[Any, ...]:
         """Texels, and for each set where it begins, its rows and its columns."""
-        import mitsuba as mi
+        import mitsuba
+
+        mi: Any = mitsuba  # its type stubs know one variant only
 
         sizes = [m.roughness.shape for m in look]
         first = np.cumsum([0, *(h * w for h, w in sizes)])
@@ -158,7 +164,9 @@ class Studio:
 
     def _drawn(self, camera: Camera, looks: Sequence[tuple[Any, ...]], spp: int) -> list[Float[np.ndarray, "h w 4"]]:
         import drjit as dr
-        import mitsuba as mi
+        import mitsuba
+
+        mi: Any = mitsuba  # its type stubs know one variant only
 
         down, across = window(self._mesh, camera)
         height, width = down.stop - down.start, across.stop - across.start
@@ -198,7 +206,9 @@ class Studio:
     def _shaded(self, ray: Any, turn: Sequence[Any], looks: Sequence[tuple[Any, ...]]) -> list[Any]:
         """(r, g, b, 1) of what the ray meets, by look; zero where it meets nothing."""
         import drjit as dr
-        import mitsuba as mi
+        import mitsuba
+
+        mi: Any = mitsuba  # its type stubs know one variant only
 
         first = self._traced.scene.ray_intersect_preliminary(ray, coherent=True)
         point = first.compute_surface_interaction(ray, mi.RayFlags.All)
@@ -233,7 +243,9 @@ class Studio:
 
     def _open(self, part: Any, uv: Any, valid: Any) -> Any:
         """Open sky (x, y, z, share) at a place, bilinear."""
-        import mitsuba as mi
+        import mitsuba
+
+        mi: Any = mitsuba  # its type stubs know one variant only
 
         size = self._sky_size
         columns = mi.UInt32(size)
@@ -243,7 +255,9 @@ class Studio:
     def _fetched(self, levels: Sequence[Any], towards: Any) -> list[Any]:
         """The light of each of the maps numbered `levels` from a unit direction (studio axes)."""
         import drjit as dr
-        import mitsuba as mi
+        import mitsuba
+
+        mi: Any = mitsuba  # its type stubs know one variant only
 
         down = dr.acos(dr.clip(towards.y, -1, 1)) * (dr.inv_pi * (ROWS - 1))
         right = dr.atan2(towards.x, -towards.z) * (dr.inv_two_pi * 2 * ROWS) + (2 * ROWS - 0.5)
@@ -257,7 +271,8 @@ class Studio:
             pixels = [
                 [dr.gather(mi.Vector4f, self._light, first + below * 2 * ROWS + c) for c in columns] for below in (0, 1)
             ]
-            found = dr.lerp(*(dr.lerp(*line, x) for line in pixels), y)
+            upper, lower = (dr.lerp(pair[0], pair[1], x) for pair in pixels)
+            found = dr.lerp(upper, lower, y)
             return mi.Color3f(found.x, found.y, found.z)
 
         return [at(one) for one in levels]
@@ -265,7 +280,9 @@ class Studio:
     def _glossy(self, roughness: Any, towards: Any) -> Any:
         """Prefiltered radiance, linear between the two nearest of ROUGHNESS."""
         import drjit as dr
-        import mitsuba as mi
+        import mitsuba
+
+        mi: Any = mitsuba  # its type stubs know one variant only
 
         place = mi.Float(0)
         for low, high in pairwise(ROUGHNESS):
@@ -277,7 +294,9 @@ class Studio:
 
 def _turned(matrix: Sequence[Any], vector: Any) -> Any:
     """A 3 x 3 matrix, row by row, times a vector."""
-    import mitsuba as mi
+    import mitsuba
+
+    mi: Any = mitsuba  # its type stubs know one variant only
 
     rows = [matrix[3 * r] * vector.x + matrix[3 * r + 1] * vector.y + matrix[3 * r + 2] * vector.z for r in range(3)]
     return mi.Vector3f(*rows)
@@ -286,7 +305,9 @@ def _turned(matrix: Sequence[Any], vector: Any) -> Any:
 def _material(look: tuple[Any, ...], part: Any, uv: Any, valid: Any) -> tuple[Any, Any, Any, Any]:
     """Albedo, tangent-space normal (not unit), roughness and metallic at a place, bilinear."""
     import drjit as dr
-    import mitsuba as mi
+    import mitsuba
+
+    mi: Any = mitsuba  # its type stubs know one variant only
 
     texels, starts, rows, columns = look
     start, height, width = (dr.gather(mi.UInt32, a, part, valid) for a in (starts, rows, columns))
@@ -313,7 +334,9 @@ def _bilinear(
 ) -> Any:
     """The value of a page of `height` x `width` at uv in [0, 1), its v down as Mitsuba has it; pages repeat."""
     import drjit as dr
-    import mitsuba as mi
+    import mitsuba
+
+    mi: Any = mitsuba  # its type stubs know one variant only
 
     x, y = uv.x * mi.Float(width) - 0.5, uv.y * mi.Float(height) - 0.5
     left, top = dr.floor(x), dr.floor(y)

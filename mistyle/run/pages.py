@@ -34,12 +34,11 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
     looks = (made.repaired.maps, made.atlas.start, made.baked.maps)
     drawn = draw(made.asset, looks, settings, lambda done: report(0.7 * done), turning=2, path_traced=full)
     after, bare, before = drawn.close
+    best = after if drawn.traced is None else drawn.traced
     if full:
         write_turn(folder / "turntable", drawn.turns[0])
-        write_png(folder / "beauty.png", drawn.traced)
-    write_png(
-        folder / "overview.png", side_by_side([bare, made.style.rgb, after if drawn.traced is None else drawn.traced])
-    )
+        write_png(folder / "beauty.png", best)
+    write_png(folder / "overview.png", side_by_side([bare, made.style.rgb, best]))
     report(0.8)
     named = STAGES | RETOUCH | FIRST
     page = Report(

@@ -28,10 +28,10 @@ def write_turn(place: Path, frames: Sequence[Frame], mp4: bool = False) -> list[
     if mp4:
         encoder()
     place.mkdir(parents=True, exist_ok=True)
-    frames = [np.float32(frame) / np.float32(255) if frame.dtype == np.uint8 else frame for frame in frames]
-    for k, frame in enumerate(frames):
+    straight = [frame.astype(np.float32) / np.float32(255) if frame.dtype == np.uint8 else frame for frame in frames]
+    for k, frame in enumerate(straight):
         write_png(place / f"{k:03}.png", frame)
-    flat = [grounded(frame) for frame in frames]
+    flat = [grounded(frame) for frame in straight]
     written = [place, place.with_suffix(".webp")]
     write_webp(written[1], flat)
     if mp4:
