@@ -14,11 +14,12 @@ import numpy as np
 from PIL import Image
 
 from mistyle.core.camera import RigSettings, rig
+from mistyle.core.image import srgb_from_linear
 from mistyle.files.images import write_png
 from mistyle.files.read import read_mesh, read_picture
-from mistyle.run import start
+from mistyle.render.unlit import unlit
+from mistyle.run import painting, start
 from mistyle.run.settings import Settings
-from mistyle.run.variations import tile
 
 ROOT = Path(__file__).resolve().parents[1]
 STRIPS: dict[str, tuple[dict[str, Any], ...]] = {
@@ -84,6 +85,14 @@ def main() -> None:
             made = strip(asset, picture, base, variants[:2] if chosen.quick else variants, side)
             size = save(made, chosen.out / f"{name}.jpg")
             print(f"{chosen.out / name}.jpg  {made.width} x {made.height}  {size} bytes", flush=True)
+
+
+def tile(asset, picture, settings, cameras, report) -> np.ndarray:
+    """The painted surface from every camera, without light, side by side, on white, encoded sRGB."""
+    atlas = start.lay_out(asset, settings, lambda done: None)
+    coats = painting.coat(asset, picture, atlas, settings, report)
+    drawn = unlit(asset.mesh, painting.painted(asset, coats, atlas, settings), cameras)
+    return np.concatenate([srgb_from_linear(rgb + 1 - share[..., None]) for rgb, share in drawn], axis=1)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from mistyle.core.tangents import corner_tangents
 from mistyle.files.images import write_png
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.render.unlit import unlit
-from mistyle.run import options, painting, start, variations
+from mistyle.run import options, painting, preview, start, variations
 from mistyle.run.settings import Settings
 from mistyle.stages import coat
 from mistyle.stages.texels import rasterise
@@ -361,7 +361,7 @@ def test_lengths_and_variations():
     assert [m.settings.seed for m in made] == [5, 6, 7, 8] and made[0].settings.surface.stroke_scale == 1
     assert len({m.label for m in made}) == 4 and made[1].settings.surface.stroke_scale != 1
     tiles = [np.full((3, 5, 3), k / 10, np.float32) for k in range(3)]
-    sheet_of = variations.arranged(tiles)
+    sheet_of = preview.rows_of(tiles, 2)
     assert (
         sheet_of.shape == (6, 10, 3) and (sheet_of[3:, :5] == np.float32(0.2)).all() and (sheet_of[3:, 5:] == 1).all()
     )

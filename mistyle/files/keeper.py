@@ -77,15 +77,16 @@ class Keeper:
         write: Callable[[Path], Any],
         edited: Mapping[str, str] | None = None,
         notes: Callable[[], Sequence[str]] = lambda: (),
+        about: Mapping[str, Any] | None = None,
     ) -> Path:
         """Run `write(folder)` on a new empty folder and keep it as the stage's result under `key`.
 
         An older result of the stage is replaced only once the new one is complete; when `write` raises, or the disk
         is full (MistyleError), the older one stays and nothing else does. What a user did there is not lost: an older
         result with changed files is set aside like a broken one, and files that the stage had not written stay.
-        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them, and the
-        sentences that `notes()` gives after `write`. UsageError where a file that the stage did not write has the name
-        of one that it writes now.
+        `edited` (name to sha256) are changed files that `write` has taken up: the marker remembers them, the sentences
+        that `notes()` gives after `write`, and what else is said `about` the result. UsageError where a file that the
+        stage did not write has the name of one that it writes now.
         """
         target = self.root / _checked(stage)
         self._check_lock()
@@ -94,8 +95,8 @@ class Keeper:
         def fill(folder: Path) -> None:
             write(folder)
             self._check_lock()
-            about = {"edited": dict(edited or {}), "notes": list(notes())}
-            store.seal(folder, stage=stage, key=key, **{name: value for name, value in about.items() if value})
+            told = {**(about or {}), "edited": dict(edited or {}), "notes": list(notes())}
+            store.seal(folder, stage=stage, key=key, **{name: value for name, value in told.items() if value})
             output.keep_folder(self.root, stage)
             if claimed and target.exists() and any(output.files_of(target)):
                 if store.intact(target, lambda name: name in (edited or {})) is None:

@@ -107,7 +107,9 @@ def intersect(traced: Tracer, ray: Any, tangents: Float[np.ndarray, "f 3 4"] | N
 
     first = traced.scene.ray_intersect_preliminary(ray, coherent=True)
     point = first.compute_surface_interaction(ray, mi.RayFlags.All)
-    return point, point.sh_frame if tangents is None else _tangent_frame(point, first.prim_uv, tangents)
+    if tangents is None:
+        return point, point.sh_frame
+    return point, tangent_frame(point, first.prim_uv, mi.Float(aligned(tangents).ravel()))
 
 
 def light(traced: Tracer, surface: Surface, lights: Lights, *, shadows: bool = True) -> Lit:
@@ -269,12 +271,14 @@ def _each(kind: Any, values: Float[np.ndarray, "c 3"], camera_of: Any) -> Any:
     return dr.gather(kind, mi.Float(aligned(values).ravel()), camera_of)
 
 
-def _tangent_frame(point: Any, barycentric: Any, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
-    """Interpolated tangent, made perpendicular to the shading normal; bitangent = handedness · (normal x tangent)."""
+def tangent_frame(point: Any, barycentric: Any, corners: Any) -> Any:
+    """Interpolated tangent, made perpendicular to the shading normal; bitangent = handedness · (normal x tangent).
+
+    `corners` holds the tangents of all face corners (xyz and handedness), one after the other.
+    """
     import drjit as dr
     import mitsuba as mi
 
-    corners = mi.Float(aligned(tangents).ravel())
     valid = point.is_valid()
     tangent, hand = mi.Vector3f(0), mi.Float(1)
     weights = (1 - barycentric.x - barycentric.y, barycentric.x, barycentric.y)

@@ -1,6 +1,7 @@
 """Drawing: exact surface hits through pixel centres, the views of a job, and pictures for reports."""
 
-from collections.abc import Callable, Sequence
+import itertools
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,9 @@ from mistyle.core.view import View
 from mistyle.render import device
 from mistyle.render import scene as scenery
 from mistyle.render.pages import paged_shapes
+
+# Seeds of passes must not meet those of a neighbouring seed: an odd step visits every number once.
+SEED_STEP = 0x9E3779B1
 
 
 @dataclass(frozen=True)
@@ -196,18 +200,45 @@ def pictures(
     return result
 
 
-def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
-    """Render camera after camera; the object is loaded once, a template that follows the camera anew for each."""
+def passes(
+    mesh: Mesh,
+    maps: Sequence[Maps],
+    camera: Camera,
+    template: str | Path = "studio",
+    spp: int = 2,
+    seed: int = 0,
+    *,
+    backdrop: bool = True,
+) -> Iterator[Float[np.ndarray, "h w 4"]]:
+    """`picture` again and again, without end: independent ones of `spp` samples a pixel; the scene is loaded once."""
     import mitsuba as mi
 
     device.use()
-    chosen = None if maps is None else [as_fine_as(m, max(max(c.size) for c in cameras)) for m in maps]
+    shapes = _shapes(mesh, maps, max(camera.size))
+    described = scenery.scene_dict(mesh, maps, camera, template, spp=spp, seed=seed, backdrop=backdrop, shapes=shapes)
+    scene = mi.load_dict(described, optimize=False)
+    for k in itertools.count():
+        yield np.array(mi.render(scene, spp=spp, seed=(seed + k * SEED_STEP) % 2**32), dtype=np.float32)
+
+
+def _shapes(mesh, maps, pixels):
+    """The object for pictures of so many pixels a side."""
+    chosen = None if maps is None else [as_fine_as(m, pixels) for m in maps]
     if chosen is not None and len(chosen) > 1:
         shapes = paged_shapes(mesh, chosen, flip_invalid=True)
     else:
         shapes = scenery.object_shapes(mesh, chosen, flip_invalid=True, frame="mikkt")
     del chosen
     memory.let_go()
+    return shapes
+
+
+def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
+    """Render camera after camera; the object is loaded once, a template that follows the camera anew for each."""
+    import mitsuba as mi
+
+    device.use()
+    shapes = _shapes(mesh, maps, max(max(c.size) for c in cameras))
 
     def loaded(camera):
         described = scenery.scene_dict(
@@ -224,10 +255,8 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
         times, each = scenery.passes(spp)
         total = np.zeros((*camera.size, 4), np.float32)
         for k in range(times):
-            # Seeds of passes must not meet those of a neighbouring seed: an odd step visits every number once.
-            total += np.array(
-                mi.render(scene, sensor=sensor, spp=each, seed=(seed + k * 0x9E3779B1) % 2**32), dtype=np.float32
-            )
+            step = (seed + k * SEED_STEP) % 2**32
+            total += np.array(mi.render(scene, sensor=sensor, spp=each, seed=step), dtype=np.float32)
         return total / np.float32(times)
 
     yield from map(drawn, cameras)

@@ -29,13 +29,26 @@ def ambient_occlusion(
     that is shifted by a hash of the point's index and `seed`. A Tracer saves building the structure again. Hollows
     narrower than 0.002 are not seen.
     """
+    return open_sky(mesh, positions, normals, rays=rays, distance=distance, seed=seed)[:, 3].copy()
+
+
+def open_sky(
+    mesh: Mesh | Tracer,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    *,
+    rays: int = 64,
+    distance: float = 1.2,
+    seed: int = 0,
+) -> Float[np.ndarray, "n 4"]:
+    """The mean direction of unoccluded sky (unit; the normal where there is none), and `ambient_occlusion`'s share."""
     device.use()
     import drjit as dr
     import mitsuba
 
     mi: Any = mitsuba  # its type stubs know one variant only
     scene = (mesh if isinstance(mesh, Tracer) else tracer(mesh)).scene
-    out = np.empty(len(positions), np.float32)
+    out = np.empty((len(positions), 4), np.float32)
     golden = (5**0.5 - 1) / 2
     for low in range(0, len(positions), CHUNK):
         part = slice(low, low + CHUNK)
@@ -46,12 +59,16 @@ def ambient_occlusion(
         shift_x = mi.sample_tea_float32(index, mi.UInt32(2 * seed))
         shift_y = mi.sample_tea_float32(index, mi.UInt32(2 * seed + 1))
 
-        def body(k, open_rays, frame=frame, origin=origin, shift_x=shift_x, shift_y=shift_y):
+        def body(k, open_rays, towards, frame=frame, origin=origin, shift_x=shift_x, shift_y=shift_y):
             x, y = shift_x + (mi.Float(k) + 0.5) / rays, shift_y + mi.Float(k) * golden
             local = mi.warp.square_to_cosine_hemisphere(mi.Point2f(x - dr.floor(x), y - dr.floor(y)))
-            ray = mi.Ray3f(origin, frame.to_world(local), distance, 0.0, [])
-            return k + 1, open_rays + dr.select(scene.ray_test(ray), 0.0, 1.0)
+            away = frame.to_world(local)
+            seen = dr.select(scene.ray_test(mi.Ray3f(origin, away, distance, 0.0, [])), 0.0, 1.0)
+            return k + 1, open_rays + seen, towards + away * seen
 
-        state = dr.while_loop((mi.UInt32(0), dr.zeros(mi.Float, len(lifted))), lambda k, _: k < rays, body)
-        out[part] = np.array(state[1]) / rays
+        state = (mi.UInt32(0), dr.zeros(mi.Float, len(lifted)), dr.zeros(mi.Vector3f, len(lifted)))
+        _, count, total = dr.while_loop(state, lambda k, *_: k < rays, body)
+        length = dr.norm(total)
+        mean = dr.select(length > 1e-3, total / length, frame.n)
+        out[part, :3], out[part, 3] = np.array(mean).T, np.array(count) / rays
     return out

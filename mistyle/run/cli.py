@@ -26,11 +26,13 @@ from mistyle.run.options import (
     DELIVERY_OPTIONS,
     NAME_HELP,
     PAINT_OPTIONS,
+    REPORT_OPTIONS,
     add_delivery_options,
     add_job_options,
     add_memory_option,
     add_mesh_options,
     add_paint_options,
+    add_report_option,
     asset_name,
     examples,
     said_settings,
@@ -126,10 +128,17 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     )
     verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     verb.add_argument(
+        "--preview",
+        action="store_true",
+        help="only paint, without fit and repair: four views and the maps on one sheet, OUT/preview/preview.png; the "
+        "same command without it goes on from there",
+    )
+    verb.add_argument(
         "--variations", type=int, metavar="N", help="only try N seeds and stroke sizes, quickly, on one contact sheet"
     )
     _add_dry_run(verb)
     add_memory_option(verb)
+    add_report_option(verb)
     add_delivery_options(verb)
 
 
@@ -147,12 +156,14 @@ def _add_stylize(verbs: Any) -> None:
             """
             mistyle stylize bunny.obj starry_night.jpg -o out/
             mistyle stylize chair.glb great_wave.jpg -o out/ --preset draft --atlas 1024
+            mistyle stylize spot.obj great_wave.jpg -o out/ --preview
             mistyle stylize spot.obj great_wave.jpg -o out/ --variations 4
             mistyle stylize chair.glb great_wave.jpg -o out/ --style seat=gold.jpg --stroke-size 3cm
             mistyle stylize helmet.glb woodcut.jpg -o out/ --uv keep --metallic keep --refine normal-roughness
             mistyle stylize bunny.obj starry_night.jpg -o out/ --from fit --set fit.iterations2=100
             mistyle stylize chair.usda wave.jpg -o out/ --formats glb,usd --target houdini
             mistyle stylize chair.glb wave.jpg -o out/ --target unreal,blender --name '{mesh}_{style}_v{v:03}'
+            mistyle stylize bunny.obj starry_night.jpg -o out/ --report none
             mistyle stylize --preset paper --print-config > job.toml
             """
         ),
@@ -242,6 +253,7 @@ OPTIONS = {
     **PAINT_OPTIONS,
     **GENERATIVE_OPTIONS,
     **DELIVERY_OPTIONS,
+    **REPORT_OPTIONS,
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",
@@ -315,6 +327,15 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     if options.dry_run:
         return _tell_plan(options, plan(job))
     progress = Progress()
+    if options.preview and options.variations:
+        raise UsageError("--preview and --variations: give one of them; --variations shows several paintings")
+    if options.preview:
+        from mistyle.run.preview import preview
+
+        made = preview(job, progress)
+        print(json.dumps(made) if options.json else f"preview   {made['preview']}")
+        progress.tell_notes()
+        return 0
     if options.variations:
         from mistyle.run.variations import sheet
 
@@ -327,7 +348,8 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
         print(json.dumps(summary))
     else:
         for label in ("asset", "textures", "report", "picture", "views", "stylized"):
-            print(f"{label:<9} {summary[label]}", file=sys.stderr)
+            if label in summary:
+                print(f"{label:<9} {summary[label]}", file=sys.stderr)
     progress.tell_notes()
     return 0
 

@@ -11,10 +11,12 @@ from mistyle.core.errors import UsageError
 from mistyle.run.options import (
     DELIVERY_OPTIONS,
     NAME_HELP,
+    REPORT_OPTIONS,
     add_delivery_options,
     add_job_options,
     add_memory_option,
     add_mesh_options,
+    add_report_option,
     asset_name,
     examples,
     said_settings,
@@ -38,6 +40,7 @@ OPTIONS = {
     "metallic": "recover.metallic",
     "iterations": "recover.iterations",
     "memory": "memory",
+    **REPORT_OPTIONS,
     **DELIVERY_OPTIONS,
 }
 SCENE_OPTIONS = {
@@ -114,6 +117,7 @@ def _add_material_options(verb: argparse.ArgumentParser) -> None:
     made.add_argument("--start", choices=["nothing", "own"], help="own: begin from the mesh's own material")
     made.add_argument("--iterations", type=int, metavar="N", help="steps of the gradient stage")
     made.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
+    add_report_option(verb)
     add_delivery_options(verb)
 
 
@@ -241,7 +245,8 @@ def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
         print(json.dumps(summary))
     else:
         for label in ("asset", "textures", "scene", "report", "picture"):
-            print(f"{label:<9} {summary[label]}", file=sys.stderr)
+            if label in summary:
+                print(f"{label:<9} {summary[label]}", file=sys.stderr)
         for name, value in summary["figures"].items():
             print(f"{name:<17} {value:.4g}", file=sys.stderr)
     progress.tell_notes()

@@ -97,20 +97,24 @@ UNEDITED = Edited()
 
 
 def asset_stage(
-    run: Any, after: Sequence[str], write: Callable[[Path, Edited, Callable[[float], None]], object]
+    run: Any,
+    after: Sequence[str],
+    write: Callable[[Path, Edited, Callable[[float], None]], object],
+    about: Mapping[str, Any] | None = None,
 ) -> tuple[Path, Edited]:
     """The stage 'asset': its folder, and the edits that a person made there.
 
     `write(folder, edited, report)` writes the asset; an asset whose textures were edited since is written again with
-    them, into the GLB and into the other file of each map.
+    them, into the GLB and into the other file of each map. `about` is what else the stage's marker says.
     """
-    folder = run.stage("asset", after, [run.job.name], lambda f, r: write(f, UNEDITED, r))
+    about = about or {}
+    folder = run.stage("asset", after, [run.job.name], lambda f, r: write(f, UNEDITED, r), about)
     every, changed = run.edited.get("asset", {}), tuple(run.changed.get("asset", {}))
     if not every:
         return folder, UNEDITED
     if changed:
         edited = Edited(folder, tuple(name for name in every if name not in changed), changed)
-        run.absorb("asset", lambda f, r: write(f, edited, r))
+        run.absorb("asset", lambda f, r: write(f, edited, r), about)
     return folder, Edited(folder, tuple(every))
 
 

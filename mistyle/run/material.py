@@ -144,12 +144,9 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, shown))
         made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
         progress.note(*asset.source.notes, *placed.notes, *recovered.notes)
-        run.stage(
-            "report",
-            ["asset", "measure"],
-            [s.report, job.name],
-            lambda f, r: material_report(f, made, progress, r),
-        )
+        if s.report.detail != "none":
+            inputs = [s.report, job.name]
+            run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, made, progress, r))
         return deliver(job, progress) | write_summary(made, run)
 
 

@@ -9,13 +9,14 @@ import numpy as np
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.run import report_overlays
 from mistyle.run.charts import Chart
-from mistyle.run.pages import close_up, file_list, frames, heat, map_shots, render, setting_groups, shown, side_by_side
+from mistyle.run.pages import file_list, heat, map_shots, setting_groups, side_by_side
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, MapSet, Note, Pair, Report, Shot, Step, Timing, write_report
+from mistyle.run.report_draw import draw
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
 from mistyle.run.stages import MATERIAL_STAGES, Run
-from mistyle.run.summary import earlier, merged_peaks, merged_seconds, peak_gb, versions, write_record
+from mistyle.run.summary import earlier, merged_peaks, merged_seconds, peak_gb, report_files, versions, write_record
 from mistyle.run.turntable import write_turn
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
@@ -36,15 +37,18 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
 
 
 def material_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html`, `beauty.png`, `overview.png` and the turntable into `folder`."""
+    """Draw the pictures and write `index.html` and `overview.png` into `folder`; for a full report `beauty.png` and the
+    turntable too."""
     from mistyle.files.images import write_png
 
     settings, maps = made.job.settings, made.recovered.maps
-    turntable = frames(made.asset, maps, settings, lambda done: report(0.7 * done))
-    write_turn(folder / "turntable", turntable)
-    beauty = shown(render(made.asset, maps, [close_up(settings)], settings, backdrop=True, finer=4)[0])[..., :3]
+    full = settings.report.detail == "full"
+    drawn = draw(made.asset, [maps], settings, lambda done: report(0.8 * done), path_traced=full)
+    beauty = drawn.close[0] if drawn.traced is None else drawn.traced
     _, reference, predicted = made.measured.worst[0]
-    write_png(folder / "beauty.png", beauty)
+    if full:
+        write_turn(folder / "turntable", drawn.turns[0])
+        write_png(folder / "beauty.png", beauty)
     shots = [encoded(reference, reference), encoded(predicted, reference), beauty]
     write_png(folder / "overview.png", side_by_side(shots))
     report(0.9)
@@ -55,7 +59,7 @@ def material_report(folder: Path, made: Any, progress: Progress, report: Callabl
         style=f"{len(made.captures)} pictures of {made.job.references.name}",
         relation="fitted to",
         painting=Shot(encoded(reference, reference), f"A reference: {made.measured.names[made.measured.worst[0][0]]}"),
-        turntable=tuple(turntable),
+        turntable=tuple(drawn.turns[0]),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
         notes=tuple(Note(text) for text in progress.notes),
@@ -197,8 +201,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "asset": str(job.out / "asset" / f"{job.name}.glb"),
         "textures": str(job.out / "asset" / "textures"),
         "scene": str(job.out / "scene" / f"{job.name}.xml"),
-        "report": str(job.out / "report" / "index.html"),
-        "picture": str(job.out / "report" / "overview.png"),
+        **report_files(job),
         "seconds": merged_seconds(path, run),
         "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
         "peaks_gb": merged_peaks(path, run),

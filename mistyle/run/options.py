@@ -74,6 +74,19 @@ def add_memory_option(verb: argparse.ArgumentParser) -> None:
     )
 
 
+# Option -> dotted setting, for `add_report_option`.
+REPORT_OPTIONS = {"report": "report.detail"}
+
+
+def add_report_option(verb: argparse.ArgumentParser) -> None:
+    """How much of a report a job makes."""
+    verb.add_argument(
+        "--report",
+        choices=["none", "page", "full"],
+        help="full (default): the page, turntable frames and a path-traced picture; page: the page alone; none",
+    )
+
+
 # Option -> dotted setting, for `add_paint_options`.
 PAINT_OPTIONS = {
     "style_slot": "coat.slots",

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel
 
-from mistyle.core.asset import Asset
-from mistyle.core.camera import Camera, orbit
+from mistyle.core.camera import Camera
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
@@ -16,52 +15,47 @@ from mistyle.files.own import read_own
 from mistyle.run import report_overlays
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
+from mistyle.run.report_draw import draw, shown
 from mistyle.run.report_model import page_model
-from mistyle.run.report_pictures import Sizes, eight_bit, in_bands, kind_in_step, kind_of_maps
-from mistyle.run.stages import RETOUCH, STAGES
+from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
+from mistyle.run.stages import FIRST, RETOUCH, STAGES
 from mistyle.run.style_look import look_facts
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
 from mistyle.stages.fit_judge import undone_where
 
-ELEVATION = 15.0
-
 
 def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html`, `beauty.png`, `overview.png` (mesh, style, result) and the turntable's
-    frames, as `turntable/*.png` and `turntable.webp`, into `folder`."""
+    """Draw the pictures and write `index.html` and `overview.png` (mesh, style, result) into `folder`; for a full
+    report `beauty.png` (path-traced) and the turntable's frames, `turntable/*.png` and `turntable.webp`, too."""
     from mistyle.files.images import write_png
 
     settings = made.job.settings
-    turntable = frames(made.asset, made.repaired.maps, settings, lambda done: report(0.4 * done))
-    write_turn(folder / "turntable", turntable)
-    turntable = [eight_bit(frame) for frame in turntable]
-    plain = [
-        eight_bit(frame)
-        for frame in frames(made.asset, made.atlas.start, settings, lambda done: report(0.4 + 0.3 * done))
-    ]
-    close = close_up(settings)
-    beauty, before, bare = (
-        shown(render(made.asset, maps, [close], settings, backdrop=True, finer=4)[0])[..., :3]
-        for maps in (made.repaired.maps, made.baked.maps, made.atlas.start)
-    )
-    report(0.9)
-    write_png(folder / "beauty.png", beauty)
-    write_png(folder / "overview.png", side_by_side([bare, made.style.rgb, beauty]))
+    full = settings.report.detail == "full"
+    looks = (made.repaired.maps, made.atlas.start, made.baked.maps)
+    drawn = draw(made.asset, looks, settings, lambda done: report(0.7 * done), turning=2, path_traced=full)
+    after, bare, before = drawn.close
+    best = after if drawn.traced is None else drawn.traced
+    if full:
+        write_turn(folder / "turntable", drawn.turns[0])
+        write_png(folder / "beauty.png", best)
+    write_png(folder / "overview.png", side_by_side([bare, made.style.rgb, best]))
+    report(0.8)
+    named = STAGES | RETOUCH | FIRST
     page = Report(
         title=made.job.name,
         mesh=made.job.mesh.name,
         style=made.job.style.name,
         painting=Shot(made.style.rgb, f"The style: {made.job.style.name}"),
-        turntable=tuple(turntable),
-        plain=tuple(plain),
+        turntable=tuple(drawn.turns[0]),
+        plain=tuple(drawn.turns[1]),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
         notes=tuple(Note(text) for text in progress.notes),
-        steps=steps(made, Shot(before, "as baked"), Shot(beauty, "after fit and repair")),
+        steps=steps(made, Shot(before, "as baked"), Shot(after, "after fit and repair")),
         maps=map_sets(made),
         model=page_model(made.folder / f"{made.job.name}.glb"),
-        timings=tuple(Timing((STAGES | RETOUCH)[k], v, k in progress.reused) for k, v in progress.seconds.items()),
+        timings=tuple(Timing(named[k], v, k in progress.reused) for k, v in progress.seconds.items()),
         figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k.split(".")[-1]]) for k, v in figures(made).items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),
@@ -95,45 +89,6 @@ def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
         width = round(picture.shape[1] * height / picture.shape[0])
         row += [resize(picture, (height, width)), gap]
     return np.clip(np.concatenate(row[:-1], axis=1), 0, 1)
-
-
-def frames(asset: Asset, maps: Sequence[Maps], settings: Any, report: Callable[[float], None]) -> list[np.ndarray]:
-    """Pictures all round the asset, transparent where nothing is, sRGB."""
-    chosen, size = settings.report, (settings.report.resolution, settings.report.resolution)
-    cameras = [
-        orbit(30 + 360 * k / chosen.frames, ELEVATION, distance=4, fov=30, size=size) for k in range(chosen.frames)
-    ]
-    drawn = render(asset, maps, cameras, settings, report=report)[::-1]
-    return [shown(drawn.pop()) for _ in cameras]
-
-
-def close_up(settings: Any) -> Camera:
-    """The camera of the picture that stands for the asset."""
-    size = (settings.report.resolution * 2, settings.report.resolution * 2)
-    return orbit(30, ELEVATION, distance=4, fov=30, size=size)
-
-
-def render(
-    asset: Asset,
-    maps: Sequence[Maps],
-    cameras: Sequence[Camera],
-    settings: Any,
-    report: Callable[[float], None] = lambda done: None,
-    backdrop: bool = False,
-    finer: int = 1,
-) -> list[np.ndarray]:
-    """Linear premultiplied rgb and alpha under the studio lights."""
-    from mistyle.render.draw import pictures
-
-    return pictures(
-        asset.mesh, maps, cameras, "studio", settings.report.spp * finer, settings.seed, report, backdrop=backdrop
-    )
-
-
-def shown(picture: np.ndarray) -> np.ndarray:
-    """A rendered picture as people see it: straight sRGB and alpha."""
-    alpha = np.clip(picture[..., 3:], 0, 1)
-    return np.concatenate([srgb_from_linear(picture[..., :3] / np.maximum(alpha, 1e-4)), alpha], axis=-1)
 
 
 def facts(made: Any) -> tuple[tuple[str, str], ...]:

@@ -185,6 +185,13 @@ def whose(coats: Coats | Solution, part: int, texels: Texels) -> list[tuple[Solu
     return [(one, texels.covered & (coats.choice[part] == k)) for k, one in enumerate(coats.solutions)]
 
 
+def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> Coats:
+    """The stage "surface": the painting, before it is laid into a texture."""
+    s, seed = run.job.settings, run.job.settings.seed
+    inputs = [style.rgb, style.alpha, s.surface, s.coat, coat_files(s.coat), seed]
+    return run.record("surface", ["texels"], inputs, lambda r: coat(asset, style, atlas, s, r))
+
+
 def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) -> list[View]:
     """The stylized views, drawn from the painted texture so that all agree by construction."""
     from mistyle.files.views import read_views, write_views

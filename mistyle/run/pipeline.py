@@ -18,15 +18,16 @@ from mistyle.files.textures import part_stems
 from mistyle.run import asset_files
 from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
+from mistyle.run.first_asset import write_first
 from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import fit_settings, inpainter_inputs, opaque, release, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
-from mistyle.run.painting import bake, check_coat, coat, coat_files, stylized_stage, unlit_views
+from mistyle.run.painting import bake, check_coat, coat_files, stylized_stage, surface_stage, unlit_views
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import STAGES, Job, Run, claim_run
-from mistyle.run.start import draw, lay_out, read, start_engines
+from mistyle.run.start import draw, mesh_stage, start_engines, texels_stage
 from mistyle.run.style_look import StyleLook, style_looks
 
 
@@ -71,15 +72,17 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
         start_engines(job.settings)
         made = _stages(run, files, style, look_again)
         progress.note(*made.asset.source.notes, *style.notes, *made.fit.notes)
-        from mistyle.run.pages import job_report
-
-        run.stage(
-            "report",
-            ["asset"],
-            [job.settings.report, job.name],
-            lambda folder, r: job_report(folder, made, progress, r),
-        )
+        if job.settings.report.detail != "none":
+            report_stage(run, made, progress)
         return deliver(job, progress) | write_summary(made, run)
+
+
+def report_stage(run: Run, made: Made, progress: Progress) -> None:
+    """The page and the pictures that show a person what was made."""
+    from mistyle.run.pages import job_report
+
+    inputs = [run.job.settings.report, run.job.name]
+    run.stage("report", ["asset"], inputs, lambda folder, r: job_report(folder, made, progress, r))
 
 
 def inputs_of(job: Job) -> list[Path]:
@@ -90,11 +93,9 @@ def inputs_of(job: Job) -> list[Path]:
 
 def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> Made:
     s, seed = run.job.settings, run.job.settings.seed
-    asset = run.record(
-        "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)
-    )
+    asset = mesh_stage(run, files)
     look_again(*size_of(asset))
-    atlas = run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
+    atlas = texels_stage(run, asset)
     views = views_stage(run, asset, atlas)
     looks = style_looks(style, run.job.style.name, s, run.progress)
     baked, stylized = painted_stages(run, asset, style, atlas, views)
@@ -118,7 +119,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
         sets = zip(atlas.texels, repaired.maps, strict=True)
         write_asset(folder, run.job, asset, sets, report, edited)
 
-    folder, edited = asset_stage(run, ["repair"], write)
+    folder, edited = asset_stage(run, ["repair"], write, {"painted": run.keys["bake"]})
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
@@ -161,20 +162,18 @@ def painted_stages(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
 ) -> tuple[Baked, list[View]]:
     """From the style to the painted texture and its views: the stages 'surface', 'bake' and 'stylized'."""
-    s, seed = run.job.settings, run.job.settings.seed
+    s = run.job.settings
     if s.stylizer != "embedded":
         from mistyle.run.sweep import swept_stages
 
-        return swept_stages(run, asset, style, atlas, views)
-    coats = run.record(
-        "surface",
-        ["texels"],
-        [style.rgb, style.alpha, s.surface, s.coat, coat_files(s.coat), seed],
-        lambda r: coat(asset, style, atlas, s, r),
-    )
+        swept = swept_stages(run, asset, style, atlas, views)
+        write_first(run, asset, atlas, swept[0])
+        return swept
+    coats = surface_stage(run, asset, style, atlas)
     baked = run.record(
         "bake", ["views", "surface"], [s.bake, s.fit.refine, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
     )
+    write_first(run, asset, atlas, baked)
     stylized = stylized_stage(run, asset, baked, views)
     return baked, stylized
 

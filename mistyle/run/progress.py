@@ -18,6 +18,7 @@ class Progress:
 
     def __init__(self, quiet: bool = False) -> None:
         self.quiet = quiet
+        self.began = time.perf_counter()
         self.seconds: dict[str, float] = {}
         self.peaks: dict[str, float] = {}
         self.reused: list[str] = []

@@ -67,6 +67,35 @@ def webp(picture: Shaped[np.ndarray, "h w *c"], longest: int, quality: int = 84,
     return Inline("data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode(), *image.size)
 
 
+# How the bytes of a picture grow with its pixels: less than these, for a finer picture is smoother.
+GROWTH, GROWTH_SHARP = 0.87, 0.8
+
+
+class Encoder:
+    """`webp` for a page: a picture that comes twice is encoded once. A class because it keeps what it made."""
+
+    def __init__(self, scale: float) -> None:
+        self._scale = scale
+        self._made: dict[tuple[Any, ...], tuple[Any, Inline]] = {}
+
+    def __call__(
+        self, picture: Shaped[np.ndarray, "h w *c"], longest: int, quality: int = 84, sharp: bool = False
+    ) -> Inline:
+        key = (id(picture), longest, quality, sharp)
+        if key not in self._made:
+            self._made[key] = picture, webp(picture, longest, quality, sharp)
+        return self._made[key][1]
+
+    def growth(self, scale: float) -> float:
+        """About how many bytes more the same pictures take at another scale."""
+        more = 0.0
+        for (_, longest, _, sharp), (picture, made) in self._made.items():
+            side = min(max(picture.shape[:2]), longest * scale / self._scale)
+            pixels = (side / max(made.width, made.height)) ** 2
+            more += len(made.uri) * (pixels ** (GROWTH_SHARP if sharp else GROWTH) - 1)
+        return more
+
+
 def in_bands(
     shape: tuple[int, int], make: Callable[[slice], np.ndarray], longest: int, sharp: bool = False
 ) -> UInt8[np.ndarray, "h w n"]:

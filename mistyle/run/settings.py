@@ -69,6 +69,11 @@ class ReportSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    detail: Literal["none", "page", "full"] = Field(
+        default="full",
+        description="full also writes the turntable's frames and a path-traced picture; page only the page and its "
+        "overview; none nothing",
+    )
     frames: int = Field(default=24, ge=4, le=240, description="turntable frames")
     resolution: int = Field(default=448, ge=64, le=4096, description="pixels of a turntable frame")
     spp: int = Field(default=8, ge=1, le=4096, description="samples per pixel of a turntable frame")

@@ -1,10 +1,11 @@
 """The stages of a run and how each is kept: under a key made of everything it depends on."""
 
 import contextlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from mistyle.core import memory, stopping
@@ -31,6 +32,8 @@ STAGES = {
     "asset": "write the asset",
     "report": "write the report",
 }
+# Before fit and repair, in the place of "asset".
+FIRST = {"first asset": "write the first asset"}
 # Only where views were edited.
 RETOUCH = {"retouch": "lay the edited views into the texture"}
 # Those of `mistyle fit`.
@@ -46,8 +49,11 @@ MATERIAL_STAGES = {
     "scene": "write the Mitsuba scene",
     "report": "write the report",
 }
+# Those of `mistyle stylize --preview`.
+PREVIEW_STAGES = {name: STAGES[name] for name in ("mesh", "texels", "surface")} | {"preview": "draw the preview"}
 # These stand in the run folder itself, for people; the others in work/.
-VISIBLE = ("views", "stylized", "masks", "asset", "scene", "report")
+NOTHING: Mapping[str, Any] = MappingProxyType({})
+VISIBLE = ("views", "stylized", "masks", "asset", "scene", "report", "preview")
 
 
 @dataclass(frozen=True)
@@ -133,8 +139,16 @@ class Run(Generic[Work]):
             output.forget_folder(self.job.out, "work")
             self.job.out.rmdir()
 
-    def stage(self, name: str, after: Sequence[str], inputs: Any, write: Callable[[Path, Report], object]) -> Path:
-        """The folder of stage `name`, taken over or made; it depends on `inputs` and on the stages `after`."""
+    def stage(
+        self,
+        name: str,
+        after: Sequence[str],
+        inputs: Any,
+        write: Callable[[Path, Report], object],
+        about: Mapping[str, Any] = NOTHING,
+    ) -> Path:
+        """The folder of stage `name`, taken over or made; it depends on `inputs` and on the stages `after`. `about` is
+        what else its marker says."""
         stopping.check()
         key = self.keys[name] = digest([self.base, name, inputs, [self.keys[a] for a in after]])
         keeper = self.visible if name in VISIBLE else self.hidden
@@ -152,9 +166,21 @@ class Run(Generic[Work]):
 
         before = len(self.progress.notes)
         with self.progress.stage(name, self.stages[name]) as report:
-            return keeper.put(name, key, fill, notes=lambda: self.progress.notes[before:])
+            return keeper.put(name, key, fill, notes=lambda: self.progress.notes[before:], about=about)
 
-    def absorb(self, name: str, write: Callable[[Path, Report], object]) -> Path:
+    def early(
+        self, name: str, key: str, what: str, write: Callable[[Path, Report], object], about: Mapping[str, Any]
+    ) -> None:
+        """Write what stands in the place of the visible stage `name` until it comes, under a `key` of its own.
+
+        It is replaced like an older result of the stage: edits of a person's are set aside.
+        """
+        stopping.check()
+        self._spare(self.visible, name)
+        with self.progress.stage(f"first {name}", what) as report:
+            self.visible.put(name, key, lambda folder: write(folder, report), about=about)
+
+    def absorb(self, name: str, write: Callable[[Path, Report], object], about: Mapping[str, Any] = NOTHING) -> Path:
         """Write a taken-over stage anew with the edits that it was found with, which are then part of it."""
         keeper, edited = self.visible, self.edited[name]
 
@@ -163,7 +189,7 @@ class Run(Generic[Work]):
 
         self.progress.reused.remove(name)
         with self.progress.stage(name, self.stages[name]) as report:
-            return keeper.put(name, self.plain[name], fill, edited=edited)
+            return keeper.put(name, self.plain[name], fill, edited=edited, about=about)
 
     def _take_note(self, keeper: Keeper, name: str) -> None:
         """Edits of a taken-over stage become part of its key, on which all later stages hang."""

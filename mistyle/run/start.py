@@ -36,6 +36,20 @@ def read(path: Path, chosen: ReadSettings, size: int, report: Report) -> Asset:
     return read_mesh(path, **how, size=size, progress=report)
 
 
+def mesh_stage(run: Any, files: Sequence[Path]) -> Asset:
+    """The stage "mesh" of a job; `files` are those that the mesh consists of."""
+    s = run.job.settings
+    return run.record(
+        "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)
+    )
+
+
+def texels_stage(run: Any, asset: Asset) -> Atlas:
+    """The stage "texels" of a job that paints."""
+    s = run.job.settings
+    return run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
+
+
 def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:
     """Rasterise every texture set and lay the asset's own material into it."""
     texels, start = [], []

@@ -33,10 +33,10 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
     seconds = merged_seconds(path, run)
     summary = {
         "name": job.name,
+        "finished": True,
         "asset": str(job.out / "asset" / f"{job.name}.glb"),
         "textures": str(job.out / "asset" / "textures"),
-        "report": str(job.out / "report" / "index.html"),
-        "picture": str(job.out / "report" / "overview.png"),
+        **report_files(job),
         "views": str(job.out / "views"),
         "stylized": str(job.out / "stylized"),
         "seconds": seconds,
@@ -54,6 +54,14 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
     }
     write_record(job, record, run.progress)
     return summary
+
+
+def report_files(job: Any) -> dict[str, str]:
+    """Where the report and its picture lie; nothing where none is wanted."""
+    if job.settings.report.detail == "none":
+        return {}
+    folder = job.out / "report"
+    return {"report": str(folder / "index.html"), "picture": str(folder / "overview.png")}
 
 
 def write_record(job: Any, record: dict[str, Any], progress: Progress) -> None:

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 
 from mistyle.core.errors import EnvironmentMissing
 from mistyle.files.images import write_png
@@ -14,8 +14,12 @@ SECONDS = 6.0  # once round
 GROUND = (0.115, 0.115, 0.12)  # sRGB, behind the asset where a file has no transparency
 
 
-def write_turn(place: Path, frames: Sequence[Float[np.ndarray, "h w 4"]], mp4: bool = False) -> list[Path]:
-    """Write straight sRGB frames with alpha (0..1) as `place`/000.png …, `place`.webp and, if asked for, `place`.mp4.
+Frame = Float[np.ndarray, "h w 4"] | UInt8[np.ndarray, "h w 4"]
+
+
+def write_turn(place: Path, frames: Sequence[Frame], mp4: bool = False) -> list[Path]:
+    """Write straight sRGB frames with alpha (0..1, or 8 bits) as `place`/000.png …, `place`.webp and, with `mp4`,
+    `place`.mp4.
 
     `place` is new: frames of an earlier turn are not removed here.
 
@@ -24,9 +28,10 @@ def write_turn(place: Path, frames: Sequence[Float[np.ndarray, "h w 4"]], mp4: b
     if mp4:
         encoder()
     place.mkdir(parents=True, exist_ok=True)
-    for k, frame in enumerate(frames):
+    straight = [frame.astype(np.float32) / np.float32(255) if frame.dtype == np.uint8 else frame for frame in frames]
+    for k, frame in enumerate(straight):
         write_png(place / f"{k:03}.png", frame)
-    flat = [grounded(frame) for frame in frames]
+    flat = [grounded(frame) for frame in straight]
     written = [place, place.with_suffix(".webp")]
     write_webp(written[1], flat)
     if mp4:

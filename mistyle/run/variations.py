@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.camera import RigSettings, rig
-from mistyle.core.image import srgb_from_linear
 from mistyle.files.output import claim, replace_files
+from mistyle.run.preview import ATLAS, lit_views, painted_maps, reduced, rows_of
 from mistyle.run.progress import Progress
 from mistyle.run.settings import Settings
 
-SAMPLES, ATLAS, RESOLUTION = 40_000, 1024, 384
+SAMPLES, RESOLUTION = 40_000, 384
 VIEWS = (0, 13)  # of the paper's rig: front right and front left
 STROKES = (1.0, 1.6, 0.7)  # sizes of strokes, as factors, that take turns
 COLUMNS = 4
@@ -59,14 +59,16 @@ def sheet(
     claim(out, [SHEET], inputs=inputs, overwrite=overwrite)
     picture = read_style(style, settings.colour)
     start.start_engines(settings)
-    cameras = rig(RigSettings(resolution=RESOLUTION))
+    cameras = [rig(RigSettings(resolution=RESOLUTION))[k] for k in VIEWS]
     with progress.stage("mesh", "read the mesh") as report:
         asset = start.read(mesh, settings.read, ATLAS, report)
     progress.note(*asset.source.notes, *picture.notes)
-    tiles, labels = [], []
+    tiles, labels, atlas = [], [], start.lay_out(asset, reduced(settings), lambda done: None)
+    drawn = lit_views(asset, settings.seed)
     for variation in variations(settings, count):
         with progress.stage("surface", f"paint with {variation.label}") as report:
-            tiles.append(tile(asset, picture, variation.settings, [cameras[k] for k in VIEWS], report))
+            maps = painted_maps(asset, picture, atlas, variation.settings, report)
+            tiles.append(np.concatenate(drawn(maps, cameras), axis=1))
         labels.append(variation.label)
     fill = partial(_write_sheet, tiles)
     replace_files(out, "variations", fill, inputs=inputs, overwrite=overwrite)
@@ -76,28 +78,4 @@ def sheet(
 def _write_sheet(tiles: list[Float[np.ndarray, "h w 3"]], folder: Path) -> None:
     from mistyle.files.images import write_png
 
-    write_png(folder / SHEET, arranged(tiles))
-
-
-def tile(asset: Any, picture: Any, settings: Settings, cameras: Any, report: Any) -> Float[np.ndarray, "h w 3"]:
-    """The painted surface from every camera, side by side, on white, encoded sRGB."""
-    from mistyle.render.unlit import unlit
-    from mistyle.run import painting, start
-
-    atlas = start.lay_out(asset, settings, lambda done: None)
-    coats = painting.coat(asset, picture, atlas, settings, report)
-    maps = painting.painted(asset, coats, atlas, settings)  # pictures without light show no relief
-    drawn = unlit(asset.mesh, maps, cameras)
-    return np.concatenate([srgb_from_linear(rgb + 1 - share[..., None]) for rgb, share in drawn], axis=1)
-
-
-def arranged(tiles: list[Float[np.ndarray, "h w 3"]]) -> Float[np.ndarray, "H W 3"]:
-    """Tiles in rows of two, from the top left, the rest white."""
-    columns = min(COLUMNS // len(VIEWS), len(tiles))
-    height, width = tiles[0].shape[:2]
-    rows = -(-len(tiles) // columns)
-    result = np.ones((rows * height, columns * width, 3), np.float32)
-    for k, picture in enumerate(tiles):
-        row, column = divmod(k, columns)
-        result[row * height : (row + 1) * height, column * width : (column + 1) * width] = picture
-    return result
+    write_png(folder / SHEET, rows_of(tiles, min(COLUMNS // len(VIEWS), len(tiles))))
