@@ -83,18 +83,16 @@ def _ours(path: Path, name: str, camera: Camera, samples: int, environment: Path
 
 
 def _job(path: Path, asset: Asset, camera: Camera, samples: int, environment: Path) -> dict[str, Any]:
-    """What Blender needs. It stands Z-up files upright by itself, so that the camera is turned with the mesh."""
+    """What Blender needs. The reader has glTF and USD in metres and Y up; Blender turns both as cycles_worker says."""
     from mistyle.render import lookdev
     from mistyle.run.render_files import user_camera
 
     matrix, scale = user_camera(asset, camera)
-    turn = np.eye(4)
-    turn[:3, :3] = asset.source.work_from_user[:3, :3] * scale
     return {
         "glb": str(path.resolve()),
         "size": list(camera.size[::-1]),
         "fov_x": camera.fov,
-        "camera": (turn @ matrix).tolist(),
+        "camera": matrix.tolist(),
         "distance": 4.0 * scale,
         "depth": lookdev.DEPTH,
         "threads": os.cpu_count() or 1,

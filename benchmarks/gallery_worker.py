@@ -40,6 +40,7 @@ def draw(worker, job):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     load(job["glb"])
     scene = bpy.context.scene
+    single_scattering()
     for thing in list(scene.objects):
         if thing.type in ("LIGHT", "CAMERA"):
             bpy.data.objects.remove(thing)
@@ -61,19 +62,32 @@ def draw(worker, job):
 
 
 def load(path):
-    """Import at rest: poses and shape keys of animations are taken off again."""
+    """Import at rest: a glTF without its animations (which nothing says to play), a USD at its first time."""
     with quiet():
         if path.lower().endswith((".glb", ".gltf")):
+            from io_scene_gltf2.blender.imp.scene import BlenderScene
+
+            BlenderScene.create_animations = staticmethod(lambda gltf: None)
             bpy.ops.import_scene.gltf(filepath=path)
         else:
             bpy.ops.wm.usd_import(
                 filepath=path,
-                apply_unit_conversion_scale=False,
+                apply_unit_conversion_scale=True,
                 import_lights=False,
                 import_cameras=False,
-                set_frame_range=False,
+                set_frame_range=True,
                 import_usd_preview=True,
             )
+            bpy.context.scene.frame_set(bpy.context.scene.frame_start)
+
+
+def single_scattering():
+    """glTF's lobe (specification, appendix B) has one bounce between facets; Blender adds the further ones to rough
+    metals unless it is told not to."""
+    for material in bpy.data.materials:
+        for node in material.node_tree.nodes if material.node_tree else []:
+            if node.type == "BSDF_PRINCIPLED":
+                node.distribution = "GGX"
 
 
 @contextlib.contextmanager
