@@ -1,4 +1,4 @@
-"""Runs inside Blender's Python: draws one model after another in Cycles, each by a job of mistyle/render/cycles_worker.py.
+"""Runs inside Blender's Python: draws models one after another in Cycles, by jobs of mistyle/render/cycles_worker.py.
 
 Takes a JSON file: `settings` (the folder of cycles_worker.py) and `jobs`, of which each names its model (`glb`, a glTF
 or a USD file) and one shot. A model whose picture is there already is skipped, so that the same command goes on after
@@ -56,7 +56,11 @@ def draw(worker, job):
     with quiet():
         bpy.ops.render.render(write_still=True)
     meshes = [o for o in scene.objects if o.type == "MESH"]
-    made = {"blender": bpy.app.version_string, "meshes": len(meshes), "faces": sum(len(o.data.polygons) for o in meshes)}
+    made = {
+        "blender": bpy.app.version_string,
+        "meshes": len(meshes),
+        "faces": sum(len(o.data.polygons) for o in meshes),
+    }
     with open(shot["out"] + ".json", "w", encoding="utf-8") as file:
         json.dump(made, file)
 

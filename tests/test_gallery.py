@@ -1,4 +1,4 @@
-"""benchmarks.gallery: how pairs of pictures are judged, which differences are explained, and the figures. No Blender."""
+"""benchmarks.gallery: how pairs of pictures are judged and which differences are explained. No Blender is needed."""
 
 from dataclasses import replace
 
