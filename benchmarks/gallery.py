@@ -6,7 +6,7 @@ Models are the glTF and USD files of DIR, or those that FILE names (paths relati
 comment; default: DIR/models.txt where there is one). `benchmarks/gallery_models.txt` lists the files that the README's
 figures are of, with the repositories and commits that they were taken from. Both sides see the same camera (35 degrees
 to the right, 15 up, the model's sphere in a field of view of 30 degrees) and one soft sky of three colours; both
-pictures lie over the same grey and have the same exposure, 256 pixels a side and 64 samples a pixel. Blender is a
+pictures lie over the same grey and have the same exposure, 256 pixels a side and 32 samples a pixel. Blender is a
 check, not a dependency: --blender or $MISTYLE_BLENDER_PYTHON names a Python in which `import bpy` works. It keeps its
 pictures in OUT/cycles, so that a second run draws only our side.
 
@@ -192,7 +192,7 @@ def main(argv: list[str] | None = None) -> int:
     blender = find_blender(given.blender)
     if blender is None:
         options.error("needs --blender PYTHON or $MISTYLE_BLENDER_PYTHON: a Python in which `import bpy` works")
-    size, samples = (96, 16) if given.quick else (256, 64)
+    size, samples = (96, 16) if given.quick else (256, 32)
     names = models_of(given.models, given.list, given.only)
     jobs = draw_ours(given.models, names, given.out, size, samples)
     rows = worst_first([row(d, given.out, read_json(REASONS)) for d in draw_cycles(jobs, given.out, blender)])
