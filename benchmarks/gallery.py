@@ -1,6 +1,6 @@
 """A folder of other people's models, each drawn here and by Blender's Cycles under one light, and what differs.
 
-    python -m benchmarks.gallery --models DIR [--list FILE] [--only PATTERN] [--out DIR] [--quick] [--json FILE]
+    python -m benchmarks.gallery --models DIR [--list FILE] [--only PATTERN] [--out DIR] [--judge] [--quick] [--json F]
 
 Models are the glTF and USD files of DIR, or those that FILE names (paths relative to DIR, one a line, '#' begins a
 comment; default: DIR/models.txt where there is one). `benchmarks/gallery_models.txt` lists the files that the README's
@@ -18,16 +18,18 @@ pictures in OUT/cycles, so that a second run draws only our side.
 
 Figures: models (drawn by both), within_flip_005 (mean FLIP of the whole picture up to 0.05), share_within,
 within_on_model (the same of the mean over the pixels that either picture covers, which no background dilutes),
-silent_differences (beyond 0.05, and neither a note nor a reason by "cycles" explains it), refused (by mistyle, with a
-sentence; among the models, beyond 0.05), cycles_failed (not among the models). OUT/index.html and OUT/gallery.json list
-every model with both pictures, FLIP, notes and reason, worst first. Ends with 1 where a difference is silent.
+silent_differences (beyond 0.05, and neither a note nor a reason by "cycles" explains it) and, not among the models,
+refused (by mistyle, with a sentence) and cycles_failed. --judge draws nothing and judges the last list of OUT again.
+OUT/index.html and OUT/gallery.json list every model with both pictures, FLIP, notes and reason, worst first. Ends with
+1 where a difference is silent.
 """
 
+import argparse
 import html
 import json
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from fnmatch import fnmatch
 from pathlib import Path
 from typing import Any
@@ -56,7 +58,7 @@ class Row:
 
     flip         mean FLIP of the whole picture, on_model of what either picture covers; None where one is missing
     reason       why it differs, "" where nobody knows; explained: whether a note or Blender's own departure says so
-    notes        the reader's sentences, or the one of a refusal; trouble: why Blender made no picture
+    notes        the reader's sentences, or the one of a refusal (refused); trouble: why Blender made no picture
     """
 
     model: str
@@ -66,6 +68,7 @@ class Row:
     explained: bool
     notes: tuple[str, ...]
     trouble: str
+    refused: bool
     ours: str
     cycles: str
 
@@ -75,7 +78,7 @@ class Row:
 
     @property
     def silent(self) -> bool:
-        return not self.within and not self.explained and not self.trouble
+        return not self.within and not self.explained and not self.trouble and not self.refused
 
 
 def over_grey(picture: Float[np.ndarray, "h w 4"]) -> Float[np.ndarray, "h w 3"]:
@@ -112,25 +115,32 @@ def row(drawn: Drawn, folder: Path, reasons: Mapping[str, Any]) -> Row:
             write_png(folder / shown[side], srgb_from_linear(over_grey(picture)))
     if drawn.ours is not None and drawn.theirs is not None:
         flip, on_model = apart(drawn.ours, drawn.theirs)
-    reason, explained = why(drawn.model, drawn.notes, reasons)
-    if drawn.refused:
-        reason, explained = reason or "refused, with a sentence", True
-    return Row(
+    found = Row(
         model=drawn.model,
         flip=flip,
         on_model=on_model,
-        reason=reason,
-        explained=explained,
+        reason="",
+        explained=False,
         notes=drawn.notes,
         trouble=drawn.trouble,
+        refused=drawn.refused,
         ours=shown.get("ours", ""),
         cycles=shown.get("cycles", ""),
     )
+    return judged(found, reasons)
+
+
+def judged(found: Row, reasons: Mapping[str, Any]) -> Row:
+    """A row with its reason."""
+    reason, explained = why(found.model, found.notes, reasons)
+    if found.refused:
+        return replace(found, reason=reason or "refused, with a sentence", explained=True)
+    return replace(found, reason=reason, explained=explained)
 
 
 def tally(rows: Sequence[Row]) -> dict[str, float]:
     """The figures of a list."""
-    compared = [r for r in rows if not r.trouble]
+    compared = [r for r in rows if r.flip is not None]
     within = sum(r.within for r in compared)
     return {
         "models": len(compared),
@@ -138,8 +148,8 @@ def tally(rows: Sequence[Row]) -> dict[str, float]:
         "share_within": within / max(len(compared), 1),
         "within_on_model": sum(r.on_model is not None and r.on_model <= LIMIT for r in compared),
         "silent_differences": sum(r.silent for r in compared),
-        "refused": sum(r.flip is None for r in compared),
-        "cycles_failed": len(rows) - len(compared),
+        "refused": sum(r.refused for r in rows),
+        "cycles_failed": sum(bool(r.trouble) for r in rows),
     }
 
 
@@ -181,21 +191,35 @@ def models_of(folder: Path, listed: Path | None, only: str) -> list[str]:
     return [name for name in found if fnmatch(name, only)]
 
 
+def again(folder: Path) -> list[Row]:
+    """The rows of an earlier run, with the reasons as they are now."""
+    rows = json.loads((folder / "gallery.json").read_text(encoding="utf-8"))
+    reasons = read_json(REASONS)
+    return [judged(Row(**r | {"notes": tuple(r["notes"])}), reasons) for r in rows]
+
+
+def drawn_rows(given: argparse.Namespace) -> list[Row]:
+    """Every model drawn on both sides and judged."""
+    blender = find_blender(given.blender)
+    if blender is None:
+        raise UsageError("needs --blender PYTHON or $MISTYLE_BLENDER_PYTHON: a Python in which `import bpy` works")
+    size, samples = (96, 16) if given.quick else (256, 32)
+    names = models_of(given.models, given.list, given.only)
+    jobs = draw_ours(given.models, names, given.out, size, samples)
+    reasons = read_json(REASONS)
+    return [row(drawn, given.out, reasons) for drawn in draw_cycles(jobs, given.out, blender)]
+
+
 def main(argv: list[str] | None = None) -> int:
     options = parser((__doc__ or "").splitlines()[0])
     options.add_argument("--models", type=Path, required=True, metavar="DIR", help="the folder of the models")
     options.add_argument("--list", type=Path, metavar="FILE", help="which of them (default: DIR/models.txt, else all)")
     options.add_argument("--only", default="*", metavar="PATTERN", help="only models whose path matches")
     options.add_argument("--out", type=Path, default=Path("gallery"), metavar="DIR", help="pictures, page and list")
+    options.add_argument("--judge", action="store_true", help="draw nothing: judge the last list of OUT again")
     options.add_argument("--blender", metavar="PYTHON", help="a Python in which `import bpy` works")
     given = options.parse_args(argv)
-    blender = find_blender(given.blender)
-    if blender is None:
-        options.error("needs --blender PYTHON or $MISTYLE_BLENDER_PYTHON: a Python in which `import bpy` works")
-    size, samples = (96, 16) if given.quick else (256, 32)
-    names = models_of(given.models, given.list, given.only)
-    jobs = draw_ours(given.models, names, given.out, size, samples)
-    rows = worst_first([row(d, given.out, read_json(REASONS)) for d in draw_cycles(jobs, given.out, blender)])
+    rows = worst_first(again(given.out) if given.judge else drawn_rows(given))
     figures = tally(rows)
     quiet = str(given.json) == "-"
     for r in rows:
