@@ -310,6 +310,9 @@ def _bound(pxr: Any, prim: Any, shape: Polygons, number: Any, time: Any, notes: 
     if (of_polygon < 0).any():
         own = _material_of(pxr, prim, notes)
         of_polygon[of_polygon < 0] = number(own, shown)
+        colour = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+        if not own and not (colour and colour.HasValue()):
+            notes.append("A mesh has neither a material nor a display colour: it was read as white.")
         opacity = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity")
         if not own and opacity and opacity.HasValue() and (np.array(opacity.Get(time), float) < 1).any():
             notes.append("displayOpacity was not read.")
