@@ -425,6 +425,40 @@ def test_lamps_keep_their_light_and_unlit_goes_when_asked(tmp_path: Path) -> Non
     assert "unlit" not in str(written(read(file, tmp_path, lit=True), tmp_path / "lit.glb")[0])
 
 
+# --- what is noted and not drawn ---
+
+
+@pytest.mark.parametrize(
+    ("material", "words"),
+    [
+        ({"alphaMode": "BLEND", "pbrMetallicRoughness": {"baseColorFactor": [1, 1, 1, 0.5]}}, ("blended", "stays")),
+        ({"alphaMode": "MASK", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}, ("cut out", "stays")),
+        (
+            {"pbrMetallicRoughness": {}, "extensions": {"KHR_materials_sheen": {}, "KHR_materials_clearcoat": {}}},
+            ("KHR_materials_clearcoat, KHR_materials_sheen", "stays"),
+        ),
+        ({"extensions": {"KHR_materials_pbrSpecularGlossiness": {}}}, ("specular colour",)),
+        ({"doubleSided": True}, ("rough metal",)),
+        (None, ("no material", "rough metal")),
+    ],
+)
+def test_what_is_not_drawn_is_noted(material: Tree | None, words: tuple[str, ...], tmp_path: Path) -> None:
+    noise(tmp_path)
+    file = square(**({} if material is None else {"material": 0}))
+    file.tree |= {"textures": [{"source": 0}], "images": [{"uri": "a.png"}]}
+    file.tree["materials"] = [material or {}]
+    file.tree["extensionsUsed"] = sorted(file.tree["materials"][0].get("extensions", {}))
+    assert noted(read(file, tmp_path), *words)
+
+
+@pytest.mark.parametrize("alpha", ["OPAQUE", "BLEND", "MASK"])
+def test_nothing_is_noted_of_a_plain_material(alpha: str, tmp_path: Path) -> None:
+    """An alpha mode without an alpha changes nothing."""
+    file = square(material=0)
+    file.tree["materials"] = [{"alphaMode": alpha, "pbrMetallicRoughness": {"roughnessFactor": 0.3}}]
+    assert read(file, tmp_path).source.notes == ()
+
+
 # --- containers and codecs ---
 
 

@@ -221,3 +221,11 @@ def test_maps_of_one_material_have_their_own_coordinates(tmp_path: Path) -> None
     assert found.roughness[6, 4] == pytest.approx(200 / 255, abs=0.01)
     lost = read_mesh(write(tmp_path, plate(BOUND), material(inputs, shaders + second)), uv="keep", size=8)
     assert lost.materials[0].roughness is None and any("roughness map" in note for note in lost.source.notes)
+
+
+def test_a_mesh_without_any_colour_is_noted_as_white(tmp_path: Path) -> None:
+    path = tmp_path / "a.usda"
+    for extra, noted in (("", True), (primvar("displayColor", "color3f", COLOURS[:1], "constant"), False)):
+        path.write_text("#usda 1.0\n" + plate(extra))
+        notes = read_usd(path, 100).notes
+        assert any("neither a material nor a display colour" in note for note in notes) == noted

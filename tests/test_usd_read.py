@@ -555,3 +555,18 @@ def test_damaged_bytes_are_refused_or_read_and_never_more(tmp_path, rng):
                 assert str(damaged) in str(error)
                 refused += 1
     assert refused >= 12
+
+
+@pytest.mark.parametrize("points", ["int[] points = [0, 1, 2]", "point3f points = (0, 1, 2)", "double points = 7"])
+def test_points_of_another_type_are_left_out_with_a_note(points: str, tmp_path: Path) -> None:
+    other = mesh("Odd").replace("point3f[] points = [(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0.5, 2, 0)]", points)
+    found = raw(stage(tmp_path / "a.usda", mesh() + other))
+    assert len(found.faces) == 3
+    assert any("points are of another type" in note for note in found.notes)
+
+
+@pytest.mark.parametrize("normals", ["int normals = 7", "normal3f normals = (0, 0, 1)", "int[] normals = [1, 2, 3]"])
+def test_normals_of_another_type_are_left_out_with_a_note(normals: str, tmp_path: Path) -> None:
+    found = raw(stage(tmp_path / "a.usda", mesh(extra=INDEXED + normals)))
+    assert found.normals is None
+    assert any("Normals of another type" in note for note in found.notes)

@@ -39,6 +39,25 @@ def shadeless(entry: Tree) -> bool:
     return emits(entry) and not any(c > 0 for c in base[:3])
 
 
+def sees_through(tree: Tree, material: int) -> bool:
+    """Whether a material may be cut out or blended: by its alpha mode, and by a factor, a texture or vertex colours
+    that have an alpha."""
+    entry = tree["materials"][material]
+    if entry.get("alphaMode", "OPAQUE") == "OPAQUE":
+        return False
+    pbr = entry.get("pbrMetallicRoughness", {})
+    glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+    factors = [*pbr.get("baseColorFactor", [])[3:], *glossy.get("diffuseFactor", [])[3:]]
+    primitives = [p for mesh in tree.get("meshes", []) for p in mesh["primitives"] if p.get("material") == material]
+    colours = [p["attributes"]["COLOR_0"] for p in primitives if "COLOR_0" in p["attributes"]]
+    return (
+        any(alpha < 1 for alpha in factors)
+        or "baseColorTexture" in pbr
+        or "diffuseTexture" in glossy
+        or any(tree["accessors"][c]["type"] == "VEC4" for c in colours)
+    )
+
+
 def has_tangents(tree: Tree, material: int) -> bool:
     """Whether the file gives the frames of the material's normal map itself."""
     primitives = [p for mesh in tree.get("meshes", []) for p in mesh["primitives"] if p.get("material") == material]

@@ -14,6 +14,7 @@ from mistyle.files.gltf_infos import (
     emits,
     has_tangents,
     image_of,
+    sees_through,
     set_of,
     shadeless,
     texture_infos,
@@ -24,6 +25,7 @@ from mistyle.files.pictures import Budget, texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 
 Tree = dict[str, Any]
+_READ = ("KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_materials_pbrSpecularGlossiness")
 
 
 def read_material(
@@ -63,7 +65,7 @@ def _load(
 ) -> tuple[Maps, tuple[str, ...]]:
     """The material's textures. glTF has no tiles."""
     maps: dict[str, RawMap] = {}
-    notes = _unseen(tree["materials"][index], index)
+    notes = _unseen(tree, index)
     base = base_set(tree, index)
     for name, info in texture_infos(tree, index).items():
         image = _image(tree, buffers, path, info["index"], notes)
@@ -90,8 +92,9 @@ def _load(
     return maps, tuple(notes)
 
 
-def _unseen(entry: Tree, index: int) -> list[str]:
+def _unseen(tree: Tree, index: int) -> list[str]:
     """What the material says that renders here do not show as it says it."""
+    entry = tree["materials"][index]
     name, notes = entry.get("name") or f"material_{index}", []
     if shadeless(entry):
         notes.append(
@@ -105,6 +108,33 @@ def _unseen(entry: Tree, index: int) -> list[str]:
         )
     if "KHR_materials_unlit" in entry.get("extensions", {}):
         notes.append(f"Material '{name}' is unlit: without --lit, viewers of a result show its albedo alone.")
+    return notes + _left_out(tree, index, name)
+
+
+def _left_out(tree: Tree, index: int, name: str) -> list[str]:
+    """Notes of what is in a material and not in its maps: alpha, extensions, and defaults that were read otherwise."""
+    entry, notes = tree["materials"][index], []
+    if sees_through(tree, index):
+        how = "cut out" if entry["alphaMode"] == "MASK" else "blended"
+        notes.append(
+            f"Material '{name}' is {how} by its alpha, which stays in a finished asset; renders here draw it whole."
+        )
+    more = sorted(n for n in entry.get("extensions", {}) if n.startswith("KHR_materials_") and n not in _READ)
+    if more:
+        notes.append(
+            f"Material '{name}' has {', '.join(more)}, which stays in a finished asset; renders here leave it out."
+        )
+    glossy = "KHR_materials_pbrSpecularGlossiness" in entry.get("extensions", {})
+    if glossy:
+        notes.append(
+            f"Of material '{name}' (KHR_materials_pbrSpecularGlossiness) diffuse colour and glossiness were read, the "
+            "specular colour and what its texture says of gloss were not."
+        )
+    elif "pbrMetallicRoughness" not in entry and "KHR_materials_unlit" not in entry.get("extensions", {}):
+        notes.append(
+            f"Material '{name}' leaves metalness and roughness open: it was read as a dielectric of roughness 0.5, "
+            "where glTF's default is rough metal."
+        )
     return notes
 
 

@@ -59,6 +59,11 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
             "Export the mesh itself, visible and as triangles",
         )
     used = sorted({p.material for p in pieces})
+    if -1 in used:
+        notes.append(
+            "A primitive has no material: it was read as a white dielectric of roughness 0.5, where glTF's default is "
+            "rough metal."
+        )
     place = {m: i for i, m in enumerate(used)}
     counts = [len(p.faces) for p in pieces]
     # All of it goes from one process to another, in as few bytes as hold it.

@@ -17,7 +17,7 @@ from mistyle.core.raster import fragments
 from mistyle.core.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
 from mistyle.core.unwrap import unwrap
 from mistyle.core.upright import lies_on_its_side
-from mistyle.core.uvs import Layout, Verdict, arrange
+from mistyle.core.uvs import Layout, Verdict, arrange, signed_areas
 from mistyle.files.bounds import refuse
 from mistyle.files.lookups import effective, framed, looked_up, plain_lookups
 from mistyle.files.polygons import check_positions
@@ -28,6 +28,8 @@ NO_AREA = 1e-13
 ONE_COLOUR = 1 / 512  # vertex colours that differ by less (linear) are one
 TORN = "faces that share texels have different vertex colours"
 MAX_TORN = 0.05  # two faces may give a texel vertex colours that differ so far (linear)
+PALETTE = 4  # texels that a face shows on average, below which a texture is a palette
+FACE_TEXELS = 64  # of a palette's face, once it has texels of its own
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
 SIDEWAYS = "The mesh seems to lie on its side: it is tallest along z and its base is there. --up z turns it upright."
 UnwrapMode = Literal["keep", "new", "auto"]
@@ -70,7 +72,7 @@ def _side(entry: RawMap, raw: Raw, plan: _Plan, size: int) -> tuple[int, int]:
     height, width = entry.values.shape[:2]
     if not plan.carried and _is_plain(entry, raw.uvs, plan.rows):
         return height, width
-    side = min(size, max(height, width))
+    side = _carried_side(entry, looked_up(entry, raw.uvs, plan.rows), size)
     return side, side
 
 
@@ -378,8 +380,21 @@ def _placed(name: str, entry: RawMap, raw: Raw, mesh: Mesh, rows: np.ndarray, si
     wrap = effective(entry.wrap, lookup)
     entry = (framed(entry) if name == "normal" else entry).finished()
     lookup = np.clip(np.nan_to_num(lookup), -1e6, 1e6)
-    side = min(size, max(entry.values.shape[:2]))
+    side = _carried_side(entry, lookup, size)
     values, face = carry(entry.values, lookup, mesh.corner_uvs[rows], side, wrap)
     if name == "normal":
         values = turn_normals(values, face, mesh.positions, mesh.faces[rows], lookup, mesh.corner_uvs[rows])
     return values
+
+
+def _carried_side(entry: RawMap, lookup: Float[np.ndarray, "f 3 2"] | None, size: int) -> int:
+    """Texels along a side of a map that is carried over, `size` at most: as many as it has; where it repeats, as dense
+    on the surface as before; of a palette, which shows its faces a texel or less each, enough for the faces. The new
+    UVs are taken to cover a half of their square, since memory is foretold before they are there."""
+    height, width = entry.values.shape[:2]
+    side = max(height, width)
+    if lookup is None or side >= size or (entry.values == entry.values[:1, :1]).all():
+        return min(size, side)
+    seen = float(np.abs(signed_areas(np.nan_to_num(lookup))).sum()) * height * width
+    needed = 2 * max(seen, FACE_TEXELS * len(lookup) if seen < PALETTE * len(lookup) else 0.0)
+    return min(size, max(side, int(np.ceil(np.sqrt(min(needed, float(size) ** 2))))))

@@ -225,10 +225,10 @@ def _prototypes(pxr: Any, prim: Any, cache: Any, time: Any, notes: list[str]) ->
 def polygons(pxr: Any, prim: Any, path: Path, max_faces: int = 2**31) -> Polygons | None:
     """The faces of a mesh prim as triangles, in file order; None where it has none. Holes are left out."""
     mesh, time = pxr.UsdGeom.Mesh(prim), pxr.Usd.TimeCode.EarliestTime()
-    points = np.array(mesh.GetPointsAttr().Get(time) or np.zeros((0, 3)), np.float64).reshape(-1, 3)
+    points = _triples(mesh.GetPointsAttr().Get(time))
     sizes = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int64)
     vertices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int64)
-    if not len(points) or not len(sizes):
+    if points is None or not len(points) or not len(sizes):
         return None
     again = "Export the mesh again"
     if (sizes < 0).any() or sizes.sum() != len(vertices):
@@ -247,11 +247,23 @@ def polygons(pxr: Any, prim: Any, path: Path, max_faces: int = 2**31) -> Polygon
     return Polygons(points, sizes, vertices, corner, polygon[kept], turned)
 
 
+def _triples(values: Any) -> Float[np.ndarray, "n 3"] | None:
+    """A list of three numbers each, no rows where nothing is authored; None for a value of another type."""
+    if values is None:
+        return np.zeros((0, 3))
+    found = np.array(values, np.float64)
+    if found.size == 0:
+        return np.zeros((0, 3))
+    return found if found.ndim == 2 and found.shape[1] == 3 else None
+
+
 def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, notes) -> _Piece | None:
+    mesh = pxr.UsdGeom.Mesh(prim)
     shape = polygons(pxr, prim, path, max_faces)
+    if shape is None and mesh.GetPointsAttr().HasAuthoredValue() and _triples(mesh.GetPointsAttr().Get(time)) is None:
+        notes.append("A mesh whose points are of another type than point3f[] was left out.")
     if shape is None or not len(shape.corner):
         return None
-    mesh = pxr.UsdGeom.Mesh(prim)
     if mesh.GetSubdivisionSchemeAttr().Get(time) != pxr.UsdGeom.Tokens.none:
         notes.append("A subdivision surface was read as its control cage.")
     if "SkelBindingAPI" in prim.GetAppliedSchemas():
@@ -298,6 +310,9 @@ def _bound(pxr: Any, prim: Any, shape: Polygons, number: Any, time: Any, notes: 
     if (of_polygon < 0).any():
         own = _material_of(pxr, prim, notes)
         of_polygon[of_polygon < 0] = number(own, shown)
+        colour = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
+        if not own and not (colour and colour.HasValue()):
+            notes.append("A mesh has neither a material nor a display colour: it was read as white.")
         opacity = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity")
         if not own and opacity and opacity.HasValue() and (np.array(opacity.Get(time), float) < 1).any():
             notes.append("displayOpacity was not read.")
@@ -334,7 +349,11 @@ def _normals(pxr: Any, mesh: Any, shape: Polygons, time: Any, notes: list[str]) 
     primvar = pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     if primvar and primvar.HasValue():
         return _spread(primvar.ComputeFlattened(time), primvar.GetInterpolation(), shape, 3, "normals", notes)
-    return _spread(mesh.GetNormalsAttr().Get(time), mesh.GetNormalsInterpolation(), shape, 3, "normals", notes)
+    values = mesh.GetNormalsAttr().Get(time)
+    if values is not None and _triples(values) is None:
+        notes.append("Normals of another type than normal3f[] were left out.")
+        return None
+    return _spread(values, mesh.GetNormalsInterpolation(), shape, 3, "normals", notes)
 
 
 def uv_primvar(pxr: Any, mesh: Any, wanted: list[str]) -> Any:

@@ -117,6 +117,12 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--stroke-scale", type=float, metavar="X", help="size of the strokes on the surface, 1 is the default"
     )
+    verb.add_argument(
+        "--form",
+        type=float,
+        metavar="X",
+        help="0 to 1: paint sky light and openness into the albedo, for hand-painted looks (default 0: no light)",
+    )
     add_paint_options(verb)
     add_generative_options(verb)
     verb.add_argument(
@@ -250,6 +256,7 @@ OPTIONS = {
     "stylizer": "stylizer",
     "samples": "surface.samples",
     "stroke_scale": "surface.stroke_scale",
+    "form": "surface.form",
     **PAINT_OPTIONS,
     **GENERATIVE_OPTIONS,
     **DELIVERY_OPTIONS,

@@ -55,7 +55,7 @@ def vibrations(level: Level, count: int) -> Float[np.ndarray, "n k"]:
     scale = diags(1 / np.sqrt(degree))
     laplacian = (identity(size) - scale @ bound @ scale).tocsc()
     start = np.cos(np.arange(size) * 0.7548776662)
-    values, vectors = eigsh(laplacian, count + 1, sigma=-SHIFT, v0=start, tol=1e-8)
+    values, vectors = eigsh(laplacian, count + 1, sigma=-SHIFT, v0=start)
     chosen = vectors[:, np.argsort(values, kind="stable")[1:]] / np.sqrt(degree)[:, None]
     chosen -= chosen.mean(axis=0)
     chosen *= np.where(chosen[np.abs(chosen).argmax(axis=0), np.arange(chosen.shape[1])] < 0, -1, 1)
