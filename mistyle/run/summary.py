@@ -114,10 +114,29 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "painted_share": ("share of the covered texels whose albedo was painted", "higher"),
     "seen_share": ("share of the covered texels that at least one view sees", "higher"),
     "repaired_share": ("share of the covered texels that were painted again after the fit", ""),
+    "light_up_over_down": (
+        "mean albedo of what faces up over that of what faces down; 1 is no light from above in the albedo",
+        "",
+    ),
+    "light_correlation": (
+        "largest correlation of the log albedo with an axis of the normal or with openness",
+        "lower",
+    ),
     "detail": ("correlation of the render's fine lightness with the stylized views' after this phase", "higher"),
     "style": ("patch and Gram distance of the render to the stylized views after this phase", "lower"),
     "views": ("difference of a surface point between neighbouring views, over the picture's own detail", "lower"),
 }
+
+
+def light_figures(made: Any) -> dict[str, float]:
+    """How much light the finished albedo holds; nothing where it cannot be said."""
+    from mistyle.stages.light_left import light_left
+
+    found = light_left(made.asset.mesh, made.atlas.texels, made.repaired.maps, made.job.settings.seed)
+    if found is None:
+        return {}
+    ratio = {} if found.ratio is None else {"light_up_over_down": found.ratio}
+    return ratio | {"light_correlation": found.strongest}
 
 
 def figures(made: Any) -> dict[str, float]:
@@ -132,5 +151,6 @@ def figures(made: Any) -> dict[str, float]:
         "painted_share": share([m.known for m in made.repaired.maps]),
         "seen_share": share([s > 0 for s in made.baked.seen]),
         "repaired_share": share(made.repaired.mask),
+        **light_figures(made),
         **{name: pair[made.fit.kept[name.partition(".")[0]]] for name, pair in made.fit.figures.items()},
     }

@@ -1,0 +1,30 @@
+"""How much light a finished albedo holds, over all texture sets; the measure itself is in `measure/baked_light.py`."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import Mesh, face_areas
+from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
+
+LOOKED_AT = 40_000  # texels at most, evenly over the sets: enough for two digits
+
+
+def light_left(mesh: Mesh, sets: Sequence[Texels], maps: Sequence[Maps], seed: int = 0) -> BakedLight | None:
+    """The albedo's dependence on the surface's direction and openness; None where nothing is covered."""
+    from mistyle.render.occlusion import ambient_occlusion
+
+    areas = face_areas(mesh).astype(np.float64)
+    step = max(1, sum(int(t.covered.sum()) for t in sets) // LOOKED_AT)
+    found = []
+    for texels, chosen in zip(sets, maps, strict=True):
+        at = np.flatnonzero(texels.covered)
+        weight = texel_areas(texels.face.reshape(-1)[at], areas)[::step]
+        at = at[::step]
+        flat = (values.reshape(-1, 3)[at] for values in (chosen.albedo, texels.position, texels.normal))
+        found.append((*flat, weight))
+    albedo, positions, normals, weight = (np.concatenate(columns) for columns in zip(*found, strict=True))
+    if not len(albedo):
+        return None
+    return baked_light(albedo, normals, ambient_occlusion(mesh, positions, normals, seed=seed), weight)
