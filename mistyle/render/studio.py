@@ -234,7 +234,8 @@ class Studio:
             mirrored = ray.d + 2 * cosine * tilted
             soft = self._fetched((mi.UInt32(len(ROUGHNESS) - 1),), _turned(turn, towards))[0] * share
             glossy = self._glossy(roughness, _turned(turn, dr.normalize(mirrored)))
-            glossy *= dr.clip(dr.power(cosine + share, dr.exp2(-16 * roughness - 1)) - 1 + share, 0, 1)
+            hidden: Any = dr.power(cosine + share, dr.exp2(-16 * roughness - 1))
+            glossy *= dr.clip(hidden - 1 + share, 0, 1)
             f0 = dr.lerp(mi.Color3f(SPECULAR), albedo, metallic)
             a, b = _split_sum(roughness, cosine)
             colour = albedo * (1 - metallic) * soft + (f0 * a + b) * glossy

@@ -23,7 +23,7 @@ FIRST = 30.0  # azimuth of the first frame and of the close-up
 SKY_TEXELS, SKY_RAYS = 256, 64  # a side of a set, and rays for each
 # Of the path-traced picture: samples a pixel of a pass, the mean error of sRGB (0..1) that ends it, and how many times
 # the samples of `report.spp` it may take.
-PASS, GOOD, MOST = 2, 0.45 / 255, 4
+PASS, GOOD, MOST = 2, 0.6 / 255, 4
 PLAIN = 0.18  # radiance behind the close-up where nothing is path-traced
 
 
