@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.paths import scenes
-from mistyle.run.progress import Progress
 
 SHEET = "demo.png"
 ROW = 480  # pixels of a row of the sheet
@@ -37,13 +36,14 @@ def demo_files(style: str | None, mesh: str | None) -> tuple[Path, Path]:
     return scenes() / MESHES[mesh or painting.mesh], scenes() / painting.file
 
 
-def run_all(jobs: Sequence[Any], out: Path, progress: Progress, *, overwrite: bool = False) -> dict[str, Any]:
+def run_all(jobs: Sequence[Any], out: Path, progress: Any, *, overwrite: bool = False) -> dict[str, Any]:
     """Run the jobs one after another and write OUT/demo.png, one row a job: mesh, painting, result.
 
     Returns the sheet's path ("" where no job wrote a report) and the summaries.
     """
     from mistyle.files.output import claim, replace_files
     from mistyle.run.pipeline import stylize
+    from mistyle.run.progress import Progress
 
     inputs = [path for job in jobs for path in (job.mesh, job.style)]
     claim(out, [SHEET], inputs=inputs, overwrite=overwrite)
