@@ -451,6 +451,15 @@ def test_what_is_not_drawn_is_noted(material: Tree | None, words: tuple[str, ...
     assert noted(read(file, tmp_path), *words)
 
 
+@pytest.mark.parametrize(("filtering", "said"), [(9728, True), (9729, False), (None, False)])
+def test_nearest_lookups_are_noted(filtering: int | None, said: bool, tmp_path: Path) -> None:
+    noise(tmp_path)
+    file = textured(square(material=0))
+    file.tree["samplers"] = [{} if filtering is None else {"magFilter": filtering}]
+    file.tree["textures"][0]["sampler"] = 0
+    assert noted(read(file, tmp_path), "nearest texel") == said
+
+
 @pytest.mark.parametrize("alpha", ["OPAQUE", "BLEND", "MASK"])
 def test_nothing_is_noted_of_a_plain_material(alpha: str, tmp_path: Path) -> None:
     """An alpha mode without an alpha changes nothing."""

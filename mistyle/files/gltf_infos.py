@@ -79,6 +79,12 @@ def wrap_of(tree: Tree, texture: int) -> Wraps:
     return WRAPS.get(sampler.get("wrapS"), "repeat"), WRAPS.get(sampler.get("wrapT"), "repeat")
 
 
+def nearest(tree: Tree, texture: int) -> bool:
+    """Whether a texture's sampler shows single texels where it is enlarged."""
+    number, samplers = tree["textures"][texture].get("sampler"), tree.get("samplers", [])
+    return number is not None and samplers[number].get("magFilter") == 9728
+
+
 def set_of(info: Tree) -> int:
     moved = info.get("extensions", {}).get("KHR_texture_transform", {})
     return int(moved.get("texCoord", info.get("texCoord", 0)))

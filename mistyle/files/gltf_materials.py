@@ -14,6 +14,7 @@ from mistyle.files.gltf_infos import (
     emits,
     has_tangents,
     image_of,
+    nearest,
     sees_through,
     set_of,
     shadeless,
@@ -72,6 +73,11 @@ def _load(
         if image is None:
             continue
         where, data = image
+        if nearest(tree, info["index"]):
+            notes.append(
+                f"Textures of material '{_name(tree, index)}' show their nearest texel (magFilter NEAREST); renders "
+                "here interpolate."
+            )
         number = set_of(info)
         lookup: Tree = dict(
             uvs=other.get(number) if number != base else None,
@@ -89,13 +95,17 @@ def _load(
         else:
             maps["roughness"] = RawMap(np.ascontiguousarray(pixels[..., 1]), **lookup, kind="data")
             maps["metallic"] = RawMap(np.ascontiguousarray(pixels[..., 2]), **lookup, kind="data")
-    return maps, tuple(notes)
+    return maps, tuple(dict.fromkeys(notes))
+
+
+def _name(tree: Tree, index: int) -> str:
+    return tree["materials"][index].get("name") or f"material_{index}"
 
 
 def _unseen(tree: Tree, index: int) -> list[str]:
     """What the material says that renders here do not show as it says it."""
     entry = tree["materials"][index]
-    name, notes = entry.get("name") or f"material_{index}", []
+    name, notes = _name(tree, index), []
     if shadeless(entry):
         notes.append(
             f"Material '{name}' is black and shows its emission alone: that was taken as its albedo, and finished "
