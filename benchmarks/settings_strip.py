@@ -23,9 +23,10 @@ from mistyle.run.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 STRIPS: dict[str, tuple[dict[str, Any], ...]] = {
-    "stroke_scale": tuple({"stroke_scale": v} for v in (0.5, 1.0, 2.0, 3.0)),
-    "detail": ({"detail": 0.0, "glaze": 0.0}, {"detail": 2.0, "glaze": 0.3}, {}, {"detail": 12.0, "relief": 4.0}),
-    "strength": tuple({"stroke_coherence": v} for v in (0.0, 0.01, 0.02, 0.04)),
+    "stroke_scale": tuple({"stroke_scale": v} for v in (0.5, 1.0, 2.0, 4.0)),
+    "form": tuple({"form": v} for v in (0.0, 0.5, 1.0)),
+    "detail": ({"detail": 0.0}, {}, {"glaze": 0.8}, {"detail": 12.0, "relief": 4.0}),
+    "strength": tuple({"stroke_coherence": v} for v in (0.0, 0.02, 0.06, 0.15)),
     "palette": ({"palette": 0.02}, {}, {"palette": 4.0}, {"palette_mix": 1.0}),
     "direction": ({"orientation": 0.0}, {}, {"direction": "up"}, {"direction": "around"}, {"flow": (1, 1)}),
 }

@@ -170,11 +170,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "diffusion": {"content": "per-view"},
     },
 }
-# The demo has three minutes: the draft with finer strokes, a larger texture, and pieces that show the painting's hand.
-PRESETS["demo"] = PRESETS["draft"] | {
-    "surface": {"samples": 150_000, "stroke_coherence": 0.04},
-    "atlas": {"size": 2048},
-}
+# The demo has three minutes: the draft with finer strokes and a larger texture.
+PRESETS["demo"] = PRESETS["draft"] | {"surface": {"samples": 150_000}, "atlas": {"size": 2048}}
 
 
 # Settings by their earlier names.
