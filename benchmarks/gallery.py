@@ -14,11 +14,12 @@ pictures in OUT/cycles, so that a second run draws only our side.
 
     notes    text of a note of mistyle's -> reason: a model whose notes have that text is explained by them
     models   model -> {"reason", and "note" or "by"}. With "note", the reason holds as long as a note of this run has
-             that text. "by": "cycles" says that Blender's side departs from the file or from its specification.
+             that text. "by": "cycles" says that Blender's side departs from the file or from its specification,
+             "by": "noise" that more samples bring the pictures together.
 
 Figures: models (drawn by both), within_flip_005 (mean FLIP of the whole picture up to 0.05), share_within,
 within_on_model (the same of the mean over the pixels that either picture covers, which no background dilutes),
-silent_differences (beyond 0.05, and neither a note nor a reason by "cycles" explains it) and, not among the models,
+silent_differences (beyond 0.05, and neither a note nor a reason with "by" explains it) and, not among the models,
 refused (by mistyle, with a sentence) and cycles_failed. --judge draws nothing and judges the last list of OUT again.
 OUT/index.html and OUT/gallery.json list every model with both pictures, FLIP, notes and reason, worst first. Ends with
 1 where a difference is silent.
@@ -48,6 +49,7 @@ from mistyle.run.blender import find_blender
 
 REASONS = Path(__file__).with_name("gallery_reasons.json")
 KINDS = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")
+BY = ("cycles", "noise")  # what explains a difference without a note
 LIMIT = 0.05  # mean FLIP
 GREY = 0.2  # linear, behind both pictures
 
@@ -100,7 +102,7 @@ def why(model: str, notes: Sequence[str], reasons: Mapping[str, Any]) -> tuple[s
     said = "\n".join(notes)
     own = reasons.get("models", {}).get(model)
     if own is not None:
-        return own["reason"], own.get("by") == "cycles" or ("note" in own and own["note"] in said)
+        return own["reason"], own.get("by") in BY or ("note" in own and own["note"] in said)
     general = [reason for text, reason in reasons.get("notes", {}).items() if text in said]
     return "; ".join(general), bool(general)
 
