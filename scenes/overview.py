@@ -18,8 +18,8 @@ PAINTING = 240  # the height of a painting there, pixels
 SAMPLES = 128  # a pixel
 ELEVATION, DISTANCE = 12.0, 3.7
 FACING = {"elephant": 28.0, "robot": 22.0}  # the camera's azimuth, degrees
-LAMPS = (-105.0, -40.0, 40.0, 105.0)  # azimuths of the lamp against the camera's, degrees
-LAMP_RADIANCE, LAMP_SHARPNESS, SKY_RADIANCE = 34.0, 60.0, 0.06
+LAMPS = (-85.0, -35.0, 35.0, 85.0)  # azimuths of the lamp against the camera's, degrees
+LAMP_RADIANCE, LAMP_SHARPNESS, SKY_RADIANCE = 34.0, 60.0, 0.1
 UNDER_LAMP = "oil"
 
 
