@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mistyle.core.paths import scenes
 
 SHEET = "demo.png"
@@ -63,10 +65,11 @@ def _write_sheet(rows: Sequence[Path], folder: Path) -> None:
     """The pictures below each other, ROW pixels high, on white, as wide as the widest."""
     from PIL import Image
 
+    from mistyle.files.read import read_picture
+
     pictures = []
     for path in rows:
-        with Image.open(path) as opened:
-            picture = opened.convert("RGB")
+        picture = Image.fromarray(np.round(read_picture(path).rgb * 255).astype(np.uint8))
         pictures.append(picture.resize((round(picture.width * ROW / picture.height), ROW), Image.Resampling.LANCZOS))
     sheet = Image.new("RGB", (max(p.width for p in pictures), ROW * len(pictures)), "white")
     for k, picture in enumerate(pictures):
