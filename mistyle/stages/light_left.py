@@ -15,8 +15,11 @@ def light_left(mesh: Mesh, sets: Sequence[Texels], maps: Sequence[Maps], seed: i
     """The albedo's dependence on the surface's direction and openness; None where nothing is covered."""
     from mistyle.render.occlusion import ambient_occlusion
 
+    covered = sum(int(texels.covered.sum()) for texels in sets)
+    if covered == 0:
+        return None
     areas = face_areas(mesh).astype(np.float64)
-    step = max(1, sum(int(t.covered.sum()) for t in sets) // LOOKED_AT)
+    step = max(1, covered // LOOKED_AT)
     found = []
     for texels, chosen in zip(sets, maps, strict=True):
         at = np.flatnonzero(texels.covered)
@@ -25,6 +28,4 @@ def light_left(mesh: Mesh, sets: Sequence[Texels], maps: Sequence[Maps], seed: i
         flat = (values.reshape(-1, 3)[at] for values in (chosen.albedo, texels.position, texels.normal))
         found.append((*flat, weight))
     albedo, positions, normals, weight = (np.concatenate(columns) for columns in zip(*found, strict=True))
-    if not len(albedo):
-        return None
     return baked_light(albedo, normals, ambient_occlusion(mesh, positions, normals, seed=seed), weight)
