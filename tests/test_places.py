@@ -2,9 +2,10 @@
 
 import numpy as np
 import pytest
+from helpers import fixed_surface
+from test_surface import dented_ball, mesh_of, open_sky, strokes
 
 from mistyle.surface import creases, kernels, places, samples, synthesis
-from tests.test_surface import dented_ball, fixed_surface, mesh_of, open_sky, strokes
 
 
 @pytest.fixture(scope="module")

@@ -132,6 +132,8 @@ def light_figures(made: Any) -> dict[str, float]:
     """How much light the finished albedo holds; nothing where it cannot be said."""
     from mistyle.stages.light_left import light_left
 
+    if not made.atlas.texels:
+        return {}
     found = light_left(made.asset.mesh, made.atlas.texels, made.repaired.maps, made.job.settings.seed)
     if found is None:
         return {}
