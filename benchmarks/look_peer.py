@@ -55,11 +55,15 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     from mistyle.render.draw import draw_views as drawn
     from mistyle.run.settings import resolve
     from mistyle.stages.lift import WarpSettings, lift
+    from mistyle.surface.chosen import settled
+    from mistyle.surface.settings import SurfaceSettings
 
     resolution, samples, atlas = sizes
     layers = {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}
     settings = resolve(None, None, layers)
     asset, style = read_mesh(piece.mesh_file, size=atlas), read_picture(piece.style_file)
+    surface = SurfaceSettings(**settled(style.rgb, style.alpha, settings.surface).model_dump())
+    settings = settings.model_copy(update={"surface": surface})
     views = drawn(asset.mesh, None, rig(RigSettings(resolution=resolution)), "paper_views", 1, settings.seed)
     colour, detail, painting = guided(asset, style, settings, views)
     broad, band = source_guides(painting.rgb)

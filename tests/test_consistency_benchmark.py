@@ -36,7 +36,7 @@ def scene(rng) -> consistency_scene.Scene:
         asset=nothing,  # type: ignore[arg-type]
         texels=(),
         style=Picture(painting, None, Path("noise.png")),
-        settings=Settings(),
+        settings=Settings.model_validate({"surface": {"detail": 4.0}}),
         views=views,
         clay=coloured,
         colour=coloured,
