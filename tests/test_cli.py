@@ -86,3 +86,8 @@ def test_print_config_needs_nothing_else(verb, capsys):
 def test_without_it_what_is_missing_is_named(words, wanted, capsys):
     assert main(words) == 2
     assert f"{words[0]} needs {wanted}" in capsys.readouterr().err
+
+
+def test_a_scene_fit_refuses_an_option_that_it_would_ignore(capsys):
+    assert main(["fit", "--scene", "room.xml", "--report", "none", "--list"]) == 2
+    assert "--report belongs to a fit of MESH" in capsys.readouterr().err

@@ -189,6 +189,8 @@ def _fit_scene(options: argparse.Namespace) -> int:
     from mistyle.run.scene_settings import SCENE_PRESETS, SceneSettings
     from mistyle.run.settings import as_toml, resolve
 
+    if options.report is not None:
+        raise UsageError("--report belongs to a fit of MESH and REFERENCES; fit --scene always writes its whole report")
     said = said_settings(options, SCENE_OPTIONS)
     settings = resolve(options.preset, options.config, said, root=SceneSettings, presets=SCENE_PRESETS)
     defines = given_defines(options.defines)
