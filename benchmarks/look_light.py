@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.look_paint import DATA
-from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
+from mistyle.measure.baked_light import BakedLight
 
 HDRIS = ("venice_sunset_1k.hdr", "studio_small_03_1k.hdr")
 SIDES = ((35.0, 15.0), (215.0, -12.0))  # azimuth, elevation; the second shows the underside
@@ -72,21 +72,17 @@ def encoded(picture: np.ndarray) -> np.ndarray:
 
 def light_of(glb: Path) -> BakedLight:
     """What the albedo of a kept GLB says about light, over all its texels."""
-    from mistyle.core.mesh import face_areas
     from mistyle.files.read import read_mesh
-    from mistyle.render.draw import tracer
-    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.stages.light_left import light_left
     from mistyle.stages.texels import rasterise, start_maps
 
     asset = read_mesh(glb)
-    traced, areas, found = tracer(asset.mesh), face_areas(asset.mesh).astype(np.float64), []
-    for part, material in enumerate(asset.materials):
-        texels = rasterise(asset.mesh, part, ATLAS)
-        at = texels.covered
-        albedo = start_maps(material, texels, ATLAS).albedo[at]
-        openness = ambient_occlusion(traced, texels.position[at], texels.normal[at])
-        found.append((albedo, texels.normal[at], openness, texel_areas(texels.face[at], areas)))
-    return baked_light(*(np.concatenate(columns) for columns in zip(*found, strict=True)))
+    texels = [rasterise(asset.mesh, part, ATLAS) for part in range(len(asset.materials))]
+    maps = [start_maps(material, one, ATLAS) for material, one in zip(asset.materials, texels, strict=True)]
+    found = light_left(asset.mesh, texels, maps, most=len(texels) * ATLAS**2)
+    if found is None:
+        raise SystemExit(f"{glb}: no texel of it is covered")
+    return found
 
 
 def mean_light(lights: Sequence[Sequence[BakedLight]]) -> dict[str, float]:

@@ -15,6 +15,7 @@ from mistyle.core.asset import Asset, Picture
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.files.textures import part_stems
+from mistyle.measure.baked_light import BakedLight
 from mistyle.run import asset_files
 from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
@@ -29,6 +30,7 @@ from mistyle.run.settings import Settings
 from mistyle.run.stages import STAGES, Job, Run, claim_run
 from mistyle.run.start import draw, mesh_stage, start_engines, texels_stage
 from mistyle.run.style_look import StyleLook, style_looks
+from mistyle.stages.light_left import light_left
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,8 @@ class Made:
     fit: Any
     repaired: Repaired
     folder: Path
-    looks: tuple[StyleLook, ...] = ()
+    looks: tuple[StyleLook, ...]
+    light: BakedLight | None
 
 
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
@@ -123,7 +126,8 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
-    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks)
+    light = light_left(asset.mesh, atlas.texels, repaired.maps, seed)
+    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light)
 
 
 def retouched_stage(

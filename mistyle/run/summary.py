@@ -9,6 +9,7 @@ from mistyle import __version__
 from mistyle.core import memory
 from mistyle.files.output import write_file
 from mistyle.files.own import read_own
+from mistyle.measure.baked_light import BakedLight
 from mistyle.run.progress import Progress
 from mistyle.run.stages import Run
 
@@ -128,17 +129,12 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
 }
 
 
-def light_figures(made: Any) -> dict[str, float]:
+def light_figures(light: BakedLight | None) -> dict[str, float]:
     """How much light the finished albedo holds; nothing where it cannot be said."""
-    from mistyle.stages.light_left import light_left
-
-    if not made.atlas.texels:
+    if light is None:
         return {}
-    found = light_left(made.asset.mesh, made.atlas.texels, made.repaired.maps, made.job.settings.seed)
-    if found is None:
-        return {}
-    ratio = {} if found.ratio is None else {"light_up_over_down": found.ratio}
-    return ratio | {"light_correlation": found.strongest}
+    ratio = {} if light.ratio is None else {"light_up_over_down": light.ratio}
+    return ratio | {"light_correlation": light.strongest}
 
 
 def figures(made: Any) -> dict[str, float]:
@@ -153,6 +149,6 @@ def figures(made: Any) -> dict[str, float]:
         "painted_share": share([m.known for m in made.repaired.maps]),
         "seen_share": share([s > 0 for s in made.baked.seen]),
         "repaired_share": share(made.repaired.mask),
-        **light_figures(made),
+        **light_figures(made.light),
         **{name: pair[made.fit.kept[name.partition(".")[0]]] for name, pair in made.fit.figures.items()},
     }

@@ -11,15 +11,18 @@ from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
 LOOKED_AT = 40_000  # texels at most, evenly over the sets: enough for two digits
 
 
-def light_left(mesh: Mesh, sets: Sequence[Texels], maps: Sequence[Maps], seed: int = 0) -> BakedLight | None:
-    """The albedo's dependence on the surface's direction and openness; None where nothing is covered."""
+def light_left(
+    mesh: Mesh, sets: Sequence[Texels], maps: Sequence[Maps], seed: int = 0, most: int = LOOKED_AT
+) -> BakedLight | None:
+    """The albedo's dependence on the surface's direction and openness, from about `most` texels; None where nothing is
+    covered."""
     from mistyle.render.occlusion import ambient_occlusion
 
     covered = sum(int(texels.covered.sum()) for texels in sets)
     if covered == 0:
         return None
     areas = face_areas(mesh).astype(np.float64)
-    step = max(1, covered // LOOKED_AT)
+    step = max(1, covered // most)
     found = []
     for texels, chosen in zip(sets, maps, strict=True):
         at = np.flatnonzero(texels.covered)
