@@ -5,8 +5,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from mistyle.core.paths import scenes
 
 SHEET = "demo.png"
@@ -63,6 +61,7 @@ def run_all(jobs: Sequence[Any], out: Path, progress: Any, *, overwrite: bool = 
 
 def _write_sheet(rows: Sequence[Path], folder: Path) -> None:
     """The pictures below each other, ROW pixels high, on white, as wide as the widest."""
+    import numpy as np
     from PIL import Image
 
     from mistyle.files.read import read_picture
