@@ -15,7 +15,7 @@ def fixed_surface(**changes: Any) -> Any:
     from mistyle.surface.chosen import resolved
     from mistyle.surface.settings import SurfaceSettings
 
-    fixed = {"levels": 5, "detail": 4.0, "palette": 0.2, "stroke_coherence": 0.03, "crop": 0.0}
+    fixed = {"levels": 5, "detail": 4.0, "palette": 0.2, "stroke_coherence": 0.03, "modelling": 0.0, "crop": 0.0}
     return resolved(SurfaceSettings(**(fixed | {"look_up": "bilinear", "borders": "blend"} | changes)), None)
 
 

@@ -148,9 +148,10 @@ def test_settings_follow_the_reading_where_they_are_open():
         made = resolved(SurfaceSettings(), read_style(picture))
         assert all(getattr(made, name) is not None for name in FROM_PAINTING)
     brush, print_, pixels = (resolved(SurfaceSettings(), read_style(p)) for p in (oil(), shapes(), art((3, 3))))
-    assert print_.stroke_coherence == 0.12 > brush.stroke_coherence and print_.detail == 3 < brush.detail
+    assert print_.stroke_coherence == 0.1 > brush.stroke_coherence and print_.detail == 3 < brush.detail
     assert (pixels.look_up, print_.look_up, brush.look_up) == ("nearest", "bilinear", "bilinear")
     assert (print_.borders, print_.palette) == ("cut", 0.05)
+    assert print_.modelling == 0 < brush.modelling
 
 
 def test_what_is_set_is_kept():

@@ -410,7 +410,8 @@ def small_search(dj, rng):
     count = len(sure)
     described = rng.normal(0, 0.1, (len(pages.lab), kernels.WIDTH)).astype(np.float32)
     asked = rng.normal(0, 0.1, (count, kernels.WIDTH)).astype(np.float32)
-    described[:, 22:], asked[:, 22:] = 0, 0
+    described[:, 22:], asked[:, 23] = 0, 0
+    asked[:, 22] = rng.uniform(0.2, 1, count)
     weight = rng.random(count).astype(np.float32)
     start = synthesis.places(pages, np.sort(rng.choice(np.flatnonzero(pages.allowed), count)))
     book = kernels.Book(
@@ -442,7 +443,7 @@ def plain_cost(level, pages, described, asked, weight, use, choice, at, coherenc
         other = described[pages.starts[page] + row * width + column]
         apart = ((described[pixel] - other)[:, :8] ** 2).sum(axis=1)
         seam = 0.3 + 0.7 * np.minimum(apart / full, 1)
-        cost = cost + coherence * seam * np.where(page == at.page, jump, 1)
+        cost = cost + coherence * asked[:, 22] * seam * np.where(page == at.page, jump, 1)
     return cost
 
 

@@ -6,7 +6,7 @@ from jaxtyping import Float
 from mistyle.surface.reading import StyleReading, read_style
 from mistyle.surface.settings import ResolvedSettings, SurfaceSettings
 
-FROM_PAINTING = ("levels", "detail", "palette", "stroke_coherence", "look_up", "borders", "crop")
+FROM_PAINTING = ("levels", "detail", "palette", "stroke_coherence", "modelling", "look_up", "borders", "crop")
 FLAT_SHARE = 0.2  # of the area in flat regions from which on a painting is wholly flat
 FEW_TONES = 2
 LINED = (0.6, 0.75)  # line-likeness at which a painting begins to be graphic, and at which it wholly is
@@ -14,7 +14,7 @@ RIGHT_ANGLED = (0.1, 0.3)  # the same for how rectilinear it is
 CLEAR = (0.25, 0.5)  # the same for the clarity of its unit
 GRAPHIC = 0.5  # from which on pieces are cut
 LARGE_UNIT = 0.2  # in long sides: a unit that five levels do not see
-COHERENCE = (0.08, 0.12)  # brushwork, graphic
+COHERENCE = (0.05, 0.1)  # brushwork, graphic
 DETAIL = (4.0, 3.0)  # modelled, flat
 PALETTE = (0.2, 0.05)  # brushwork, graphic
 
@@ -42,6 +42,7 @@ def from_painting(reading: StyleReading) -> dict[str, object]:
         "detail": between(DETAIL, flat(reading)),
         "palette": between(PALETTE, share),
         "stroke_coherence": between(COHERENCE, share),
+        "modelling": round(1 - share, 2),
         "look_up": "nearest" if min(reading.pixel_grid) > 0 else "bilinear",
         "borders": "cut" if share >= GRAPHIC else "blend",
         "crop": reading.border,

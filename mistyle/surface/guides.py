@@ -15,7 +15,7 @@ from mistyle.surface.creases import LEAST_RELIEF, bounded, cavity_of, creases
 from mistyle.surface.linefield import KEY
 from mistyle.surface.places import light, place_fields, without
 from mistyle.surface.samples import Level, Points, carry, drop, smooth, workers
-from mistyle.surface.settings import PlainSettings
+from mistyle.surface.settings import ResolvedSettings
 
 Occlusion = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Content = Callable[[np.ndarray, np.ndarray], np.ndarray]  # positions, normals -> lightness 0..1 of the asset's texture
@@ -23,6 +23,8 @@ ROTATIONS = 30
 LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, while colours are transported
 FIELD_POINTS = 6_000  # samples at most on which the places are found
 MIDDLE, SPREAD = 0.5, 0.22  # mean and standard deviation of the tone of places
+HOLLOW = 0.4  # tone that a full hollow loses and a full ridge gains by CONVEX: parts end at their creases
+CALM = 0.65  # share of the palette's spread of lightness between places: larger patches of light and dark hide a shape
 LEAST_DETAIL = 0.05  # difference of tone between two smoothings that counts as full detail
 CONVEX = 0.4  # how much of a ridge or bulge counts, against a hollow
 LEAST_CONTENT = 0.02  # standard deviation of a texture's lightness from which on it counts in full
@@ -43,23 +45,26 @@ def guides(
     levels: Sequence[Level],
     palette: Float[np.ndarray, "m 3"],
     occlusion: Occlusion,
-    settings: PlainSettings,
+    settings: ResolvedSettings,
     rng: np.random.Generator,
     content: Content | None = None,
 ) -> list[Guide]:
     """Guides of all levels, coarse to fine. `palette` is Lab/100 of the blurred painting, a few thousand colours.
 
     `content` is the lightness of a texture that the surface has already; `settings.keep_content` is its share in tone
-    and detail, `settings.form` that of sky light and openness.
+    and detail, `settings.form` that of sky light and openness, `settings.modelling` that of all hollows and bumps.
     """
     middle = max(len(levels) - 2, 0)
     base = levels[middle].points
     openness = smooth(levels[middle], occlusion(base.positions, base.normals).astype(np.float32), 1)
     fields = places(levels, base, openness)
-    tone = [carry(base, MIDDLE + SPREAD * fields[:, 0], level.points) for level in levels]
-    details = creases(levels)
+    lit, cavity = tones(levels, openness, settings.bake_light)
+    tone = [
+        carry(base, MIDDLE + SPREAD * fields[:, 0], level.points) - HOLLOW * hollow
+        for level, hollow in zip(levels, cavity, strict=True)
+    ]
+    details = mixed(creases(levels), detail(levels, tone, cavity), settings.modelling)
     if settings.form > 0:
-        lit, cavity = tones(levels, openness, settings.bake_light)
         tone = mixed(tone, lit, settings.form)
         details = mixed(details, detail(levels, lit, cavity), settings.form)
     if content is not None and settings.keep_content > 0:
@@ -67,6 +72,8 @@ def guides(
         tone, details = with_content(levels, tone, details, found, settings.keep_content)
     shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
     colour = colour_field(tone[middle], fields, shown, palette, rng)
+    typical = palette[:, 0].mean()
+    colour[:, 0] = typical + CALM * (colour[:, 0] - typical)
     return [
         Guide(carry(base, colour, level.points), wanted, level.directed)
         for level, wanted in zip(levels, details, strict=True)
@@ -81,10 +88,15 @@ def mixed(
 
 
 def places(levels: Sequence[Level], base: Points, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """`place_fields` at the points of `base`, found on the finest level that is small enough."""
+    """`place_fields` at the points of `base`, found on the finest level that is small enough.
+
+    The first, of lightness, grows upwards in the mean: heads and lids are light, and dark strokes draw their features.
+    """
     small = next((level for level in reversed(levels) if len(level.directed) <= FIELD_POINTS), levels[0])
     found = carry(small.points, place_fields(small, drop(base, openness, small.points)), base)
     rest = without(found, light(base.normals, openness))
+    if (rest[:, 0] * base.positions[:, 1]).sum() < 0:
+        rest[:, 0] = -rest[:, 0]
     return (rest / np.maximum(rest.std(axis=0), 1e-9)).astype(np.float32)
 
 

@@ -16,9 +16,10 @@ from mistyle.core.lanes import aligned
 
 TURNED = np.uint32(1 << 31)  # the bit of a table entry that says the neighbour's picture is upside down
 PAGES = 4  # the picture in its four quarter turns
-WIDTH = 24  # floats per style pixel: 16 patch components, 3 colour, 2 orientation, 1 band, 2 unused
+WIDTH = 24  # floats per style pixel: 16 patch components, 3 colour, 2 orientation, 1 band, 2 unused by pixels
 PATCH = 16
 LINEAR = 21  # how many of them enter the squared distance with weight one; the band follows at this index
+CLOSED = 22  # index at which a sample says what share of the price of leaving a stroke is due there, 0..1
 BORDER = 2  # half a patch: centres keep this far from a page's edge
 SIGMA = 1.6  # of the vote's Gaussian, in samples
 FOLLOW = (7, 11, 13, 17, 2, 10, 14, 22)  # table entries at distance 1 and 2 along the axes, whose place is continued
@@ -301,7 +302,8 @@ def search(
     i = dr.arange(dj.UInt, table.count)
     target = [dr.gather(dj.Array4f, wanted.descriptor, i * (WIDTH // 4) + k) for k in range(WIDTH // 4)]
     band_weight = dr.gather(dj.Float, wanted.band_weight, i)
-    coherence, variety = dr.gather(dj.Float, prices, dj.UInt(0)), dr.gather(dj.Float, prices, dj.UInt(1))
+    coherence = dr.gather(dj.Float, prices, dj.UInt(0)) * target[CLOSED // 4][CLOSED % 4]
+    variety = dr.gather(dj.Float, prices, dj.UInt(1))
     beside = [continued(dj, table, book, place, i * 25 + slot) for slot in BESIDE]
     seam = dr.gather(dj.Float, prices, dj.UInt(2))
     end = (

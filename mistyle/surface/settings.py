@@ -87,6 +87,7 @@ Levels = Annotated[int, Field(ge=2, le=8)]
 Detail = Annotated[float, Field(ge=0.0, le=16.0)]
 Palette = Annotated[float, Field(ge=0.0, le=8.0)]
 Coherence = Annotated[float, Field(ge=0.0, le=0.2)]
+Modelling = Annotated[float, Field(ge=0.0, le=1.0)]
 LookUp = Literal["nearest", "bilinear"]
 Borders = Literal["cut", "blend"]
 Share = Annotated[float, Field(ge=0.0, le=0.4)]
@@ -117,7 +118,12 @@ class SurfaceSettings(PlainSettings):
     stroke_coherence: Coherence | None = Field(
         default=None,
         description="price of leaving a stroke: higher copies larger pieces of the painting; unset: from the painting "
-        "(0.08 for brushwork, up to 0.12 for graphic ones)",
+        "(0.05 for brushwork, up to 0.1 for graphic ones)",
+    )
+    modelling: Modelling | None = Field(
+        default=None,
+        description="how much every hollow and bump asks for dark and light strokes, beside creases and ridges; unset: "
+        "from the painting (1 for brushwork, down to 0 for graphic ones)",
     )
     look_up: LookUp | None = Field(
         default=None,
@@ -142,6 +148,7 @@ class ResolvedSettings(PlainSettings):
     detail: Detail
     palette: Palette
     stroke_coherence: Coherence
+    modelling: Modelling
     look_up: LookUp
     borders: Borders
     crop: tuple[Share, Share, Share, Share]

@@ -7,12 +7,12 @@ place p (page, x, y) of the painting with the least
     |D_p - D_s|^2 + detail w(s) (band_p - relief std(band) d_s)^2 + variety use(p) / wanted use(p)
         + stroke_coherence * sum over 4 neighbours of seam [1 if on another page, else min(jump^2, 4) / 4]
 
-(about neighbours at which a copied piece has got too large, staying near costs instead: surface/pieces.py), where D
-joins 16 principal components of the patch (Lab / 100, over 5), the large-area colour (weights 1, 0.6, 0.6 times
-`palette`, five times that for paintings of two tones) and the stroke direction (`orientation`); d_s is the detail
-guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance in pixels from where the neighbour's picture would go on, and seam
-(0.3 to 1) how different the neighbour's picture, gone on with, and p look there: after the seam cost of graph-cut
-textures (Kwatra et al. 2003).
+(down to a fifth at creases and ridges, where a stroke may end; about neighbours at which a copied piece has got too
+large, staying near costs instead: surface/pieces.py), where D joins 16 principal components of the patch (Lab / 100,
+over 5), the large-area colour (weights 1, 0.6, 0.6 times `palette`, five times that for paintings of two tones) and the
+stroke direction (`orientation`); d_s is the detail guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance in pixels from
+where the neighbour's picture would go on, and seam (0.3 to 1) how different the neighbour's picture, gone on with, and
+p look there: after the seam cost of graph-cut textures (Kwatra et al. 2003).
 
 The search is deterministic: all places are tried for all samples on the coarse levels; on every level a sample tries
 to go on with its neighbours' pictures (coherent search, Ashikhmin 2001) and a fixed set of steps about its own place.
@@ -29,6 +29,7 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.mesh import Mesh
 from mistyle.surface import kernels, style
 from mistyle.surface.chosen import settled
+from mistyle.surface.creases import CREASE
 from mistyle.surface.glaze import glaze
 from mistyle.surface.guides import Content, Guide, Occlusion, guides
 from mistyle.surface.linefield import Course, directions, line_field
@@ -48,6 +49,7 @@ FINE_ROUNDS = 4  # on levels beyond the fifth
 SWEEPS = 3  # passes of the coherent search in each round
 ALL_PAIRS = 1.2e9  # sample-pixel pairs up to which all are tried, summed over the rounds of a level
 CHUNK_PAIRS = 8_000_000
+LOOSE = 0.8  # share of the price of leaving a stroke that is not due where the detail guide is at its strongest
 INITIAL_JITTER = 0.004
 CHROMA = 0.6
 TWO_TONES = 5.0  # how many times as much the large-area colour of a painting without middle tones counts
@@ -314,6 +316,7 @@ def described_guide(
     out[:, 16:19] = guide.colour * guide_scale[:3]
     out[:, 19] = guide.directed * guide_scale[3]
     out[:, 21] = guide.detail * np.float32(settings.relief * pages.band.std())
+    out[:, kernels.CLOSED] = 1 - LOOSE * np.minimum(np.abs(guide.detail) / -CREASE, 1)
     weight = urgency(guide.detail)
     # A scan that is bumpy all over would leave no stroke free: the more of it asks, the less each place may.
     load = max(float(weight.mean()), 1e-6)
