@@ -663,6 +663,12 @@ def test_a_real_pair_shows_palette_strokes_and_form():
     apart = round(float(distance[:, 1].mean()) / (solution.spacing / max(solution.scale)))
     step = np.abs(light[:, apart:] - light[:, :-apart]).mean()
     assert 0.5 < np.abs(colour[near[:, 1], 0] - colour[:, 0]).mean() / step < 2.0
-    # Form: lighter above than below.
+    # No light: as light above as below. Form: hollows are darker than ridges.
     up = solution.normals[:, 1]
-    assert colour[up > 0.5, 0].mean() > colour[up < -0.5, 0].mean() + 0.05
+    assert abs(colour[up > 0.5, 0].mean() - colour[up < -0.5, 0].mean()) < 0.08
+    around = KDTree(solution.positions).query(solution.positions, k=25)[1]
+    height = (
+        ((solution.positions[around] - solution.positions[:, None]) * solution.normals[:, None]).sum(axis=2).mean(1)
+    )
+    low, high = np.percentile(height, (10, 90))
+    assert colour[height > high, 0].mean() < colour[height < low, 0].mean() - 0.05

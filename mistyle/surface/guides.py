@@ -24,7 +24,7 @@ LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, while colours
 FIELD_POINTS = 6_000  # samples at most on which the places are found
 MIDDLE, SPREAD = 0.5, 0.22  # mean and standard deviation of the tone of places
 HOLLOW = 0.4  # tone that a full hollow loses and a full ridge gains by CONVEX: parts end at their creases
-CALM = 0.65  # share of the palette's spread of lightness between places: larger patches of light and dark hide a shape
+CALM = 0.65  # share of the palette's spread of lightness between places, where the shape alone chooses them
 LEAST_DETAIL = 0.05  # difference of tone between two smoothings that counts as full detail
 CONVEX = 0.4  # how much of a ridge or bulge counts, against a hollow
 LEAST_CONTENT = 0.02  # standard deviation of a texture's lightness from which on it counts in full
@@ -67,13 +67,15 @@ def guides(
     if settings.form > 0:
         tone = mixed(tone, lit, settings.form)
         details = mixed(details, detail(levels, lit, cavity), settings.form)
+    kept = 0.0
     if content is not None and settings.keep_content > 0:
         found = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
-        tone, details = with_content(levels, tone, details, found, settings.keep_content)
+        kept = settings.keep_content * min(float(found[-1].std()) / LEAST_CONTENT, 1.0)
+        tone, details = with_content(levels, tone, details, found, kept)
     shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
     colour = colour_field(tone[middle], fields, shown, palette, rng)
-    typical = palette[:, 0].mean()
-    colour[:, 0] = typical + CALM * (colour[:, 0] - typical)
+    typical, spread = palette[:, 0].mean(), CALM + (1 - CALM) * max(settings.form, kept)
+    colour[:, 0] = typical + spread * (colour[:, 0] - typical)
     return [
         Guide(carry(base, colour, level.points), wanted, level.directed)
         for level, wanted in zip(levels, details, strict=True)
@@ -135,13 +137,12 @@ def with_content(
     tone: Sequence[Float[np.ndarray, " _"]],
     details: Sequence[Float[np.ndarray, " _"]],
     content: Sequence[Float[np.ndarray, " _"]],
-    keep: float,
+    share: float,
 ) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
-    """Tone and details with the share `keep` given over to the lightness of the asset's own texture, at its contrast.
+    """Tone and details with that share given over to the lightness of the asset's own texture, at its contrast.
 
-    The texture's lightness is brought to the tone's mean; a texture of one colour says nothing and changes nothing.
+    The texture's lightness is brought to the tone's mean.
     """
-    share = keep * min(float(content[-1].std()) / LEAST_CONTENT, 1.0)
     shift = np.float32(tone[-1].mean() - content[-1].mean())
     own = [lightness + shift for lightness in content]
     return mixed(tone, own, share), mixed(details, detail(levels, own, [0 * c for c in own]), share)
