@@ -14,7 +14,7 @@ RIGHT_ANGLED = (0.1, 0.3)  # the same for how rectilinear it is
 CLEAR = (0.25, 0.5)  # the same for the clarity of its unit
 GRAPHIC = 0.5  # from which on pieces are cut
 LARGE_UNIT = 0.2  # in long sides: a unit that five levels do not see
-COHERENCE = (0.05, 0.1)  # brushwork, graphic
+COHERENCE = (0.08, 0.1)  # brushwork, graphic
 DETAIL = (4.0, 3.0)  # modelled, flat
 PALETTE = (0.2, 0.05)  # brushwork, graphic
 

@@ -118,7 +118,7 @@ class SurfaceSettings(PlainSettings):
     stroke_coherence: Coherence | None = Field(
         default=None,
         description="price of leaving a stroke: higher copies larger pieces of the painting; unset: from the painting "
-        "(0.05 for brushwork, up to 0.1 for graphic ones)",
+        "(0.08 for brushwork, up to 0.1 for graphic ones)",
     )
     modelling: Modelling | None = Field(
         default=None,
