@@ -24,6 +24,12 @@ from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
 from mistyle.stages.fit_judge import undone_where
 
+SAME = "Under the same studio light"
+UNFITTED = (
+    "The painting's own relief and gloss. The views were drawn from these very maps, so a fit to the views has nothing "
+    "to add, and none ran: --refine all runs it."
+)
+
 
 def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
     """Draw the pictures and write `index.html` and `overview.png` (mesh, style, result) into `folder`; for a full
@@ -32,9 +38,9 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
 
     settings = made.job.settings
     full = settings.report.detail == "full"
-    looks = (made.repaired.maps, made.atlas.start, made.baked.maps)
+    looks = (made.repaired.maps, made.atlas.start, *(() if settings.keeps_painting else (made.baked.maps,)))
     drawn = draw(made.asset, looks, settings, lambda done: report(0.7 * done), turning=2, path_traced=full)
-    after, bare, before = drawn.close
+    after, bare, *before = drawn.close
     best = after if drawn.traced is None else drawn.traced
     if full:
         write_turn(folder / "turntable", drawn.turns[0])
@@ -52,7 +58,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
         notes=tuple(Note(text) for text in progress.notes),
-        steps=steps(made, Shot(before, "as baked"), Shot(after, "after fit and repair")),
+        steps=steps(made, [Pair(Shot(b, "as baked"), Shot(after, "after fit and repair"), SAME) for b in before]),
         maps=map_sets(made),
         model=page_model(made.folder / f"{made.job.name}.glb"),
         timings=tuple(Timing(named[k], v, k in progress.reused) for k, v in progress.seconds.items()),
@@ -103,8 +109,8 @@ def facts(made: Any) -> tuple[tuple[str, str], ...]:
     )
 
 
-def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
-    """The stages in the order of the paper."""
+def steps(made: Any, refined: Sequence[Pair]) -> tuple[Step, ...]:
+    """The stages in the order of the paper; `refined` are pictures before and after fit and repair."""
     views = Step(
         "Views of the mesh",
         "Every camera of the rig, with the mesh's own material.",
@@ -136,12 +142,20 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         ),
         columns=3,
     )
+    return (views, stylized, baked, *refining(made, refined, longest))
+
+
+def refining(made: Any, pairs: Sequence[Pair], longest: int) -> tuple[Step, ...]:
+    """Fit and repair, or why there was none."""
+    if made.job.settings.keeps_painting:
+        return (Step("Normal and roughness", UNFITTED, "4.2"),)
+    parts = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True))
     fit = Step(
         "Differentiable fit",
         "Normal and roughness under directional light, then albedo under ambient light. "
         + (undone_where() if made.job.settings.fit.judge else "Every phase is kept: fit.judge is off."),
         "4.2",
-        pairs=(Pair(before, after, "Under the same studio light"),),
+        pairs=tuple(pairs),
         facts=fit_facts(made.fit),
     )
     repair = Step(
@@ -155,7 +169,7 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         ),
         columns=3,
     )
-    return (views, stylized, baked, fit, repair)
+    return (fit, repair)
 
 
 def angle(camera: Camera) -> str:
