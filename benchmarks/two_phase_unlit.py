@@ -25,9 +25,12 @@ MESHES = {"spot": "spot.obj", "bunny": "stanford-bunny.obj", "teapot": "teapot.o
 STYLES = ("starry_night", "great_wave", "mosaic_ducks", "woodcut_head")
 # What is set for the one with the fit, and for the one without.
 DESIGNS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
-    "phase1": ({}, {"refine": "albedo"}),
-    "phase2": ({"refine": "albedo"}, {"refine": "off"}),
-    "both": ({}, {"refine": "off"}),
+    "phase1": ({"fit": {"refine": "all"}}, {"fit": {"refine": "albedo"}}),
+    "phase2": ({"fit": {"refine": "albedo"}}, {"fit": {"refine": "off"}}),
+    "both": ({"fit": {"refine": "all"}}, {"fit": {"refine": "off"}}),
+    # Twice the relief, to begin with and to aim at.
+    "bold": ({"fit": {"refine": "all", "relief": 0.3}, "coat": {"height": 0.3}}, {"fit": {"refine": "off"}}),
+    "bold_unfitted": ({"fit": {"refine": "off"}, "coat": {"height": 0.3}}, {"fit": {"refine": "off"}}),
 }
 SMALL, LARGE = 252, 378  # pixels of a picture's side, under an environment and under the key light
 SPP = {"path": 32, "direct": 16}  # samples a pixel under either
@@ -69,11 +72,11 @@ def silent(done: float) -> None:
     pass
 
 
-def settings_of(preset: str, fit: Mapping[str, Any]) -> Any:
-    """A preset's settings with some of the fit's."""
+def settings_of(preset: str, change: Mapping[str, Any]) -> Any:
+    """A preset's settings with some of them changed."""
     from mistyle.run.settings import PRESETS, Settings, merge
 
-    return Settings.model_validate(merge(PRESETS[preset], {"fit": dict(fit)}))
+    return Settings.model_validate(merge(PRESETS[preset], change))
 
 
 def paint(mesh: str, style: str, preset: str) -> Painted:
@@ -96,12 +99,12 @@ def paint(mesh: str, style: str, preset: str) -> Painted:
     return Painted(mesh, style, chosen, asset, atlas, coats, views, picture)
 
 
-def finish(painted: Painted, preset: str, fit: Mapping[str, Any]) -> Finished:
+def finish(painted: Painted, preset: str, change: Mapping[str, Any]) -> Finished:
     """Bake, fit and repair with a design's settings."""
     from mistyle.run import painting, pipeline
     from mistyle.stages.inpaint import struggle_mask
 
-    s = settings_of(preset, fit)
+    s = settings_of(preset, change)
     baked = painting.bake(painted.asset, painted.coats, painted.atlas, painted.views, s, silent)
     stylized = painting.unlit_views(painted.asset, baked.maps, painted.views, silent)
     took: dict[str, float] = {}
@@ -192,10 +195,10 @@ def sheets(chosen: argparse.Namespace) -> dict[str, float]:
         known: dict[str, tuple[Finished, list[np.ndarray]]] = {}
         for design in chosen.designs:
             ends = []
-            for fit in DESIGNS[design]:
-                name = json.dumps(fit, sort_keys=True)
+            for change in DESIGNS[design]:
+                name = json.dumps(change, sort_keys=True)
                 if name not in known:
-                    made = finish(painted, chosen.preset, fit)
+                    made = finish(painted, chosen.preset, change)
                     known[name] = made, pictures(painted.asset, made.maps, FRONT[mesh])
                 ends.append(known[name])
             (fitted, after), (_, before) = ends
@@ -244,7 +247,7 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     )
     made.add_argument("verb", choices=("sheets", "score"))
     for name, known in (("meshes", tuple(MESHES)), ("styles", STYLES), ("designs", tuple(DESIGNS))):
-        made.add_argument(f"--{name}", nargs="+", choices=known, default=known)
+        made.add_argument(f"--{name}", nargs="+", choices=known, default=known[:1] if name == "designs" else known)
     made.add_argument("--preset", choices=("draft", "standard", "demo"), default="draft")
     made.add_argument("--out", type=Path, default=Path("unlit"), metavar="DIR", help="sheets: a folder for each design")
     made.add_argument("--seed", type=int, default=0, help="of the shuffle")
