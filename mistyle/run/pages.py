@@ -22,7 +22,7 @@ from mistyle.run.stages import FIRST, RETOUCH, STAGES
 from mistyle.run.style_look import look_facts
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
-from mistyle.stages.fit_judge import undone_where
+from mistyle.stages.fit_judge import TOLERANCE, undone_where, worse
 
 SAME = "Under the same studio light"
 UNFITTED = (
@@ -207,13 +207,23 @@ def mask_over(mask: np.ndarray, maps: Maps, texels: Texels, longest: int) -> np.
 
 
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
-    """Each phase: kept or undone, and the figures that decided."""
-    kept = [(f"{phase}", "kept" if good else "undone: it made a figure worse") for phase, good in fit.kept.items()]
+    """Each phase: kept (and what got worse all the same) or undone, and the figures that decided."""
+    kept = [
+        (phase, _kept(fit, phase) if good else "undone: it made a figure worse") for phase, good in fit.kept.items()
+    ]
     figures = []
     for name, (before, after) in fit.figures.items():
         undone = "" if fit.kept[name.partition(".")[0]] else f" (undone: the result has {before:.4g})"
         figures.append((name, f"{before:.4g} → {after:.4g}{undone}"))
     return (*kept, *figures)
+
+
+def _kept(fit: Any, phase: str) -> str:
+    pairs = {name.partition(".")[2]: pair for name, pair in fit.figures.items() if name.startswith(f"{phase}.")}
+    if set(pairs) != set(TOLERANCE):
+        return "kept, not judged"
+    slipped = worse(*({name: pair[k] for name, pair in pairs.items()} for k in (0, 1)), times=0.0)
+    return f"kept; worse within the tolerance: {', '.join(slipped)}" if slipped else "kept; no figure got worse"
 
 
 def map_shots(maps: Maps, longest: int) -> tuple[Shot, ...]:
