@@ -211,7 +211,7 @@ def test_phase_1_goes_on_from_a_given_relief_and_leaves_it_where_it_is_undone(sc
     tilt[..., 0], tilt[..., 2] = 0.3, np.sqrt(1 - 0.09)
     raised = replace(maps, normal=tilt, roughness=np.full_like(maps.roughness, 0.4))
     from_flat, from_relief = (
-        two_phase(mesh, [maps], views, [texels], only, 0, begin=begin).maps[0] for begin in (None, [raised])
+        two_phase(mesh, [maps], views, [texels], only, 0, begin=begin).maps[0] for begin in ((), [raised])
     )
     covered = texels.covered
     assert np.abs(from_flat.normal[covered, 0]).mean() < 0.06

@@ -240,7 +240,7 @@ def fit(
         fit_settings(settings),
         settings.seed,
         report,
-        begin=baked.begin or None,
+        begin=baked.begin,
         style=opaque(style) if settings.fit.tv_from == "style" else None,
         unlit=unlit(stylized, baked.gains) if baked.gains else None,
     )

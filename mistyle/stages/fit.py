@@ -83,7 +83,7 @@ def two_phase(
     *,
     phase1_lights: Lights | None = None,
     only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
-    begin: Sequence[Maps] | None = None,
+    begin: Sequence[Maps] = (),
     style: Float[np.ndarray, "sh sw 3"] | None = None,
     unlit: Sequence[View] | None = None,
 ) -> Fit:
@@ -96,7 +96,7 @@ def two_phase(
     light was taken out of them. The same inputs, settings, seed and thread count give the same bytes. A gradient that
     is not a number ends its phase at the last good state, and a note says where.
     """
-    first = tuple(maps if begin is None else begin)
+    first = tuple(begin or maps)
     if settings.metallic == "zero":
         maps, first = ([replace(m, metallic=np.zeros_like(m.metallic)) for m in each] for each in (maps, first))
     nothing = tuple(np.zeros(m.roughness.shape, np.float32) for m in maps)
@@ -106,8 +106,9 @@ def two_phase(
     world = _world(mesh, targets, settings)
     shrink = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
     table = fit_table.build(first, texels, shrink, only)
-    if begin is not None:
-        table.plain = fit_table.build(maps, texels, shrink, only).values
+    if begin:
+        unpainted = fit_table.build(maps, texels, shrink, only).values
+        table.plain = table.start | {name: unpainted[name] for name in ("tilt", "roughness")}
     phases = _phases(settings, phase1_lights or lights("phase1"), targets, style, unlit is not None)
     judge = fit_judge.bench(world.traced, world.tangents, targets) if settings.judge else None
     total, done = max(sum(phase.iterations for phase in phases), 1), 0
