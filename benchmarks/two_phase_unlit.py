@@ -4,7 +4,8 @@ sheets   paints STYLES on MESHES, once each, and finishes every painting in two 
          and `key.json` into --out. A sheet shows A on the left and B on the right: turned under an environment, the
          environment turned about it, and a hard key light from four sides. Which way is A is drawn by lot (--seed).
 score    compares answers, {"NN": {viewer: "A", "B" or "="}}, with the key: `unlit.preferred` is the share of the
-         answers that chose the fit (a "=" counts half), `unlit.preferred.MESH` and `.STYLE` the same of a part.
+         answers that chose the fit (a "=" counts half), `unlit.preferred.MESH` and `.STYLE` the same of a part. The
+         key and answers in this folder are of 9824def's drafts, phase 1 against the painter's maps, phase 2 in both.
 """
 
 import argparse
@@ -21,6 +22,8 @@ from benchmarks.look_light import GROUND, close_camera, sky
 from benchmarks.look_paint import DATA
 from benchmarks.look_sheets import lettered, write
 
+HERE = Path(__file__).resolve().parent
+KEY_FILE, ANSWERS = HERE / "two_phase_unlit_key.json", HERE / "two_phase_unlit_answers.json"
 MESHES = {"spot": "spot.obj", "bunny": "stanford-bunny.obj", "teapot": "teapot.obj"}
 STYLES = ("starry_night", "great_wave", "mosaic_ducks", "woodcut_head")
 # What is set for the one with the fit, and for the one without.
@@ -251,8 +254,8 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     made.add_argument("--preset", choices=("draft", "standard", "demo"), default="draft")
     made.add_argument("--out", type=Path, default=Path("unlit"), metavar="DIR", help="sheets: a folder for each design")
     made.add_argument("--seed", type=int, default=0, help="of the shuffle")
-    made.add_argument("--key", type=Path, metavar="FILE", help="score")
-    made.add_argument("--answers", type=Path, metavar="FILE", help="score")
+    made.add_argument("--key", type=Path, default=KEY_FILE, metavar="FILE", help="score (default: in this folder)")
+    made.add_argument("--answers", type=Path, default=ANSWERS, metavar="FILE", help="score (default: in this folder)")
     made.add_argument("--json", type=Path, metavar="FILE")
     return made.parse_args(argv)
 

@@ -26,6 +26,11 @@ def test_the_share_that_chose_the_fit_is_counted_by_the_key(tmp_path):
     assert figures["unlit.preferred.spot"] == figures["unlit.preferred"]
 
 
+def test_the_answers_that_lie_here_belong_to_the_key_beside_them():
+    figures = unlit.score(unlit.options(["score"]))
+    assert figures["answers"] == 36 and 0 <= figures["unlit.preferred"] < 0.5, "the default follows from it"
+
+
 @pytest.mark.parametrize(("answers", "said"), [({"03": {"x": "A"}}, "sheet '03'"), ({"01": {"x": "C"}}, "found 'C'")])
 def test_answers_that_belong_to_no_sheet_are_refused(tmp_path, answers, said):
     with pytest.raises(SystemExit, match=said):
