@@ -74,7 +74,7 @@ def main() -> None:
     targets = views_of(asset, flat, resolution)
     figures: dict[str, float] = {}
     results: dict[str, Any] = {}
-    for name, begin in (("flat", None), ("painted", begun)):
+    for name, begin in (("flat", ()), ("painted", begun)):
         results[name] = timed(
             figures,
             f"{name}.seconds",

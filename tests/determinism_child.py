@@ -23,7 +23,7 @@ SETTINGS = {
     "draw": {"spp": 2, "paper_files": True},
     "surface": {"samples": 1500},
     "atlas": {"size": 96, "padding": 4},
-    "fit": {"iterations1": 4, "iterations2": 4, "crops": 2, "crop_size": 64},
+    "fit": {"refine": "all", "iterations1": 4, "iterations2": 4, "crops": 2, "crop_size": 64},
 }
 
 

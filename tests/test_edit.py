@@ -27,7 +27,7 @@ TINY = {
     "draw": {"spp": 1},
     "surface": {"samples": 1000},
     "atlas": {"size": 128, "padding": 4},
-    "fit": {"iterations1": 1, "iterations2": 1, "crops": 1, "crop_size": 32, "judge": False},
+    "fit": {"refine": "all", "iterations1": 1, "iterations2": 1, "crops": 1, "crop_size": 32, "judge": False},
     "report": {"frames": 4, "resolution": 64, "spp": 1},
     "threads": 2,
 }

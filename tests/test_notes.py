@@ -8,6 +8,7 @@ from verbs import VERBS
 
 from mistyle.run import summary
 from mistyle.run.cli import main
+from mistyle.run.pages import fit_facts
 from mistyle.run.progress import Progress, grouped
 from mistyle.stages.fit_judge import TOLERANCE, undone_where, worse
 
@@ -72,3 +73,12 @@ def test_the_sentence_about_undone_phases_states_the_tolerances_that_decide():
         part = next(p for p in sentence.replace(" or ", ", ").split(", ") if name in p)
         assert all(f"{value:.0%}" in part for value in [share] if value)
         assert all(f"{value:g}" in part for value in [absolute] if value)
+
+
+def test_a_kept_phase_says_what_got_worse_within_the_tolerance():
+    figures = {"detail": (0.90, 0.88), "style": (2.0, 1.5), "views": (0.5, 0.5)}
+    judged = SimpleNamespace(kept={"phase1": True}, figures={f"phase1.{name}": pair for name, pair in figures.items()})
+    assert dict(fit_facts(judged))["phase1"] == "kept; worse within the tolerance: detail"
+    judged.figures["phase1.detail"] = (0.88, 0.90)
+    assert dict(fit_facts(judged))["phase1"] == "kept; no figure got worse"
+    assert dict(fit_facts(SimpleNamespace(kept={"phase1": True}, figures={})))["phase1"] == "kept, not judged"

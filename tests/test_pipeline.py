@@ -3,6 +3,7 @@ nothing is redone without need."""
 
 import hashlib
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,14 +16,14 @@ from mistyle.core.errors import InputRefused, Stopped, UsageError
 from mistyle.run import painting, pipeline
 from mistyle.run.progress import Progress
 from mistyle.run.settings import resolve
-from mistyle.run.stages import FIRST, STAGES, Job
+from mistyle.run.stages import FIRST, REFINING, STAGES, Job
 
 TINY = {
     "rig": {"resolution": 128},
     "draw": {"spp": 2},
     "surface": {"samples": 3000},
     "atlas": {"size": 128, "padding": 4},
-    "fit": {"iterations1": 4, "iterations2": 4, "crops": 1, "crop_size": 64},
+    "fit": {"refine": "all", "iterations1": 4, "iterations2": 4, "crops": 1, "crop_size": 64},
     "report": {"frames": 4, "resolution": 64, "spp": 2},
     "threads": 2,
 }
@@ -109,6 +110,27 @@ def test_a_stopped_run_resumes_to_the_same_bytes(inputs, whole, tmp_path, monkey
     pipeline.stylize(job(inputs, tmp_path), progress)
     assert progress.reused, "what was finished before is taken over"
     assert hashes(tmp_path) == hashes(whole)
+
+
+def test_a_painted_surface_is_final_by_default(inputs, tmp_path):
+    """No fit, no masks, no repair, no asset that another replaces; --from goes on behind what was left out."""
+    from mistyle.files.records import load_record
+
+    made, progress = job(inputs, tmp_path), Progress(quiet=True)
+    unfitted = made.settings.model_copy(update={"fit": made.settings.fit.model_copy(update={"refine": "auto"})})
+    made = replace(made, settings=unfitted)
+    summary = pipeline.stylize(made, progress)
+    assert list(progress.seconds) == [name for name in STAGES if name not in REFINING]
+    assert summary["figures"]["repaired_share"] == 0 and not (tmp_path / "masks").exists()
+    baked = load_record(tmp_path / "work" / "bake" / "record").maps[0]
+    covered = load_record(tmp_path / "work" / "texels" / "record").texels[0].covered
+    assert np.abs(baked.normal[covered, :2]).mean() > 0.02 and baked.roughness[covered].std() > 0.005
+    normal = np.asarray(Image.open(tmp_path / "asset" / "textures" / "bell_normal.png"), float)[..., :2] / 255 * 2 - 1
+    assert np.abs(normal[covered] - baked.normal[covered, :2]).mean() < 0.02
+    assert "--refine all" in (tmp_path / "report" / "index.html").read_text()
+    again = Progress(quiet=True)
+    pipeline.stylize(replace(made, redo_from="repair"), again)
+    assert "bake" in again.reused and "asset" not in again.reused
 
 
 def test_a_second_run_takes_everything_over_and_from_redoes(inputs, whole):

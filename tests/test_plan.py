@@ -118,6 +118,11 @@ def test_the_command_line_plans_and_refuses(tmp_path, capsys):
     assert main(["demo", "-o", str(tmp_path / "out"), "--dry-run", "--json"]) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["memory_gb"] == pytest.approx(max(told["peaks_gb"].values()), abs=0.01) and not told["in_files"]
+    seconds = {row["stage"]: row["seconds"] for row in told["stages"]}
+    assert seconds["fit"] == seconds["masks"] == seconds["repair"] == 0 < seconds["surface"]
+    assert main(["demo", "-o", str(tmp_path / "out"), "--dry-run", "--json", "--set", "fit.refine=all"]) == 0
+    fitted = {row["stage"]: row["seconds"] for row in json.loads(capsys.readouterr().out)["stages"]}
+    assert fitted["fit"] > 5 and fitted["repair"] > 0
     assert main(["demo", "-o", str(tmp_path / "out"), "--memory", "300M"]) == 2
     assert "--memory 0.3G: the job needs" in capsys.readouterr().err
     assert not (tmp_path / "out").exists(), "refused before anything is made"

@@ -79,3 +79,22 @@ def test_views_take_the_samples_that_their_use_needs():
 
     assert (DrawSettings().samples(read=False), DrawSettings().samples()) == (1, 8)
     assert (DrawSettings(spp=3).samples(read=False), DrawSettings(spp=3).samples()) == (3, 3)
+
+
+@pytest.mark.parametrize(
+    ("preset", "change", "refined", "kept"),
+    [
+        ("standard", {}, "off", True),
+        ("draft", {"stylizer": "embedded-view"}, "all", False),
+        ("draft", {"stylizer": "diffusion"}, "all", False),
+        ("draft", {"inpainter": "paint3d"}, "all", False),
+        ("draft", {"fit": {"metallic": "fit"}}, "all", False),
+        ("draft", {"fit": {"refine": "albedo"}}, "albedo", False),
+        ("fine", {}, "all", False),
+        ("fine", {"fit": {"refine": "off"}}, "off", True),
+        ("paper", {}, "all", False),
+    ],
+)
+def test_the_fit_is_off_where_its_views_are_drawn_from_what_it_would_fit(preset, change, refined, kept):
+    settings = resolve(preset, None, change, {})
+    assert (settings.refined, settings.keeps_painting) == (refined, kept)

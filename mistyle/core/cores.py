@@ -1,6 +1,7 @@
 """How many processor cores this process may use, and how many it does."""
 
 import os
+import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
@@ -21,12 +22,14 @@ def use_threads(count: int) -> None:
     # torch waits for its threads by spinning, for milliseconds after each operation, on cores that Dr.Jit's threads and
     # other jobs need: most of a fit's processor time. Its OpenMP reads this when it is loaded; a user's choice stays.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    # So is its number of threads; loading torch for that alone takes seconds that a job without a fit does not have.
+    os.environ["OMP_NUM_THREADS"] = str(count)
     import cv2
     import scipy.linalg  # noqa: F401  (loads SciPy's own BLAS, which could not be told later)
-    import torch
     from threadpoolctl import threadpool_limits
 
-    torch.set_num_threads(count)
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(count)
     cv2.setNumThreads(count)
     threadpool_limits(limits=count, user_api="blas")
 

@@ -178,7 +178,7 @@ def view_pixels(settings: Settings) -> int:
 
 def counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> Counts:
     """The counts of `stylize` for a mesh of so many faces, texture sets and bytes of own maps."""
-    crop = 0 if settings.fit.refine == "off" else settings.fit.crops * settings.fit.crop_size**2
+    crop = 0 if settings.refined == "off" else settings.fit.crops * settings.fit.crop_size**2
     return Counts(
         sets * settings.atlas.size**2,
         view_pixels(settings),

@@ -126,7 +126,9 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     add_paint_options(verb)
     add_generative_options(verb)
     verb.add_argument(
-        "--refine", choices=["off", "normal-roughness", "all"], help="which maps the differentiable fit may change"
+        "--refine",
+        choices=["auto", "off", "normal-roughness", "albedo", "all"],
+        help="which maps the differentiable fit may change (auto: none that the embedded stylizer painted)",
     )
     verb.add_argument("--metallic", choices=["keep", "zero", "fit"], help="what becomes of the asset's own metalness")
     verb.add_argument(

@@ -30,12 +30,14 @@ def named(settings: Settings, path: Path | None) -> Path | None:
 
 
 def fit_settings(settings: Settings) -> FitSettings:
-    """The fit's settings with what the rest of the job decides: where the features lie, and how the views are
-    painted."""
+    """The fit's settings with what the rest of the job decides: where the features lie, how the views are painted, and
+    which maps may change."""
     chosen, painted = settings.fit, settings.fit.painted
     if painted == "auto":
         painted = "with-light" if settings.stylizer == "diffusion" else "without-light"
-    return chosen.model_copy(update={"features": named(settings, chosen.features), "painted": painted})
+    return chosen.model_copy(
+        update={"features": named(settings, chosen.features), "painted": painted, "refine": settings.refined}
+    )
 
 
 def check(settings: Settings, say: Callable[[str], None]) -> None:

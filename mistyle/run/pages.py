@@ -22,7 +22,13 @@ from mistyle.run.stages import FIRST, RETOUCH, STAGES
 from mistyle.run.style_look import look_facts
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
-from mistyle.stages.fit_judge import undone_where
+from mistyle.stages.fit_judge import TOLERANCE, undone_where, worse
+
+SAME = "Under the same studio light"
+UNFITTED = (
+    "The painting's own relief and gloss. The views were drawn from these very maps, so a fit to the views has nothing "
+    "to add, and none ran: --refine all runs it."
+)
 
 
 def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
@@ -32,9 +38,9 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
 
     settings = made.job.settings
     full = settings.report.detail == "full"
-    looks = (made.repaired.maps, made.atlas.start, made.baked.maps)
+    looks = (made.repaired.maps, made.atlas.start, *(() if settings.keeps_painting else (made.baked.maps,)))
     drawn = draw(made.asset, looks, settings, lambda done: report(0.7 * done), turning=2, path_traced=full)
-    after, bare, before = drawn.close
+    after, bare, *before = drawn.close
     best = after if drawn.traced is None else drawn.traced
     if full:
         write_turn(folder / "turntable", drawn.turns[0])
@@ -52,7 +58,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
         notes=tuple(Note(text) for text in progress.notes),
-        steps=steps(made, Shot(before, "as baked"), Shot(after, "after fit and repair")),
+        steps=steps(made, [Pair(Shot(b, "as baked"), Shot(after, "after fit and repair"), SAME) for b in before]),
         maps=map_sets(made),
         model=page_model(made.folder / f"{made.job.name}.glb"),
         timings=tuple(Timing(named[k], v, k in progress.reused) for k, v in progress.seconds.items()),
@@ -103,8 +109,8 @@ def facts(made: Any) -> tuple[tuple[str, str], ...]:
     )
 
 
-def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
-    """The stages in the order of the paper."""
+def steps(made: Any, refined: Sequence[Pair]) -> tuple[Step, ...]:
+    """The stages in the order of the paper; `refined` are pictures before and after fit and repair."""
     views = Step(
         "Views of the mesh",
         "Every camera of the rig, with the mesh's own material.",
@@ -136,12 +142,20 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         ),
         columns=3,
     )
+    return (views, stylized, baked, *refining(made, refined, longest))
+
+
+def refining(made: Any, pairs: Sequence[Pair], longest: int) -> tuple[Step, ...]:
+    """Fit and repair, or why there was none."""
+    if made.job.settings.keeps_painting:
+        return (Step("Normal and roughness", UNFITTED, "4.2"),)
+    parts = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True))
     fit = Step(
         "Differentiable fit",
         "Normal and roughness under directional light, then albedo under ambient light. "
         + (undone_where() if made.job.settings.fit.judge else "Every phase is kept: fit.judge is off."),
         "4.2",
-        pairs=(Pair(before, after, "Under the same studio light"),),
+        pairs=tuple(pairs),
         facts=fit_facts(made.fit),
     )
     repair = Step(
@@ -155,7 +169,7 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         ),
         columns=3,
     )
-    return (views, stylized, baked, fit, repair)
+    return (fit, repair)
 
 
 def angle(camera: Camera) -> str:
@@ -193,13 +207,23 @@ def mask_over(mask: np.ndarray, maps: Maps, texels: Texels, longest: int) -> np.
 
 
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
-    """Each phase: kept or undone, and the figures that decided."""
-    kept = [(f"{phase}", "kept" if good else "undone: it made a figure worse") for phase, good in fit.kept.items()]
+    """Each phase: kept (and what got worse all the same) or undone, and the figures that decided."""
+    kept = [
+        (phase, _kept(fit, phase) if good else "undone: it made a figure worse") for phase, good in fit.kept.items()
+    ]
     figures = []
     for name, (before, after) in fit.figures.items():
         undone = "" if fit.kept[name.partition(".")[0]] else f" (undone: the result has {before:.4g})"
         figures.append((name, f"{before:.4g} → {after:.4g}{undone}"))
     return (*kept, *figures)
+
+
+def _kept(fit: Any, phase: str) -> str:
+    pairs = {name.partition(".")[2]: pair for name, pair in fit.figures.items() if name.startswith(f"{phase}.")}
+    if set(pairs) != set(TOLERANCE):
+        return "kept, not judged"
+    slipped = worse(*({name: pair[k] for name, pair in pairs.items()} for k in (0, 1)), times=0.0)
+    return f"kept; worse within the tolerance: {', '.join(slipped)}" if slipped else "kept; no figure got worse"
 
 
 def map_shots(maps: Maps, longest: int) -> tuple[Shot, ...]:

@@ -103,16 +103,13 @@ def bake(asset: Asset, coats: Coats, atlas: Atlas, views: Sequence[View], settin
     for part, texels in enumerate(atlas.texels):
         seen.append(accepted(views, texels, settings.bake, mesh=asset.mesh)[1].reshape(texels.covered.shape))
         report((part + 1) / len(atlas.texels))
-    if settings.fit.refine == "off":
+    if settings.refined in PAINTERS:
         return Baked(tuple(with_relief), tuple(seen))
     return Baked(tuple(maps), tuple(seen), tuple(with_relief))
 
 
-# Slope of the painting's relief, and share of its gloss: in maps that nothing refines, and where the fit begins.
-HEIGHT = 0.15
-
-
-FINAL_GLOSS, FIRST_GLOSS = 1.0, 0.5
+PAINTERS = ("off", "albedo")  # what may be refined where normal and roughness stay the painter's
+HEIGHT, GLOSS = 0.15, 1.0  # slope of the painting's relief in the normal map, and share of its gloss in the roughness
 LOOKED_UP = 2**20  # texels whose colour is looked up at one time
 
 
@@ -148,9 +145,8 @@ def raised(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settin
     from mistyle.core.image import nearest_fill_in_place
     from mistyle.stages.coat import lay_relief, painted_mask, protected
 
-    full = FINAL_GLOSS if settings.fit.refine == "off" else FIRST_GLOSS
     height = HEIGHT if settings.coat.height is None else settings.coat.height
-    gloss = full if settings.coat.gloss is None else settings.coat.gloss
+    gloss = GLOSS if settings.coat.gloss is None else settings.coat.gloss
     if height == gloss == 0:
         return list(maps)
     result = []

@@ -27,7 +27,7 @@ from mistyle.run.made import Atlas, Baked, Repaired
 from mistyle.run.painting import bake, check_coat, coat_files, stylized_stage, surface_stage, unlit_views
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
-from mistyle.run.stages import STAGES, Job, Run, claim_run
+from mistyle.run.stages import REFINING, STAGES, Job, Run, claim_run
 from mistyle.run.start import draw, mesh_stage, start_engines, texels_stage
 from mistyle.run.style_look import StyleLook, style_looks
 from mistyle.stages.light_left import light_left
@@ -95,7 +95,7 @@ def inputs_of(job: Job) -> list[Path]:
 
 
 def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> Made:
-    s, seed = run.job.settings, run.job.settings.seed
+    s = run.job.settings
     asset = mesh_stage(run, files)
     look_again(*size_of(asset))
     atlas = texels_stage(run, asset)
@@ -106,6 +106,37 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     if "stylized" in run.edited:
         baked, stylized = retouched_stage(run, asset, atlas, baked, stylized)
         painted = ["retouch"]
+    if s.keeps_painting:
+        run.skip(REFINING, painted)
+        fitted = fit(asset, style, atlas, baked, stylized, s, lambda done: None)
+        repaired = Repaired(fitted.maps, tuple(np.zeros(texels.covered.shape, bool) for texels in atlas.texels))
+    else:
+        fitted, repaired = refined_stages(run, asset, style, atlas, views, baked, stylized, painted)
+
+    def write(folder: Path, edited: Edited, report: Report) -> None:
+        sets = zip(atlas.texels, repaired.maps, strict=True)
+        write_asset(folder, run.job, asset, sets, report, edited)
+
+    folder, edited = asset_stage(run, ["repair"], write, {"painted": run.keys["bake"]})
+    maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
+    repaired = replace(repaired, maps=tuple(maps))
+    tell_edits(run)
+    light = light_left(asset.mesh, atlas.texels, repaired.maps, s.seed)
+    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light)
+
+
+def refined_stages(
+    run: Run,
+    asset: Asset,
+    style: Picture,
+    atlas: Atlas,
+    views: Sequence[View],
+    baked: Baked,
+    stylized: Sequence[View],
+    painted: Sequence[str],
+) -> tuple[Any, Repaired]:
+    """The stages "fit", "masks" and "repair"."""
+    s, seed = run.job.settings, run.job.settings.seed
     look = [style.rgb] if s.fit.tv_from == "style" else []
     fitted = run.record(
         "fit", painted, [fit_settings(s), seed, *look], lambda r: fit(asset, style, atlas, baked, stylized, s, r)
@@ -117,17 +148,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
         [s.repair, seed, *inpainter_inputs(s, style)],
         lambda r: repair(asset, style, atlas, baked, views, fitted, masks, s, r),
     )
-
-    def write(folder: Path, edited: Edited, report: Report) -> None:
-        sets = zip(atlas.texels, repaired.maps, strict=True)
-        write_asset(folder, run.job, asset, sets, report, edited)
-
-    folder, edited = asset_stage(run, ["repair"], write, {"painted": run.keys["bake"]})
-    maps = edited(part_stems(run.job.name, asset.mesh.parts), repaired.maps)[0]
-    repaired = replace(repaired, maps=tuple(maps))
-    tell_edits(run)
-    light = light_left(asset.mesh, atlas.texels, repaired.maps, seed)
-    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light)
+    return fitted, repaired
 
 
 def retouched_stage(
@@ -175,9 +196,10 @@ def painted_stages(
         return swept
     coats = surface_stage(run, asset, style, atlas)
     baked = run.record(
-        "bake", ["views", "surface"], [s.bake, s.fit.refine, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
+        "bake", ["views", "surface"], [s.bake, s.refined, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
     )
-    write_first(run, asset, atlas, baked)
+    if not s.keeps_painting:
+        write_first(run, asset, atlas, baked)
     stylized = stylized_stage(run, asset, baked, views)
     return baked, stylized
 
@@ -218,7 +240,7 @@ def fit(
         fit_settings(settings),
         settings.seed,
         report,
-        begin=baked.begin or None,
+        begin=baked.begin,
         style=opaque(style) if settings.fit.tv_from == "style" else None,
         unlit=unlit(stylized, baked.gains) if baked.gains else None,
     )
@@ -279,7 +301,7 @@ def settle_relief(
     from mistyle.stages.fit import two_phase
 
     steps = round(settings.fit.iterations1 * SETTLING)
-    if settings.fit.refine == "off" or steps == 0 or not any(mask.any() for mask in masks):
+    if settings.refined == "off" or steps == 0 or not any(mask.any() for mask in masks):
         return list(maps)
     short = fit_settings(settings).model_copy(
         update={"painted": "without-light", "refine": "normal-roughness", "iterations1": steps}

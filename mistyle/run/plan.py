@@ -80,8 +80,8 @@ def plan(job: Job) -> dict[str, Any]:
     s = job.settings
     pixels = view_pixels(s)
     texels = extent.sets * s.atlas.size**2
-    crops = (s.fit.iterations1 + (s.fit.iterations2 if s.fit.refine == "all" else 0)) * s.fit.crops
-    crops *= s.fit.refine != "off"
+    crops = fit_steps(s) * s.fit.crops
+    repaired = not s.keeps_painting
     frames = s.report.frames * s.report.resolution**2 * s.report.spp
     seconds = {
         "mesh": _reading(extent),
@@ -91,8 +91,8 @@ def plan(job: Job) -> dict[str, Any]:
         "bake": 2 * texels * PER_TEXEL + pixels * PER_VIEW_PIXEL,
         "stylized": 2 * pixels * PER_VIEW_PIXEL,
         "fit": crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
-        "masks": 0.3 * texels * PER_TEXEL,
-        "repair": texels * PER_TEXEL + 0.1 * crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
+        "masks": repaired * 0.3 * texels * PER_TEXEL,
+        "repair": repaired * texels * PER_TEXEL + 0.1 * crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
         "asset": 2 * texels * PER_TEXEL,
         "report": 5 + frames * PER_SAMPLE_RAY,
     }
@@ -103,6 +103,12 @@ def plan(job: Job) -> dict[str, Any]:
         **_memory(s, lambda c: counts(c, extent.faces, extent.sets, extent.own), PLAIN, TILED, STYLED),
         "disk_gb": round((texels * BYTES_PER_TEXEL + 2 * pixels * BYTES_PER_VIEW_PIXEL) / 1e9, 2),
     }
+
+
+def fit_steps(settings: Settings) -> int:
+    """The steps of the phases that will run."""
+    steps = {"normal-roughness": settings.fit.iterations1, "albedo": settings.fit.iterations2}
+    return sum(count for name, count in steps.items() if settings.refined in (name, "all"))
 
 
 def plan_render(mesh: Path, out: Path, settings: Settings) -> dict[str, Any]:

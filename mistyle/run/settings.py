@@ -122,6 +122,21 @@ class Settings(BaseModel):
     diffusion: DiffusionSettings = DiffusionSettings()
     paint3d: Paint3dSettings = Paint3dSettings()
 
+    @property
+    def refined(self) -> Literal["off", "normal-roughness", "albedo", "all"]:
+        """Which maps the fit may change. Of a surface that is painted once, its maps are the source of the views, and
+        the fit would find them again; it runs there only for what somebody asked of it by other settings."""
+        if self.fit.refine != "auto":
+            return self.fit.refine
+        wanted = self.fit.metallic == "fit" or self.fit.features is not None or self.inpainter != "fill"
+        return "all" if wanted or self.stylizer != "embedded" else "off"
+
+    @property
+    def keeps_painting(self) -> bool:
+        """Whether nothing after the bake changes the maps: the fit is off, and a repair would take the painting
+        again."""
+        return self.refined == "off" and self.stylizer == "embedded" and self.inpainter == "fill"
+
 
 # The ways to run a job; the defaults of the records are the standard ones.
 PRESETS: dict[str, dict[str, Any]] = {
@@ -137,7 +152,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "draw": {"paper_files": True},
         "surface": {"samples": 1_000_000},
         "atlas": {"size": 4096},
-        "fit": {"iterations1": 400, "iterations2": 600, "crops": 8, "lights": "together"},
+        "fit": {"refine": "all", "iterations1": 400, "iterations2": 600, "crops": 8, "lights": "together"},
         "diffusion": {"content": "per-view"},
     },
     # To the letter, where README lists departures too; its steps of the fit are not given, they are those of `fine`.
@@ -154,6 +169,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
         "atlas": {"size": 4096},
         "fit": {
+            "refine": "all",
             "painted": "with-light",
             "unlight": 0.0,
             "lights": "together",

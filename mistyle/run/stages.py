@@ -32,6 +32,8 @@ STAGES = {
     "asset": "write the asset",
     "report": "write the report",
 }
+# Those that a job leaves out where nothing after the bake changes the maps.
+REFINING = ("fit", "masks", "repair")
 # Before fit and repair, in the place of "asset".
 FIRST = {"first asset": "write the first asset"}
 # Only where views were edited.
@@ -167,6 +169,12 @@ class Run(Generic[Work]):
         before = len(self.progress.notes)
         with self.progress.stage(name, self.stages[name]) as report:
             return keeper.put(name, key, fill, notes=lambda: self.progress.notes[before:], about=about)
+
+    def skip(self, names: Sequence[str], after: Sequence[str]) -> None:
+        """Leave out stages that change nothing; those that stand on them stand on `after`."""
+        self.redoing = self.redoing or self.job.redo_from in names
+        for name in names:
+            self.keys[name] = digest([self.base, name, "left out", [self.keys[a] for a in after]])
 
     def early(
         self, name: str, key: str, what: str, write: Callable[[Path, Report], object], about: Mapping[str, Any]

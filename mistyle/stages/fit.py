@@ -83,32 +83,35 @@ def two_phase(
     *,
     phase1_lights: Lights | None = None,
     only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
-    begin: Sequence[Maps] | None = None,
+    begin: Sequence[Maps] = (),
     style: Float[np.ndarray, "sh sw 3"] | None = None,
     unlit: Sequence[View] | None = None,
 ) -> Fit:
     """Fit `maps` (one per texture set, as baked) so that renders look like `targets` (linear rgb, stylized).
 
     `phase1_lights` replaces those of `scenes/phase1_directional.xml`; `only` names the texels that may change, all
-    others keep their bytes. Phase 1 starts at the normal and roughness of `begin`, where given; what counts as unfitted
-    is `maps` all the same, and they are what stays where the phase is undone. With `style` (sRGB) its gradient lowers
-    the albedo's total variation, not the targets'. `unlit` are the targets of phase 2, where light was taken out of
-    them. The same inputs, settings, seed and thread count give the same bytes. A gradient that is not a number ends its
-    phase at the last good state, and a note says where.
+    others keep their bytes. With `begin` the fit starts at those maps, keeps their detail finer than the views, and
+    returns them where every phase is undone; phase 1's clay is compared with clay of `maps` all the same. With `style`
+    (sRGB) its gradient lowers the albedo's total variation, not the targets'. `unlit` are the targets of phase 2, where
+    light was taken out of them. The same inputs, settings, seed and thread count give the same bytes. A gradient that
+    is not a number ends its phase at the last good state, and a note says where.
     """
+    first = tuple(begin or maps)
     if settings.metallic == "zero":
-        maps = [replace(m, metallic=np.zeros_like(m.metallic)) for m in maps]
+        maps, first = ([replace(m, metallic=np.zeros_like(m.metallic)) for m in each] for each in (maps, first))
     nothing = tuple(np.zeros(m.roughness.shape, np.float32) for m in maps)
+    fit = Fit(tuple(first), nothing, nothing, {}, {}, {}, (), nothing)
     if settings.refine == "off" or not any(view.mask.any() for view in targets):
-        return Fit(tuple(maps), nothing, nothing, {}, {}, {}, (), nothing)
+        return fit
     world = _world(mesh, targets, settings)
     shrink = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
-    table = fit_table.build(maps, texels, shrink, only)
-    begun = {} if begin is None else fit_table.build(begin, texels, shrink, only).values
+    table = fit_table.build(first, texels, shrink, only)
+    if begin:
+        unpainted = fit_table.build(maps, texels, shrink, only).values
+        table.plain = table.start | {name: unpainted[name] for name in ("tilt", "roughness")}
     phases = _phases(settings, phase1_lights or lights("phase1"), targets, style, unlit is not None)
     judge = fit_judge.bench(world.traced, world.tangents, targets) if settings.judge else None
     total, done = max(sum(phase.iterations for phase in phases), 1), 0
-    fit = Fit(tuple(maps), nothing, nothing, {}, {}, {}, (), nothing)
     for phase, rng in zip(phases, np.random.default_rng(seed).spawn(len(phases)), strict=True):
         if phase.iterations:
             share = (done / total, phase.iterations / total)
@@ -116,44 +119,64 @@ def two_phase(
                 world = replace(world, targets=_pictures(unlit))
                 judge = fit_judge.bench(world.traced, world.tangents, unlit) if settings.judge else None
             with memory.kept():
-                first = begun if phase is phases[0] else {}
-                fit = _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress, first)
+                fit = _one_phase(
+                    Run(world, table, phase, settings, rng), fit, tuple(first), only, judge, share, progress
+                )
             done += phase.iterations
     return fit
 
 
-def _one_phase(world, table, phase, fit, maps, only, settings, rng, judge, share, progress, begun) -> Fit:
+def _one_phase(
+    run: Run,
+    fit: Fit,
+    first: tuple[Maps, ...],
+    only: Sequence[Bool[np.ndarray, "h w"]] | None,
+    judge: fit_judge.Bench | None,
+    share: tuple[float, float],
+    progress: Callable[[float], None],
+) -> Fit:
     """Run a phase and keep its result unless a figure got worse; `share` is (begin, length) of the whole progress.
 
-    `begun` are values by name at which normal and roughness start instead of where they are.
+    At the steps of `fit_judge.checks` a phase that is far from keeping what it had is stopped: it would be undone.
     """
+    phase, table, notes = run.phase, run.table, list(fit.notes)
     saved = {name: table.values[name].copy() for name in phase.rates}
-    table.values.update({name: begun[name] for name in ("tilt", "roughness") if name in begun})
-    run, notes = Run(world, table, phase, settings, rng), list(fit.notes)
+
+    def seen(maps: Sequence[Maps]) -> dict[str, float]:
+        assert judge is not None
+        return fit_judge.figures(judge, maps, phase.lights, gloss=phase.gloss)
+
+    old = seen(fit.maps) if judge is not None else {}
+    stops = fit_judge.checks(phase.iterations) if judge is not None else ()
+    after, new, stopped = fit.maps, old, 0
     for iteration in range(phase.iterations):
         note = run.step(iteration)
         if note:
             notes.append(note)
             break
         progress(share[0] + share[1] * (iteration + 1) / phase.iterations)
-    after = tuple(fit_table.finished(table, maps, only))
-    figures, kept = dict(fit.figures), True
-    if judge is not None:
-        old, new = (fit_judge.figures(judge, each, phase.lights, gloss=phase.gloss) for each in (fit.maps, after))
-        figures |= {f"{phase.name}.{name}": (old[name], new[name]) for name in old}
-        worse = fit_judge.worse(old, new)
-        kept = not worse
-        if worse:
-            notes.append(f"{phase.name} was undone: {', '.join(worse)} got worse.")
-            table.values.update(saved)
+        if iteration + 1 in stops:
+            after = tuple(fit_table.finished(table, first, only))
+            new = seen(after)
+            if fit_judge.worse(old, new, fit_judge.HOPELESS):
+                stopped = iteration + 1
+                break
+    if not stopped:
+        after = tuple(fit_table.finished(table, first, only))
+        new = seen(after) if judge is not None else {}
+    worse = fit_judge.worse(old, new) if judge is not None else []
+    if worse:
+        early = f" after {stopped} of {phase.iterations} steps" if stopped else ""
+        notes.append(f"{phase.name} was undone{early}: {', '.join(worse)} got worse.")
+        table.values.update(saved)
     return Fit(
-        maps=after if kept else fit.maps,
-        struggle=tuple(fit_table.spread(table, maps, run.struggle)),
-        touched=tuple(fit_table.spread(table, maps, run.touched)),
-        agreed=tuple(fit_table.spread(table, maps, np.abs(run.pulled).mean(axis=1))),
+        maps=fit.maps if worse else after,
+        struggle=tuple(fit_table.spread(table, first, run.struggle)),
+        touched=tuple(fit_table.spread(table, first, run.touched)),
+        agreed=tuple(fit_table.spread(table, first, np.abs(run.pulled).mean(axis=1))),
         trace=fit.trace | {f"{phase.name}.{name}": values for name, values in run.trace.items()},
-        kept=fit.kept | {phase.name: kept},
-        figures=figures,
+        kept=fit.kept | {phase.name: not worse},
+        figures=fit.figures | {f"{phase.name}.{name}": (old[name], new[name]) for name in old},
         notes=tuple(notes),
     )
 
@@ -212,7 +235,7 @@ def _phases(
     style: Float[np.ndarray, "h w 3"] | None = None,
     unlit: bool = False,
 ) -> list[Phase]:
-    """Phase 1, and with refine = all phase 2; `unlit` where the latter's targets show no light."""
+    """The phases that `refine` names (auto: both); `unlit` where the latter's targets show no light."""
     flat = settings.painted != "with-light"
     moving = {"tilt": settings.rate_normal, "roughness": settings.rate_roughness}
     first = Phase(
@@ -226,20 +249,22 @@ def _phases(
         iterations=settings.iterations1,
         loss=_relief_loss(settings) if flat else _lit_loss(settings),
     )
-    if settings.refine != "all":
+    if settings.refine == "normal-roughness":
         return [first]
+    alone = settings.refine == "albedo"
+    reduced = 0.0 if alone else settings.reduced
     second = Phase(
         name="phase2",
         lights=lights("phase2"),
         one_by_one=False,
         clay=False,
         gloss=not (flat or unlit),
-        rates={"albedo": settings.rate_albedo} | {name: rate * settings.reduced for name, rate in moving.items()},
+        rates={"albedo": settings.rate_albedo} | {name: rate * reduced for name, rate in moving.items() if reduced},
         variation={"albedo": _albedo_variation(settings, targets, style)},
         iterations=settings.iterations2,
         loss=_colour_loss(settings),
     )
-    return [first, second]
+    return [second] if alone else [first, second]
 
 
 def _albedo_variation(

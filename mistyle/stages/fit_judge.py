@@ -4,7 +4,7 @@ Windows of a few target views are rendered with the maps before and after the ph
 with the stylized views in three figures: `detail` (correlation of band-pass lightness: are the strokes still there),
 `style` (patch and Gram distance) and `views` (difference of a surface point seen from two neighbouring cameras under
 the same light, over the contrast of the picture's own detail, for a bolder picture differs more). None of them may get
-worse by more than TOLERANCE.
+worse by more than TOLERANCE. A phase that is worse by HOPELESS times as much on its way is stopped there.
 """
 
 from collections.abc import Sequence
@@ -29,6 +29,9 @@ WINDOW = 256
 # strokes: a good one costs up to 0.04 of the correlation and, on a bold flat style, 0.07 of the agreement; noise and
 # lost strokes cost more. The rest is what another seed of the crops changes.
 TOLERANCE = {"detail": (0.0, 0.06), "style": (0.05, 0.0), "views": (0.05, 0.1)}
+HOPELESS = 2.0
+CHECKS = (0.25, 0.5)  # shares of a phase's steps after which it is judged on its way
+FEWEST = 10  # steps before the first such judgement: it takes as long as one or two steps
 HIGHER_IS_BETTER = {"detail": True, "style": False, "views": False}
 
 
@@ -114,12 +117,18 @@ def figures(where: Bench, maps: Sequence[Maps], lights: Lights, *, gloss: bool =
     }
 
 
-def worse(before: dict[str, float], after: dict[str, float]) -> list[str]:
-    """The figures that got worse by more than their tolerance."""
+def checks(iterations: int) -> tuple[int, ...]:
+    """After how many of a phase's steps it is judged on its way."""
+    steps = (round(share * iterations) for share in CHECKS)
+    return tuple(step for step in steps if FEWEST <= step < iterations)
+
+
+def worse(before: dict[str, float], after: dict[str, float], times: float = 1.0) -> list[str]:
+    """The figures that got worse by more than so many times their tolerance."""
     result = []
     for name, (share, absolute) in TOLERANCE.items():
         loss = before[name] - after[name] if HIGHER_IS_BETTER[name] else after[name] - before[name]
-        if loss > share * abs(before[name]) + absolute:
+        if loss > times * (share * abs(before[name]) + absolute):
             result.append(name)
     return result
 

@@ -29,8 +29,8 @@ LAST_RATE = 0.1  # share of the learning rate at the end of a phase; a cosine le
 class Shot:
     """One step's crops, rendered, beside their targets: n crops of s x s pixels (torch).
 
-    render linear, target sRGB (n, 3, s, s); `plain` the same render with the normals and roughness of before the fit,
-    where the phase asks for it; mask (n, 1, s, s) 0 or 1; position and normal (n, 3, s, s) world; `light`
+    render linear, target sRGB (n, 3, s, s); `plain` the same render with the normals and roughness of the unpainted
+    surface, where the phase asks for it; mask (n, 1, s, s) 0 or 1; position and normal (n, 3, s, s) world; `light`
     (n, 3) the direction to each crop's light, or to where the mean of its lights stands, None under ambient light;
     `zoomed` crop pixels per pixel of the view.
     """
@@ -149,7 +149,7 @@ class Run:
             names = tuple("normal" if name == "tilt" else name for name in moving)
             return self.shader(lit, pixels, names).reshape(count, size, size, 3).permute(0, 3, 1, 2), leaves
 
-        plain = picture(self.table.start, {})[0] if self.phase.clay else None
+        plain = picture(self.table.plain, {})[0] if self.phase.clay else None
         render, leaves = picture(self.table.values, self.phase.rates)
         wanted = torch.stack([crop_picture(self.world.targets[c.view], c, size) for c in crops])
 

@@ -11,7 +11,11 @@ class FitSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    refine: Literal["off", "normal-roughness", "all"] = Field(default="all", description="which maps may change")
+    refine: Literal["auto", "off", "normal-roughness", "albedo", "all"] = Field(
+        default="auto",
+        description="which maps may change: those of phase 1, of phase 2, or of both; auto: none where the embedded "
+        "stylizer paints the surface, whose views tell nothing that its own maps do not, and all elsewhere",
+    )
     painted: Literal["auto", "without-light", "with-light"] = Field(
         default="auto",
         description="whether the stylized views show lit objects; auto: as the stylizer paints (diffusion with light)",

@@ -32,7 +32,8 @@ FILL = 6  # texels of the table by which a change is continued beyond the last t
 class Table:
     """All texels (t) of all texture sets at the fit's resolution, row by row, set after set; changes as the fit goes.
 
-    tilt is the tangent-space normal's x and y. `start` keeps the values before the fit. `right` and `below` say
+    tilt is the tangent-space normal's x and y. `start` keeps the values before the fit, `plain` those of an unpainted
+    surface. `right` and `below` say
     whether a texel's neighbour in the same set belongs to the same UV island. `steps` counts Adam's steps per texel.
     `place` is -1 everywhere, scratch of `pairs`.
     """
@@ -40,6 +41,7 @@ class Table:
     sizes: tuple[tuple[int, int], ...]
     values: dict[str, Float[np.ndarray, "t c"]]
     start: dict[str, Float[np.ndarray, "t c"]]
+    plain: dict[str, Float[np.ndarray, "t c"]]
     right: Bool[np.ndarray, " t"]
     below: Bool[np.ndarray, " t"]
     columns: Int[np.ndarray, " t"]
@@ -91,6 +93,7 @@ def build(
     return Table(
         tuple(sizes),
         values,
+        start,
         start,
         np.concatenate(right),
         np.concatenate(below),

@@ -179,12 +179,11 @@ class CoatSettings(BaseModel):
         default=None,
         ge=0,
         le=1,
-        description="slope (root mean square) of the painting's relief in the normal map that the fit begins with, or "
-        "that is final where nothing is fitted; 0.15 by default",
+        description="slope (root mean square) of the painting's relief in the normal map; 0.15 by default",
     )
     gloss: float | None = Field(
         default=None,
         ge=0,
         le=2,
-        description="how much grooves and crests change the first roughness; 0.5 by default, 1 where nothing is fitted",
+        description="how much grooves and crests change the roughness; 1 by default",
     )
