@@ -83,9 +83,9 @@ def _load(
                 f"Textures of material '{_name(tree, index)}' show their nearest texel (magFilter NEAREST); renders "
                 "here interpolate."
             )
-        number = set_of(info)
+        chosen = set_of(info)
         lookup: Tree = dict(
-            uvs=other.get(number) if number != base else None,
+            uvs=other.get(chosen) if chosen != base else None,
             transform=texture_transform(info),
             wrap=wrap_of(tree, info["index"]),
         )

@@ -287,7 +287,7 @@ def _texels(kind: str, texture: Texture, place: Place, budget: Budget, notes: li
         data = bytes_of(place, MAX_PICTURE_BYTES)
         if data is None:
             notes.append(f"Texture {texture.file} is not there and was left out.")
-        decoded = kind in COLOURS and texture.space != "raw"
+        decoded = texture.space != "raw" if kind in COLOURS else texture.space == "sRGB" and kind != "normal"
         pixels = None if data is None else decode(data, str(place), budget, "colour" if decoded else "data")
     if pixels is None:
         return None

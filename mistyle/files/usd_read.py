@@ -155,9 +155,11 @@ def _raw(pieces: list[_Piece], materials: list[Found], notes: list[str], path: P
 def _pose(pxr: Any, stage: Any) -> None:
     """Put skinned meshes into the pose of their skeletons at the first time; the file stays as it is."""
     stage.SetEditTarget(stage.GetSessionLayer())
-    first = stage.GetStartTimeCode() if stage.HasAuthoredTimeCodeRange() else 0.0
     for prim in stage.Traverse():
         if prim.IsA(pxr.UsdSkel.Root):
+            moving = [p for p in pxr.Usd.PrimRange(prim) if p.IsA(pxr.UsdSkel.Animation)]
+            times = [t for p in moving for a in p.GetAttributes() for t in a.GetTimeSamples()[:1]]
+            first = min(times, default=0.0)
             pxr.UsdSkel.BakeSkinning(pxr.UsdSkel.Root(prim), pxr.Gf.Interval(first, first))
 
 

@@ -25,6 +25,7 @@ from mistyle.render import scene as scenery
 
 PASSED = 32  # surfaces that a path passes through at most
 LABELS = ("sampler", "ray", "active", "depth", "passed", "result", "throughput", "before", "pdf", "delta", "valid")
+LEAST_INDEX = 1.001  # Mitsuba refuses a solid of the index of air
 BARE = 0.8  # albedo of what has no material at all, as in Blender
 
 
@@ -50,6 +51,8 @@ def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray,
     if shading.unlit or shading.black:
         maps = replace(maps, albedo=np.zeros((2, 2, 3), np.float32))
     described: dict[str, Any] = {"type": "twosided", "bsdf": _relief(material, maps, made)}
+    if shading.transmission > 0:
+        described = _glass(shading, maps)
     opacity = _opacity(material, made)
     if opacity is not None:
         described = {"type": "mask", "opacity": opacity, "nested": described}
@@ -102,6 +105,22 @@ def _relief(material: Material, maps: OwnMaps, made: dict[str, type]) -> dict[st
     )
     normal = scenery.texture_dict(scenery.encoded(maps.normal))
     return {"type": plugins.NORMALMAP, "normalmap": normal, "flip_invalid_normals": True, "bsdf": surface}
+
+
+def _glass(shading: Shading, maps: OwnMaps) -> dict[str, Any]:
+    """What lets light through, by Mitsuba's own material: with a volume a solid that refracts, else a thin sheet."""
+    told: dict[str, Any] = {
+        "base_color": scenery.texture_dict(maps.albedo),
+        "roughness": scenery.texture_dict(maps.roughness[..., None]),
+        "spec_trans": shading.transmission,
+        "eta": max(shading.ior, LEAST_INDEX),
+    }
+    if shading.thin:
+        return {"type": "principledthin", **told}
+    metallic = scenery.texture_dict(maps.metallic[..., None])
+    normal = scenery.texture_dict(scenery.encoded(maps.normal))
+    inner = {"type": "principled", "metallic": metallic, **told}
+    return {"type": plugins.NORMALMAP, "normalmap": normal, "bsdf": inner}
 
 
 def _radiance(material: Material, maps: OwnMaps) -> Float[np.ndarray, "h w 3"] | None:
@@ -347,11 +366,12 @@ def _surface_class(mi: Any) -> type:
             _, roughness, metallic, specular = values
             alpha = dr.maximum(dr.square(roughness), bsdf.ALPHA_FLOOR)
             shine = dr.clip(dr.maximum(metallic, dr.max(specular)), 0, 1)
+            shine = 0.5 + 0.5 * shine if self.edge > 0 else dr.clip(metallic, 0, 1)
             coated = 0.3 * self.coat
             kind = mi.MicrofacetType.GGX
             coat = mi.MicrofacetDistribution(kind, max(self.coat_roughness**2, bsdf.ALPHA_FLOOR), sample_visible=True)
             spread = mi.MicrofacetDistribution(kind, alpha, sample_visible=True)
-            return (0.5 + 0.5 * shine) * (1 - coated), mi.Float(coated), spread, coat
+            return shine * (1 - coated), mi.Float(coated), spread, coat
 
         def _pdf(self, si, wo, active, values):
             shiny, coated, spread, coat = self._strategy(values)
