@@ -154,6 +154,9 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
             f"Material '{name}' has {', '.join(drawn)}, which stays in a finished asset; the views that are painted "
             "leave it out."
         )
+    with_maps = [n for n in drawn if any(k.endswith("Texture") for k in extension(entry["extensions"], n))]
+    if any(n != "KHR_materials_specular" for n in with_maps):
+        notes.append(f"Of {' and '.join(with_maps)} of material '{name}' the factors were read, not the textures.")
     more = [n for n in more if n not in _DRAWN]
     if more:
         notes.append(

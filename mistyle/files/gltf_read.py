@@ -21,6 +21,7 @@ from mistyle.files.polygons import check_indices, check_positions, too_many
 from mistyle.files.raw import Corners, Indexed, Raw
 
 Tree = dict[str, Any]
+MAX_INSTANCED = 500_000  # faces up to which all instances of a node are read
 
 
 @dataclass(frozen=True)
@@ -46,7 +47,6 @@ class _Place:
     """Where a primitive's vertices stand: their first number, their positions in world space and their matrices."""
 
     node: int
-    primitive: int
     start: int
     positions: np.ndarray
     places: np.ndarray
@@ -138,8 +138,8 @@ def _pieces(
 ) -> tuple[list[_Piece], list[np.ndarray]]:
     pieces: list[_Piece] = []
     positions: list[np.ndarray] = []
-    vertices = faces = 0
     world = world_matrices(tree)
+    faces = vertices = 0
     for node in _scene_nodes(tree, notes):
         entry = tree["nodes"][node]
         if "mesh" not in entry:
@@ -154,59 +154,54 @@ def _pieces(
         if _flattened(matrix):
             notes.append("Nodes that are scaled to a point or a line were left out; they stay in a finished asset.")
             continue
-        primitives = [
-            (k, p) for k, p in enumerate(tree["meshes"][entry["mesh"]]["primitives"]) if "POSITION" in p["attributes"]
-        ]
-        placed: dict[str, tuple[int, np.ndarray]] = {}
-        for turn, instance in enumerate(_instances(tree, buffers, entry, max_faces - faces, notes)):
-            for number, primitive in primitives:
+        for instance in _instances(tree, buffers, entry, min(max_faces, MAX_INSTANCED) - faces, notes):
+            placed: dict[str, _Place] = {}
+            for number, primitive in enumerate(tree["meshes"][entry["mesh"]]["primitives"]):
                 _check_counts(tree, primitive, max_faces, path)
                 index = _indices(tree, buffers, primitive, path)
-                if index is None or len(index) == 0:
+                if index is None or "POSITION" not in primitive["attributes"] or len(index) == 0:
                     notes.append("Points and lines were left out.")
                     continue
                 faces += len(index)
                 too_many(faces, max_faces, path)
-                places = matrix @ instance
-                if joints is not None:
-                    places = skinned(tree, buffers, joints, primitive, matrix, path)
                 # Primitives that share their vertices share the positions as well.
-                key = f"{turn} {_vertices_of(primitive)}"
+                key = _vertices_of(primitive)
                 if key not in placed:
-                    local = _vectors(tree, buffers, primitive["attributes"]["POSITION"], 3, path)
-                    at = posed(morphed(tree, buffers, entry, primitive, "POSITION", local), places)
-                    check_positions(at, path)
-                    positions.append(at)
-                    placed[key] = vertices, at
-                    vertices += len(local)
+                    places = matrix @ instance
+                    if joints is not None:
+                        places = skinned(tree, buffers, joints, primitive, matrix, path)
+                    placed[key] = _place(tree, buffers, path, node, primitive, vertices, places)
+                    positions.append(placed[key].positions)
+                    vertices += len(positions[-1])
                     too_many(vertices, 3 * max_faces, path, "vertices")
-                where = _Place(node, number, *placed[key], places)
-                pieces.append(_piece(tree, buffers, path, where, primitive, index, notes))
+                pieces.append(_piece(tree, buffers, path, placed[key], number, index, notes))
     return pieces, positions
 
 
-def _vertices_of(primitive: Tree) -> list[Any]:
+def _place(
+    tree: Tree, buffers: Buffers, path: Path, node: int, primitive: Tree, start: int, places: np.ndarray
+) -> _Place:
+    local = _vectors(tree, buffers, primitive["attributes"]["POSITION"], 3, path)
+    at = posed(morphed(tree, buffers, tree["nodes"][node], primitive, "POSITION", local), places)
+    check_positions(at, path)
+    return _Place(node, start, at, places)
+
+
+def _vertices_of(primitive: Tree) -> str:
     """What decides where a primitive's vertices stand: their accessors' numbers."""
-    names = [n for n in primitive["attributes"] if n == "POSITION" or n.startswith(("JOINTS_", "WEIGHTS_"))]
-    return [
-        sorted((n, primitive["attributes"][n]) for n in names),
-        [t.get("POSITION") for t in primitive.get("targets", [])],
-    ]
+    named = primitive["attributes"].items()
+    own = sorted((n, a) for n, a in named if n == "POSITION" or n.startswith(("JOINTS_", "WEIGHTS_")))
+    return str([own, [target.get("POSITION") for target in primitive.get("targets", [])]])
 
 
 def _instances(tree: Tree, buffers: Buffers, node: Tree, room: int, notes: list[str]) -> list[np.ndarray]:
     """The matrices of a node's instances; the first alone where there is no `room` for the faces of all."""
     found = instances(tree, buffers, node, notes)
-    if len(found) == 1 or "skin" in node:
+    if len(found) <= 1 or "skin" in node:
         return found[:1]
-    counts = [
-        tree["accessors"][p["attributes"]["POSITION"]]["count"]
-        if "indices" not in p
-        else tree["accessors"][p["indices"]]["count"]
-        for p in tree["meshes"][node["mesh"]]["primitives"]
-        if "POSITION" in p["attributes"]
-    ]
-    if len(found) * sum(counts) > 3 * room:
+    primitives = [p for p in tree["meshes"][node["mesh"]]["primitives"] if "POSITION" in p["attributes"]]
+    corners = sum(tree["accessors"][p.get("indices", p["attributes"]["POSITION"])]["count"] for p in primitives)
+    if len(found) * corners > 3 * room:
         notes.append(f"Of {len(found)} instances ({INSTANCING}) the first was read; all of them show the same texels.")
         return found[:1]
     return found
@@ -218,9 +213,10 @@ def _flattened(matrix: Float[np.ndarray, "4 4"]) -> bool:
     return bool(second <= 1e-9 * first)
 
 
-def _piece(tree, buffers, path, where: _Place, primitive, index, notes) -> _Piece:
+def _piece(tree: Tree, buffers: Buffers, path: Path, where: _Place, number: int, index, notes: list[str]) -> _Piece:
     """One primitive's corners in world space, v up; the winding is turned where the node mirrors space."""
     node = tree["nodes"][where.node]
+    primitive = tree["meshes"][node["mesh"]]["primitives"][number]
     attributes = primitive["attributes"]
     count = tree["accessors"][attributes["POSITION"]]["count"]
     check_indices(index, count, path, "vertex")
@@ -248,7 +244,7 @@ def _piece(tree, buffers, path, where: _Place, primitive, index, notes) -> _Piec
     return _Piece(
         node=where.node,
         mesh=node["mesh"],
-        primitive=where.primitive,
+        primitive=number,
         material=primitive.get("material", -1),
         texcoord=base if base in sets else -1,
         first_vertex=where.start,

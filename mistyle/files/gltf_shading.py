@@ -50,7 +50,7 @@ def _reflectance(said: Tree, ior: float) -> tuple[Triple, float]:
         return triple(extension(said, GLOSSY), "specularFactor", (1.0, 1.0, 1.0), 1.0), 1.0
     specular = extension(said, "KHR_materials_specular")
     weight = number(specular, "specularFactor", 1.0, 0.0, 1.0)
-    normal = 1.0 if ior == 0 else ((ior - 1) / (ior + 1)) ** 2
+    normal = 1.0 if ior == 0 else round(((ior - 1) / (ior + 1)) ** 2, 12)  # 0.04 for 1.5, as the default is
     red, green, blue = triple(specular, "specularColorFactor", (1.0, 1.0, 1.0), MAX_RADIANCE)
     return (min(normal * red, 1) * weight, min(normal * green, 1) * weight, min(normal * blue, 1) * weight), weight
 

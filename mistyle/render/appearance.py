@@ -64,6 +64,7 @@ def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray,
 
 def shapes(asset: Asset, maps: list[OwnMaps]) -> dict[str, Any]:
     """Every texture set as one loaded shape, by name."""
+    device.use()
     tangents = corner_tangents(asset.mesh)
     there = [p for p in range(len(asset.mesh.parts)) if (asset.mesh.part == p).any()]
     plain = [p for p in there if is_plain(asset.materials[p])]
@@ -76,7 +77,8 @@ def needs_path(shapes: dict[str, Any]) -> bool:
     """Whether Mitsuba's own integrators would not show some shape as it is: it radiates, or is seen through."""
     import mitsuba as mi
 
-    return any(s.is_emitter() or mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in shapes.values())
+    loaded = [s for s in shapes.values() if isinstance(s, mi.Shape)]
+    return any(s.is_emitter() or mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in loaded)
 
 
 def integrator(depth: int) -> Any:
@@ -131,9 +133,8 @@ def _radiance(material: Material, maps: OwnMaps) -> Float[np.ndarray, "h w 3"] |
     factor = np.array(shading.emission, np.float32)
     if not factor.any():
         return None
-    if shading.black:
-        return factor if material.albedo is None else material.albedo * factor
-    return np.broadcast_to(factor, (2, 2, 3)) if material.emission is None else material.emission * factor
+    texture = material.albedo if shading.black else material.emission
+    return np.broadcast_to(factor, (2, 2, 3)) if texture is None else texture * factor
 
 
 def _opacity(material: Material, made: dict[str, type]) -> Any:
@@ -148,12 +149,10 @@ def _opacity(material: Material, made: dict[str, type]) -> Any:
     return texture if shading.cutoff is None else made["Cut"](texture, shading.cutoff)
 
 
-def _loaded(values: Float[np.ndarray, "*h w c"]) -> Any:
+def _loaded(values: Float[np.ndarray, "h w c"]) -> Any:
     import mitsuba as mi
 
-    return mi.load_dict(
-        scenery.texture_dict(np.ascontiguousarray(np.broadcast_to(values, (2, 2, 3)) if values.ndim == 1 else values))
-    )
+    return mi.load_dict(scenery.texture_dict(np.ascontiguousarray(values)))
 
 
 @cache
