@@ -122,7 +122,7 @@ def test_a_glowing_part_lights_its_neighbour(tmp_path: Path) -> None:
     file = square(material=0)
     wall = {**file.tree["meshes"][0]["primitives"][0], "material": 1}
     file.tree["meshes"].append({"primitives": [wall]})
-    file.tree["nodes"].append({"mesh": 1, "rotation": [0, np.sin(np.pi / 4), 0, np.cos(np.pi / 4)]})
+    file.tree["nodes"].append({"mesh": 1, "rotation": [0, -np.sin(np.pi / 4), 0, np.cos(np.pi / 4)]})
     file.tree["scenes"][0]["nodes"] = [0, 1]
     plain = {"pbrMetallicRoughness": pbr()}
     file.tree["materials"] = [plain, plain | {"emissiveFactor": [1, 1, 1]}]

@@ -163,7 +163,7 @@ def _pose(pxr: Any, stage: Any) -> None:
             pxr.UsdSkel.BakeSkinning(pxr.UsdSkel.Root(prim), pxr.Gf.Interval(first, first))
 
 
-def _metres(pxr: Any, stage: Any) -> float:
+def metres(pxr: Any, stage: Any) -> float:
     """The stage's unit; numbers of another type than the schema's, which USD would refuse, count as well."""
     try:
         return float(pxr.UsdGeom.GetStageMetersPerUnit(stage))
@@ -174,7 +174,7 @@ def _metres(pxr: Any, stage: Any) -> float:
 
 def _user_matrix(pxr: Any, stage: Any, notes: list[str]) -> Float[np.ndarray, "4 4"]:
     """From the stage's units and axis to metres and Y up, for row vectors."""
-    unit = _metres(pxr, stage)
+    unit = metres(pxr, stage)
     unit = unit if np.isfinite(unit) and unit > 0 else 1.0
     z_up = pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z
     if z_up or unit != 1:

@@ -79,7 +79,7 @@ def _sheet(width: float, length: float) -> Outline:
 def _ball(radius: float, half: float) -> tuple[np.ndarray, np.ndarray]:
     """Profiles (distance from the axis, height) and normals of a sphere whose halves stand apart by 2 · half."""
     angle = np.linspace(-np.pi / 2, np.pi / 2, RINGS + 1)
-    normals = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    normals = np.stack([np.cos(angle), np.sin(angle)], axis=1).round(15) + 0.0  # the poles lie on the axis
     below, above = normals[: RINGS // 2 + 1], normals[RINGS // 2 :]
     profile = np.concatenate([below * radius - [0, half], above * radius + [0, half]])
     directions = np.concatenate([below, above])
