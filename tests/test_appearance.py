@@ -84,7 +84,7 @@ def test_blending_covers_by_alpha(with_colours: bool, tmp_path: Path) -> None:
     file = square(material=0)
     file.tree["materials"] = [material]
     if with_colours:
-        colours = np.tile(np.float32([1, 1, 1, 0.5]), (4, 1))
+        colours = np.tile(np.array([1, 1, 1, 0.5], np.float32), (4, 1))
         file.tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = file.accessor(colours)
     asset = read_mesh(file.save(tmp_path / "a.gltf"), size=64)
     picture = middle(drawn(asset, spp=1024))
@@ -231,7 +231,7 @@ def bent(tmp_path: Path, weights: np.ndarray) -> Asset:
     """The square on two joints, of which the second is moved by (0, 0, 3)."""
     file = square()
     attributes = file.tree["meshes"][0]["primitives"][0]["attributes"]
-    attributes["JOINTS_0"] = file.accessor(np.tile(np.uint8([0, 1, 0, 0]), (4, 1)))
+    attributes["JOINTS_0"] = file.accessor(np.tile(np.array([0, 1, 0, 0], np.uint8), (4, 1)))
     attributes["WEIGHTS_0"] = file.accessor(weights.astype(np.float32))
     file.tree["skins"] = [{"joints": [1, 2]}]
     file.tree["nodes"] = [{"mesh": 0, "skin": 0}, {"children": [2]}, {"translation": [0, 0, 3]}]
@@ -260,7 +260,7 @@ def test_a_result_of_a_posed_mesh_keeps_the_files_vertices(tmp_path: Path) -> No
 def test_morph_weights_count(on_node: bool, tmp_path: Path) -> None:
     file = square()
     primitive = file.tree["meshes"][0]["primitives"][0]
-    step = np.float32([[0, 0, 0], [0, 0, 0], [0, 0, 1], [0, 0, 1]])
+    step = np.array([[0, 0, 0], [0, 0, 0], [0, 0, 1], [0, 0, 1]], np.float32)
     primitive["targets"] = [{"POSITION": file.accessor(step)}, {"POSITION": file.accessor(step * 5)}]
     file.tree["meshes"][0]["weights"] = [0.0, 0.0] if on_node else [0.5, 0.0]
     if on_node:

@@ -251,8 +251,14 @@ def SkelRoot "Rig"
 SKIN = """
     rel skel:skeleton = </R/Rig/Bones>
     matrix4d primvars:skel:geomBindTransform = ( (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1) )
-    int[] primvars:skel:jointIndices = [0] ( interpolation = "constant" elementSize = 1 )
-    float[] primvars:skel:jointWeights = [1] ( interpolation = "constant" elementSize = 1 )
+    int[] primvars:skel:jointIndices = [0] (
+        interpolation = "constant"
+        elementSize = 1
+    )
+    float[] primvars:skel:jointWeights = [1] (
+        interpolation = "constant"
+        elementSize = 1
+    )
 """
 
 

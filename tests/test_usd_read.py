@@ -504,6 +504,16 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
     check(asset, tmp_path / "out" / "torn.usda", 3)
 
 
+def test_a_sphere_gets_no_look(tmp_path):
+    """It has no faces that a layer could bind materials to, or give coordinates."""
+    from mistyle.files.materialx import Look
+
+    asset = read_mesh(stage(tmp_path / "a.usda", 'def Sphere "Ball" {}\n'), size=64)
+    looks = [Look("material", *(f"textures/{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))]
+    with pytest.raises(InputRefused, match="Ball is a Sphere"):
+        write_look(tmp_path / "look.usda", None, asset, looks, "wave", beside=tmp_path)
+
+
 def _cut(asset) -> bool:
     """Whether the new UVs part the quad along its diagonal."""
     corners = {}

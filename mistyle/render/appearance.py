@@ -347,7 +347,7 @@ def _surface_class(mi: Any) -> type:
         def to_string(self):
             return f"Surface[{self.textures}, {self.edge}, {self.coat}, {self.coat_roughness}]"
 
-        def _values(self, si, active):
+        def _values(self, si, active) -> Any:
             return (
                 self.textures["base_color"].eval(si, active),
                 self.textures["roughness"].eval_1(si, active),
