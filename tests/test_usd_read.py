@@ -507,6 +507,7 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
 def test_a_sphere_gets_no_look(tmp_path):
     """It has no faces that a layer could bind materials to, or give coordinates."""
     from mistyle.files.materialx import Look
+    from mistyle.files.usd_look import write_look
 
     asset = read_mesh(stage(tmp_path / "a.usda", 'def Sphere "Ball" {}\n'), size=64)
     looks = [Look("material", *(f"textures/{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))]
