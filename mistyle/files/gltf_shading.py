@@ -36,7 +36,8 @@ def shading_of(entry: Tree, through: bool) -> Shading:
         edge=edge,
         coat=number(coat, "clearcoatFactor", 0.0, 0.0, 1.0),
         coat_roughness=number(coat, "clearcoatRoughnessFactor", 0.0, 0.0, 1.0) if coat else 0.0,
-        transmission=number(glass, "transmissionFactor", 0.0, 0.0, 1.0),
+        # A texture says which parts are glass; without reading it, none is.
+        transmission=0.0 if "transmissionTexture" in glass else number(glass, "transmissionFactor", 0.0, 0.0, 1.0),
         ior=ior,
         thin=number(volume, "thicknessFactor", 0.0, 0.0, math.inf) == 0,
         unlit=unlit,

@@ -26,6 +26,7 @@ from mistyle.files.usd_materials import Found, at_own_coordinates, outside, plai
 from mistyle.files.usd_shapes import is_shape, outline
 
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+CAGE_CREASE = 89.0  # degrees; sharper edges of a cage would have normals that face away from who sees them
 UV_NAMES = ("st", "UVMap", "map1", "uv")
 
 
@@ -155,11 +156,12 @@ def _raw(pieces: list[_Piece], materials: list[Found], notes: list[str], path: P
 def _pose(pxr: Any, stage: Any) -> None:
     """Put skinned meshes into the pose of their skeletons at the first time; the file stays as it is."""
     stage.SetEditTarget(stage.GetSessionLayer())
-    for prim in stage.Traverse():
+    prims = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
+    moving = [p for p in prims if p.IsA(pxr.UsdSkel.Animation)]
+    times = [t for p in moving for a in p.GetAttributes() for t in a.GetTimeSamples()[:1]]
+    first = min(times, default=0.0)
+    for prim in prims:
         if prim.IsA(pxr.UsdSkel.Root):
-            moving = [p for p in pxr.Usd.PrimRange(prim) if p.IsA(pxr.UsdSkel.Animation)]
-            times = [t for p in moving for a in p.GetAttributes() for t in a.GetTimeSamples()[:1]]
-            first = min(times, default=0.0)
             pxr.UsdSkel.BakeSkinning(pxr.UsdSkel.Root(prim), pxr.Gf.Interval(first, first))
 
 
@@ -398,7 +400,7 @@ def _normals(pxr: Any, prim: Any, shape: Polygons, time: Any, notes: list[str]) 
         return outline(prim, time).normals[shape.corner].astype(np.float32)
     found = _own_normals(pxr, pxr.UsdGeom.Mesh(prim), shape, time, notes)
     if found is None and _subdivides(pxr, prim, time):
-        found = crease_normals(shape.points, shape.vertices[shape.corner], same_points(shape.points), 180.0)
+        found = crease_normals(shape.points, shape.vertices[shape.corner], same_points(shape.points), CAGE_CREASE)
     return found
 
 
