@@ -19,8 +19,9 @@ pictures in OUT/cycles, so that a second run draws only our side.
 
 Figures: models (drawn by both), within_flip_005 (mean FLIP of the whole picture up to 0.05), share_within,
 within_on_model (the same of the mean over the pixels that either picture covers, which no background dilutes),
-silent_differences (beyond 0.05, and neither a note nor a reason with "by" explains it) and, not among the models,
-refused (by mistyle, with a sentence) and cycles_failed. --judge draws nothing and judges the last list of OUT again.
+silent_differences (beyond 0.05, and neither a note nor a reason with "by" explains it), cycles_departs (beyond 0.05
+because Blender departs from the specification; they count as misses) and, not among the models, refused (by mistyle,
+with a sentence) and cycles_failed. --judge draws nothing and judges the last list of OUT again.
 OUT/index.html and OUT/gallery.json list every model with both pictures, FLIP, notes and reason, worst first. Ends with
 1 where a difference is silent.
 """
@@ -60,6 +61,7 @@ class Row:
 
     flip         mean FLIP of the whole picture, on_model of what either picture covers; None where one is missing
     reason       why it differs, "" where nobody knows; explained: whether a note or Blender's own departure says so
+    by           who departs from the specification, where `BY` says so
     notes        the reader's sentences, or the one of a refusal (refused); trouble: why Blender made no picture
     """
 
@@ -73,6 +75,7 @@ class Row:
     refused: bool
     ours: str
     cycles: str
+    by: str = ""
 
     @property
     def within(self) -> bool:
@@ -135,6 +138,7 @@ def row(drawn: Drawn, folder: Path, reasons: Mapping[str, Any]) -> Row:
 def judged(found: Row, reasons: Mapping[str, Any]) -> Row:
     """A row with its reason."""
     reason, explained = why(found.model, found.notes, reasons)
+    found = replace(found, by=reasons.get("models", {}).get(found.model, {}).get("by", ""))
     if found.refused:
         return replace(found, reason=reason or "refused, with a sentence", explained=True)
     return replace(found, reason=reason, explained=explained)
@@ -150,6 +154,7 @@ def tally(rows: Sequence[Row]) -> dict[str, float]:
         "share_within": within / max(len(compared), 1),
         "within_on_model": sum(r.on_model is not None and r.on_model <= LIMIT for r in compared),
         "silent_differences": sum(r.silent for r in compared),
+        "cycles_departs": sum(not r.within and r.by == "cycles" for r in compared),
         "refused": sum(r.refused for r in rows),
         "cycles_failed": sum(bool(r.trouble) for r in rows),
     }

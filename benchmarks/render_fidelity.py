@@ -14,14 +14,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 
 from benchmarks.common import finish
-from mistyle.core.asset import Asset
 from mistyle.core.camera import look_at
-from mistyle.core.image import bilinear, erode, resize, srgb_from_linear
+from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.light import Environment
 from mistyle.core.paths import scenes
 
@@ -114,7 +112,7 @@ def displayed(linear: np.ndarray) -> np.ndarray:
 
 
 def draw_helmet(data: Path, size: tuple[int, int], spp: int) -> np.ndarray:
-    """Linear picture; what the helmet emits is added where it is seen, and lights nothing else."""
+    """Linear picture."""
     from mistyle.files.read import read_mesh, read_radiance
     from mistyle.render import lookdev
 
@@ -128,40 +126,7 @@ def draw_helmet(data: Path, size: tuple[int, int], spp: int) -> np.ndarray:
     camera = replace(camera, world_from_cam=moved)
     light = Environment(read_radiance(data / "hdri/aircraft_workshop_01_1k.hdr"), turn=90.0)
     scene = lookdev.asset_scene(lookdev.asset_shapes(asset), camera, [light], "path")
-    rgb = lookdev.drawn(scene, 0, spp, 1)[..., :3]
-    return rgb + emitted(asset, camera, emission(path))
-
-
-def emission(path: Path) -> np.ndarray:
-    """The linear emission texture of a GLB's only material."""
-    import io
-
-    from PIL import Image
-
-    from mistyle.core.image import linear_from_srgb
-    from mistyle.files.read import load_gltf
-
-    tree, buffers = load_gltf(path)
-    material = tree["materials"][0]
-    image = tree["images"][tree["textures"][material["emissiveTexture"]["index"]]["source"]]
-    view = tree["bufferViews"][image["bufferView"]]
-    start = view.get("byteOffset", 0)
-    data = buffers[view["buffer"]][start : start + view["byteLength"]]
-    encoded = np.asarray(Image.open(io.BytesIO(data)).convert("RGB"), np.float32) / 255
-    return linear_from_srgb(encoded) * np.asarray(material.get("emissiveFactor", [1, 1, 1]), np.float32)
-
-
-def emitted(asset: Asset, camera: Any, texture: np.ndarray, times: int = 3) -> np.ndarray:
-    """What the texture adds to each pixel: mean of `times` x `times` rays."""
-    from mistyle.core.camera import resized
-    from mistyle.render.draw import gbuffer
-
-    height, width = camera.size
-    hits = gbuffer(asset.mesh, resized(camera, (height * times, width * times)))
-    rows, columns = texture.shape[:2]
-    px = np.stack([hits.uv[..., 0] % 1 * columns, (1 - hits.uv[..., 1]) % 1 * rows], axis=-1).reshape(-1, 2)
-    found = bilinear(texture, px, "repeat").reshape(*hits.mask.shape, 3) * hits.mask[..., None]
-    return resize(found, (height, width))
+    return lookdev.drawn(scene, 0, spp, 1)[..., :3]
 
 
 def cycles(data: Path, blender: str, quick: bool, pictures: Path | None, only: str | None = None) -> dict[str, float]:

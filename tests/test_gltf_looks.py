@@ -435,7 +435,12 @@ def test_lamps_keep_their_light_and_unlit_goes_when_asked(tmp_path: Path) -> Non
         ({"alphaMode": "MASK", "pbrMetallicRoughness": {"baseColorTexture": {"index": 0}}}, ("cut out", "stays")),
         (
             {"pbrMetallicRoughness": {}, "extensions": {"KHR_materials_sheen": {}, "KHR_materials_clearcoat": {}}},
-            ("KHR_materials_clearcoat, KHR_materials_sheen", "stays"),
+            ("KHR_materials_sheen", "stays", "renders here leave it out"),
+        ),
+        ({"pbrMetallicRoughness": {}, "extensions": {"KHR_materials_clearcoat": {}}}, ("clearcoat", "painted")),
+        (
+            {"pbrMetallicRoughness": {}, "extensions": {"KHR_materials_clearcoat": {"clearcoatTexture": {"index": 0}}}},
+            ("KHR_materials_clearcoat", "not the textures"),
         ),
         ({"extensions": {"KHR_materials_pbrSpecularGlossiness": {}}}, ("specular colour",)),
         ({"doubleSided": True}, ("rough metal",)),

@@ -1,6 +1,7 @@
 """What a USD file says about looks: bindings by purpose, wrap modes, primvars of every kind, display colours."""
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from PIL import Image
 
 from mistyle.files.raw import Raw
 from mistyle.files.read import read_mesh
-from mistyle.files.usd_read import read_usd
+from mistyle.files.usd_read import metres, read_usd
 
 pxr = pytest.importorskip("pxr")
 
@@ -166,7 +167,7 @@ def test_wrap_modes_say_nothing_inside_the_square(tmp_path: Path) -> None:
         assert found.notes == ()
 
 
-def test_what_is_not_read_is_said(tmp_path: Path) -> None:
+def test_what_is_not_painted_is_said(tmp_path: Path) -> None:
     inputs = "        int inputs:useSpecularWorkflow = 1\n        color3f inputs:specularColor = (1, 0, 0)\n"
     inputs += "        float inputs:metallic = 1\n        color3f inputs:emissiveColor = (0, 2, 0)\n"
     inputs += "        float inputs:clearcoat = 0.5\n        float inputs:opacity = 0.5\n"
@@ -174,10 +175,120 @@ def test_what_is_not_read_is_said(tmp_path: Path) -> None:
     found = read(tmp_path, plate(BOUND + see_through), material(inputs))
     assert found.materials[0].metallic_factor == 0
     told = " ".join(found.notes)
-    assert "specular workflow" in told and "emissiveColor and clearcoat and opacity of material 'M'" in told
-    assert "displayOpacity" not in told and "displayOpacity was not read." in read(tmp_path, plate(see_through)).notes
+    assert "specular workflow" in told and "emissiveColor and clearcoat and opacity of material 'M' is drawn" in told
+    shading = found.materials[0].shading
+    assert (shading.opacity, shading.emission, shading.coat, shading.specular) == (0.5, (0, 2, 0), 0.5, (1, 0, 0))
+    assert "displayOpacity" not in told
+    assert read(tmp_path, plate(see_through)).materials[0].shading.opacity == 0.5
+    varied = see_through.replace("[0.5]", "[0.5, 1, 1, 1]")
+    assert any("displayOpacity was not read" in note for note in read(tmp_path, plate(varied)).notes)
     neutral = "        color3f inputs:emissiveColor = (0, 0, 0)\n        float inputs:opacity = 1\n"
     assert read(tmp_path, plate(BOUND), material(neutral)).notes == ()
+
+
+def test_opacity_and_emission_of_textures(tmp_path: Path) -> None:
+    """A cut-out by a texture's alpha; emission and a roughness that the file calls sRGB by its colours."""
+    Image.new("RGBA", (2, 2), (188, 255, 255, 51)).save(tmp_path / "wood.png")
+    inputs, shaders = texture(
+        '        token inputs:sourceColorSpace = "sRGB"\n        float outputs:a\n        float outputs:r\n'
+    )
+    inputs += "        color3f inputs:emissiveColor.connect = </R/M/T.outputs:rgb>\n"
+    inputs += "        float inputs:opacity.connect = </R/M/T.outputs:a>\n        float inputs:opacityThreshold = 0.3\n"
+    inputs += "        float inputs:roughness.connect = </R/M/T.outputs:r>\n"
+    found = read(tmp_path, plate(BOUND), material(inputs, shaders)).materials[0]
+    maps = {name: entry.values[0, 0] for name, entry in found.load(1001)[0].items()}
+    assert maps["opacity"] == pytest.approx(0.2) and found.shading.cutoff == pytest.approx(0.3)
+    assert maps["emission"] == pytest.approx([0.503, 1, 1], abs=1e-3) and found.shading.emission == (1, 1, 1)
+    assert maps["roughness"] == pytest.approx(0.503, abs=1e-3)
+
+
+AREAS = {
+    "Sphere": ("double radius = 2", 4 * np.pi * 4),
+    "Cube": ("double size = 3", 6 * 9),
+    "Cylinder": ("double radius = 2\n double height = 3", 2 * np.pi * 2 * 3 + 2 * np.pi * 4),
+    "Cone": ("double radius = 3\n double height = 4", np.pi * 3 * 5 + np.pi * 9),
+    "Capsule": ("double radius = 1\n double height = 2", 4 * np.pi + 2 * np.pi * 2),
+    "Plane": ("double width = 2\n double length = 3", 6),
+}
+
+
+@pytest.mark.parametrize("axis", ["X", "Y", "Z"])
+@pytest.mark.parametrize("kind", sorted(AREAS))
+def test_shapes_have_their_area_and_face_outwards(kind: str, axis: str, tmp_path: Path) -> None:
+    said, area = AREAS[kind]
+    said += "" if kind in ("Sphere", "Cube") else f'\n uniform token axis = "{axis}"'
+    found = read_usd(write(tmp_path, f'def {kind} "S"\n{{\n {said}\n}}\n'), 10_000)
+    corners = found.positions[found.faces]
+    vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    assert np.linalg.norm(vectors, axis=1).sum() == pytest.approx(area, rel=5e-3)
+    assert found.normals is not None and (np.einsum("fc,fkc->fk", vectors, found.normals) > 0).all()
+    if kind != "Plane":
+        assert (np.einsum("fc,fkc->fk", vectors, corners) > -1e-9).all()
+    assert any("no meshes" in note for note in found.notes)
+
+
+RIG = """
+def SkelRoot "Rig"
+{
+    def Skeleton "Bones" ( prepend apiSchemas = ["SkelBindingAPI"] )
+    {
+        uniform token[] joints = ["a"]
+        uniform matrix4d[] bindTransforms = [( (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1) )]
+        uniform matrix4d[] restTransforms = [( (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1) )]
+        rel skel:animationSource = </R/Rig/Move>
+    }
+    def SkelAnimation "Move"
+    {
+        uniform token[] joints = ["a"]
+        quatf[] rotations = [(1, 0, 0, 0)]
+        half3[] scales = [(1, 1, 1)]
+        float3[] translations.timeSamples = {
+            3: [(0, 0, 5)],
+            9: [(0, 0, 7)],
+        }
+    }
+"""
+SKIN = """
+    rel skel:skeleton = </R/Rig/Bones>
+    matrix4d primvars:skel:geomBindTransform = ( (1, 0, 0, 0), (0, 1, 0, 0), (0, 0, 1, 0), (0, 0, 0, 1) )
+    int[] primvars:skel:jointIndices = [0] (
+        interpolation = "constant"
+        elementSize = 1
+    )
+    float[] primvars:skel:jointWeights = [1] (
+        interpolation = "constant"
+        elementSize = 1
+    )
+"""
+
+
+def test_a_skeleton_poses_its_mesh(tmp_path: Path) -> None:
+    """One joint, moved by its animation's first sample."""
+    body = plate(SKIN).replace(API, 'prepend apiSchemas = ["SkelBindingAPI"]')
+    found = read(tmp_path, f"{RIG}{body}}}\n")
+    assert found.positions[:, 2] == pytest.approx(np.full(4, 5.0))
+    assert any("pose of its skeleton" in note for note in found.notes)
+
+
+def test_a_cage_is_shaded_smooth_and_a_polygon_mesh_is_not(tmp_path: Path) -> None:
+    none = read(tmp_path, plate(""))
+    cage = read(tmp_path, plate("").replace('"none"', '"catmullClark"'))
+    assert none.normals is None and cage.normals == pytest.approx(np.tile([0, 0, 1.0], (2, 3, 1)))
+
+
+def test_a_unit_of_another_type_counts(tmp_path: Path) -> None:
+    """A file may hold the unit as a float, which USD refuses to give as the double that it should be."""
+    stage = pxr.Usd.Stage.Open(str(write(tmp_path, plate(""))))
+
+    def refuses(_: object) -> float:
+        raise error
+
+    with pytest.raises(pxr.Tf.ErrorException) as caught:
+        pxr.Usd.Stage.Open(str(tmp_path / "none.usda"))
+    error = caught.value
+    stage.GetRootLayer().pseudoRoot.SetInfo("metersPerUnit", 2.0)
+    stub = SimpleNamespace(UsdGeom=SimpleNamespace(GetStageMetersPerUnit=refuses), Tf=pxr.Tf)
+    assert metres(stub, stage) == 2.0
 
 
 def test_an_unknown_shader_is_said(tmp_path: Path) -> None:

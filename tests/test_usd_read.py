@@ -95,7 +95,7 @@ def test_winding_follows_orientation_and_mirrors(tmp_path, orientation, scale, u
 def test_several_meshes_instances_and_what_is_hidden(tmp_path):
     body = mesh("One") + mesh("Two", extra=VERTEX + '    token visibility = "invisible"\n')
     body += mesh("Three", extra=INDEXED + '    uniform token purpose = "proxy"\n')
-    body += 'def Sphere "Ball" {}\n'
+    body += 'def BasisCurves "Hair" {}\n'
     body += 'def Xform "A" ( instanceable = true\n references = </Proto> ) { double3 xformOp:translate = (5, 0, 0)\n'
     body += '    uniform token[] xformOpOrder = ["xformOp:translate"]\n}\n'
     body += 'def Xform "B" ( instanceable = true\n references = </Proto> ) {}\n'
@@ -106,7 +106,7 @@ def test_several_meshes_instances_and_what_is_hidden(tmp_path):
     np.testing.assert_array_equal(found.twin, [0, 1, 2, 3, 4, 5, 3, 4, 5])
     np.testing.assert_allclose(found.positions[5:10] - found.positions[10:15], np.tile([5, 0, 0], (5, 1)))
     told = " ".join(found.notes)
-    assert all(word in told for word in ("Invisible", "proxy", "no meshes", "share their texels"))
+    assert all(word in told for word in ("Invisible", "proxy", "no surfaces", "share their texels"))
 
 
 def test_a_point_instancer_of_millions_costs_one_prototype(tmp_path):
@@ -502,6 +502,17 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
     write_look(tmp_path / "out" / "torn.usda", None, asset, looks, "wave", beside=tmp_path / "out")
     assert complaints(tmp_path / "out" / "torn.usda") == []
     check(asset, tmp_path / "out" / "torn.usda", 3)
+
+
+def test_a_sphere_gets_no_look(tmp_path):
+    """It has no faces that a layer could bind materials to, or give coordinates."""
+    from mistyle.files.materialx import Look
+    from mistyle.files.usd_look import write_look
+
+    asset = read_mesh(stage(tmp_path / "a.usda", 'def Sphere "Ball" {}\n'), size=64)
+    looks = [Look("material", *(f"textures/{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))]
+    with pytest.raises(InputRefused, match="Ball is a Sphere"):
+        write_look(tmp_path / "look.usda", None, asset, looks, "wave", beside=tmp_path)
 
 
 def _cut(asset) -> bool:

@@ -39,6 +39,39 @@ class Picture:
 
 
 @dataclass(frozen=True)
+class Shading:
+    """What a material says besides albedo, normal, roughness and metalness. Pictures of the file show it; the views
+    that are painted do not.
+
+    opacity         factor of the coverage, 0..1
+    cutoff          coverage at or above it is whole and below it nothing (glTF: MASK); None: blended
+    emission        factor of the emitted radiance, linear Rec.709, >= 0, unbounded
+    specular        factor of the dielectric's reflectance at normal incidence (F0), linear Rec.709, 0..1
+    edge            factor of its reflectance at grazing incidence (F90), 0..1
+    coat            weight of a clear coat of index 1.5, 0..1; coat_roughness its perceptual roughness
+    transmission    share of the dielectric's diffuse part that is transmitted, 0..1; ior the index, thin: no volume
+    unlit           albedo is what is seen, in whatever light
+    black           the albedo stands for the emission: as a surface the material is black
+    stated          "colour": the file leaves metalness and roughness open, and glTF's default, rough metal, is drawn;
+                    "nothing": there is no material at all, and a matt grey of 0.8 is drawn, as Blender does
+    """
+
+    opacity: float = 1.0
+    cutoff: float | None = None
+    emission: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    specular: tuple[float, float, float] = (0.04, 0.04, 0.04)
+    edge: float = 1.0
+    coat: float = 0.0
+    coat_roughness: float = 0.0
+    transmission: float = 0.0
+    ior: float = 1.5
+    thin: bool = True
+    unlit: bool = False
+    black: bool = False
+    stated: Literal["surface", "colour", "nothing"] = "surface"
+
+
+@dataclass(frozen=True)
 class Material:
     """The material that a file gives one texture set. Row 0 of every map is v = 1; maps repeat outside the square.
 
@@ -50,6 +83,10 @@ class Material:
     normal     unit tangent-space normal, +Y, the file's normal scale applied
     roughness  perceptual, 0..1
     metallic   0..1
+    opacity    coverage, linear, 0..1
+    emission   linear Rec.709, 0..1
+    specular   linear Rec.709, 0..1
+    shading    the factors of the last three, and what has no maps
     """
 
     name: str
@@ -60,6 +97,10 @@ class Material:
     albedo_factor: Float[np.ndarray, " 3"]
     roughness_factor: float
     metallic_factor: float
+    opacity: Float[np.ndarray, "ho wo"] | None = None
+    emission: Float[np.ndarray, "he we 3"] | None = None
+    specular: Float[np.ndarray, "hs ws 3"] | None = None
+    shading: Shading = Shading()
 
 
 @dataclass(frozen=True)

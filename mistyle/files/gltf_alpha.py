@@ -82,7 +82,7 @@ def _texture_alpha(
 def _base_texture(tree: Tree, material: int) -> Tree | None:
     entry = tree["materials"][material]
     glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-    return entry.get("pbrMetallicRoughness", {}).get("baseColorTexture") or glossy.get("diffuseTexture")
+    return glossy.get("diffuseTexture") if glossy else entry.get("pbrMetallicRoughness", {}).get("baseColorTexture")
 
 
 def image_bytes(image: Tree, tree: Tree, buffers: Buffers, path) -> bytes | None:

@@ -14,17 +14,23 @@ FLIP_V = np.array([[1.0, 0, 0], [0, -1, 1], [0, 0, 1]])  # (u, v) -> (u, 1 - v):
 
 
 def texture_infos(tree: Tree, material: int | None) -> dict[str, Tree]:
-    """The texture references of a material that reading uses: albedo, orm, normal."""
+    """The texture references of a material that reading uses: albedo, orm, normal, emission, specular (the colour of
+    F0), gloss (the same and, in its alpha, glossiness)."""
     if material is None or material < 0:
         return {}
     entry = tree["materials"][material]
     pbr = entry.get("pbrMetallicRoughness", {})
     glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
-    base = entry.get("emissiveTexture") if shadeless(entry) else pbr.get("baseColorTexture")
+    specular = entry.get("extensions", {}).get("KHR_materials_specular", {})
+    specular = specular if isinstance(specular, dict) else {}
+    base = pbr.get("baseColorTexture") if not glossy else glossy.get("diffuseTexture")
     found = {
-        "albedo": base or glossy.get("diffuseTexture"),
-        "orm": pbr.get("metallicRoughnessTexture"),
+        "albedo": entry.get("emissiveTexture") if shadeless(entry) else base,
+        "orm": None if glossy else pbr.get("metallicRoughnessTexture"),
         "normal": entry.get("normalTexture"),
+        "emission": entry.get("emissiveTexture") if emits(entry) and not shadeless(entry) else None,
+        "specular": None if glossy else specular.get("specularColorTexture"),
+        "gloss": glossy.get("specularGlossinessTexture"),
     }
     return {name: info for name, info in found.items() if isinstance(info, dict) and "index" in info}
 
@@ -35,8 +41,9 @@ def emits(entry: Tree) -> bool:
 
 def shadeless(entry: Tree) -> bool:
     """Whether a material shows its emission alone: a black base colour is how files say so without an extension."""
+    glossy = "KHR_materials_pbrSpecularGlossiness" in entry.get("extensions", {})
     base = entry.get("pbrMetallicRoughness", {}).get("baseColorFactor", [1, 1, 1, 1])
-    return emits(entry) and not any(c > 0 for c in base[:3])
+    return emits(entry) and not glossy and not any(c > 0 for c in base[:3])
 
 
 def sees_through(tree: Tree, material: int) -> bool:

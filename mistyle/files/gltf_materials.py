@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.core.asset import Shading
 from mistyle.files.bounds import beside, read_bytes
 from mistyle.files.glb import Buffers
 from mistyle.files.gltf_check import data_uri
@@ -22,28 +23,31 @@ from mistyle.files.gltf_infos import (
     texture_transform,
     wrap_of,
 )
-from mistyle.files.pictures import Budget, texture
+from mistyle.files.gltf_shading import GLOSSY, extension, number, shading_of, triple
+from mistyle.files.pictures import Budget, alpha_of, texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 
 Tree = dict[str, Any]
-_READ = ("KHR_materials_unlit", "KHR_materials_emissive_strength", "KHR_materials_pbrSpecularGlossiness")
+_READ = ("KHR_materials_unlit", "KHR_materials_emissive_strength", GLOSSY)
+_DRAWN = ("KHR_materials_ior", "KHR_materials_specular", "KHR_materials_clearcoat", "KHR_materials_transmission")
 
 
 def read_material(
     tree: Tree, buffers: Buffers, path: Path, index: int, other: dict[int, np.ndarray], budget: Budget
 ) -> RawMaterial:
     if index < 0:
-        return RawMaterial("material", no_textures, roughness_factor=0.5)
+        return RawMaterial("material", no_textures, roughness_factor=0.5, shading=Shading(stated="nothing"))
     entry = tree["materials"][index]
-    glossy = entry.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
+    said = entry.get("extensions", {})
     # glTF's default is rough metal, which a file that says nothing about its surface hardly means.
     pbr = entry.get("pbrMetallicRoughness", {"metallicFactor": 0.0, "roughnessFactor": 0.5})
-    if glossy and "pbrMetallicRoughness" not in entry:
-        rough = 1 - float(glossy.get("glossinessFactor", 1.0))
+    if GLOSSY in said:
+        glossy = extension(said, GLOSSY)
+        gloss = number(glossy, "glossinessFactor", 1.0, 0.0, 1.0)
         pbr = {
-            "baseColorFactor": glossy.get("diffuseFactor", [1, 1, 1]),
+            "baseColorFactor": triple(glossy, "diffuseFactor", (1.0, 1.0, 1.0), 1.0),
             "metallicFactor": 0.0,
-            "roughnessFactor": rough,
+            "roughnessFactor": 1.0 if "gloss" in texture_infos(tree, index) else 1 - gloss,
         }
     colour = entry["emissiveFactor"] if shadeless(entry) else pbr.get("baseColorFactor", [1, 1, 1])
     rough, metal = pbr.get("roughnessFactor", 1.0), pbr.get("metallicFactor", 1.0)
@@ -58,6 +62,7 @@ def read_material(
         (red, green, blue),
         float(np.clip(rough, 0, 1)),
         float(np.clip(metal, 0, 1)),
+        shading_of(entry, sees_through(tree, index)),
     )
 
 
@@ -78,15 +83,27 @@ def _load(
                 f"Textures of material '{_name(tree, index)}' show their nearest texel (magFilter NEAREST); renders "
                 "here interpolate."
             )
-        number = set_of(info)
+        chosen = set_of(info)
         lookup: Tree = dict(
-            uvs=other.get(number) if number != base else None,
+            uvs=other.get(chosen) if chosen != base else None,
             transform=texture_transform(info),
             wrap=wrap_of(tree, info["index"]),
         )
         pixels = texture(data, where, budget)
         if name == "albedo":
             maps["albedo"] = RawMap(pixels, **lookup, kind="colour")
+            alpha = alpha_of(data, where) if sees_through(tree, index) else None
+            if alpha is not None:
+                maps["opacity"] = RawMap(alpha, **lookup, kind="data")
+        elif name in ("emission", "specular"):
+            maps[name] = RawMap(pixels, **lookup, kind="colour")
+        elif name == "gloss":
+            maps["specular"] = RawMap(pixels, **lookup, kind="colour")
+            glossy = extension(tree["materials"][index]["extensions"], GLOSSY)
+            gloss = np.float32(number(glossy, "glossinessFactor", 1.0, 0.0, 1.0))
+            alpha = alpha_of(data, where)
+            alpha = np.ones((2, 2), np.float32) if alpha is None else alpha
+            maps["roughness"] = RawMap(1 - alpha * gloss, **lookup, kind="data")
         elif name == "normal":
             # Without TANGENT the frames follow the place of the lookup (as three.js and Khronos' viewer have it).
             frame: Tree = dict(scale=float(info.get("scale", 1.0)))
@@ -113,8 +130,8 @@ def _unseen(tree: Tree, index: int) -> list[str]:
         )
     elif emits(entry):
         notes.append(
-            f"Material '{name}' emits light, which renders here leave out; it stays in a finished asset and is added "
-            "to the painting."
+            f"Material '{name}' emits light, which the views that are painted leave out; it stays in a finished asset "
+            "and is added to the painting."
         )
     if "KHR_materials_unlit" in entry.get("extensions", {}):
         notes.append(f"Material '{name}' is unlit: without --lit, viewers of a result show its albedo alone.")
@@ -127,23 +144,33 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
     if sees_through(tree, index):
         how = "cut out" if entry["alphaMode"] == "MASK" else "blended"
         notes.append(
-            f"Material '{name}' is {how} by its alpha, which stays in a finished asset; renders here draw it whole."
+            f"Material '{name}' is {how} by its alpha, which stays in a finished asset; the views that are painted "
+            "show it whole."
         )
     more = sorted(n for n in entry.get("extensions", {}) if n.startswith("KHR_materials_") and n not in _READ)
+    drawn = [n for n in more if n in _DRAWN]
+    if drawn:
+        notes.append(
+            f"Material '{name}' has {', '.join(drawn)}, which stays in a finished asset; the views that are painted "
+            "leave it out."
+        )
+    with_maps = [n for n in drawn if any(k.endswith("Texture") for k in extension(entry["extensions"], n))]
+    if any(n != "KHR_materials_specular" for n in with_maps):
+        notes.append(f"Of {' and '.join(with_maps)} of material '{name}' the factors were read, not the textures.")
+    more = [n for n in more if n not in _DRAWN]
     if more:
         notes.append(
             f"Material '{name}' has {', '.join(more)}, which stays in a finished asset; renders here leave it out."
         )
-    glossy = "KHR_materials_pbrSpecularGlossiness" in entry.get("extensions", {})
-    if glossy:
+    if GLOSSY in entry.get("extensions", {}):
         notes.append(
-            f"Of material '{name}' (KHR_materials_pbrSpecularGlossiness) diffuse colour and glossiness were read, the "
-            "specular colour and what its texture says of gloss were not."
+            f"Of material '{name}' ({GLOSSY}) diffuse colour and glossiness are painted on; its specular colour is "
+            "drawn, and a finished asset has no such thing."
         )
     elif "pbrMetallicRoughness" not in entry and "KHR_materials_unlit" not in entry.get("extensions", {}):
         notes.append(
-            f"Material '{name}' leaves metalness and roughness open: it was read as a dielectric of roughness 0.5, "
-            "where glTF's default is rough metal."
+            f"Material '{name}' leaves metalness and roughness open: it is drawn as rough metal, glTF's default, and "
+            "painted as a dielectric of roughness 0.5."
         )
     return notes
 

@@ -75,7 +75,7 @@ def _patches(tree: Tree, buffers: Buffers, asset: Asset) -> dict[int, list[Patch
         groups[primitive.node, primitive.mesh, primitive.primitive].append(primitive)
     result: dict[int, list[Patch]] = defaultdict(list)
     for (node, mesh, number), entries in groups.items():
-        rows = np.concatenate([np.arange(e.start, e.stop) for e in entries])
+        rows = np.arange(entries[0].start, entries[0].stop)  # further ones are instances, with the same texels
         faces = asset.mesh.faces[rows].astype(np.int64) - entries[0].first_vertex
         order = [0, 1, 2]
         try:

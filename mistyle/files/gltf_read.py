@@ -1,25 +1,27 @@
 """glTF to triangles: node transforms, skins in their bind pose, strips and fans, materials with their textures."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.asset import Primitive
+from mistyle.core.asset import Primitive, Shading
 from mistyle.core.normals import area_vectors
 from mistyle.files.bounds import refuse
 from mistyle.files.glb import Buffers, values
 from mistyle.files.gltf_check import AGAIN, load_gltf
-from mistyle.files.gltf_infos import base_set, wanted_sets
+from mistyle.files.gltf_infos import base_set, sees_through, wanted_sets
 from mistyle.files.gltf_materials import read_material
+from mistyle.files.gltf_pose import INSTANCING, instances, joint_matrices, mirrors, morphed, posed, skinned, turned
 from mistyle.files.gltf_vertices import triangles
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_indices, check_positions, too_many
 from mistyle.files.raw import Corners, Indexed, Raw
 
 Tree = dict[str, Any]
+MAX_INSTANCED = 500_000  # faces up to which all instances of a node are read
 
 
 @dataclass(frozen=True)
@@ -37,14 +39,25 @@ class _Piece:
     uvs: Corners | None
     other_uvs: dict[int, np.ndarray]
     colours: Corners | None
+    alphas: Corners | None
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a primitive's vertices stand: their first number, their positions in world space and their matrices."""
+
+    node: int
+    start: int
+    positions: np.ndarray
+    places: np.ndarray
 
 
 def read_gltf(path: Path, max_faces: int) -> Indexed:
     """Triangles of the default scene (of all nodes where there is none), in node order and file order.
 
-    Positions are in world space, node transforms applied. A skinned mesh comes in its bind pose: its own node's
-    transform has no meaning (glTF 2.0, 3.7.3.3), it is placed as its skeleton's root places it. Morph targets stay
-    at their base shape. Primitives of points and lines, hidden nodes (KHR_node_visibility) and nodes scaled to nothing
+    Positions are in world space, node transforms applied. A skinned mesh comes in the pose that its joints' nodes have:
+    its own node's transform has no meaning (glTF 2.0, 3.7.3.3). Morph targets count by the weights that the file gives
+    them. Primitives of points and lines, hidden nodes (KHR_node_visibility) and nodes scaled to nothing
     are left out with a note. Where NORMAL is missing faces are flat, as the specification demands.
     """
     notes: list[str] = []
@@ -61,8 +74,8 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
     used = sorted({p.material for p in pieces})
     if -1 in used:
         notes.append(
-            "A primitive has no material: it was read as a white dielectric of roughness 0.5, where glTF's default is "
-            "rough metal."
+            "A primitive has no material: it is drawn matt and grey, as Blender draws it, and painted as a white "
+            "dielectric of roughness 0.5; glTF's default is white rough metal."
         )
     place = {m: i for i, m in enumerate(used)}
     counts = [len(p.faces) for p in pieces]
@@ -71,6 +84,9 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
     material = np.repeat(np.array([place[p.material] for p in pieces], kind), counts)
     budget = Budget(path)
     materials = tuple(read_material(tree, buffers, path, m, _other_sets(pieces, m), budget) for m in used)
+    if -1 in used and any(p.material < 0 and p.colours is not None for p in pieces):
+        # Vertex colours are a statement, which glTF's default material shows.
+        materials = (replace(materials[0], shading=Shading(stated="colour")), *materials[1:])
     starts = np.cumsum([0, *counts])
     primitives = tuple(
         Primitive(p.node, p.mesh, p.primitive, int(a), int(b), p.material, p.texcoord, -1, p.first_vertex)
@@ -93,11 +109,15 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
     colours = None
     if any(p.colours is not None and (p.colours.values != 1).any() for p in pieces):
         colours = _joined([p.colours or _same_for_all(len(p.faces), [1.0] * 3) for p in pieces], faces)
+    alphas = None
+    if any(p.alphas is not None and (p.alphas.values != 1).any() for p in pieces):
+        alphas = _joined([p.alphas or _same_for_all(len(p.faces), [1.0]) for p in pieces], faces)
     return Indexed(
         raw,
         _joined([p.normals for p in pieces], faces),
         uvs if np.isfinite(uvs.values).any() else None,
         colours,
+        alphas,
     )
 
 
@@ -118,44 +138,73 @@ def _pieces(
 ) -> tuple[list[_Piece], list[np.ndarray]]:
     pieces: list[_Piece] = []
     positions: list[np.ndarray] = []
-    vertices = faces = 0
     world = world_matrices(tree)
-    first: dict[tuple[int, int], int] = {}
+    faces = vertices = 0
     for node in _scene_nodes(tree, notes):
         entry = tree["nodes"][node]
         if "mesh" not in entry:
             continue
-        matrix = world[node]
+        matrix, joints = world[node], None
         if "skin" in entry:
-            matrix = _bind_pose(tree, buffers, entry["skin"], world, path)
-            notes.append("A skinned mesh was read in its bind pose; skin and animations stay as they are.")
-        if not np.isfinite(matrix).all():
+            joints, root = joint_matrices(tree, buffers, entry["skin"], world, path)
+            matrix = joints[root]
+            notes.append("A skinned mesh was read in the pose of its joints; skin and animations stay as they are.")
+        if not np.isfinite(matrix if joints is None else joints).all():
             raise refuse(path, f"node {node} with a transform that is not finite", "finite numbers", AGAIN)
         if _flattened(matrix):
             notes.append("Nodes that are scaled to a point or a line were left out; they stay in a finished asset.")
             continue
-        if "EXT_mesh_gpu_instancing" in entry.get("extensions", {}):
-            notes.append("Instances (EXT_mesh_gpu_instancing) were read once; all of them show the same texels.")
-        for number, primitive in enumerate(tree["meshes"][entry["mesh"]]["primitives"]):
-            _check_counts(tree, primitive, max_faces, path)
-            index = _indices(tree, buffers, primitive, path)
-            if index is None or "POSITION" not in primitive["attributes"] or len(index) == 0:
-                notes.append("Points and lines were left out.")
-                continue
-            faces += len(index)
-            too_many(faces, max_faces, path)
-            accessor = primitive["attributes"]["POSITION"]
-            if (node, accessor) not in first:
-                first[node, accessor] = vertices
-                local = _vectors(tree, buffers, accessor, 3, path)
-                positions.append(_placed(local, matrix))
-                check_positions(positions[-1], path)
-                vertices += len(local)
-                too_many(vertices, 3 * max_faces, path, "vertices")
-            pieces.append(
-                _piece(tree, buffers, path, (node, entry["mesh"], number), primitive, index, matrix, first, notes)
-            )
+        for instance in _instances(tree, buffers, entry, min(max_faces, MAX_INSTANCED) - faces, notes):
+            placed: dict[str, _Place] = {}
+            for number, primitive in enumerate(tree["meshes"][entry["mesh"]]["primitives"]):
+                _check_counts(tree, primitive, max_faces, path)
+                index = _indices(tree, buffers, primitive, path)
+                if index is None or "POSITION" not in primitive["attributes"] or len(index) == 0:
+                    notes.append("Points and lines were left out.")
+                    continue
+                faces += len(index)
+                too_many(faces, max_faces, path)
+                # Primitives that share their vertices share the positions as well.
+                key = _vertices_of(primitive)
+                if key not in placed:
+                    places = matrix @ instance
+                    if joints is not None:
+                        places = skinned(tree, buffers, joints, primitive, matrix, path)
+                    placed[key] = _place(tree, buffers, path, node, primitive, vertices, places)
+                    positions.append(placed[key].positions)
+                    vertices += len(positions[-1])
+                    too_many(vertices, 3 * max_faces, path, "vertices")
+                pieces.append(_piece(tree, buffers, path, placed[key], number, index, notes))
     return pieces, positions
+
+
+def _place(
+    tree: Tree, buffers: Buffers, path: Path, node: int, primitive: Tree, start: int, places: np.ndarray
+) -> _Place:
+    local = _vectors(tree, buffers, primitive["attributes"]["POSITION"], 3, path)
+    at = posed(morphed(tree, buffers, tree["nodes"][node], primitive, "POSITION", local), places)
+    check_positions(at, path)
+    return _Place(node, start, at, places)
+
+
+def _vertices_of(primitive: Tree) -> str:
+    """What decides where a primitive's vertices stand: their accessors' numbers."""
+    named = primitive["attributes"].items()
+    own = sorted((n, a) for n, a in named if n == "POSITION" or n.startswith(("JOINTS_", "WEIGHTS_")))
+    return str([own, [target.get("POSITION") for target in primitive.get("targets", [])]])
+
+
+def _instances(tree: Tree, buffers: Buffers, node: Tree, room: int, notes: list[str]) -> list[np.ndarray]:
+    """The matrices of a node's instances; the first alone where there is no `room` for the faces of all."""
+    found = instances(tree, buffers, node, notes)
+    if len(found) <= 1 or "skin" in node:
+        return found[:1]
+    primitives = [p for p in tree["meshes"][node["mesh"]]["primitives"] if "POSITION" in p["attributes"]]
+    corners = sum(tree["accessors"][p.get("indices", p["attributes"]["POSITION"])]["count"] for p in primitives)
+    if len(found) * corners > 3 * room:
+        notes.append(f"Of {len(found)} instances ({INSTANCING}) the first was read; all of them show the same texels.")
+        return found[:1]
+    return found
 
 
 def _flattened(matrix: Float[np.ndarray, "4 4"]) -> bool:
@@ -164,30 +213,23 @@ def _flattened(matrix: Float[np.ndarray, "4 4"]) -> bool:
     return bool(second <= 1e-9 * first)
 
 
-def _placed(local: Float[np.ndarray, "v 3"], matrix: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "v 3"]:
-    """Positions in world space; where that is the node's own, the file's float32 as they are: half of the bytes."""
-    if local.dtype == np.float32 and np.array_equal(matrix, np.eye(4)):
-        return local
-    return local.astype(np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-
-
-def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -> _Piece:
+def _piece(tree: Tree, buffers: Buffers, path: Path, where: _Place, number: int, index, notes: list[str]) -> _Piece:
     """One primitive's corners in world space, v up; the winding is turned where the node mirrors space."""
+    node = tree["nodes"][where.node]
+    primitive = tree["meshes"][node["mesh"]]["primitives"][number]
     attributes = primitive["attributes"]
     count = tree["accessors"][attributes["POSITION"]]["count"]
     check_indices(index, count, path, "vertex")
     index = index.astype(np.int32)
-    if np.linalg.det(matrix[:3, :3]) < 0:
+    if mirrors(where.places):
         index = index[:, [0, 2, 1]]
     if "NORMAL" in attributes:
         vectors = _vectors(tree, buffers, attributes["NORMAL"], 3, path).astype(np.float64)
-        if not np.array_equal(matrix[:3, :3], np.eye(3)):
-            vectors = vectors @ np.linalg.pinv(matrix[:3, :3])  # the inverse transpose, for row vectors
+        vectors = turned(morphed(tree, buffers, node, primitive, "NORMAL", vectors), where.places)
         corner = index
     else:
         notes.append("A primitive has no normals: its faces are shaded flat, as glTF demands.")
-        local = _vectors(tree, buffers, attributes["POSITION"], 3, path).astype(np.float64)
-        vectors = area_vectors(local @ matrix[:3, :3].T, index)
+        vectors = area_vectors(where.positions, index)
         corner = np.repeat(np.arange(len(index), dtype=np.int32)[:, None], 3, axis=1)
     length = np.linalg.norm(vectors, axis=1, keepdims=True)
     normals = Corners((vectors / np.where(length > 0, length, 1)).astype(np.float32), corner)
@@ -198,19 +240,20 @@ def _piece(tree, buffers, path, where, primitive, index, matrix, first, notes) -
     }
     base = base_set(tree, primitive.get("material"))
     colours = _colours(tree, buffers, attributes["COLOR_0"], path) if "COLOR_0" in attributes else None
-    start = first[where[0], attributes["POSITION"]]
+    through = "material" in primitive and sees_through(tree, primitive["material"])
     return _Piece(
-        node=where[0],
-        mesh=where[1],
-        primitive=where[2],
+        node=where.node,
+        mesh=node["mesh"],
+        primitive=number,
         material=primitive.get("material", -1),
         texcoord=base if base in sets else -1,
-        first_vertex=start,
-        faces=index + np.int32(start),
+        first_vertex=where.start,
+        faces=index + np.int32(where.start),
         normals=normals,
         uvs=sets.get(base),
         other_uvs={n: uvs.finished() for n, uvs in sets.items() if n != base},
-        colours=None if colours is None else Corners(colours, index),
+        colours=None if colours is None else Corners(colours[:, :3], index),
+        alphas=Corners(colours[:, 3:], index) if colours is not None and colours.shape[1] == 4 and through else None,
     )
 
 
@@ -242,12 +285,12 @@ def _texcoords(tree: Tree, buffers: Buffers, accessor: int, path: Path) -> Float
     return np.stack([uv[:, 0], 1 - uv[:, 1]], axis=1)
 
 
-def _colours(tree: Tree, buffers: Buffers, accessor: int, path: Path) -> Float[np.ndarray, "n 3"]:
-    """Linear vertex colours 0..1, without their alpha (which files/gltf_alpha.py reads)."""
+def _colours(tree: Tree, buffers: Buffers, accessor: int, path: Path) -> Float[np.ndarray, "n k"]:
+    """Linear vertex colours 0..1, with their alpha where they have one."""
     kind = tree["accessors"][accessor]
     if kind["type"] not in ("VEC3", "VEC4"):
         raise refuse(path, f"vertex colours of {kind['type']}", "VEC3 or VEC4", AGAIN)
-    found = values(tree, buffers, accessor)[:, :3]
+    found = values(tree, buffers, accessor)
     if found.dtype.kind != "f":  # whole numbers that the file forgot to call normalised
         found = found / np.float32(np.iinfo(found.dtype).max)
     return np.clip(np.nan_to_num(found.astype(np.float32), nan=1.0), 0, 1)
@@ -308,24 +351,6 @@ def world_matrices(tree: Tree) -> list[Float[np.ndarray, "4 4"]]:
             world[child] = world[i] @ local[child]
             stack.append(child)
     return world
-
-
-def _bind_pose(
-    tree: Tree, buffers: Buffers, skin: int, world: list[np.ndarray], path: Path
-) -> Float[np.ndarray, "4 4"]:
-    """Where the root joint puts the mesh: its world matrix times its inverse bind matrix. The same as skinning where
-    the file's rest pose is the bind pose; else the bind pose, upright and at the right size all the same."""
-    joints = tree["skins"][skin]["joints"]
-    below = {c for j in joints for c in tree["nodes"][j].get("children", [])}
-    root = next((k for k, j in enumerate(joints) if j not in below), 0)
-    inverse = np.eye(4)
-    if "inverseBindMatrices" in tree["skins"][skin]:
-        accessor = tree["skins"][skin]["inverseBindMatrices"]
-        entry = tree["accessors"][accessor]
-        if entry["type"] != "MAT4" or entry["componentType"] != 5126 or entry["count"] < len(joints):
-            raise refuse(path, "inverse bind matrices of another kind", "one float MAT4 per joint", AGAIN)
-        inverse = values(tree, buffers, accessor)[root].astype(np.float64).reshape(4, 4).T
-    return world[joints[root]] @ inverse
 
 
 def _other_sets(pieces: list[_Piece], material: int) -> dict[int, Float[np.ndarray, "f 3 2"]]:

@@ -62,7 +62,9 @@ def extent(raw: Raw, path: Path, uv: UnwrapMode, size: int) -> Extent:
             sides = {name: _side(entry, raw, plan, size) for name, entry in maps.items()}
             if tinted:
                 sides["albedo"] = _tinted_side(sides.get("albedo"), size)
-            channels = {name: 3 if name in ("albedo", "normal") else 1 for name in sides}
+            if raw.alphas is not None and not _one_colour(raw.alphas[plan.rows]):
+                sides["opacity"] = _tinted_side(sides.get("opacity"), size)
+            channels = {name: 1 if name in ("roughness", "metallic", "opacity") else 3 for name in sides}
             own += sum(4 * height * width * channels[name] for name, (height, width) in sides.items())
     return Extent(len(raw.faces), unwrapped, sets, own)
 
@@ -82,7 +84,7 @@ def _tinted_side(albedo: tuple[int, int] | None, size: int) -> tuple[int, int]:
     return side, side
 
 
-def _one_colour(colours: Float[np.ndarray, "f 3 3"]) -> bool:
+def _one_colour(colours: Float[np.ndarray, "f 3 c"]) -> bool:
     return bool(np.ptp(colours, axis=(0, 1)).max() < ONE_COLOUR)
 
 
@@ -330,6 +332,12 @@ def _material(
     if raw.colours is not None and (raw.colours[rows] != 1).any():
         albedo, factor = _tinted(albedo, factor, raw.colours[rows], mesh.corner_uvs[rows], size)
         notes.append(f"The vertex colours of material '{source.name}' were taken into its albedo.")
+    opacity, shading = done.get("opacity"), source.shading
+    if raw.alphas is not None and (raw.alphas[rows] != 1).any():
+        planes = None if opacity is None else opacity[..., None]
+        planes, scale = _tinted(planes, np.ones(1, np.float32), raw.alphas[rows], mesh.corner_uvs[rows], size)
+        opacity = None if planes is None else planes[..., 0]
+        shading = replace(shading, opacity=shading.opacity * float(scale[0]))
     for name in [n for n, values in done.items() if values is None]:
         notes.append(
             f"The {name} map of material '{source.name}' was left out: its faces have no UVs to look it up at."
@@ -343,6 +351,10 @@ def _material(
         albedo_factor=factor,
         roughness_factor=float(source.roughness_factor),
         metallic_factor=float(source.metallic_factor),
+        opacity=opacity,
+        emission=done.get("emission"),
+        specular=done.get("specular"),
+        shading=shading,
     )
 
 
@@ -355,14 +367,14 @@ def _is_plain(entry: RawMap, uvs: Float[np.ndarray, "f 3 2"] | None, rows: np.nd
 
 
 def _tinted(
-    albedo: Float[np.ndarray, "h w 3"] | None,
-    factor: Float[np.ndarray, "3"],
-    colours: Float[np.ndarray, "f 3 3"],
+    albedo: Float[np.ndarray, "h w c"] | None,
+    factor: Float[np.ndarray, " c"],
+    colours: Float[np.ndarray, "f 3 c"],
     uvs: Float[np.ndarray, "f 3 2"],
     size: int,
-) -> tuple[Float[np.ndarray, "h2 w2 3"] | None, Float[np.ndarray, "3"]]:
-    """Albedo and its factor, multiplied by the colours of the faces' corners. One colour for all goes into the factor,
-    others into a texture of `size` texels along a side, or more where the albedo has more."""
+) -> tuple[Float[np.ndarray, "h2 w2 c"] | None, Float[np.ndarray, " c"]]:
+    """Albedo (or opacity) and its factor, multiplied by the colours of the faces' corners. One colour for all goes into
+    the factor, others into a texture of `size` texels along a side, or more where the albedo has more."""
     if _one_colour(colours):
         return albedo, factor * (colours.min(axis=(0, 1)) + colours.max(axis=(0, 1))) / 2
     shape = _tinted_side(None if albedo is None else albedo.shape[:2], size)

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.asset import Primitive
+from mistyle.core.asset import Primitive, Shading
 from mistyle.core.errors import InputRefused
 from mistyle.core.retexture import REPEAT, Wraps
 from mistyle.files.bounds import WORK_TEXTURE
@@ -41,7 +41,7 @@ class RawMap:
         return replace(self, values=values, kind=None)
 
 
-Maps = Mapping[str, RawMap]  # keys: albedo, normal, roughness, metallic
+Maps = Mapping[str, RawMap]  # keys: albedo, normal, roughness, metallic, opacity, emission, specular
 
 
 @dataclass(frozen=True)
@@ -80,6 +80,7 @@ class RawMaterial:
     albedo_factor: tuple[float, float, float] = (1.0, 1.0, 1.0)
     roughness_factor: float = 1.0
     metallic_factor: float = 0.0
+    shading: Shading = Shading()
 
 
 @dataclass(frozen=True)
@@ -92,6 +93,7 @@ class Raw:
     twin      the face whose UVs each face shares because the file stores them once (glTF instances), itself otherwise
     authored  the `uvs` of the file where files/lookups.py made others of them, else None
     colours   per corner, linear Rec.709, 0..1: what the albedo is to be multiplied by (vertex colours); None for white
+    alphas    per corner, 0..1: what the opacity is to be multiplied by; None for 1
     """
 
     kind: str
@@ -106,6 +108,7 @@ class Raw:
     notes: tuple[str, ...] = field(default=())
     authored: Float[np.ndarray, "f 3 2"] | None = None
     colours: Float[np.ndarray, "f 3 3"] | None = None
+    alphas: Float[np.ndarray, "f 3 1"] | None = None
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,7 @@ class Indexed:
     normals: Corners
     uvs: Corners | None
     colours: Corners | None = None
+    alphas: Corners | None = None
 
     def finished(self) -> Raw:
         """As everything after the border has it."""
@@ -150,6 +154,7 @@ class Indexed:
             normals=self.normals.finished(),
             uvs=None if self.uvs is None else self.uvs.finished(),
             colours=None if self.colours is None else self.colours.finished(),
+            alphas=None if self.alphas is None else self.alphas.finished(),
         )
 
 

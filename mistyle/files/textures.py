@@ -110,7 +110,7 @@ def set_textures(material: Tree, textures: dict[str, int], texcoord: int = 0) ->
         return {"index": textures[name]} | ({"texCoord": texcoord} if texcoord else {})
 
     glossy = drop_extension(material, "KHR_materials_pbrSpecularGlossiness")
-    if "pbrMetallicRoughness" not in material:
+    if glossy is not None or "pbrMetallicRoughness" not in material:
         material["pbrMetallicRoughness"] = {"baseColorFactor": (glossy or {}).get("diffuseFactor", [1, 1, 1, 1])}
     surface = material["pbrMetallicRoughness"]
     alpha = float(surface.pop("baseColorFactor", [1, 1, 1, 1])[3])

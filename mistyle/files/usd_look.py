@@ -21,6 +21,7 @@ from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.files.materialx import Look
 from mistyle.files.usd import define_material, library
 from mistyle.files.usd_read import Polygons, mesh_prims, open_stage, polygons, uv_primvar
+from mistyle.files.usd_shapes import is_shape
 
 SET = "look"
 
@@ -94,6 +95,12 @@ def _shapes(pxr: Any, source: Any, asset: Asset) -> dict[str, tuple[Primitive, P
     result = {}
     for one in asset.source.primitives:
         prim, matrix = there.get(one.name, (None, None))
+        if prim is not None and is_shape(prim):
+            kind = str(prim.GetTypeName())
+            raise InputRefused(
+                f"{path}: {one.name} is a {kind}, which has no faces for a look to name; expected meshes. Turn it into "
+                "a mesh, or deliver another format"
+            )
         shape = None if prim is None else polygons(pxr, prim, path)
         if shape is None or matrix is None or len(shape.corner) != one.stop - one.start:
             raise InputRefused(f"{path}: {one.name} is no longer the mesh that the run read; run the job again")

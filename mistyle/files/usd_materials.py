@@ -9,18 +9,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.core.asset import Shading
 from mistyle.core.errors import InputRefused
 from mistyle.core.retexture import Wrap
-from mistyle.files.pictures import MAX_PICTURE_BYTES, Budget, decode
+from mistyle.files.pictures import MAX_PICTURE_BYTES, Budget, alpha_of, decode
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 from mistyle.files.usd_layers import Place, bytes_of, locate, place_of
 
 CHANNELS = {"r": (0,), "g": (1,), "b": (2,), "rgb": (0, 1, 2), "a": ()}
 INPUTS = {"albedo": "diffuseColor", "roughness": "roughness", "metallic": "metallic", "normal": "normal"}
+# What is drawn and not painted.
+SHADING = {"opacity": "opacity", "emission": "emissiveColor", "specular": "specularColor"}
 WRAPS: dict[str, Wrap] = {"repeat": "repeat", "mirror": "mirror", "clamp": "clamp", "black": "clamp"}
+PLAIN = Shading()
+COLOURS = ("albedo", "emission", "specular")
 OUTSIDE = 1e-3  # UVs that leave the unit square by less show nothing of what lies there
 # Inputs that change how a surface looks and are not read, unless they have this value.
-UNREAD = {"emissiveColor": 0.0, "clearcoat": 0.0, "displacement": 0.0, "opacity": 1.0, "opacityThreshold": 0.0}
+UNREAD = {"displacement": 0.0}
+UNPAINTED = {"emissiveColor": 0.0, "clearcoat": 0.0, "opacity": 1.0, "ior": 1.5}
 DEFAULTS = {"albedo": (0.18, 0.18, 0.18), "roughness": 0.5, "metallic": 0.0}
 
 
@@ -65,9 +71,14 @@ def _moved(load: Any, others: dict[str, np.ndarray], tile: int) -> tuple[Maps, t
     return {k: replace(m, uvs=others[k]) if k in others else m for k, m in maps.items()}, notes
 
 
-def plain(name: str, albedo: tuple[float, float, float] = (1.0, 1.0, 1.0), colour: str | None = None) -> Found:
-    """A material without textures; `colour` is the primvar that is its albedo."""
-    return Found(RawMaterial(name, no_textures, None, albedo, 0.5, 0.0), None, colour)
+def plain(
+    name: str,
+    albedo: tuple[float, float, float] = (1.0, 1.0, 1.0),
+    colour: str | None = None,
+    shading: Shading = PLAIN,
+) -> Found:
+    """A material without textures; `colour` is the primvar that is its albedo, `shading` what else it says."""
+    return Found(RawMaterial(name, no_textures, None, albedo, 0.5, 0.0, shading), None, colour)
 
 
 def outside(found: Found, uvs: Float[np.ndarray, "n 3 2"] | None) -> list[str]:
@@ -111,13 +122,17 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
                 notes.append(f"The {named} of material '{name}' comes from a {value.kind}, which was not read.")
         elif value is not None and kind != "normal":
             constants[kind] = value
+    shading = _shading(pxr, surface, textures, time)
     unread = [said for said in UNREAD if _differs(_source(pxr, surface.GetInput(said), time), UNREAD[said])]
     if unread:
         notes.append(f"The {' and '.join(unread)} of material '{name}' was not read.")
-    if _source(pxr, surface.GetInput("useSpecularWorkflow"), time):
+    unpainted = [n for n in UNPAINTED if _differs(_source(pxr, surface.GetInput(n), time), UNPAINTED[n])]
+    if unpainted:
         notes.append(
-            f"Material '{name}' has the specular workflow: it was read as not metallic, without specularColor."
+            f"The {' and '.join(unpainted)} of material '{name}' is drawn; paintings and finished assets leave it out."
         )
+    if _source(pxr, surface.GetInput("useSpecularWorkflow"), time):
+        notes.append(f"Material '{name}' has the specular workflow: it is drawn so, and painted as not metallic.")
         textures.pop("metallic", None)
         constants["metallic"] = 0.0
     white = "albedo" in textures or colour is not None
@@ -130,8 +145,38 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
         (albedo[0], albedo[1], albedo[2]),
         1.0 if "roughness" in textures else float(np.clip(constants["roughness"], 0, 1)),
         1.0 if "metallic" in textures else float(np.clip(constants["metallic"], 0, 1)),
+        shading,
     )
     return Found(made, next((t.primvar for t in textures.values()), None), colour, textures)
+
+
+def _shading(pxr: Any, surface: Any, textures: dict[str, Texture], time: Any) -> Shading:
+    """What the preview surface says besides the maps that are painted; its textures go into `textures`."""
+
+    def constant(name: str, otherwise: Any) -> Any:
+        value = _source(pxr, surface.GetInput(name), time)
+        return otherwise if value is None or isinstance(value, Texture | Primvar) else value
+
+    glossy = bool(_source(pxr, surface.GetInput("useSpecularWorkflow"), time))
+    for kind, name in SHADING.items():
+        value = _source(pxr, surface.GetInput(name), time)
+        if isinstance(value, Texture) and (kind != "specular" or glossy):
+            textures[kind] = value
+    ior, threshold = float(constant("ior", 1.5)), float(constant("opacityThreshold", 0.0))
+    f0 = [((1 - ior) / (1 + ior)) ** 2] * 3 if ior > 0 else [1.0] * 3
+    if glossy:
+        f0 = [1.0] * 3 if "specular" in textures else list(constant("specularColor", (0.0, 0.0, 0.0)))
+    glow = [1.0] * 3 if "emission" in textures else list(constant("emissiveColor", (0.0, 0.0, 0.0)))
+    red, green, blue = (float(c) for c in np.clip(np.nan_to_num(f0), 0, 1))
+    coat = float(np.clip(constant("clearcoat", 0.0), 0, 1))
+    return Shading(
+        opacity=1.0 if "opacity" in textures else float(np.clip(constant("opacity", 1.0), 0, 1)),
+        cutoff=threshold if threshold > 0 else None,
+        emission=(max(float(glow[0]), 0), max(float(glow[1]), 0), max(float(glow[2]), 0)),
+        specular=(red, green, blue) if glossy or ior != 1.5 else Shading().specular,
+        coat=coat,
+        coat_roughness=float(np.clip(constant("clearcoatRoughness", 0.01), 0, 1)) if coat else 0.0,
+    )
 
 
 def _differs(value: Any, neutral: float) -> bool:
@@ -235,19 +280,30 @@ def _texels(kind: str, texture: Texture, place: Place, budget: Budget, notes: li
     """One map as `Material` has it; None with a note where it is not there or cannot be used."""
     chosen = CHANNELS[texture.channel]
     if not chosen:
-        notes.append(f"Texture {texture.file} is used by its alpha, which was not read.")
-        return None
+        return _alpha(texture, place, notes)
     if place.file.suffix.lower() == ".exr" or place.inner.lower().endswith(".exr"):
         pixels = _light(place, notes)
     else:
         data = bytes_of(place, MAX_PICTURE_BYTES)
         if data is None:
             notes.append(f"Texture {texture.file} is not there and was left out.")
-        decoded = kind == "albedo" and texture.space != "raw"
+        decoded = texture.space != "raw" if kind in COLOURS else texture.space == "sRGB" and kind != "normal"
         pixels = None if data is None else decode(data, str(place), budget, "colour" if decoded else "data")
     if pixels is None:
         return None
     return _meant(kind, texture, pixels, chosen)
+
+
+def _alpha(texture: Texture, place: Place, notes: list[str]) -> Float[np.ndarray, "h w"] | None:
+    """A map that is a texture's alpha; 1 where it has none."""
+    data = bytes_of(place, MAX_PICTURE_BYTES)
+    if data is None:
+        notes.append(f"Texture {texture.file} is not there and was left out.")
+        return None
+    alpha = alpha_of(data, str(place))
+    alpha = np.ones((2, 2), np.float32) if alpha is None else alpha
+    scale, bias = ((said or (other,) * 4)[3] for said, other in ((texture.scale, 1.0), (texture.bias, 0.0)))
+    return np.clip(alpha * np.float32(scale) + np.float32(bias), 0, 1)
 
 
 def _light(place: Place, notes: list[str]) -> np.ndarray | None:
@@ -275,6 +331,6 @@ def _meant(kind: str, texture: Texture, pixels: np.ndarray, chosen: tuple[int, .
         values[..., 2] = np.maximum(values[..., 2], 1e-3)
         return (values / np.linalg.norm(values, axis=-1, keepdims=True)).astype(np.float32)
     values = np.clip(values, 0, 1)
-    if kind == "albedo":
+    if kind in COLOURS:
         return np.ascontiguousarray(values[..., list(chosen * 3 if len(chosen) == 1 else chosen)])
     return np.ascontiguousarray(values[..., chosen[0]])

@@ -7,14 +7,15 @@ its first instance stands, since all instances show the same texels.
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.asset import TURNED, Primitive
+from mistyle.core.asset import TURNED, Primitive, Shading
+from mistyle.core.normals import crease_normals, same_points
 from mistyle.files.bounds import MAX_NODES, refuse
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_indices, check_positions, too_many, triangulate
@@ -22,8 +23,10 @@ from mistyle.files.raw import Raw
 from mistyle.files.usd import library
 from mistyle.files.usd_layers import check_layers, said, textures_named
 from mistyle.files.usd_materials import Found, at_own_coordinates, outside, plain, read_material
+from mistyle.files.usd_shapes import is_shape, outline
 
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+CAGE_CREASE = 89.0  # degrees; sharper edges of a cage would have normals that face away from who sees them
 UV_NAMES = ("st", "UVMap", "map1", "uv")
 
 
@@ -89,12 +92,14 @@ def read_usd(path: Path, max_faces: int) -> Raw:
     budget, root = Budget(path), path.resolve().parent
 
     def number(material: Any, shown: Found) -> int:
-        key = str(material.GetPath()) if material else f"{shown.material.albedo_factor} {shown.colour}"
+        here = shown.material
+        key = str(material.GetPath()) if material else f"{here.albedo_factor} {shown.colour} {here.shading}"
         if key not in found:
             found[key] = len(materials)
             materials.append(read_material(pxr, material, root, budget, time, notes) if material else shown)
         return found[key]
 
+    _pose(pxr, stage)
     user, pieces, faces = _user_matrix(pxr, stage, notes), [], 0
     for prim, owner, matrix in mesh_prims(pxr, stage, path, notes):
         piece = _piece(pxr, prim, owner, matrix @ user, time, path, max_faces, number, materials, notes)
@@ -103,7 +108,7 @@ def read_usd(path: Path, max_faces: int) -> Raw:
             too_many(faces, max_faces, path)
             pieces.append(piece)
     if not pieces:
-        raise refuse(path, "no mesh on its stage", "at least one visible UsdGeomMesh", "Export the mesh itself")
+        raise refuse(path, "no mesh on its stage", "at least one visible mesh", "Export the mesh itself")
     return _raw(pieces, materials, notes, path)
 
 
@@ -148,9 +153,30 @@ def _raw(pieces: list[_Piece], materials: list[Found], notes: list[str], path: P
     )
 
 
+def _pose(pxr: Any, stage: Any) -> None:
+    """Put skinned meshes into the pose of their skeletons at the first time; the file stays as it is."""
+    stage.SetEditTarget(stage.GetSessionLayer())
+    prims = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
+    moving = [p for p in prims if p.IsA(pxr.UsdSkel.Animation)]
+    times = [t for p in moving for a in p.GetAttributes() for t in a.GetTimeSamples()[:1]]
+    first = min(times, default=0.0)
+    for prim in prims:
+        if prim.IsA(pxr.UsdSkel.Root):
+            pxr.UsdSkel.BakeSkinning(pxr.UsdSkel.Root(prim), pxr.Gf.Interval(first, first))
+
+
+def metres(pxr: Any, stage: Any) -> float:
+    """The stage's unit; numbers of another type than the schema's, which USD would refuse, count as well."""
+    try:
+        return float(pxr.UsdGeom.GetStageMetersPerUnit(stage))
+    except pxr.Tf.ErrorException:
+        said = stage.GetRootLayer().pseudoRoot.GetInfo("metersPerUnit")
+        return float(said) if isinstance(said, int | float) else 0.01
+
+
 def _user_matrix(pxr: Any, stage: Any, notes: list[str]) -> Float[np.ndarray, "4 4"]:
     """From the stage's units and axis to metres and Y up, for row vectors."""
-    unit = float(pxr.UsdGeom.GetStageMetersPerUnit(stage))
+    unit = metres(pxr, stage)
     unit = unit if np.isfinite(unit) and unit > 0 else 1.0
     z_up = pxr.UsdGeom.GetStageUpAxis(stage) == pxr.UsdGeom.Tokens.z
     if z_up or unit != 1:
@@ -176,11 +202,11 @@ def mesh_prims(pxr: Any, stage: Any, path: Path, notes: list[str]) -> Iterator[t
         elif prim.IsA(pxr.UsdGeom.PointInstancer):
             visited.PruneChildren()
             yield from _prototypes(pxr, prim, cache, time, notes)
-        elif prim.IsA(pxr.UsdGeom.Mesh):
+        elif prim.IsA(pxr.UsdGeom.Mesh) or is_shape(prim):
             inside = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
             yield prim, str(inside.GetPath()), np.array(cache.GetLocalToWorldTransform(prim))
         elif prim.IsA(pxr.UsdGeom.Gprim):
-            notes.append("Shapes that are no meshes (spheres, curves, points) were left out.")
+            notes.append("Shapes that are no surfaces (curves, points, volumes) were left out.")
 
 
 def _shown(pxr: Any, prim: Any, time: Any, notes: list[str]) -> bool:
@@ -217,7 +243,7 @@ def _prototypes(pxr: Any, prim: Any, cache: Any, time: Any, notes: list[str]) ->
         place[3, :3] = np.array(at[i], float)
         above = np.linalg.pinv(np.array(cache.GetParentToWorldTransform(own)))
         for inner in pxr.Usd.PrimRange(own, pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)):
-            if inner.IsA(pxr.UsdGeom.Mesh):
+            if inner.IsA(pxr.UsdGeom.Mesh) or is_shape(inner):
                 local = np.array(cache.GetLocalToWorldTransform(inner)) @ above
                 yield inner, str(inner.GetPath()), local @ place @ world
 
@@ -225,6 +251,11 @@ def _prototypes(pxr: Any, prim: Any, cache: Any, time: Any, notes: list[str]) ->
 def polygons(pxr: Any, prim: Any, path: Path, max_faces: int = 2**31) -> Polygons | None:
     """The faces of a mesh prim as triangles, in file order; None where it has none. Holes are left out."""
     mesh, time = pxr.UsdGeom.Mesh(prim), pxr.Usd.TimeCode.EarliestTime()
+    if is_shape(prim):
+        shape = outline(prim, time)
+        corner = triangulate(shape.sizes, shape.points[shape.vertices])
+        polygon = np.repeat(np.arange(len(shape.sizes)), shape.sizes)[corner[:, 0]]
+        return Polygons(shape.points, shape.sizes, shape.vertices, corner, polygon, False)
     points = _triples(mesh.GetPointsAttr().Get(time))
     sizes = np.array(mesh.GetFaceVertexCountsAttr().Get(time) or [], np.int64)
     vertices = np.array(mesh.GetFaceVertexIndicesAttr().Get(time) or [], np.int64)
@@ -260,15 +291,17 @@ def _triples(values: Any) -> Float[np.ndarray, "n 3"] | None:
 def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, notes) -> _Piece | None:
     mesh = pxr.UsdGeom.Mesh(prim)
     shape = polygons(pxr, prim, path, max_faces)
-    if shape is None and mesh.GetPointsAttr().HasAuthoredValue() and _triples(mesh.GetPointsAttr().Get(time)) is None:
+    if is_shape(prim):
+        notes.append("Shapes that are no meshes (spheres, cubes and the like) were read as meshes.")
+    elif shape is None and mesh.GetPointsAttr().HasAuthoredValue() and _triples(mesh.GetPointsAttr().Get(time)) is None:
         notes.append("A mesh whose points are of another type than point3f[] was left out.")
     if shape is None or not len(shape.corner):
         return None
-    if mesh.GetSubdivisionSchemeAttr().Get(time) != pxr.UsdGeom.Tokens.none:
+    if _subdivides(pxr, prim, time):
         notes.append("A subdivision surface was read as its control cage.")
     if "SkelBindingAPI" in prim.GetAppliedSchemas():
-        notes.append("A skinned mesh was read in its bind pose.")
-    if mesh.GetPointsAttr().ValueMightBeTimeVarying():
+        notes.append("A skinned mesh was read in the pose of its skeleton at the first time.")
+    elif not is_shape(prim) and mesh.GetPointsAttr().ValueMightBeTimeVarying():
         notes.append("Of an animated mesh the first frame was read.")
     if not np.isfinite(matrix).all():
         raise refuse(path, f"{prim.GetPath()} with a transform that is not finite", "finite numbers", "Export it again")
@@ -277,7 +310,7 @@ def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, n
         shape = Polygons(shape.points, shape.sizes, shape.vertices, shape.corner[:, [0, 2, 1]], shape.polygon, True)
     positions = shape.points @ linear + matrix[3, :3]
     material = _bound(pxr, prim, shape, number, time, notes)
-    normals = _normals(pxr, mesh, shape, time, notes)
+    normals = _normals(pxr, prim, shape, time, notes)
     return _Piece(
         name=str(prim.GetPath()),
         owner=owner,
@@ -312,10 +345,13 @@ def _bound(pxr: Any, prim: Any, shape: Polygons, number: Any, time: Any, notes: 
         of_polygon[of_polygon < 0] = number(own, shown)
         colour = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayColor")
         if not own and not (colour and colour.HasValue()):
-            notes.append("A mesh has neither a material nor a display colour: it was read as white.")
+            notes.append(
+                "A mesh has neither a material nor a display colour: it is drawn matt and grey, as Blender "
+                "draws it, and painted as white."
+            )
         opacity = pxr.UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance("displayOpacity")
-        if not own and opacity and opacity.HasValue() and (np.array(opacity.Get(time), float) < 1).any():
-            notes.append("displayOpacity was not read.")
+        if not own and opacity and opacity.HasValue() and np.size(opacity.Get(time)) > 1:
+            notes.append("displayOpacity was not read where it is not the same everywhere.")
     return of_polygon[shape.polygon]
 
 
@@ -337,15 +373,38 @@ def _display(pxr: Any, prim: Any, time: Any) -> Found:
     primvars = pxr.UsdGeom.PrimvarsAPI(prim)
     primvar = primvars.FindPrimvarWithInheritance("displayColor")
     values = _table(primvar, time) if primvar and primvar.HasValue() else None
+    cover = primvars.FindPrimvarWithInheritance("displayOpacity")
+    opacity = _table(cover, time) if cover and cover.HasValue() else None
+    shading = Shading()
+    if opacity is not None and opacity.shape == (1, 1):
+        shading = Shading(opacity=float(np.clip(opacity[0, 0], 0, 1)))
     if values is None or values.shape[1] != 3:
-        return plain("material")
+        return plain("material", shading=replace(shading, stated="nothing"))
     if len(values) > 1:
-        return plain("material", colour="displayColor")
+        return plain("material", colour="displayColor", shading=shading)
     red, green, blue = (float(c) for c in np.clip(np.nan_to_num(values[0], nan=1.0), 0, 1))
-    return plain("material", (red, green, blue))
+    return plain("material", (red, green, blue), shading=shading)
 
 
-def _normals(pxr: Any, mesh: Any, shape: Polygons, time: Any, notes: list[str]) -> np.ndarray | None:
+def _subdivides(pxr: Any, prim: Any, time: Any) -> bool:
+    """Whether a prim is the cage of a smooth surface."""
+    if is_shape(prim):
+        return False
+    flat = (pxr.UsdGeom.Tokens.none, pxr.UsdGeom.Tokens.bilinear)
+    return pxr.UsdGeom.Mesh(prim).GetSubdivisionSchemeAttr().Get(time) not in flat
+
+
+def _normals(pxr: Any, prim: Any, shape: Polygons, time: Any, notes: list[str]) -> np.ndarray | None:
+    """A prim's own normals; those of the cage, smooth, where it is subdivided and has none."""
+    if is_shape(prim):
+        return outline(prim, time).normals[shape.corner].astype(np.float32)
+    found = _own_normals(pxr, pxr.UsdGeom.Mesh(prim), shape, time, notes)
+    if found is None and _subdivides(pxr, prim, time):
+        found = crease_normals(shape.points, shape.vertices[shape.corner], same_points(shape.points), CAGE_CREASE)
+    return found
+
+
+def _own_normals(pxr: Any, mesh: Any, shape: Polygons, time: Any, notes: list[str]) -> np.ndarray | None:
     primvar = pxr.UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     if primvar and primvar.HasValue():
         return _spread(primvar.ComputeFlattened(time), primvar.GetInterpolation(), shape, 3, "normals", notes)

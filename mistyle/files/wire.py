@@ -24,6 +24,7 @@ from mistyle.files.lending import LENT
 RECORDS = {
     "Picture": "mistyle.core.asset:Picture",
     "Primitive": "mistyle.core.asset:Primitive",
+    "Shading": "mistyle.core.asset:Shading",
     "Lens": "mistyle.core.distortion:Lens",
     "Corners": "mistyle.files.raw:Corners",
     "Indexed": "mistyle.files.raw:Indexed",

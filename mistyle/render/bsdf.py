@@ -175,6 +175,38 @@ def _gltf(a: Angles, roughness: Any, metallic: Any, specular: float) -> tuple[An
     return dr.fma(dielectric, (1 - fresnel) * a.cos_o * (1 / dr.pi), tint), dr.fma(dielectric, fresnel * lobe, white)
 
 
+def layered(
+    a: Angles, albedo: Any, roughness: Any, metallic: Any, f0: Any, f90: float, coat: float, coat_roughness: float
+) -> Any:
+    """f cos(theta_o) of glTF's surface with KHR_materials_specular, KHR_materials_ior and KHR_materials_clearcoat.
+
+    `albedo` and `f0` (of the dielectric) are colours; F(f0) = f0 + (f90 - f0)(1 - |wi·h|)^5, of which the largest
+    channel is what the diffuse lobe loses. The coat of index 1.5 covers the base by its Fresnel term at the normal.
+    With f0 = 0.04, f90 = 1 and no coat it is `gltf`. Safe numbers where `a.valid` is False.
+    """
+    import drjit as dr
+
+    edge = _schlick(a.cos_d)
+    lobe = _lobe(a, _alpha2(roughness))
+    fresnel = f0 + (f90 - f0) * edge
+    dielectric = (1 - dr.max(fresnel)) * albedo * (a.cos_o * (1 / dr.pi)) + fresnel * lobe
+    metal = (albedo + (1 - albedo) * edge) * lobe
+    base = dielectric * (1 - metallic) + metal * metallic
+    if coat == 0:
+        return base
+    share = coat * dr.fma(1 - GLTF_F0, _schlick(a.cos_i), GLTF_F0)
+    return base * (1 - share) + share * _lobe(a, max(coat_roughness**2, ALPHA_FLOOR) ** 2)
+
+
+def _lobe(a: Angles, alpha2: Any) -> Any:
+    """GGX: D V cos(theta_o) with height-correlated Smith."""
+    import drjit as dr
+
+    visible = a.cos_o * _smith_root(a.cos_i, alpha2) + a.cos_i * _smith_root(a.cos_o, alpha2)
+    spread = dr.fma(alpha2, a.cos2_h, a.sin2_h)
+    return alpha2 * a.cos_o / (2 * dr.pi * dr.square(spread) * visible)
+
+
 MODELS: dict[str, Callable[[Angles, Any, Any, float], tuple[Any, Any]]] = {"principled": _principled, "gltf": _gltf}
 
 

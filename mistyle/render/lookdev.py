@@ -27,11 +27,12 @@ from mistyle.core.light import (
 )
 from mistyle.core.maps import OwnMaps
 from mistyle.core.paths import scenes
-from mistyle.render import device
+from mistyle.render import appearance, device
 from mistyle.render.emitters import emitters
-from mistyle.render.scene import object_shapes, passes, sensor_dict
+from mistyle.render.scene import passes, sensor_dict
 
 DEPTH = 6  # vertices of a path at most, the light's included
+OWN = {"path": DEPTH, "direct": 2}  # vertices of the paths of `appearance.integrator` that stands in
 ROWS = 512
 # Programs for other environments' Pythons, which know nothing of mistyle.
 CYCLES_WORKER, MITSUBA_WORKER = (str(Path(__file__).with_name(f"{n}_worker.py")) for n in ("cycles", "mitsuba"))
@@ -80,9 +81,9 @@ def material_maps(material: Material, metallic: Literal["keep", "zero"] = "keep"
 
 
 def asset_shapes(asset: Asset) -> dict[str, Any]:
-    """The asset as glTF means it: glTF's own reflectance model, normal maps in MikkTSpace frames."""
-    maps = [material_maps(m) for m in asset.materials]
-    return object_shapes(asset.mesh, maps, flip_invalid=True, model="gltf", frame="mikkt")
+    """The asset as its file means it: glTF's own reflectance model, normal maps in MikkTSpace frames, and what
+    render/appearance.py has: opacity, emission, reflectance, coats."""
+    return appearance.shapes(asset, [material_maps(m) for m in asset.materials])
 
 
 def asset_scene(shapes: dict[str, Any], camera: Camera, lights: Sequence[Light], integrator: str) -> Any:
@@ -90,7 +91,9 @@ def asset_scene(shapes: dict[str, Any], camera: Camera, lights: Sequence[Light],
     import mitsuba as mi
 
     device.use()
-    described: dict[str, Any] = {"type": "scene", "integrator": integrator_dict(integrator)}
+    own = integrator in OWN and appearance.needs_path(shapes)
+    chosen = appearance.integrator(OWN[integrator]) if own else integrator_dict(integrator)
+    described: dict[str, Any] = {"type": "scene", "integrator": chosen}
     described["sensor"] = sensor_dict(camera, 64)
     for k, emitter in enumerate(emitters(lights, camera)):
         described[f"light{k}"] = emitter

@@ -61,12 +61,13 @@ def mitsuba_mesh(
     name: str = "object",
     *,
     tangents: Float[np.ndarray, "f 3 4"] | None = None,
+    emitter: Any = None,
 ) -> Any:
     """A Mitsuba mesh of one texture set (None: of all faces), faces in the order of `Mesh.faces`.
 
-    v is flipped here and nowhere else: Mitsuba's texture row 0 is v = 0, ours is v = 1. `bsdf` is a loaded BSDF.
-    `tangents` (of all the mesh's faces, as `mikktspace` makes them) become the attributes that `mistyle_normalmap`
-    reads.
+    v is flipped here and nowhere else: Mitsuba's texture row 0 is v = 0, ours is v = 1. `bsdf` and `emitter` are
+    loaded. `tangents` (of all the mesh's faces, as `mikktspace` makes them) become the attributes that
+    `mistyle_normalmap` reads.
     """
     import drjit as dr
     import mitsuba as mi
@@ -80,6 +81,8 @@ def mitsuba_mesh(
     props = mi.Properties()
     if bsdf is not None:
         props["mesh_bsdf"] = bsdf
+    if emitter is not None:
+        props["mesh_emitter"] = emitter
     shape = mi.Mesh(
         name, len(welded.positions), len(welded.faces), props=props, has_vertex_normals=True, has_vertex_texcoords=True
     )
@@ -179,6 +182,14 @@ def object_shapes(
             bsdf = mi.load_dict(bsdf_dict(chosen[p], flip_invalid, model=model, frame=frame))
             shapes[f"part{p}"] = mitsuba_mesh(mesh, p, bsdf, f"part{p}", tangents=tangents)
     return shapes
+
+
+def object_shape(mesh: Mesh, part: int, maps: Maps, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
+    """One texture set as `object_shapes` makes it with glTF's model in MikkTSpace frames, for pictures."""
+    import mitsuba as mi
+
+    bsdf = mi.load_dict(bsdf_dict(maps, True, model="gltf", frame="mikkt"))
+    return mitsuba_mesh(mesh, part, bsdf, f"part{part}", tangents=tangents)
 
 
 def samples(spp: int) -> int:

@@ -159,8 +159,8 @@ def _mitsuba(integrator: str, found: Subject, shot: Shot, spp: int, seeds: Seque
         path = found.path if found.asset is None else exported(found, shot)
         scene, sensor = lookdev.file_scene(path), shot.sensor
     elif shot.camera is not None:
-        scene = lookdev.asset_scene(_shapes(found), shot.camera, shot.lights, "path")
-        sensor = 0
+        scene = lookdev.asset_scene(_shapes(found), shot.camera, shot.lights, integrator)
+        sensor, own = 0, None
     else:
         raise ValueError("a mesh needs a camera")
     pictures, seconds = [], []
