@@ -1,0 +1,239 @@
+"""What the two phases find of materials that are known: `python -m benchmarks.two_phase [--quick] [--json FILE]`
+
+A mesh is painted with known relief, roughness and albedo (`two_phase_truth.py`). Three kinds of views show it: `lit`,
+by Mitsuba's `path` under the three lights of phase 1, which are fixed to the camera; `soft`, the same under the lights
+of the paper's views, which stand still; and `unlit`, the albedo. Rows: `flat` (the baked albedo, flat, roughness 0.5),
+`painter` (true albedo, the painter's guess of relief and gloss), `paper` (both phases as the paper has them, which are
+Adam alone), `phase1`, `phase2` (after both) and `solver` (`mistyle fit`, the bound). Figures by row: `normal` (mean,
+degrees), `roughness` (root mean square error), `albedo` (dB), over the surface that three views see. `normal_ratio` and
+`roughness_ratio` are phase 1's error over the flat start's; `albedo_light_left` is the slope of log(albedo / truth)
+after phase 2 over the same of the baked views, `albedo_spread_left` the ratio of their standard deviations, which has
+the errors of detail too. `struggle.precision` and `struggle.recall`: what the repair finds of contradictions planted in
+unlit views (`two_phase_struggle.py`), by `repair.agreement`. `--slopes` are those of the true relief. `--sheets FOLDER`
+writes the maps and a relit picture of every row.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from benchmarks import two_phase_struggle as struggle
+from benchmarks import two_phase_truth as known
+from benchmarks.common import finish, parser, timed
+from benchmarks.recovery_truth import Truth, data_folder, seen
+from benchmarks.two_phase_truth import Painted, silent
+from mistyle.core.camera import Camera
+from mistyle.core.capture import in_memory
+from mistyle.core.image import luminance, srgb_from_linear
+from mistyle.core.light import Lights, lights
+from mistyle.core.maps import Maps
+from mistyle.core.view import View
+from mistyle.files.read import read_mesh, read_picture
+from mistyle.measure.material_metrics import map_errors
+from mistyle.run import start
+from mistyle.run.settings import Settings
+from mistyle.stages.backproject import backproject, fill
+from mistyle.stages.fit import two_phase, view_mask
+from mistyle.stages.fit_lit import lit_phases
+from mistyle.stages.fit_settings import FitSettings
+from mistyle.stages.inpaint import RepairSettings
+from mistyle.stages.recover import recover
+from mistyle.stages.recover_settings import RecoverSettings
+
+KINDS = {"lit": "phase1", "soft": "paper"}
+DARK = 0.02  # linear albedo under which a logarithm says nothing of light
+LEAST_VIEWS = 3
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A painted object, its views' cameras, and the weight of each texel in the figures."""
+
+    scene: Painted
+    cameras: tuple[Camera, ...]
+    weights: tuple[np.ndarray, ...]
+    seen: tuple[np.ndarray, ...]
+    settings: Settings
+    spp: int
+    cache: Path | None
+
+
+def main(argv: list[str] | None = None) -> None:
+    options = parser(__doc__ or "")
+    options.add_argument("--mesh", type=Path, default=data_folder() / "meshes" / "plain" / "spot.obj")
+    options.add_argument("--style", type=Path, default=data_folder() / "styles" / "starry_night.jpg")
+    options.add_argument("--slopes", type=float, nargs="+", default=None)
+    options.add_argument("--kinds", nargs="+", choices=[*KINDS, "unlit", "struggle"], default=None)
+    options.add_argument("--cache", type=Path, metavar="FOLDER", help="where rendered views are kept")
+    options.add_argument("--sheets", type=Path, metavar="FOLDER")
+    chosen = options.parse_args(argv)
+    settings = sized(chosen.quick)
+    start.start_engines(settings)
+    figures: dict[str, float] = {}
+    slopes = chosen.slopes or ([0.2] if chosen.quick else [0.1, 0.2, 0.3])
+    for slope in slopes:
+        bench = prepare(chosen.mesh, chosen.style, settings, slope, 64 if chosen.quick else 128, chosen.cache)
+        prefix = "" if slope == 0.2 else f"slope_{slope:g}."
+        for kind in chosen.kinds or [*KINDS, "unlit", "struggle"]:
+            rows, more = measure(bench, kind)
+            figures |= {f"{prefix}{kind}.{name}": value for name, value in more.items()}
+            if chosen.sheets and rows:
+                write_sheet(bench, rows, chosen.sheets / f"{prefix}{kind}.png")
+    finish(figures, chosen.json)
+
+
+def sized(quick: bool) -> Settings:
+    """The job's settings: a stroke covers as many texels as at the standard sizes."""
+    samples, resolution, size, scale = (8_000, 160, 128, 4.0) if quick else (20_000, 256, 256, 2.0)
+    steps = 40 if quick else 80
+    return Settings.model_validate(
+        {
+            "surface": {"samples": samples, "stroke_scale": scale},
+            "atlas": {"size": size},
+            "rig": {"resolution": resolution},
+            "fit": {"iterations1": steps, "iterations2": steps, "crops": 2, "crop_size": 96, "refine": "all"},
+        }
+    )
+
+
+def prepare(mesh: Path, style: Path, settings: Settings, slope: float, spp: int, cache: Path | None) -> Bench:
+    """The object painted, and which of its texels count."""
+    asset = read_mesh(mesh, size=settings.atlas.size)
+    atlas = start.lay_out(asset, settings, silent)
+    scene = known.painted(asset, read_picture(style), atlas, settings, slope, seed=0)
+    cameras = known.cameras_of(settings.rig.resolution, 16)
+    count = seen(Truth("", asset.mesh, atlas.texels, scene.truth, scene.areas), cameras)
+    weights = tuple(area * (c >= LEAST_VIEWS) for area, c in zip(scene.areas, count, strict=True))
+    return Bench(scene, tuple(cameras), weights, count, settings, spp, cache)
+
+
+def measure(bench: Bench, kind: str) -> tuple[dict[str, Sequence[Maps]], dict[str, float]]:
+    """The maps by row, and the figures, of one kind of views."""
+    if kind == "struggle":
+        return {}, struggling(bench)
+    return unlit_rows(bench) if kind == "unlit" else lit_rows(bench, lights(KINDS[kind]))
+
+
+def lit_rows(bench: Bench, lit: Lights) -> tuple[dict[str, Sequence[Maps]], dict[str, float]]:
+    """Views that show light."""
+    scene, mesh, figures = bench.scene, bench.scene.asset.mesh, dict[str, float]()
+    views = known.lit_views(scene, scene.truth, bench.cameras, lit, bench.spp, bench.cache)
+    flat = baked(bench, views)
+    chosen = bench.settings.fit.model_copy(update={"painted": "with-light"})
+    paper = chosen.model_copy(update={"judge": False})
+    old = timed(figures, "paper.seconds", lambda: two_phase(mesh, flat, views, scene.atlas.texels, paper, 0))
+    new = timed(figures, "phase2.seconds", lambda: lit_phases(mesh, flat, views, scene.atlas.texels, lit, chosen, 0))
+    first = [_with(b, m, "normal", "roughness") for b, m in zip(flat, new.maps, strict=True)]
+    captures = in_memory(bench.cameras, [lit] * len(views), [v.rgb for v in views], [view_mask(v) for v in views])
+    bound = timed(figures, "solver.seconds", lambda: solver(bench, captures))
+    rows = {"flat": flat, "painter": scene.painter, "paper": old.maps, "phase1": first, "phase2": new.maps}
+    rows["solver"] = bound
+    figures |= errors(bench, rows)
+    for name in ("normal", "roughness"):
+        figures[f"{name}_ratio"] = figures[f"phase1.{name}"] / figures[f"flat.{name}"]
+    for row in ("paper", "phase2", "solver"):
+        slope, spread = light_left(bench, flat, rows[row])
+        prefix = "" if row == "phase2" else f"{row}."
+        figures |= {f"{prefix}albedo_light_left": slope, f"{prefix}albedo_spread_left": spread}
+    return rows, figures
+
+
+def unlit_rows(bench: Bench) -> tuple[dict[str, Sequence[Maps]], dict[str, float]]:
+    """Views that show the albedo: nothing in them but the painter's rule tells of relief."""
+    scene, mesh, texels = bench.scene, bench.scene.asset.mesh, bench.scene.atlas.texels
+    views, figures = known.unlit_views(scene, bench.cameras), dict[str, float]()
+    chosen = bench.settings.fit.model_copy(update={"judge": False})
+    rows: dict[str, Sequence[Maps]] = {"flat": scene.flat, "painter": scene.painter}
+    for row, refine in (("phase1", "normal-roughness"), ("phase2", "all")):
+        each = chosen.model_copy(update={"refine": refine})
+        rows[row] = two_phase(mesh, scene.flat, views, texels, each, 0, begin=scene.painter).maps
+    return rows, figures | errors(bench, rows)
+
+
+def struggling(bench: Bench) -> dict[str, float]:
+    """Precision and recall of the repair's mask, by `repair.agreement` and at its default."""
+    scene, figures = bench.scene, dict[str, float]()
+    planted = struggle.plant(scene, known.unlit_views(scene, bench.cameras), seed=0)
+    chosen = FitSettings(
+        iterations1=0, iterations2=2 * bench.settings.fit.iterations2, crops=4, crop_size=96, judge=False, refine="all"
+    )
+    fit = two_phase(scene.asset.mesh, scene.flat, planted.views, scene.atlas.texels, chosen, 0)
+    for agreement in (*struggle.AGREEMENTS, RepairSettings().agreement):
+        repair = RepairSettings(agreement=agreement)
+        both = struggle.found(scene, fit, bench.seen, planted, repair)
+        figures |= {f"{name}_{agreement:g}": value for name, value in zip(("precision", "recall"), both, strict=True)}
+    return figures | dict(zip(("precision", "recall"), both, strict=True))
+
+
+def solver(bench: Bench, captures: Any) -> Sequence[Maps]:
+    """The material solver with its own settings, but for fewer steps on so small pictures."""
+    chosen = RecoverSettings(iterations=960, bounces=4, bounce_samples=64)
+    return recover(bench.scene.asset.mesh, bench.scene.atlas.texels, captures, chosen, 0).maps
+
+
+def baked(bench: Bench, views: Sequence[View]) -> list[Maps]:
+    """The views in the texture as they are, flat and half rough: where a stylizer that paints views leaves the fit."""
+    scene, result = bench.scene, []
+    for texels, begin in zip(scene.atlas.texels, scene.flat, strict=True):
+        found = backproject(views, texels, bench.settings.bake, mesh=scene.asset.mesh)
+        half = np.full_like(begin.roughness, 0.5)
+        result.append(Maps(fill(found, texels), begin.normal, half, np.zeros_like(half), found.known))
+    return result
+
+
+def errors(bench: Bench, rows: dict[str, Sequence[Maps]]) -> dict[str, float]:
+    """normal, roughness and albedo of every row."""
+    result = {}
+    for row, maps in rows.items():
+        e = map_errors(bench.scene.truth, maps, bench.weights)
+        result[f"{row}.normal"], result[f"{row}.roughness"] = e.normal_mean_deg, float(np.sqrt(e.roughness_mse))
+        result[f"{row}.albedo"] = min(e.albedo_psnr, 99.0)
+    return result
+
+
+def light_left(bench: Bench, flat: Sequence[Maps], maps: Sequence[Maps]) -> tuple[float, float]:
+    """What is left of the light that `flat` has baked in: slope, and ratio of standard deviations, of the log."""
+    weight = np.concatenate([w.ravel() for w in bench.weights])
+    weight = weight / weight.sum()
+
+    def excess(of: Sequence[Maps]) -> np.ndarray:
+        logs = [
+            np.log(np.maximum(np.concatenate([luminance(m.albedo).ravel() for m in each]), DARK))
+            for each in (of, bench.scene.truth)
+        ]
+        return logs[0] - logs[1] - (weight * (logs[0] - logs[1])).sum()
+
+    before, after = excess(flat), excess(maps)
+    square = float((weight * before**2).sum())
+    return float((weight * before * after).sum()) / square, float(np.sqrt((weight * after**2).sum() / square))
+
+
+def write_sheet(bench: Bench, rows: dict[str, Sequence[Maps]], file: Path) -> None:
+    """Truth and every row, a line each: albedo, normal, roughness, and the object under a lamp from the side."""
+    from mistyle.render.draw import pictures
+
+    lines = []
+    for maps in [bench.scene.truth, *rows.values()]:
+        shown = pictures(bench.scene.asset.mesh, maps, [bench.cameras[1]], spp=32)[0]
+        lit = srgb_from_linear(np.clip(shown[..., :3], 0, 1))
+        m, size = maps[0], bench.settings.rig.resolution
+        rough = np.repeat(m.roughness[..., None], 3, axis=-1)
+        flat = [srgb_from_linear(np.clip(m.albedo, 0, 1)), m.normal / 2 + 0.5, rough, lit]
+        tiles = [Image.fromarray(np.round(np.clip(t, 0, 1) * 255).astype(np.uint8)).resize((size, size)) for t in flat]
+        lines.append(np.concatenate([np.asarray(t) for t in tiles], axis=1))
+    file.parent.mkdir(parents=True, exist_ok=True)
+    Image.fromarray(np.concatenate(lines)).save(file)
+
+
+def _with(maps: Maps, other: Maps, *names: str) -> Maps:
+    from dataclasses import replace
+
+    return replace(maps, **{name: getattr(other, name) for name in names})
+
+
+if __name__ == "__main__":
+    main()
