@@ -21,9 +21,9 @@ from mistyle.core.light import Lights
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.stages import fit_table
 from mistyle.stages.fit import Fit, shrinkage, two_phase, view_mask
 from mistyle.stages.fit_settings import FitSettings
+from mistyle.stages.fit_table import ROUGHNESS_FLOOR
 from mistyle.stages.recover import Recovered, recover
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
@@ -32,6 +32,7 @@ from mistyle.stages.unlight import BOUND, LEAST, STROKE, blurred
 # A stylized view is not a measurement: fewer steps and samples than for photographs.
 ITERATIONS, BOUNCES, BOUNCE_SAMPLES, JOINT_SAMPLES, SUBSAMPLES = 640, 2, 32, 9, 4
 SOLVED_SHARE = 0.8  # of the whole progress
+LEAST_Z = 0.3  # of a normal: 72 degrees off
 DESCRIBED = ("normal", "roughness", "albedo", "metallic")
 
 
@@ -39,9 +40,11 @@ DESCRIBED = ("normal", "roughness", "albedo", "metallic")
 class Solved:
     """The solution at the fit's resolution, one set of maps per texture set, and the views without their light.
 
+    start     the maps as they came, at that resolution
     residual  root mean square of view - render, relative to the views': the maps as they came, the solution
     """
 
+    start: tuple[Maps, ...]
     maps: tuple[Maps, ...]
     unlit: tuple[View, ...]
     residual: tuple[float, float]
@@ -67,8 +70,7 @@ def lit_phases(
     """
     solved = solve(mesh, maps, targets, texels, lights, settings, seed, lambda done: progress(SOLVED_SHARE * done))
     better = solved.residual[1] < solved.residual[0]
-    first, second = (laid(maps, solved.maps, texels, names) for names in (("tilt", "roughness"), ("albedo",)))
-    begun = [replace(a, albedo=b.albedo) for a, b in zip(first, second, strict=True)] if better else list(maps)
+    begun = laid(maps, solved.start, solved.maps) if better else list(maps)
     only_albedo = settings.model_copy(update={"iterations1": 0})
     fit = two_phase(
         mesh, begun, targets, texels, only_albedo, seed,
@@ -114,26 +116,31 @@ def solve(
     residual, unlit = _explained(mesh, captures, (start, made), targets)
     progress(1.0)
     trace = {f"phase1.{name}": values for name, values in found.trace.items()}
-    return Solved(made, tuple(unlit), residual, trace, found.notes)
+    return Solved(tuple(start), made, tuple(unlit), residual, trace, found.notes)
 
 
-def laid(maps: Sequence[Maps], solved: Sequence[Maps], texels: Sequence[Texels], names: Sequence[str]) -> list[Maps]:
-    """`maps` with what the solution (at its own, coarser resolution) changes of the channels `names` of a table."""
-    by = maps[0].roughness.shape[0] // solved[0].roughness.shape[0]
-    table = fit_table.build(maps, texels, by)
-    table.values |= {name: fit_table.build(solved, _blocks(texels, by), 1).values[name] for name in names}
-    return fit_table.finished(table, maps)
-
-
-def _blocks(texels: Sequence[Texels], by: int) -> list[Texels]:
-    """The covered cells of by x by texels, for a table of maps that are as coarse."""
+def laid(
+    maps: Sequence[Maps], start: Sequence[Maps], solved: Sequence[Maps], names: Sequence[str] = DESCRIBED
+) -> list[Maps]:
+    """`maps` with what the solution changes of the maps `names`; `start` and `solved` are at its own, coarser
+    resolution, `start` the shrunk `maps`. Detail that is finer than it stays."""
     result = []
-    for t in texels:
-        height, width = (side // by for side in t.covered.shape)
-        island = t.island.reshape(height, by, width, by).max(axis=(1, 3))
-        place = np.zeros((height, width, 3), np.float32)
-        result.append(Texels(place, place, island >= 0, island, island))
+    for fine, before, after in zip(maps, start, solved, strict=True):
+        size, fields = fine.roughness.shape, {}
+        for name in names:
+            change = (getattr(after, name) - getattr(before, name)).astype(np.float32)
+            if change.any():
+                moved = getattr(fine, name) + (change if change.shape[:2] == size else resize(change, size))
+                fields[name] = _allowed(name, moved)
+        result.append(replace(fine, **fields))
     return result
+
+
+def _allowed(name: str, values: Float[np.ndarray, "h w *c"]) -> Float[np.ndarray, "h w *c"]:
+    if name == "normal":
+        values = values * np.array([1, 1, 0], np.float32) + np.maximum(values[..., 2:], LEAST_Z) * np.array([0, 0, 1])
+        return (values / np.linalg.norm(values, axis=-1, keepdims=True)).astype(np.float32)
+    return np.clip(values, ROUGHNESS_FLOOR if name == "roughness" else 0, 1).astype(np.float32)
 
 
 def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
