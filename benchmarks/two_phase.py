@@ -14,7 +14,7 @@ writes the maps and a relit picture of every row.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,10 @@ from mistyle.core.capture import in_memory
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.core.light import Lights, lights
 from mistyle.core.maps import Maps
-from mistyle.core.view import View
 from mistyle.files.read import read_mesh, read_picture
 from mistyle.measure.material_metrics import map_errors
 from mistyle.run import start
 from mistyle.run.settings import Settings
-from mistyle.stages.backproject import backproject, fill
 from mistyle.stages.fit import two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
 from mistyle.stages.fit_settings import FitSettings
@@ -122,7 +120,7 @@ def lit_rows(bench: Bench, lit: Lights) -> tuple[dict[str, Sequence[Maps]], dict
     """Views that show light."""
     scene, mesh, figures = bench.scene, bench.scene.asset.mesh, dict[str, float]()
     views = known.lit_views(scene, scene.truth, bench.cameras, lit, bench.spp, bench.cache)
-    flat = baked(bench, views)
+    flat = known.baked(scene, views)
     chosen = bench.settings.fit.model_copy(update={"painted": "with-light"})
     paper = chosen.model_copy(update={"judge": False})
     old = timed(figures, "paper.seconds", lambda: two_phase(mesh, flat, views, scene.atlas.texels, paper, 0))
@@ -136,7 +134,7 @@ def lit_rows(bench: Bench, lit: Lights) -> tuple[dict[str, Sequence[Maps]], dict
     for name in ("normal", "roughness"):
         figures[f"{name}_ratio"] = figures[f"phase1.{name}"] / figures[f"flat.{name}"]
     for row in ("paper", "phase2", "solver"):
-        slope, spread = light_left(bench, flat, rows[row])
+        slope, spread = light_left(bench.weights, scene.truth, flat, rows[row])
         prefix = "" if row == "phase2" else f"{row}."
         figures |= {f"{prefix}albedo_light_left": slope, f"{prefix}albedo_spread_left": spread}
     return rows, figures
@@ -175,16 +173,6 @@ def solver(bench: Bench, captures: Any) -> Sequence[Maps]:
     return recover(bench.scene.asset.mesh, bench.scene.atlas.texels, captures, chosen, 0).maps
 
 
-def baked(bench: Bench, views: Sequence[View]) -> list[Maps]:
-    """The views in the texture as they are, flat and half rough: where a stylizer that paints views leaves the fit."""
-    scene, result = bench.scene, []
-    for texels, begin in zip(scene.atlas.texels, scene.flat, strict=True):
-        found = backproject(views, texels, bench.settings.bake, mesh=scene.asset.mesh)
-        half = np.full_like(begin.roughness, 0.5)
-        result.append(Maps(fill(found, texels), begin.normal, half, np.zeros_like(half), found.known))
-    return result
-
-
 def errors(bench: Bench, rows: dict[str, Sequence[Maps]]) -> dict[str, float]:
     """normal, roughness and albedo of every row."""
     result = {}
@@ -195,17 +183,19 @@ def errors(bench: Bench, rows: dict[str, Sequence[Maps]]) -> dict[str, float]:
     return result
 
 
-def light_left(bench: Bench, flat: Sequence[Maps], maps: Sequence[Maps]) -> tuple[float, float]:
+def light_left(
+    weights: Sequence[np.ndarray], truth: Sequence[Maps], flat: Sequence[Maps], maps: Sequence[Maps]
+) -> tuple[float, float]:
     """What is left of the light that `flat` has baked in: slope, and ratio of standard deviations, of the log."""
-    weight = np.concatenate([w.ravel() for w in bench.weights])
+    weight = np.concatenate([w.ravel() for w in weights])
     weight = weight / weight.sum()
 
+    def logs(of: Sequence[Maps]) -> np.ndarray:
+        return np.log(np.maximum(np.concatenate([luminance(m.albedo).ravel() for m in of]), DARK))
+
     def excess(of: Sequence[Maps]) -> np.ndarray:
-        logs = [
-            np.log(np.maximum(np.concatenate([luminance(m.albedo).ravel() for m in each]), DARK))
-            for each in (of, bench.scene.truth)
-        ]
-        return logs[0] - logs[1] - (weight * (logs[0] - logs[1])).sum()
+        ratio = logs(of) - logs(truth)
+        return ratio - (weight * ratio).sum()
 
     before, after = excess(flat), excess(maps)
     square = float((weight * before**2).sum())
@@ -230,8 +220,6 @@ def write_sheet(bench: Bench, rows: dict[str, Sequence[Maps]], file: Path) -> No
 
 
 def _with(maps: Maps, other: Maps, *names: str) -> Maps:
-    from dataclasses import replace
-
     return replace(maps, **{name: getattr(other, name) for name in names})
 
 

@@ -9,7 +9,6 @@ dry paint in patches that no colour shows either. Lit views come from Mitsuba's 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -26,11 +25,14 @@ from mistyle.measure.material_metrics import texel_areas
 from mistyle.run import painting
 from mistyle.run.made import Atlas
 from mistyle.run.settings import Settings
+from mistyle.stages.backproject import BakeSettings, backproject, fill
 from mistyle.stages.coat import lay_relief
+from mistyle.stages.texels import pad
 
 WET, DRY = 0.25, 0.7  # roughness of wet and of dry paint
 BRISTLES, PATCHES = (12.0, 32.0), (24.0, 64.0)  # wave lengths of the bristle marks and of the patches, texel sides
 WAVES = 64
+PADDING = 8  # texels
 
 
 @dataclass(frozen=True)
@@ -52,34 +54,42 @@ def silent(done: float) -> None:
 
 def painted(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, slope: float, seed: int) -> Painted:
     """The object painted with `style`; `slope` is the true relief's root mean square slope."""
+    from mistyle.backends.embedded import surface_relief
+
     coats = painting.coat(asset, style, atlas, settings, silent)
     flat = painting.painted(asset, coats, atlas, settings)
     painter = painting.raised(asset, coats, atlas, settings, flat)
-    sets = list(zip(atlas.texels, flat, range(len(flat)), strict=True))
-    truth = [true_maps(asset, coats, texels, maps, slope, [seed, part]) for texels, maps, part in sets]
+    truth = []
+    for part, (texels, maps) in enumerate(zip(atlas.texels, flat, strict=True)):
+        side = painting.texel_side(asset, part, texels)
+        place = texels.position[texels.covered], texels.normal[texels.covered]
+        guessed = surface_relief(coats.solutions[0], *place, footprint=side)[0]
+        truth.append(true_maps(asset, texels, maps, guessed, side, slope, np.random.default_rng([seed, part])))
     areas = tuple(texel_areas(asset.mesh, texels) for texels in atlas.texels)
     return Painted(asset, atlas, tuple(truth), tuple(flat), tuple(painter), areas)
 
 
-def true_maps(asset: Asset, coats: Any, texels: Texels, flat: Maps, slope: float, seed: Sequence[int]) -> Maps:
-    """`flat` with the known relief and roughness."""
-    from mistyle.backends.embedded import surface_relief
-
-    rng, at = np.random.default_rng(seed), texels.covered
+def true_maps(
+    asset: Asset,
+    texels: Texels,
+    flat: Maps,
+    guessed: Float[np.ndarray, "t 3"],
+    side: float,
+    slope: float,
+    rng: np.random.Generator,
+) -> Maps:
+    """`flat` with the known relief and roughness. `guessed` is the painting's own gradient of each covered texel (along
+    the surface, any scale), `side` the mean side of a texel in working units."""
+    at = texels.covered
     points, normals = texels.position[at], texels.normal[at]
-    solution, side = coats.solutions[0], painting.texel_side(asset, int(seed[-1]), texels)
-    guessed = surface_relief(solution, points, normals, footprint=side)[0]
     marks = _gradient(points, side, BRISTLES, rng)
     marks -= (marks * normals).sum(axis=1, keepdims=True) * normals
-    gradient = _unit_slope(guessed) + _unit_slope(marks)
-    wet = _field(points, side, PATCHES, rng)
-    roughness = WET + (DRY - WET) / (1 + np.exp(-4 * wet))
+    gradient = _unit_slope(_unit_slope(guessed) + _unit_slope(marks))
+    roughness = WET + (DRY - WET) / (1 + np.exp(-4 * _field(points, side, PATCHES, rng)))
     made = replace(flat, normal=flat.normal.copy(), roughness=np.zeros_like(flat.roughness))
-    every = slice(0, len(at))
-    lay_relief(
-        asset, made, texels, every, at, _unit_slope(gradient), roughness, slope, 1.0, corner_tangents(asset.mesh)
-    )
-    return replace(made, **{k: nearest_fill(getattr(made, k), at) for k in ("albedo", "normal", "roughness")})
+    tangents = corner_tangents(asset.mesh)
+    lay_relief(asset, made, texels, slice(0, len(at)), at, gradient, roughness, slope, 1.0, tangents)
+    return replace(made, **{name: nearest_fill(getattr(made, name), at) for name in ("albedo", "normal", "roughness")})
 
 
 def blank_views(asset: Asset, cameras: Sequence[Camera]) -> list[View]:
@@ -114,6 +124,17 @@ def lit_views(
     pictures = render(scene.asset.mesh, maps, shots, frame="mikkt", spp=spp, cache=cache)
     views = blank_views(scene.asset, cameras)
     return [replace(v, rgb=p[..., :3].copy(), coverage=p[..., 3].copy()) for v, p in zip(views, pictures, strict=True)]
+
+
+def baked(scene: Painted, views: Sequence[View]) -> list[Maps]:
+    """The views in the texture as they are, flat and half rough: where a stylizer that paints views leaves the fit."""
+    result = []
+    for texels, begin in zip(scene.atlas.texels, scene.flat, strict=True):
+        found = backproject(views, texels, BakeSettings(), mesh=scene.asset.mesh)
+        flat, half = np.zeros_like(begin.normal), np.full_like(begin.roughness, 0.5)
+        flat[..., 2] = 1
+        result.append(Maps(pad(fill(found, texels), texels, PADDING), flat, half, np.zeros_like(half), found.known))
+    return result
 
 
 def as_environment(lights: Lights) -> Lights:

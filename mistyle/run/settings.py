@@ -156,6 +156,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fit": {
             "painted": "with-light",
             "unlight": 0.0,
+            "solve": False,
             "lights": "together",
             "features": "vgg19",
             "bridge": "wrap",

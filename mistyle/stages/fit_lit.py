@@ -10,7 +10,6 @@ shading is. Where the solution explains the views worse than the maps as they ca
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -112,7 +111,7 @@ def solve(
         joint_subsamples=JOINT_SAMPLES,
     )  # fmt: skip
     found = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
-    made = tuple(_where_seen(found, start, k) for k in range(len(start)))
+    made = tuple(_where_seen(found, start, coarse, k) for k in range(len(start)))
     residual, unlit = _explained(mesh, captures, (start, made), targets)
     progress(1.0)
     trace = {f"phase1.{name}": values for name, values in found.trace.items()}
@@ -148,16 +147,14 @@ def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
     return Maps(known=np.zeros(size, bool), **fields)
 
 
-def _where_seen(found: Recovered, start: Sequence[Maps], k: int) -> Maps:
-    """The solution where a view shows the texel in the light, the start elsewhere."""
-    seen, own, other = found.seen[k] > 0, found.maps[k], start[k]
-    fields: dict[str, Any] = {
-        name: np.where(
-            seen.reshape(*seen.shape, *[1] * (getattr(own, name).ndim - 2)), *(getattr(m, name) for m in (own, other))
-        )
-        for name in DESCRIBED
-    }
-    return replace(own, **fields)
+def _where_seen(found: Recovered, start: Sequence[Maps], texels: Sequence[Texels], k: int) -> Maps:
+    """The solution but for texels that no view shows in the light: these keep the start."""
+    open_ = texels[k].covered & (found.seen[k] <= 0)
+    fields: dict[str, np.ndarray] = {}
+    for name in DESCRIBED:
+        solved, before = getattr(found.maps[k], name), getattr(start[k], name)
+        fields[name] = np.where(open_[..., None] if solved.ndim == 3 else open_, before, solved)
+    return replace(found.maps[k], **fields)
 
 
 def _explained(
