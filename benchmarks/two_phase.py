@@ -9,8 +9,8 @@ degrees), `roughness` (root mean square error), `albedo` (dB), over the surface 
 `roughness_ratio` are phase 1's error over the flat start's; `albedo_light_left` is the slope of log(albedo / truth)
 after phase 2 over the same of the baked views, `albedo_spread_left` the ratio of their standard deviations, which has
 the errors of detail too. `struggle.precision` and `struggle.recall`: what the repair finds of contradictions planted in
-unlit views (`two_phase_struggle.py`), by `repair.agreement`. `--slopes` are those of the true relief. `--sheets FOLDER`
-writes the maps and a relit picture of every row.
+unlit views (`two_phase_struggle.py`); `struggle.clean` is the share of the surface that it marks where none are.
+`--slopes` are those of the true relief. `--sheets FOLDER` writes the maps and a relit picture of every row.
 """
 
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ from benchmarks.two_phase_truth import Painted, silent
 from mistyle.core.camera import Camera
 from mistyle.core.capture import in_memory
 from mistyle.core.image import luminance, srgb_from_linear
-from mistyle.core.light import Lights, lights
+from mistyle.core.light import Lights, has_soft, lights
 from mistyle.core.maps import Maps
 from mistyle.files.read import read_mesh, read_picture
 from mistyle.measure.material_metrics import map_errors
@@ -37,7 +37,6 @@ from mistyle.run import start
 from mistyle.run.settings import Settings
 from mistyle.stages.fit import two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
-from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.inpaint import RepairSettings
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings
@@ -153,23 +152,33 @@ def unlit_rows(bench: Bench) -> tuple[dict[str, Sequence[Maps]], dict[str, float
 
 
 def struggling(bench: Bench) -> dict[str, float]:
-    """Precision and recall of the repair's mask, by `repair.agreement` and at its default."""
-    scene, figures = bench.scene, dict[str, float]()
-    planted = struggle.plant(scene, known.unlit_views(scene, bench.cameras), seed=0)
-    chosen = FitSettings(
-        iterations1=0, iterations2=2 * bench.settings.fit.iterations2, crops=4, crop_size=96, judge=False, refine="all"
-    )
-    fit = two_phase(scene.asset.mesh, scene.flat, planted.views, scene.atlas.texels, chosen, 0)
-    for agreement in (*struggle.AGREEMENTS, RepairSettings().agreement):
-        repair = RepairSettings(agreement=agreement)
-        both = struggle.found(scene, fit, bench.seen, planted, repair)
-        figures |= {f"{name}_{agreement:g}": value for name, value in zip(("precision", "recall"), both, strict=True)}
-    return figures | dict(zip(("precision", "recall"), both, strict=True))
+    """Precision and recall of the repair's mask over views with planted contradictions and views without, after few
+    steps and after four times as many; by `repair.outlier` and `repair.agreement`, and at their defaults."""
+    scene, steps = bench.scene, bench.settings.fit.iterations2
+    views = known.unlit_views(scene, bench.cameras)
+    fits = []
+    for planted in (struggle.clean(scene, views), *(struggle.plant(scene, views, seed) for seed in (0, 1))):
+        begin = known.baked(scene, planted.views)
+        for iterations, crops in ((steps, 2), (4 * steps, 4)):
+            more = {"iterations1": 0, "iterations2": iterations, "crops": crops, "judge": False}
+            chosen = bench.settings.fit.model_copy(update=more)
+            fits.append((planted, two_phase(scene.asset.mesh, begin, planted.views, scene.atlas.texels, chosen, 0)))
+    figures: dict[str, float] = {}
+    choices = {f".outlier_{o:g}.agreement_{a:g}": (o, a) for o in struggle.OUTLIERS for a in struggle.AGREEMENTS}
+    for name, (outlier, agreement) in (choices | {"": (None, None)}).items():
+        repair = RepairSettings() if outlier is None else RepairSettings(outlier=outlier, agreement=agreement)
+        each = [struggle.found(scene, fit, bench.seen, planted, repair) for planted, fit in fits]
+        both = struggle.precision_and_recall(np.sum(each, axis=0))
+        figures |= {f"{key}{name}": value for key, value in both.items()}
+        seen_area = sum(float(a[s > 0].sum()) for a, s in zip(scene.areas, bench.seen, strict=True))
+        figures[f"clean{name}"] = float(np.mean([e[1] for e in each[:2]])) / seen_area
+    return figures
 
 
 def solver(bench: Bench, captures: Any) -> Sequence[Maps]:
     """The material solver with its own settings, but for fewer steps on so small pictures."""
-    chosen = RecoverSettings(iterations=960, bounces=4, bounce_samples=64)
+    steps = 240 if has_soft(captures.lights) else 960
+    chosen = RecoverSettings(iterations=steps, bounces=4, bounce_samples=64)
     return recover(bench.scene.asset.mesh, bench.scene.atlas.texels, captures, chosen, 0).maps
 
 

@@ -15,7 +15,7 @@ from mistyle.stages.inpaint import RepairSettings, radius, struggle_mask
 
 PLACES, RADIUS = 10, 0.13  # discs on the surface, and their radius in working units
 SHIFT = 0.12  # share of the view's side by which a planted piece was moved
-AGREEMENTS = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 1.0)
+AGREEMENTS, OUTLIERS = (0.3, 0.5, 0.7, 1.0), (0.0, 3.0, 4.0, 5.0, 6.0)
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,11 @@ class Planted:
 
     views: tuple[View, ...]
     where: tuple[Bool[np.ndarray, "h w"], ...]
+
+
+def clean(scene: Painted, views: Sequence[View]) -> Planted:
+    """Nothing planted: all that is found is wrong."""
+    return Planted(tuple(views), tuple(np.zeros_like(t.covered) for t in scene.atlas.texels))
 
 
 def plant(scene: Painted, views: Sequence[View], seed: int) -> Planted:
@@ -53,17 +58,23 @@ def plant(scene: Painted, views: Sequence[View], seed: int) -> Planted:
 
 def found(
     scene: Painted, fit: Fit, seen: Sequence[np.ndarray], planted: Planted, settings: RepairSettings
-) -> tuple[float, float]:
-    """Precision and recall, by area, of the repair's mask among texels that a view sees. The mask is dilated by design:
-    what lies within its dilation of a planted texel is right, and counts for neither where it is not in the mask."""
-    right = wrong = hit = whole = 0.0
+) -> Float[np.ndarray, "4"]:
+    """Areas among the texels that a view sees: of the repair's mask what is right and what is wrong, and of what was
+    planted what is masked and all. What lies within the mask's own dilation of a planted texel is right."""
+    areas = np.zeros(4)
     for k, (texels, area) in enumerate(zip(scene.atlas.texels, scene.areas, strict=True)):
-        mask = struggle_mask(fit.struggle[k], fit.touched[k], seen[k], texels, settings, fit.agreed[k]) & (seen[k] > 0)
+        looked = seen[k] > 0
+        mask = struggle_mask(fit.struggle[k], fit.touched[k], seen[k], texels, settings, fit.agreed[k]) & looked
         near = dilate_within(planted.where[k], texels.island, radius(settings.dilation, len(mask)) + 1)
-        right, wrong = right + float(area[mask & near].sum()), wrong + float(area[mask & ~near].sum())
-        at = planted.where[k] & (seen[k] > 0)
-        hit, whole = hit + float(area[mask & at].sum()), whole + float(area[at].sum())
-    return right / max(right + wrong, 1e-12), hit / max(whole, 1e-12)
+        at = planted.where[k] & looked
+        areas += [float(area[each].sum()) for each in (mask & near, mask & ~near, mask & at, at)]
+    return areas
+
+
+def precision_and_recall(areas: Float[np.ndarray, "4"]) -> dict[str, float]:
+    """Of areas as `found` gives them."""
+    right, wrong, hit, whole = areas
+    return {"precision": right / max(right + wrong, 1e-12), "recall": hit / max(whole, 1e-12)}
 
 
 def _apart(points: Float[np.ndarray, "n 3"], rng: np.random.Generator) -> list[np.ndarray]:

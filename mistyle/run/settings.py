@@ -166,7 +166,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "tv_from": "style",
             "judge": False,
         },
-        "repair": {"agreement": 1.0},
+        "repair": {"agreement": 1.0, "outlier": 0.0},
         "train": {"loss_mode": "sum"},
         "diffusion": {"content": "per-view"},
     },

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.capture import Captures, in_memory
 from mistyle.core.image import luminance, resize
-from mistyle.core.light import Lights
+from mistyle.core.light import Lights, has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
@@ -106,7 +106,9 @@ def solve(
         [np.nan_to_num(view.rgb) for view in targets],
         [view_mask(view) for view in targets],
     )
+    # Under soft light steps on whole pictures took as long as the texels and were undone.
     chosen = RecoverSettings(
+        solver="texels" if has_soft(captures.lights) else "both",
         metallic=settings.metallic == "fit", iterations=ITERATIONS, bounces=BOUNCES, bounce_samples=BOUNCE_SAMPLES,
         joint_subsamples=JOINT_SAMPLES,
     )  # fmt: skip
