@@ -10,7 +10,7 @@ from test_seam import sphere
 from benchmarks import two_phase_struggle as struggle
 from benchmarks import two_phase_truth as known
 from benchmarks.two_phase import light_left
-from mistyle.core.asset import Asset, Source
+from mistyle.core.asset import Asset, Picture, Source
 from mistyle.core.light import Directional, lights
 from mistyle.core.maps import flat_maps
 from mistyle.core.paths import scenes
@@ -18,9 +18,11 @@ from mistyle.measure.material_metrics import map_errors, texel_areas
 from mistyle.render import device
 from mistyle.render.draw import tracer
 from mistyle.render.shade import Shade, pack
+from mistyle.run import pipeline
 from mistyle.run.generative import lights_of_views
-from mistyle.run.made import Atlas
+from mistyle.run.made import Atlas, Baked
 from mistyle.run.settings import Settings, resolve
+from mistyle.stages import fit as stages_fit
 from mistyle.stages import fit_lit
 from mistyle.stages.fit import Fit, two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
@@ -142,3 +144,17 @@ def test_the_light_of_the_views_is_known_or_not(tmp_path):
     other = Settings.model_validate({"draw": {"scene": tmp_path / "phase1_directional.xml"}})
     assert lights_of_views(other) is None
     assert not resolve("paper", None, {}).fit.solve and Settings().fit.solve
+
+
+@pytest.mark.parametrize(("more", "asked"), [({}, True), ({"solve": False}, False), ({"painted": "auto"}, False)])
+def test_a_job_solves_lit_views_under_their_light(scene, monkeypatch, more, asked):
+    """The views' own, of the paper's scene; not where the preset `paper` says so, nor where views show no light."""
+    called: list[str] = []
+    monkeypatch.setattr(fit_lit, "lit_phases", lambda *a, **k: called.append("solve") or a[4])
+    monkeypatch.setattr(stages_fit, "two_phase", lambda *a, **k: called.append("adam") or None)
+    settings = Settings.model_validate({"fit": {"painted": "with-light", "refine": "all"} | more})
+    style = Picture(np.zeros((4, 4, 3), np.float32), None, Path("style.png"))
+    baked = Baked(scene.flat, tuple(np.ones(t.covered.shape, np.int32) for t in scene.atlas.texels))
+    made = pipeline.fit(scene.asset, style, scene.atlas, baked, [], settings, known.silent)
+    assert called == (["solve"] if asked else ["adam"])
+    assert made == (lights("paper") if asked else None)

@@ -216,7 +216,7 @@ def fit(
 
     chosen, seed = fit_settings(settings), settings.seed
     where, look = atlas.texels, opaque(style) if settings.fit.tv_from == "style" else None
-    solving = chosen.painted == "with-light" and chosen.solve and chosen.refine == "all"
+    solving = chosen.painted == "with-light" and chosen.solve and chosen.refine == "all" and chosen.iterations1 > 0
     lit = lights_of_views(settings) if solving else None
     if lit is not None:
         return lit_phases(asset.mesh, baked.maps, stylized, where, lit, chosen, seed, report, style=look)
