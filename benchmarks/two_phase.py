@@ -29,7 +29,7 @@ from benchmarks.two_phase_truth import Painted, silent
 from mistyle.core.camera import Camera
 from mistyle.core.capture import in_memory
 from mistyle.core.image import luminance, srgb_from_linear
-from mistyle.core.light import Lights, has_soft, lights
+from mistyle.core.light import Directional, Lights, has_soft, lights
 from mistyle.core.maps import Maps
 from mistyle.files.read import read_mesh, read_picture
 from mistyle.measure.material_metrics import map_errors
@@ -44,6 +44,7 @@ from mistyle.stages.recover_settings import RecoverSettings
 KINDS = {"lit": "phase1", "soft": "paper"}
 DARK = 0.02  # linear albedo under which a logarithm says nothing of light
 LEAST_VIEWS = 3
+LAMP = Directional((0.87, -0.3, -0.39), (4.0, 4.0, 4.0), "camera")  # of the sheets: no light of the views
 
 
 @dataclass(frozen=True)
@@ -213,15 +214,14 @@ def light_left(
 
 def write_sheet(bench: Bench, rows: dict[str, Sequence[Maps]], file: Path) -> None:
     """Truth and every row, a line each: albedo, normal, roughness, and the object under a lamp from the side."""
-    from mistyle.render.draw import pictures
-
-    lines = []
+    lines, camera = [], bench.cameras[1]
     for maps in [bench.scene.truth, *rows.values()]:
-        shown = pictures(bench.scene.asset.mesh, maps, [bench.cameras[1]], spp=32)[0]
-        lit = srgb_from_linear(np.clip(shown[..., :3], 0, 1))
+        view = known.lit_views(bench.scene, maps, [camera], (LAMP,), 32)[0]
+        at, columns = np.nonzero(view.mask)
+        shown = view.rgb[at.min() : at.max() + 1, columns.min() : columns.max() + 1]
         m, size = maps[0], bench.settings.rig.resolution
         rough = np.repeat(m.roughness[..., None], 3, axis=-1)
-        flat = [srgb_from_linear(np.clip(m.albedo, 0, 1)), m.normal / 2 + 0.5, rough, lit]
+        flat = [srgb_from_linear(np.clip(m.albedo, 0, 1)), m.normal / 2 + 0.5, rough, srgb_from_linear(shown)]
         tiles = [Image.fromarray(np.round(np.clip(t, 0, 1) * 255).astype(np.uint8)).resize((size, size)) for t in flat]
         lines.append(np.concatenate([np.asarray(t) for t in tiles], axis=1))
     file.parent.mkdir(parents=True, exist_ok=True)
