@@ -165,9 +165,12 @@ def struggling(bench: Bench) -> dict[str, float]:
             chosen = bench.settings.fit.model_copy(update=more)
             fits.append((planted, two_phase(scene.asset.mesh, begin, planted.views, scene.atlas.texels, chosen, 0)))
     figures: dict[str, float] = {}
-    choices = {f".outlier_{o:g}.agreement_{a:g}": (o, a) for o in struggle.OUTLIERS for a in struggle.AGREEMENTS}
-    for name, (outlier, agreement) in (choices | {"": (None, None)}).items():
-        repair = RepairSettings() if outlier is None else RepairSettings(outlier=outlier, agreement=agreement)
+    choices = {
+        f".outlier_{outlier:g}.agreement_{agreement:g}": RepairSettings(outlier=outlier, agreement=agreement)
+        for outlier in struggle.OUTLIERS
+        for agreement in struggle.AGREEMENTS
+    }
+    for name, repair in (choices | {"": RepairSettings()}).items():
         each = [struggle.found(scene, fit, bench.seen, planted, repair) for planted, fit in fits]
         both = struggle.precision_and_recall(np.sum(each, axis=0))
         figures |= {f"{key}{name}": value for key, value in both.items()}

@@ -52,7 +52,7 @@ def plant(scene: Painted, views: Sequence[View], seed: int) -> Planted:
             for count, t in zip(counts, texels, strict=True):
                 disc = t.covered & (np.linalg.norm(t.position - middle, axis=-1) < RADIUS)
                 count[int(k in chosen)][disc] += _seen(view, t.position[disc])
-    where = tuple((count > 0).all(axis=0) for count in counts)
+    where = tuple(np.asarray((count > 0).all(axis=0)) for count in counts)
     return Planted(tuple(replace(v, rgb=c.astype(np.float32)) for v, c in zip(views, changed, strict=True)), where)
 
 

@@ -159,7 +159,7 @@ def _unit_slope(gradient: Float[np.ndarray, "t 3"]) -> Float[np.ndarray, "t 3"]:
 def _waves(side: float, lengths: tuple[float, float], rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     direction = rng.normal(size=(WAVES, 3))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    length = side * np.exp(rng.uniform(*np.log(lengths), WAVES))
+    length = side * np.exp(rng.uniform(np.log(lengths[0]), np.log(lengths[1]), WAVES))
     return direction * (2 * np.pi / length)[:, None], rng.uniform(0, 2 * np.pi, WAVES)
 
 
