@@ -22,6 +22,7 @@ from mistyle.run import pipeline
 from mistyle.run.generative import lights_of_views
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.settings import Settings, resolve
+from mistyle.run.summary import MEANINGS
 from mistyle.stages import fit as stages_fit
 from mistyle.stages import fit_lit
 from mistyle.stages.fit import Fit, two_phase, view_mask
@@ -102,6 +103,7 @@ def test_lit_views_tell_relief_gloss_and_paint(scene, monkeypatch):
     paper = two_phase(mesh, baked, views, texels, LIT.model_copy(update={"judge": False}), 0)
     weight = inside(scene)
     before, after, adam = (map_errors(scene.truth, maps, weight) for maps in (baked, fit.maps, paper.maps))
+    assert {name.rpartition(".")[2] for name in fit.figures} <= set(MEANINGS)
     assert fit.kept["phase1"] and fit.figures["phase1.residual"][1] < 0.5 * fit.figures["phase1.residual"][0]
     assert after.normal_mean_deg < 0.5 * before.normal_mean_deg < adam.normal_mean_deg
     assert after.roughness_mse < 0.25 * before.roughness_mse
