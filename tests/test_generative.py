@@ -24,6 +24,7 @@ SETTINGS = {
     "atlas.size": 128,
     "atlas.padding": 4,
     "fit.iterations1": 4,
+    "fit.solve": "false",
     "fit.iterations2": 4,
     "fit.crops": 1,
     "fit.crop_size": 32,

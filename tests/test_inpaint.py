@@ -12,7 +12,7 @@ from mistyle.backends.fill import _harmonic, grow, inpainter
 from mistyle.core.maps import Maps, Texels, flat_maps
 from mistyle.stages.inpaint import RepairSettings, blend_weights, radius, repair, struggle_mask
 
-BARE = RepairSettings(dilation=0, blend=0, smooth=0)
+BARE = RepairSettings(dilation=0, blend=0, smooth=0, outlier=0, agreement=0.3)
 
 
 def texels_of(island: np.ndarray, position: np.ndarray | None = None) -> Texels:
@@ -58,7 +58,7 @@ def test_the_threshold_is_mean_plus_half_a_deviation():
     assert masked(0, 0, 4, 8, 1000) == [False, False, False, True, False]
     # Mean 3.25, std sqrt(11.6875) = 3.419, threshold 4.959.
     assert masked(0, 0, 5, 8, 1000) == [False, False, True, True, False]
-    assert masked(0, 0, 4, 8, 0, choice=RepairSettings(deviations=0, dilation=0, smooth=0)) == [
+    assert masked(0, 0, 4, 8, 0, choice=RepairSettings(deviations=0, dilation=0, smooth=0, outlier=0)) == [
         False,
         False,
         True,
@@ -116,8 +116,8 @@ def test_a_place_struggles_and_noise_does_not(rng):
     texels, looks = one_island(256), ones.astype(np.float32)
     inside = np.zeros_like(ones, bool)
     inside[100:140, 60:110] = True
-    alone = struggle_mask(gradient, looks, ones, texels, RepairSettings(smooth=0, dilation=0))
-    around = struggle_mask(gradient, looks, ones, texels, RepairSettings(smooth=0.015, dilation=0))
+    alone = struggle_mask(gradient, looks, ones, texels, RepairSettings(smooth=0, dilation=0, outlier=0))
+    around = struggle_mask(gradient, looks, ones, texels, RepairSettings(smooth=0.015, dilation=0, outlier=0))
     assert alone[~inside].mean() > 0.15 and around[~inside].mean() < 0.1
     assert around[inside].mean() > 0.95 > alone[inside].mean()
 
@@ -266,6 +266,18 @@ def test_growing_is_deterministic_and_ignores_what_lies_under_the_hole(rng):
     first, second = grow(albedo, hole, texels), grow(other, hole, texels)
     assert first[hole & texels.covered].tobytes() == second[hole & texels.covered].tobytes()
     assert (first >= 0).all() and (first <= 1).all()
+
+
+def test_of_views_that_agree_nothing_stands_out():
+    seen, texels = np.ones((1, 6), np.int32), texels_of(np.array([[0] * 6]))
+    looks, limited = seen.astype(np.float32), BARE.model_copy(update={"outlier": 4.0})
+
+    def masked(last: float, choice: RepairSettings) -> list[bool]:
+        return struggle_mask(np.array([[1, 1, 1, 1, 1, last]], np.float32), looks, seen, texels, choice)[0].tolist()
+
+    # Mean and deviation always find a largest one; it has to be four times the median.
+    assert masked(3.9, BARE) == masked(4.1, BARE) == masked(4.1, limited) == [False] * 5 + [True]
+    assert masked(3.9, limited) == [False] * 6
 
 
 def test_a_large_gradient_that_all_looks_agree_on_is_no_contradiction():

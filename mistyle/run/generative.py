@@ -8,6 +8,7 @@ import numpy as np
 
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import EnvironmentMissing, UsageError
+from mistyle.core.light import Lights, SceneLights, lights
 from mistyle.core.view import View
 from mistyle.run.progress import Report
 from mistyle.run.settings import Settings
@@ -38,6 +39,17 @@ def fit_settings(settings: Settings) -> FitSettings:
     return chosen.model_copy(
         update={"features": named(settings, chosen.features), "painted": painted, "refine": settings.refined}
     )
+
+
+def lights_of_views(settings: Settings) -> Lights | None:
+    """The lights under which the views are drawn; None where only the user's own scene file describes them."""
+    from mistyle.core.paths import scenes
+
+    file = settings.draw.scene
+    if file is not None and file.resolve().parent != scenes().resolve():
+        return None
+    found = lights("paper_views" if file is None else file.stem)
+    return None if any(isinstance(light, SceneLights) for light in found) else found
 
 
 def check(settings: Settings, say: Callable[[str], None]) -> None:

@@ -21,7 +21,7 @@ from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.run.first_asset import write_first
 from mistyle.run.generative import check as check_generative
-from mistyle.run.generative import fit_settings, inpainter_inputs, opaque, release, texture_inpainter
+from mistyle.run.generative import fit_settings, inpainter_inputs, lights_of_views, opaque, release, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
 from mistyle.run.painting import bake, check_coat, coat_files, stylized_stage, surface_stage, unlit_views
@@ -139,7 +139,10 @@ def refined_stages(
     s, seed = run.job.settings, run.job.settings.seed
     look = [style.rgb] if s.fit.tv_from == "style" else []
     fitted = run.record(
-        "fit", painted, [fit_settings(s), seed, *look], lambda r: fit(asset, style, atlas, baked, stylized, s, r)
+        "fit",
+        painted,
+        [fit_settings(s), s.draw.scene, seed, *look],
+        lambda r: fit(asset, style, atlas, baked, stylized, s, r),
     )
     masks = masks_stage(run, asset, atlas, baked, fitted)
     repaired = run.record(
@@ -228,22 +231,23 @@ def fit(
     settings: Settings,
     report: Report,
 ) -> Any:
-    """Section 4.2: normal and roughness, then albedo."""
+    """Section 4.2: normal and roughness, then albedo; of views that show known light, solved for under it."""
     from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit_lit import lit_phases
     from mistyle.stages.unlight import unlit
 
-    return two_phase(
-        asset.mesh,
-        baked.maps,
-        stylized,
-        atlas.texels,
-        fit_settings(settings),
-        settings.seed,
-        report,
-        begin=baked.begin,
-        style=opaque(style) if settings.fit.tv_from == "style" else None,
-        unlit=unlit(stylized, baked.gains) if baked.gains else None,
+    chosen, seed = fit_settings(settings), settings.seed
+    where, look = atlas.texels, opaque(style) if settings.fit.tv_from == "style" else None
+    solving = chosen.painted == "with-light" and chosen.solve and chosen.refine == "all" and chosen.iterations1 > 0
+    lit = lights_of_views(settings) if solving else None
+    if lit is not None:
+        return lit_phases(asset.mesh, baked.maps, stylized, where, lit, chosen, seed, report, style=look)
+    plain = unlit(stylized, baked.gains) if baked.gains else None
+    fitted = two_phase(
+        asset.mesh, baked.maps, stylized, where, chosen, seed, report, begin=baked.begin, style=look, unlit=plain
     )
+    unknown = f"{settings.draw.scene}: the fit does not know this scene's light, so the lit views are not solved for."
+    return replace(fitted, notes=(*fitted.notes, unknown)) if solving else fitted
 
 
 def repair(

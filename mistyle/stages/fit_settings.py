@@ -27,6 +27,11 @@ class FitSettings(BaseModel):
         description="largest share of the shading under the views' own lights that is divided out of views painted "
         "with light, before the texture and phase 2 see them; 0: none (the paper)",
     )
+    solve: bool = Field(
+        default=True,
+        description="of views painted with light, solve for normal, roughness and albedo under the views' own light, "
+        "before phase 2; false: both phases by Adam alone (the paper)",
+    )
     lights: Literal["together", "one-per-view"] = Field(
         default="one-per-view",
         description="phase 1's lights, without light in the views: all at once (the paper's), or one a crop, in turn",

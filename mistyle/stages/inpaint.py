@@ -32,8 +32,15 @@ class RepairSettings(BaseModel):
         le=10,
         description="a texel struggles above mean + this many standard deviations (the paper's 0.5)",
     )
+    outlier: float = Field(
+        default=4.0,
+        ge=0,
+        le=100,
+        description="and above this many times the median: of views that agree, mean and deviation alone mark a third; "
+        "0: no such limit (the paper)",
+    )
     agreement: float = Field(
-        default=0.3,
+        default=0.7,
         ge=0,
         le=1,
         description="and only where the views contradict one another: |sum| of the gradients at most this share of "
@@ -67,8 +74,8 @@ def struggle_mask(
     agreed: Float[np.ndarray, "h w"] | None = None,
 ) -> Bool[np.ndarray, "h w"]:
     """The texels to paint again: those around which the mean |gradient| of a look exceeds mean + 0.5 std over the
-    texels that were looked at while its looks contradict one another, and those that no view sees; dilated by
-    max-pooling inside their islands.
+    texels that were looked at, and `settings.outlier` times their median, while its looks contradict one another; and
+    those that no view sees. Dilated by max-pooling inside their islands.
 
     A large gradient alone is the mark of contrast and of a fit that was not run to its end: it pulls the same way in
     all views, and more steps would mend it. `agreed` (`Fit.agreed`) tells the two apart; None leaves it out.
@@ -87,7 +94,8 @@ def struggle_mask(
         side = settings.smooth * texels.covered.shape[1]
         total, times = (gaussian(np.where(looked, a, 0).astype(np.float32), side) for a in (accumulated, looks))
         average = total[looked].astype(np.float64) / np.maximum(times[looked], least)
-        struggling[looked] = average > average.mean() + settings.deviations * average.std()
+        limit = average.mean() + settings.deviations * average.std()
+        struggling[looked] = average > max(limit, settings.outlier * float(np.median(average)))
         if agreed is not None and settings.agreement < 1:
             one_way = gaussian(np.where(looked, agreed, 0).astype(np.float32), side)[looked]
             struggling[looked] &= one_way <= settings.agreement * total[looked]

@@ -45,7 +45,7 @@ def _together(view: View, shading: Float[np.ndarray, "h w"]) -> tuple[float, flo
     if inside.sum() < 16 or seen[inside].max() <= 0 or shading[inside].max() <= 0:
         return None
     planes = _log(shading, inside), _log(seen, inside), view.normal[..., 1]
-    bare, shown, upward = (_blurred(p, inside, STROKE * width)[inside].astype(np.float64) for p in planes)
+    bare, shown, upward = (blurred(p, inside, STROKE * width)[inside].astype(np.float64) for p in planes)
     form = np.stack([np.ones_like(upward), upward], axis=1)
     x, y = (values - form @ np.linalg.lstsq(form, values, rcond=None)[0] for values in (bare, shown))
     spread = float(x @ x)
@@ -58,7 +58,7 @@ def gain(view: View, shading: Float[np.ndarray, "h w"], exponent: float) -> Floa
     """The factor that takes a share of the shading out of a view and leaves its mean lightness; 1 off the mesh."""
     if exponent == 0:
         return np.ones(view.mask.shape, np.float32)
-    logs = _blurred(_log(shading, view.mask), view.mask, NOISE * view.mask.shape[1])
+    logs = blurred(_log(shading, view.mask), view.mask, NOISE * view.mask.shape[1])
     factor = np.exp(-exponent * (logs - logs[view.mask].mean()))
     return np.where(view.mask, np.clip(factor, 1 / BOUND, BOUND), 1).astype(np.float32)
 
@@ -72,7 +72,7 @@ def _log(plane: Float[np.ndarray, "h w"], inside: np.ndarray) -> Float[np.ndarra
     return np.log(np.maximum(plane, LEAST * float(plane[inside].max()))).astype(np.float32)
 
 
-def _blurred(plane: Float[np.ndarray, "h w"], inside: np.ndarray, sigma: float) -> Float[np.ndarray, "h w"]:
+def blurred(plane: Float[np.ndarray, "h w"], inside: np.ndarray, sigma: float) -> Float[np.ndarray, "h w"]:
     """A mean over what is inside, about each pixel."""
     weight = inside.astype(np.float32)
     return gaussian(plane * weight, sigma) / np.maximum(gaussian(weight, sigma), 1e-3)
