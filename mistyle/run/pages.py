@@ -18,7 +18,7 @@ from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting
 from mistyle.run.report_draw import draw, shown
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
-from mistyle.run.stages import FIRST, RETOUCH, STAGES
+from mistyle.run.stages import FINISH, FIRST, RETOUCH, STAGES
 from mistyle.run.style_look import look_facts
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
@@ -41,7 +41,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         write_png(folder / "beauty.png", best)
     write_png(folder / "overview.png", side_by_side([bare, made.style.rgb, best]))
     report(0.8)
-    named = STAGES | RETOUCH | FIRST
+    named = STAGES | RETOUCH | FINISH | FIRST
     page = Report(
         title=made.job.name,
         mesh=made.job.mesh.name,

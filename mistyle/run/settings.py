@@ -21,6 +21,7 @@ from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.stages.backproject import BakeSettings
+from mistyle.stages.finish_settings import FinishSettings
 from mistyle.stages.fit import FitSettings
 from mistyle.stages.inpaint import RepairSettings
 from mistyle.stages.mvst import SweepSettings
@@ -112,6 +113,7 @@ class Settings(BaseModel):
     sweep: SweepSettings = SweepSettings()
     atlas: AtlasSettings = AtlasSettings()
     bake: BakeSettings = BakeSettings()
+    finish: FinishSettings = FinishSettings()
     fit: FitSettings = FitSettings()
     repair: RepairSettings = RepairSettings()
     report: ReportSettings = ReportSettings()
@@ -129,6 +131,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rig": {"resolution": 512},
         "surface": {"samples": 80_000},
         "atlas": {"size": 1024},
+        "finish": {"steps": 20, "crops": 2},
         "fit": {"iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},
         "report": {"frames": 12, "resolution": 320, "spp": 4},
     },

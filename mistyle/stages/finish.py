@@ -4,8 +4,8 @@ Each step looks straight at a few places of the surface, at the scale at which t
 the crops without light (`Film`), and the statistics of their features are compared with those of the unbroken painting
 at the same places (`finish_style.py`). Pixels count by the angle and the distance at which they are seen. The
 gradient moves a Laplacian pyramid of the texture (`render/pyramid.py`). The painter's own features hold the content,
-most along the edges of the shape; no shading appears anywhere. Changes broader than a stroke are taken out at the end,
-so that neither colours drift nor light is painted in.
+most along the edges of the shape; no shading appears anywhere. Changes broader than a stroke, and changes of colour
+that the painting does not have, are taken out at the end: neither do colours drift, nor is light painted in.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +22,7 @@ from mistyle.core.light import Ambient
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.stages import finish_style, fit_table
-from mistyle.stages.finish_settings import FinishSettings
+from mistyle.stages.finish_settings import JUDGED, FinishSettings
 from mistyle.surface.lookup import Solution
 
 if TYPE_CHECKING:
@@ -37,7 +37,10 @@ RIM = 6  # pixels along silhouettes, whose features see the background
 TRIES = 16  # places drawn for a crop; the least seen is taken
 EDGE, EDGE_REACH = 0.3, 7  # turn of the normal between pixels that is an edge of the shape; pixels around it
 BROAD = 12.0  # standard deviation in texels of the table beyond which a change is taken out
-JUDGED, JUDGE = 4, 0x5EED  # batches of crops, never stepped on, by which before and after are compared; their seed
+JUDGE = 0x5EED  # seed of the crops by which before and after are compared
+OFF_PALETTE = 0.03  # standard deviation of the painting's colours (sRGB units) along which half of a change stays
+FURTHEST = 0.12  # a change of an encoded value comes near to this and never gets there
+LEAST = 1e-6  # of a squared distance, whose root has a slope at 0
 LAST_RATE = 0.1  # share of the rate at the end; a cosine leads there
 
 
@@ -57,14 +60,14 @@ class Painted:
 
 @dataclass(frozen=True)
 class Finished:
-    """The maps with their finished albedo, and how that went.
+    """The finished albedo (linear, one per texture set), and how that went.
 
     trace   style loss of every step
     style   that loss before and after, on crops that no step used
     moved   root mean square change of the covered texels' albedo, sRGB units
     """
 
-    maps: tuple[Maps, ...]
+    albedo: tuple[Float[np.ndarray, "h w 3"], ...]
     trace: tuple[float, ...]
     style: tuple[float, float]
     moved: float
@@ -98,7 +101,7 @@ def finish(
     for step in range(settings.steps):
         run.step(step)
         progress((step + 1) / settings.steps)
-    run.take_out_broad_changes()
+    run.restrain()
     return run.result(before, run.judged())
 
 
@@ -158,14 +161,18 @@ class Finishing:
 
         n, size = self.settings.crops, self.settings.crop_size
         wanted = finish_style.wanted(self.exemplar, crops.places, n, size)
-        counts, kind = crops.counts, self.settings.statistic
         # The painter's own first: the film holds one picture at a time until its gradient is taken.
         with torch.no_grad():
             start = torch.from_numpy(self.table.start["albedo"][crops.taps.texels])
             own = self.features(self.shown(crops, start)) if self.settings.content else []
         maps = self.features(self.shown(crops, leaf, moving=True))
-        style = style_statistics(maps, wanted, counts, counts, kind=kind, rng=rng)
-        content = style.new_zeros(())
+        style = content = leaf.new_zeros(())
+        for k in range(n):
+            one, counts = slice(k, k + 1), crops.counts[k : k + 1]
+            mine, theirs = ([level[one] for level in levels] for levels in (maps, wanted))
+            distance = style_statistics(mine, theirs, counts, counts, kind=self.settings.statistic, rng=rng)
+            # By the root and the share that counts: a crop with few pixels, or far off, does not outweigh the others.
+            style = style + counts.mean() * (distance + LEAST).sqrt() / n
         # The finest features are those of single pixels, which the style is free to move.
         for a, b in zip(maps[-2:], own[-2:], strict=False):
             held = functional.interpolate(crops.held, size=a.shape[2:], mode="area")
@@ -225,8 +232,10 @@ class Finishing:
                 found.append(float(self.losses(crops, leaf, rng)[0]))
         return float(np.mean(found))
 
-    def take_out_broad_changes(self) -> None:
-        """Subtract from the change of the albedo its own mean over a few strokes."""
+    def restrain(self) -> None:
+        """Take out of the change of the albedo its own mean over a few strokes, and directions of colour in which the
+        painting does not vary (a woodcut stays black and white); and bound what is left."""
+        palette = own_directions(self.painted.solution.painting)
         values, start = self.table.values["albedo"], self.table.start["albedo"]
         for rows, size, where in zip(self.table.parts, self.table.sizes, self.painted.texels, strict=True):
             change = (values[rows] - start[rows]).reshape(*size, 3)
@@ -234,17 +243,21 @@ class Finishing:
             inside = where.covered.reshape(size[0], by, size[1], by).any(axis=(1, 3)).astype(np.float32)
             share = np.maximum(cv2.GaussianBlur(inside, (0, 0), BROAD), 1e-3)[..., None]
             broad = cv2.GaussianBlur(change * inside[..., None], (0, 0), BROAD) / share
-            finer = np.where(self.table.still[rows].reshape(size)[..., None], 0, change - broad)
+            finer = FURTHEST * np.tanh((change - broad) @ palette / FURTHEST)
+            finer = np.where(self.table.still[rows].reshape(size)[..., None], 0, finer)
             values[rows] = np.clip(start[rows] + finer.reshape(-1, 3), 0, 1)
 
     def result(self, before: float, after: float) -> Finished:
-        """The maps with what was changed laid upon them."""
+        """The albedo with what was changed laid upon it."""
+        if after >= before:
+            # What does not help on crops that no step used stays as the painter left it.
+            self.table.values["albedo"][:] = self.table.start["albedo"]
         made, squares, count = [], 0.0, 0
         laid = fit_table.finished(self.table, self.encoded, self.painted.only)
-        for new, old, where, maps in zip(laid, self.encoded, self.painted.texels, self.painted.maps, strict=True):
+        for new, old, where in zip(laid, self.encoded, self.painted.texels, strict=True):
             change = (new.albedo - old.albedo)[where.covered]
             squares, count = squares + float(np.square(change, dtype=np.float64).sum()), count + change.size
-            made.append(replace(maps, albedo=linear_from_srgb(new.albedo)))
+            made.append(linear_from_srgb(new.albedo))
         moved = float(np.sqrt(squares / max(count, 1)))
         return Finished(tuple(made), tuple(self.trace), (before, after), moved)
 
@@ -274,6 +287,12 @@ def texel_side(painted: Painted) -> float:
     """The mean side of a texel on the surface, working units, over all texture sets."""
     covered = sum(int(where.covered.sum()) for where in painted.texels)
     return float(np.sqrt(face_areas(painted.mesh).sum() / max(covered, 1)))
+
+
+def own_directions(painting: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "3 3"]:
+    """A symmetric matrix that keeps differences of colour along which the painting varies, and shrinks others to 0."""
+    spread = np.cov(painting.reshape(-1, 3).T.astype(np.float64))
+    return (spread @ np.linalg.inv(spread + OFF_PALETTE**2 * np.eye(3))).astype(np.float32)
 
 
 def frontal(

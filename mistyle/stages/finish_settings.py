@@ -1,8 +1,12 @@
 """What a user may choose about finishing the painting."""
 
+from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
+
+
+JUDGED = 3  # batches of crops, never stepped on, by which before and after are compared
 
 
 class FinishSettings(BaseModel):
@@ -12,6 +16,9 @@ class FinishSettings(BaseModel):
 
     method: Literal["off", "vgg"] = Field(
         default="off", description="vgg: style losses of VGG-19 move the painted albedo (needs --vgg FILE)"
+    )
+    features: Path | None = Field(
+        default=None, description="weights of VGG-19 for the finish alone; unset: those of fit.features (--vgg)"
     )
     steps: int = Field(default=240, ge=1, le=100_000, description="gradient steps")
     crops: int = Field(default=4, ge=1, le=64, description="rendered crops per step")
@@ -25,9 +32,9 @@ class FinishSettings(BaseModel):
     )
     style: float = Field(default=1.0, ge=0, description="weight of that statistic's distance to the painting's")
     content: float = Field(
-        default=1.0, ge=0, description="weight of the painter's own features, doubled along edges of the shape"
+        default=0.3, ge=0, description="weight of the painter's own features, doubled along edges of the shape"
     )
-    rate: float = Field(default=0.02, gt=0, le=0.5, description="typical change of the albedo in a step (sRGB units)")
+    rate: float = Field(default=0.06, gt=0, le=0.5, description="typical change of the albedo in a step (sRGB units)")
     coarse: float = Field(
         default=0.5, ge=0, le=1, description="share of that rate on each coarser level of the texture's pyramid"
     )
