@@ -60,8 +60,8 @@ def change(
 
     Numbers whose gradient is exactly zero neither move nor forget (masked updates): most texels are not seen by the
     one camera of a step. Every number counts its own steps for Adam's start-up correction. Level l moves at the rate
-    rate · share^l. `fair`: see the module; without it, `damping` times the root mean square of a level's gradients joins
-    Adam's denominator, so that numbers with little gradient, which is mostly noise, move little.
+    rate · share^l. `fair`: see the module; without it, `damping` times the root mean square of a level's gradients
+    joins Adam's denominator, so that numbers with little gradient, which is mostly noise, move little.
     """
     steps = []
     level = np.ascontiguousarray(gradient, np.float32)

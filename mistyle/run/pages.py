@@ -13,9 +13,10 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.files.own import read_own
 from mistyle.run import report_overlays
+from mistyle.run.finishing import finish_pair
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
-from mistyle.run.report_draw import draw, shown
+from mistyle.run.report_draw import close_up, draw, shown
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
 from mistyle.run.stages import FINISH, FIRST, RETOUCH, STAGES
@@ -155,7 +156,19 @@ def steps(made: Any, before: Shot, after: Shot) -> tuple[Step, ...]:
         ),
         columns=3,
     )
-    return (views, stylized, baked, fit, repair)
+    finish = () if made.finishing is None else (finish_step(made),)
+    return (views, stylized, baked, *finish, fit, repair)
+
+
+def finish_step(made: Any) -> Step:
+    """The stage 'finish': the painting before and after, and its figures."""
+    (before, after), moved = made.finishing.style, f"{made.finishing.moved:.3f} (sRGB, root mean square)"
+    return Step(
+        "Finish",
+        "Style losses of VGG-19 on many rendered crops, each compared with its own places in the painting.",
+        pairs=(finish_pair(made.asset, made.finishing, close_up(made.job.settings)),),
+        facts=(("style loss", f"{before:.4g} → {after:.4g}"), ("albedo moved by", moved)),
+    )
 
 
 def angle(camera: Camera) -> str:

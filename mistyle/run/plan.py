@@ -226,7 +226,7 @@ def _extent(mesh: Path, uv: Literal["keep", "new", "auto"], max_faces: int, size
 
 
 def _finishing(settings: Settings) -> dict[str, float]:
-    """Seconds of the stage 'finish', where it is wanted; judging takes two batches of crops for each that it compares."""
+    """Seconds of the stage 'finish', where it is wanted, with the crops that judge it before and after."""
     from mistyle.stages.finish_settings import JUDGED
 
     chosen = settings.finish

@@ -95,7 +95,10 @@ def finish(
     *,
     bridge: Any = "frozen",
 ) -> Finished:
-    """Move the albedo of `painted` for `settings.steps` steps. The same inputs, seed and threads give the same bytes."""
+    """Move the albedo of `painted` for `settings.steps` steps, and keep that if the style loss fell.
+
+    The same inputs, settings, seed and thread count give the same bytes.
+    """
     run = Finishing(painted, features, settings, seed, bridge)
     before = run.judged()
     for step in range(settings.steps):

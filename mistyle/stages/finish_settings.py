@@ -5,7 +5,6 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-
 JUDGED = 3  # batches of crops, never stepped on, by which before and after are compared
 
 
