@@ -155,8 +155,8 @@ def test_pixels_find_their_own_place_in_the_painting(painted):
     half = (wanted.shape[2] + 63) // wanted.shape[2]
     assert half == 1 or half == 2
     shown, counts = (maps[:, :, half // 2 :: half, half // 2 :: half] for maps in (shown, crops.counts))
-    at = (counts > 0.5).expand_as(shown).numpy()
-    assert at.mean() > 0.1
+    at = (counts > 0.2).expand_as(shown).numpy()
+    assert at.mean() > 0.02
     match = np.corrcoef(shown.numpy()[at], wanted.numpy()[at])[0, 1]
     flipped = np.corrcoef(shown.numpy()[at], wanted.flip(3).numpy()[at])[0, 1]
     assert match > 0.8 > flipped
@@ -166,12 +166,14 @@ def test_the_style_loss_falls_and_colours_stay(painted, weights):
     """Same bytes twice; less loss on crops that no step used; the mean colour stands still; what is masked stands."""
     covered = painted.texels[0].covered
     free = covered & (painted.texels[0].position[..., 1] > 0)
-    masked = replace(painted, only=(free,))
+    soiled = painted.maps[0].albedo + np.random.default_rng(6).normal(0, 0.15, painted.maps[0].albedo.shape)
+    maps = replace(painted.maps[0], albedo=np.clip(soiled, 0, 1).astype(np.float32))
+    masked = replace(painted, maps=(maps,), only=(free,))
     settings = QUICK.model_copy(update={"steps": 12, "content": 0.0})
     first, again = (finish(masked, load_features(weights, 3), settings, 5) for _ in range(2))
     assert all((a == b).all() for a, b in zip(first.albedo, again.albedo, strict=True))
     assert first.style[1] < first.style[0] and len(first.trace) == 12 and 0 < first.moved < 0.12
-    before, after = painted.maps[0].albedo, first.albedo[0]
+    before, after = maps.albedo, first.albedo[0]
     assert np.allclose(before[covered & ~free], after[covered & ~free], atol=1e-6)
     mean = [srgb_from_linear(albedo[free]).mean(axis=0) for albedo in (before, after)]
     assert np.abs(mean[0] - mean[1]).max() < 0.01
