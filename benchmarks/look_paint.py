@@ -13,7 +13,7 @@ import sys
 import tarfile
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -93,7 +93,7 @@ def tree_at(commit: str, cache: Path) -> Tree:
 
 def finished(piece: Piece, weights: Path) -> Piece:
     """The piece with its painting finished by VGG-19."""
-    return Piece(**vars(piece) | {"options": (*piece.options, "--finish", "vgg", "--vgg", str(weights))})
+    return replace(piece, options=(*piece.options, "--finish", "vgg", "--vgg", str(weights)))
 
 
 def environment(tree: Tree) -> dict[str, str]:

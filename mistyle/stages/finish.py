@@ -244,8 +244,9 @@ class Finishing:
             change = (values[rows] - start[rows]).reshape(*size, 3)
             by = where.covered.shape[0] // size[0]
             inside = where.covered.reshape(size[0], by, size[1], by).any(axis=(1, 3)).astype(np.float32)
-            share = np.maximum(cv2.GaussianBlur(inside, (0, 0), BROAD), 1e-3)[..., None]
-            broad = cv2.GaussianBlur(change * inside[..., None], (0, 0), BROAD) / share
+            weighted = np.concatenate([change, np.ones_like(change[..., :1])], axis=2) * inside[..., None]
+            mean = cv2.GaussianBlur(weighted.astype(np.float32), (0, 0), BROAD)
+            broad = mean[..., :3] / np.maximum(mean[..., 3:], 1e-3)
             finer = FURTHEST * np.tanh((change - broad) @ palette / FURTHEST)
             finer = np.where(self.table.still[rows].reshape(size)[..., None], 0, finer)
             values[rows] = np.clip(start[rows] + finer.reshape(-1, 3), 0, 1)
