@@ -40,6 +40,7 @@ BROAD = 12.0  # standard deviation in texels of the table beyond which a change 
 JUDGE = 0x5EED  # seed of the crops by which before and after are compared
 OFF_PALETTE = 0.03  # standard deviation of the painting's colours (sRGB units) along which half of a change stays
 FURTHEST = 0.12  # a change of an encoded value comes near to this and never gets there
+LONGEST = 1024  # pixels of the painting along its long side, at most, as its features are taken
 LEAST = 1e-6  # of a squared distance, whose root has a slope at 0
 LAST_RATE = 0.1  # share of the rate at the end; a cosine leads there
 
@@ -62,7 +63,7 @@ class Painted:
 class Finished:
     """The finished albedo (linear, one per texture set), and how that went.
 
-    trace   style loss of every step
+    trace   style loss of every step: the root of the statistic's distance, by the share of pixels that count
     style   that loss before and after, on crops that no step used
     moved   root mean square change of the covered texels' albedo, sRGB units
     """
@@ -120,11 +121,12 @@ class Finishing:
         self.painted, self.settings, self.features = painted, settings, features
         self.rng = np.random.default_rng(seed)
         self.traced = tracer(painted.mesh)
-        self.pixel = settings.texels_per_pixel * texel_side(painted)
+        shrink = texels_per_pixel(painted, settings)
+        self.pixel = shrink * texel_side(painted)
         self.exemplar = finish_style.exemplar(painted.solution, self.pixel, features)
         self.film = Film(settings.crops, settings.crop_size, bridge)
         self.encoded = [replace(m, albedo=srgb_from_linear(m.albedo)) for m in painted.maps]
-        self.table = fit_table.build(self.encoded, painted.texels, settings.texels_per_pixel, painted.only)
+        self.table = fit_table.build(self.encoded, painted.texels, shrink, painted.only)
         self.moments = [pyramid.start((*size, 3)) for size in self.table.sizes]
         self.seen = np.zeros(len(painted.solution.positions), np.float32)
         self.trace: list[float] = []
@@ -243,9 +245,8 @@ class Finishing:
         for rows, size, where in zip(self.table.parts, self.table.sizes, self.painted.texels, strict=True):
             change = (values[rows] - start[rows]).reshape(*size, 3)
             by = where.covered.shape[0] // size[0]
-            inside = where.covered.reshape(size[0], by, size[1], by).any(axis=(1, 3)).astype(np.float32)
-            weighted = np.concatenate([change, np.ones_like(change[..., :1])], axis=2) * inside[..., None]
-            mean = cv2.GaussianBlur(weighted.astype(np.float32), (0, 0), BROAD)
+            inside = np.asarray(where.covered.reshape(size[0], by, size[1], by).any(axis=(1, 3)), np.float32)[..., None]
+            mean = cv2.GaussianBlur(np.concatenate([change * inside, inside], axis=2), (0, 0), BROAD)
             broad = mean[..., :3] / np.maximum(mean[..., 3:], 1e-3)
             finer = FURTHEST * np.tanh((change - broad) @ palette / FURTHEST)
             finer = np.where(self.table.still[rows].reshape(size)[..., None], 0, finer)
@@ -285,6 +286,15 @@ class Film:
         white = self.shader(lit, torch.cat([torch.ones_like(albedo), matt], dim=1).detach())
         drawn = self.shader(lit, torch.cat([albedo, matt], dim=1), ("albedo",) if moving else ())
         return (drawn / white.clamp_min(1e-3)).reshape(n, size, size, 3).permute(0, 3, 1, 2)
+
+
+def texels_per_pixel(painted: Painted, settings: FinishSettings) -> int:
+    """As the settings say, and more where the painting would be longer than LONGEST pixels at that scale."""
+    solution, shrink = painted.solution, settings.texels_per_pixel
+    long = max(solution.painting.shape[:2]) * solution.spacing / max(solution.scale)
+    while long > LONGEST * shrink * texel_side(painted):
+        shrink *= 2
+    return shrink
 
 
 def texel_side(painted: Painted) -> float:
