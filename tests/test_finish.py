@@ -179,6 +179,19 @@ def test_the_style_loss_falls_and_colours_stay(painted, weights):
     assert np.abs(mean[0] - mean[1]).max() < 0.01
 
 
+def test_several_materials_are_finished_together(painted, weights, monkeypatch):
+    """Two texture sets of two sizes: crops across their border move both."""
+    monkeypatch.setattr(Finishing, "judged", lambda self: -float(len(self.trace)))
+    middle = painted.mesh.positions[painted.mesh.faces].mean(axis=1)[:, 1]
+    mesh = replace(painted.mesh, part=(middle > 0).astype(np.int32), parts=("low", "high"))
+    sets = (rasterise(mesh, 0, SIZE), rasterise(mesh, 1, SIZE // 2))
+    maps = tuple(flat_maps(len(texels.covered)) for texels in sets)
+    found = finish(replace(painted, mesh=mesh, maps=maps, texels=sets), load_features(weights, 3), QUICK, 0)
+    assert [albedo.shape for albedo in found.albedo] == [(SIZE, SIZE, 3), (SIZE // 2, SIZE // 2, 3)]
+    for before, after, texels in zip(maps, found.albedo, sets, strict=True):
+        assert np.abs(after - before.albedo)[texels.covered].max() > 1e-3
+
+
 def test_what_does_not_help_is_undone(painted, weights, monkeypatch):
     monkeypatch.setattr(Finishing, "judged", lambda self: 1.0)
     found = finish(painted, load_features(weights, 3), QUICK, 0)
