@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from PIL import Image
 from test_pipeline import TINY, hashes, inputs  # noqa: F401
 from test_seam import sphere
 from torch import nn
@@ -56,9 +55,9 @@ def weights(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def painting(rng_of=np.random.default_rng) -> np.ndarray:
+def painting() -> np.ndarray:
     """Stripes of two colours with soft noise, encoded."""
-    rng = rng_of(4)
+    rng = np.random.default_rng(4)
     y, x = np.mgrid[:72, :96] / 6
     wave = 0.5 + 0.4 * np.sin(x + 0.5 * y)
     picture = np.stack([wave, 0.3 + 0.3 * wave, 1 - wave], axis=2) + rng.normal(0, 0.02, (72, 96, 3))
@@ -256,7 +255,7 @@ def test_torchvisions_layers_are_chosen_alike(tmp_path, rng, ending):
         assert torch.allclose(a, b, atol=1e-5)
 
 
-def test_the_option_from_end_to_end(inputs, weights, tmp_path, capsys):  # noqa: F811
+def test_the_option_from_end_to_end(inputs, weights, tmp_path):  # noqa: F811
     """The stage's record, figures, note, picture and key."""
     tiny = TINY | {"fit": {"refine": "off"}, "rig": {"kind": "turntable", "views": 2, "resolution": 32}}
     layers = tiny | {"finish": {"method": "vgg", "steps": 2, "crops": 1, "crop_size": 64, "features": str(weights)}}
@@ -305,8 +304,7 @@ def test_the_plan_counts_the_finish(inputs, weights, tmp_path, capsys):  # noqa:
     assert plans[1]["seconds"] > plans[0]["seconds"] and "finish" in plans[1]["peaks_gb"]
 
 
-def test_help_and_painting_say_what_the_option_is(inputs, capsys):  # noqa: F811
+def test_help_names_the_option(capsys):
     with pytest.raises(SystemExit):
         main(["stylize", "--help"])
     assert "--finish {off,vgg}" in capsys.readouterr().out
-    assert Image.open(inputs[1]).size == (128, 96)

@@ -36,7 +36,8 @@ class Exemplar:
 
 @dataclass(frozen=True)
 class Places:
-    """Where n pixels lie in the painting: the page, the place on it in pixels (x, y), and whether that can be said."""
+    """Where n pixels lie in the painting: the page, the place on it in pixels (x, y), whether that can be said, and the
+    painter's nearest sample."""
 
     page: Int[np.ndarray, " n"]
     at: Float[np.ndarray, "n 2"]
@@ -45,7 +46,7 @@ class Places:
 
 
 def exemplar(solution: Solution, pixel: float, features: Features) -> Exemplar:
-    """The painting at `pixel` working units a pixel (never enlarged), and its features."""
+    """The painting at `pixel` working units a pixel, and its features (half precision)."""
     import torch
 
     own = solution.spacing / max(solution.scale)
