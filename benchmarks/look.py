@@ -5,7 +5,7 @@
 figures   paints every style on every mesh with HEAD and measures the light in the albedo: `light.*`
 sheets    paints them with HEAD and with --against COMMIT, and builds sheets for blind viewers with their key
 score     compares viewers' answers with the key: `chosen.ship.KIND`, `chosen.style.KIND`, `chosen.shape.KIND`,
-          `odd_one_out`, `chosen.ebsynth.KIND` (KIND: oil, structured)
+          `odd_one_out`, `chosen.ebsynth.KIND`, `chosen.finish.KIND` (KIND: oil, structured)
 styles    writes the style pictures that are made here
 Without a verb: figures, and the score of the answers in this folder. What was painted once is taken from --cache.
 """
@@ -38,8 +38,9 @@ def options(argv: Sequence[str] | None) -> argparse.Namespace:
     made.add_argument("--against", metavar="COMMIT", help="sheets: the other candidate; figures: measure it too")
     made.add_argument("--whole", action="store_true", help="whole jobs with their fit, not the paint alone (slow)")
     made.add_argument("--set", action="append", default=[], metavar="K=V", help="a setting of HEAD's jobs, to try it")
-    made.add_argument("--tests", default="choice,odd", help="which sheets: choice, odd, ebsynth")
+    made.add_argument("--tests", default="choice,odd", help="which sheets: choice, odd, ebsynth, finish")
     made.add_argument("--ebsynth", type=Path, metavar="PROGRAM", help="for sheets of ebsynth (see look_peer.py)")
+    made.add_argument("--vgg", type=Path, metavar="FILE", help="VGG-19 weights, for sheets of finish")
     made.add_argument("--out", type=Path, metavar="DIR", help="where sheets and key.json, or styles, are written")
     made.add_argument("--seed", type=int, default=0, help="of the sheets' shuffle")
     made.add_argument("--key", type=Path, default=KEY, metavar="FILE", help="score: the key (default: in this folder)")
@@ -117,21 +118,32 @@ def chosen_presets(chosen: argparse.Namespace, default: str) -> list[str]:
 
 
 def sheets(chosen: argparse.Namespace) -> dict[str, float]:
-    """Paint, light and write the sheets and key.json into --out; counts them."""
-    if not chosen.against or not chosen.out:
+    """Paint, light and write the sheets and key.json into --out; counts them.
+
+    Sheets of finish show the painter's result finished by VGG-19 ("head") and as it was ("other").
+    """
+    tests = chosen_names(chosen.tests, ["choice", "odd", "ebsynth", "finish"], "tests")
+    if not chosen.out or ("choice" in tests and not chosen.against):
         raise SystemExit("sheets: name the other candidate with --against COMMIT, and a folder with --out DIR")
-    tests = chosen_names(chosen.tests, ["choice", "odd", "ebsynth"], "tests")
+    if "finish" in tests and not chosen.vgg:
+        raise SystemExit("sheets of finish need the weights of VGG-19: --vgg FILE (`mistyle models` says where from)")
     if "ebsynth" in tests and not chosen.ebsynth:
         raise SystemExit(
             "sheets of ebsynth need its program: --ebsynth PROGRAM (look_peer.py says where it comes from)"
         )
     found = pieces(chosen, chosen_presets(chosen, "draft,standard"))
     start_engines()
-    ours, theirs = look_paint.this_tree(), look_paint.tree_at(chosen.against, chosen.cache)
-    our_glbs = look_paint.painted(ours, with_settings(found, chosen.set), chosen.cache)
-    their_glbs = look_paint.painted(theirs, found, chosen.cache) if "choice" in tests else our_glbs
-    lines, spent = [], []
-    for piece, mine, other in zip(found, our_glbs, their_glbs, strict=True):
+    ours = look_paint.this_tree()
+    our_pieces = with_settings(found, chosen.set)
+    done = [look_paint.finished(p, chosen.vgg) for p in our_pieces] if "finish" in tests else our_pieces
+    # Each piece and its finish one after the other: the second job takes over the painting of the first.
+    both = look_paint.painted(ours, [p for pair in zip(our_pieces, done, strict=True) for p in pair], chosen.cache)
+    our_glbs, done_glbs, their_glbs, against = both[::2], both[1::2], both[::2], None
+    if "choice" in tests:
+        theirs = look_paint.tree_at(chosen.against, chosen.cache)
+        their_glbs, against = look_paint.painted(theirs, found, chosen.cache), theirs.name
+    lines, spent, seconds = [], [], []
+    for piece, mine, end, other in zip(found, our_glbs, done_glbs, their_glbs, strict=True):
         kind = look_styles.KINDS[piece.style]
         if "choice" in tests:
             lines.append(look_sheets.build_choice(piece, kind, mine, other, chosen.out / "sheets", chosen.seed))
@@ -143,11 +155,15 @@ def sheets(chosen: argparse.Namespace) -> dict[str, float]:
                 look_sheets.build_choice(piece, kind, mine, peer, chosen.out / "sheets", chosen.seed, "ebsynth")
             )
             spent.append(look_paint.about(mine)["cpu"] / look_paint.about(peer)["cpu"])
+        if "finish" in tests:
+            lines.append(look_sheets.build_choice(piece, kind, end, mine, chosen.out / "sheets", chosen.seed, "finish"))
+            seconds.append(look_paint.about(end)["finish"])
         print(f"sheets of {piece.label}", file=sys.stderr)
-    about = {"head": ours.digest, "against": theirs.name, "seed": chosen.seed, "set": chosen.set}
+    about = {"head": ours.digest, "against": against, "seed": chosen.seed, "set": chosen.set}
     look_sheets.write_key(chosen.out / "key.json", lines, **about)
     ratio = {"ebsynth.cpu_ratio": sum(spent) / len(spent)} if spent else {}
-    return {"sheets": float(len(lines))} | ratio
+    took = {"vgg.seconds": sum(seconds) / len(seconds)} if seconds else {}
+    return {"sheets": float(len(lines))} | ratio | took
 
 
 def score(chosen: argparse.Namespace) -> dict[str, float]:

@@ -13,7 +13,7 @@ import sys
 import tarfile
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -91,6 +91,11 @@ def tree_at(commit: str, cache: Path) -> Tree:
     return Tree(full[:12], folder, program_hash(folder))
 
 
+def finished(piece: Piece, weights: Path) -> Piece:
+    """The piece with its painting finished by VGG-19."""
+    return replace(piece, options=(*piece.options, "--finish", "vgg", "--vgg", str(weights)))
+
+
 def environment(tree: Tree) -> dict[str, str]:
     """For a child that runs a tree with this interpreter's packages and this process's LLVM."""
     return dict(os.environ) | {"PYTHONPATH": str(tree.folder), "MISTYLE_DATA": str(DATA)}
@@ -104,11 +109,17 @@ def place_of(tree: Tree, piece: Piece, cache: Path) -> Path:
 def painted(tree: Tree, pieces: Sequence[Piece], cache: Path) -> list[Path]:
     """The GLB of every piece, painted where the cache has none; one process paints all of them, one after another."""
     places = [place_of(tree, piece, cache) for piece in pieces]
-    missing = [(piece, place) for piece, place in zip(pieces, places, strict=True) if not place.exists()]
+    each = dict(zip(places, pieces, strict=True))
+    missing = [(piece, place) for place, piece in each.items() if not place.exists()]
     if missing:
         places[0].parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory() as scratch:
             jobs = [job(piece, place, Path(scratch) / "run") for piece, place in missing]
+            for (before, _), (piece, _), later in zip(missing, missing[1:], jobs[1:], strict=False):
+                # The same painting with further options: its job goes on in the run folder of the one before.
+                later["goes_on"] = before.options == piece.options[: len(before.options)] and (
+                    (before.style, before.mesh, before.preset) == (piece.style, piece.mesh, piece.preset)
+                )
             run_jobs(tree, jobs, Path(scratch))
     return places
 

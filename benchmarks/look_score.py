@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+RIVALS = ("ebsynth", "finish")  # tests of one question, with a figure of their own
 QUESTIONS = {"shipped": "ship", "style": "style", "shape": "shape"}
 
 
@@ -30,7 +31,8 @@ def answers_of(sheet: str, line: Mapping[str, Any], answers: Mapping[str, Any]) 
 
 
 def score(key: Mapping[str, Any], answers: Mapping[str, Any]) -> dict[str, float]:
-    """Shares of answers: `chosen.QUESTION.KIND` for HEAD, `chosen.ebsynth.KIND`, and `odd_one_out` found.
+    """Shares of answers: `chosen.QUESTION.KIND` for HEAD, `chosen.ebsynth.KIND` and
+    `chosen.finish.KIND`, and `odd_one_out` found.
 
     `answers` counts them. SystemExit at a sheet or a letter that the key does not have.
     """
@@ -55,8 +57,8 @@ def judged(sheet: str, line: Mapping[str, Any], answer: Mapping[str, str]) -> li
     result = []
     for question in [q for q in QUESTIONS if q in answer]:
         chosen = line[letter(sheet, answer, question, "AB")] == "head"
-        if line["test"] == "ebsynth":
-            result += [(f"chosen.ebsynth.{line['kind']}", chosen)] if question == "shipped" else []
+        if line["test"] in RIVALS:
+            result += [(f"chosen.{line['test']}.{line['kind']}", chosen)] if question == "shipped" else []
         else:
             stem = f"chosen.{QUESTIONS[question]}"
             result += [(f"{stem}.{line['kind']}", chosen), (f"{stem}.{line['kind']}.{line['preset']}", chosen)]

@@ -124,7 +124,8 @@ def write(path: Path, picture: np.ndarray) -> str:
 def build_choice(
     piece: Piece, kind: str, ours: Path, theirs: Path, out: Path, seed: int, test: str = "choice"
 ) -> dict[str, Any]:
-    """Write the sheet of a choice; returns its line of the key. `test` says against whom: "choice" or "ebsynth"."""
+    """Write the sheet of a choice; returns its line of the key. `test`: "choice", "ebsynth" or
+    "finish"."""
     name = name_of(test, piece.style, piece.mesh, piece.preset, str(seed))
     pictures = {"head": lit(ours), "other": lit(theirs)}
     order = ("other", "head") if flipped(name, seed) else ("head", "other")

@@ -1,8 +1,9 @@
 """Runs `mistyle` jobs of one source tree one after another, in one process: `python -P look_worker.py < jobs.json`.
 
 It is started with PYTHONPATH set to the tree, which may be an older commit, so it knows nothing but the command line.
-A job is {"arguments": [...], "out": run folder, "keep": file}. The GLB that the job made becomes `keep`, and
-`keep`.json says how large the painting lies on the surface and what the run took; the run folder goes.
+A job is {"arguments": [...], "out": run folder, "keep": file, "goes_on": whether the run folder of the job before is
+taken over}. The GLB that the job made becomes `keep`, and `keep.json` says how large the painting lies on the surface
+and what the run took.
 """
 
 import contextlib
@@ -39,6 +40,11 @@ def painting_on_surface(out: Path) -> float | None:
     return None
 
 
+def finish_seconds(out: Path) -> float | None:
+    """Seconds of the stage "finish"; None where there was none."""
+    return json.loads((out / "run.json").read_text())["seconds"].get("finish")
+
+
 def _fields(tree: Any) -> Any:
     """Every dictionary in a tree, depth first."""
     if isinstance(tree, dict):
@@ -58,17 +64,18 @@ def _numbers(tree: Any) -> Any:
 def run(main: Any, job: dict[str, Any]) -> None:
     """One job; SystemExit where it failed."""
     out, keep = Path(job["out"]), Path(job["keep"])
-    shutil.rmtree(out, ignore_errors=True)
+    if not job.get("goes_on"):
+        shutil.rmtree(out, ignore_errors=True)
     start = time.process_time()
     with contextlib.redirect_stdout(sys.stderr):
         code = main(job["arguments"])
     if code != 0:
         raise SystemExit(f"mistyle {' '.join(job['arguments'])} ended with {code}")
     made = next(iter(sorted((out / "asset").glob("*.glb"))))
-    about = {"pixel": painting_on_surface(out), "cpu": time.process_time() - start}
+    about = {"pixel": painting_on_surface(out), "cpu": time.process_time() - start, "finish": finish_seconds(out)}
     keep.with_name(keep.name + ".json").write_text(json.dumps(about))
-    os.replace(made, keep)
-    shutil.rmtree(out, ignore_errors=True)
+    shutil.copy(made, keep.with_suffix(".part"))
+    os.replace(keep.with_suffix(".part"), keep)
 
 
 if __name__ == "__main__":

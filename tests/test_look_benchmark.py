@@ -24,6 +24,7 @@ KEY = {
         "two": choice_line("structured", "B"),
         "three": {"test": "odd", "kind": "oil", "odd": "C", "sha256": "3"},
         "four": choice_line("oil", "B", test="ebsynth"),
+        "six": choice_line("structured", "A", test="finish"),
     }
 }
 
@@ -59,11 +60,13 @@ def test_choices_count_by_question_kind_and_preset():
         "two": {"sha256": "structuredB", "anna": {"shipped": "A"}},
         "three": {"anna": {"odd": "C"}, "ben": {"odd": "D"}, "carl": {"odd": "c"}, "dora": {}},
         "four": {"anna": {"shipped": "B", "style": "A"}},
+        "six": {"anna": {"shipped": "A"}, "ben": {"shipped": "B"}},
     }
     found = look_score.score(KEY, answers)
     assert found["chosen.ship.oil"] == 1 and found["chosen.style.oil"] == 0.5 and found["chosen.shape.oil"] == 0.5
     assert found["chosen.ship.structured"] == 0 and found["chosen.ship.oil.draft"] == 1
     assert found["odd_one_out"] == pytest.approx(2 / 3) and found["answers.odd_one_out"] == 3
+    assert found["chosen.finish.structured"] == 0.5 and "chosen.finish.oil" not in found
     assert found["chosen.ebsynth.oil"] == 1 and found["answers.chosen.ship.oil"] == 2
     assert "chosen.style.structured" not in found
 
@@ -173,7 +176,7 @@ def test_the_close_camera_sees_the_whole_object_and_fills_the_picture(rng):
 WORKER = """
 import json, pathlib, sys
 for job in json.load(sys.stdin):
-    pathlib.Path(job["keep"]).write_text(" ".join(job["arguments"]))
+    pathlib.Path(job["keep"]).write_text(" ".join([*job["arguments"], str(job.get("goes_on"))]))
     print(job["keep"], flush=True)
 """
 
@@ -192,6 +195,23 @@ def test_what_was_painted_once_is_not_painted_again(tmp_path, monkeypatch):
         look_paint.painted(tree, changed, tmp_path)
     with pytest.raises(SystemExit, match="painted again"):
         look_paint.painted(Tree("HEAD", tmp_path, "abd"), [one], tmp_path)
+
+
+def test_a_finish_goes_on_from_its_own_painting_alone(tmp_path, monkeypatch):
+    worker = tmp_path / "worker.py"
+    worker.write_text(WORKER)
+    monkeypatch.setattr(look_paint, "WORKER", worker)
+    one = piece(tmp_path)
+    other = Piece(**vars(one) | {"mesh": "bunny", "options": (*one.options, "--uv", "new")})
+    order = [
+        one,
+        look_paint.finished(one, tmp_path / "vgg.pth"),
+        other,
+        look_paint.finished(other, tmp_path / "vgg.pth"),
+    ]
+    texts = [glb.read_text() for glb in look_paint.painted(Tree("HEAD", tmp_path, "abc"), order, tmp_path)]
+    assert [text.split()[-1] for text in texts] == ["None", "True", "False", "True"]
+    assert "--finish vgg" in texts[1] and "--finish" not in texts[2]
 
 
 def test_a_tree_is_known_by_its_program(tmp_path):

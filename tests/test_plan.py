@@ -12,7 +12,7 @@ from mistyle.run.cli import main
 from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
 from mistyle.run.options import gigabytes
 from mistyle.run.settings import Settings, resolve
-from mistyle.run.stages import MATERIAL_STAGES, STAGES
+from mistyle.run.stages import FINISH, MATERIAL_STAGES, STAGES
 
 
 def job(**more) -> Settings:
@@ -33,7 +33,7 @@ def test_what_is_no_amount_of_memory(text):
 
 
 def test_every_stage_has_its_needs():
-    assert set(budget.PLAIN) == set(budget.TILED) == set(STAGES)
+    assert set(budget.PLAIN) == set(budget.TILED) == {*STAGES, *FINISH}
     assert set(budget.MATERIAL) <= set(MATERIAL_STAGES)
 
 

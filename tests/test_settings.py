@@ -84,7 +84,12 @@ def test_views_take_the_samples_that_their_use_needs():
 @pytest.mark.parametrize(
     ("preset", "change", "refined", "kept"),
     [
-        ("standard", {}, "off", True),
+        ("draft", {}, "off", True),
+        ("demo", {}, "off", True),
+        ("standard", {}, "albedo", False),
+        ("standard", {"stylizer": "diffusion"}, "all", False),
+        ("draft", {"finish": {"method": "vgg"}, "fit": {"features": "vgg19"}}, "off", True),
+        ("draft", {"fit": {"features": "vgg19"}}, "all", False),
         ("draft", {"stylizer": "embedded-view"}, "all", False),
         ("draft", {"stylizer": "diffusion"}, "all", False),
         ("draft", {"inpainter": "paint3d"}, "all", False),
@@ -95,6 +100,6 @@ def test_views_take_the_samples_that_their_use_needs():
         ("paper", {}, "all", False),
     ],
 )
-def test_the_fit_is_off_where_its_views_are_drawn_from_what_it_would_fit(preset, change, refined, kept):
+def test_what_is_fitted_follows_what_painted_the_views(preset, change, refined, kept):
     settings = resolve(preset, None, change, {})
     assert (settings.refined, settings.keeps_painting) == (refined, kept)

@@ -42,11 +42,12 @@ NORMALISED_POOLS_BEFORE = (9, 16, 29, 42)
 NORMALISED_TAPS = (2, 9, 16, 29, 42)
 
 
-def load_features(path: Path | None) -> Features:
+def load_features(path: Path | None, levels: int = 5) -> Features:
     """The filter bank (None) or VGG-19 from `path`: .safetensors, .npz or .pth (core/weights.py).
 
     Accepted: torchvision's layer order (`features.N.weight` or `N.weight`, N = 0, 2, 5, …), truncated anywhere after
-    relu1_1; the normalised VGG of Li et al. (`0.weight` 1x1, then 2, 5, 9, 12, 16, …). Anything else is refused.
+    relu1_1; the normalised VGG of Li et al. (`0.weight` 1x1, then 2, 5, 9, 12, 16, …). Anything else is refused. Of
+    either, the first `levels` of relu1_1, relu2_1, … relu5_1 are computed, as far as the file has them.
     """
     if path is None:
         return filter_bank
@@ -59,10 +60,10 @@ def load_features(path: Path | None) -> Features:
             "filter bank."
         )
     if first.shape[2:] == (1, 1):
-        plan = _plan(weights, NORMALISED_CONVOLUTIONS, NORMALISED_TAPS, NORMALISED_POOLS_BEFORE, path)
+        plan = _plan(weights, NORMALISED_CONVOLUTIONS, NORMALISED_TAPS[:levels], NORMALISED_POOLS_BEFORE, path)
         return partial(_normalised_vgg, weights["0.weight"], weights["0.bias"], plan)
     pools_before = [next(n for n in TORCHVISION_CONVOLUTIONS if n > pool) for pool in TORCHVISION_POOLS]
-    plan = _plan(weights, TORCHVISION_CONVOLUTIONS, TORCHVISION_TAPS, pools_before, path)
+    plan = _plan(weights, TORCHVISION_CONVOLUTIONS, TORCHVISION_TAPS[:levels], pools_before, path)
     return partial(_torchvision_vgg, plan)
 
 

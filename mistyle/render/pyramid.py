@@ -54,26 +54,31 @@ def change(
     rate: float,
     share: float = 1.0,
     fair: bool = False,
+    damping: float = 0.0,
 ) -> Float[np.ndarray, "..."]:
     """What to add to the texture, from dL/dT; the state moves on.
 
     Numbers whose gradient is exactly zero neither move nor forget (masked updates): most texels are not seen by the
     one camera of a step. Every number counts its own steps for Adam's start-up correction. Level l moves at the rate
-    rate · share^l. `fair`: see the module.
+    rate · share^l. `fair`: see the module; without it, `damping` times the root mean square of a level's gradients
+    joins Adam's denominator, so that numbers with little gradient, which is mostly noise, move little.
     """
     steps = []
     level = np.ascontiguousarray(gradient, np.float32)
     for k, state in enumerate(moments):
         if k:
             level = reduce(level)
-        steps.append((_fair if fair else _adam)(state, level, rate * share**k))
+        pace = rate * share**k
+        steps.append(_fair(state, level, pace) if fair else _adam(state, level, pace, damping))
     total = steps[-1]
     for finer in reversed(steps[:-1]):
         total = finer + enlarge(total, finer.shape[:2])
     return total
 
 
-def _adam(state: Moments, gradient: Float[np.ndarray, "..."], rate: float) -> Float[np.ndarray, "..."]:
+def _adam(
+    state: Moments, gradient: Float[np.ndarray, "..."], rate: float, damping: float = 0.0
+) -> Float[np.ndarray, "..."]:
     flat = gradient.ravel()
     moved: Any = np.flatnonzero(flat)
     if len(moved) == flat.size:
@@ -87,6 +92,8 @@ def _adam(state: Moments, gradient: Float[np.ndarray, "..."], rate: float) -> Fl
     past = np.arange(int(count.max(initial=0)) + 1)
     mean = m / (1 - BETA_1**past).astype(np.float32)[count]
     spread = np.sqrt(v / (1 - BETA_2**past).astype(np.float32)[count])
+    if damping and spread.size:
+        spread += np.float32(damping) * np.sqrt(np.mean(spread * spread))
     result = np.zeros_like(flat)
     result[moved] = np.float32(-rate) * mean / (spread + np.float32(1e-20))
     return result.reshape(gradient.shape)

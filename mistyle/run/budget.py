@@ -7,7 +7,8 @@ jobs: `draft_spot`, `views_64` and `atlas_4096` of `python -m benchmarks.memory 
 atlas of 3072², four views and 20,000 samples, and of 2048². What only one texture set takes at a time (`one`) comes
 from a job with 20 sets of 512². Those of TILED come from stages run alone at 1024² and 2048², the report's from 2048²
 and 4096²; they count all sets alike. They hold on the processor, with two threads and the embedded filter bank: VGG-19
-and the stylizers that need models count their own (run/generative.py).
+and the stylizers that need models count their own (run/generative.py). The stage `finish` was read off one draft of
+spot (two crops of 256²), and its program counts the features of a painting of the largest size.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,8 +28,8 @@ class Need(NamedTuple):
     """A stage's peak: GB of the program, then bytes a texel, view pixel, crop pixel, surface sample, face, texel of the
     textures as the views draw them (kept by the renderer) and as the report's close-ups do, pixel of the turntable's
     frames, texel times picture where texels are solved one by one, pixel of the largest picture, as the fit looks at it
-    and as it was taken, and sample of a pass of it; byte of the file's own maps; texel whose PNG file is kept; and
-    texel of one texture set, for what only one set takes at a time."""
+    and as it was taken, and sample of a pass of it; byte of the file's own maps; texel whose PNG file is kept;
+    texel of one texture set, for what only one set takes at a time; and pixel of a step's crops of the finish."""
 
     program: float
     texel: float = 0
@@ -46,6 +47,7 @@ class Need(NamedTuple):
     own: float = 0
     packed: float = 0
     one: float = 0
+    vgg: float = 0
 
 
 # With every array in memory.
@@ -55,6 +57,7 @@ PLAIN = {
     "views": Need(0.46, texel=39, one=28, viewed=64, view=46.5),
     "surface": Need(0.49, texel=31, one=36, viewed=68, view=45.5, sample=1200),
     "bake": Need(0.59, texel=20, one=82, viewed=82, view=58.5),
+    "finish": Need(1.75, texel=100, one=98, vgg=4200),
     "stylized": Need(0.53, texel=56, one=39, viewed=64, view=63.5),
     "fit": Need(0.75, texel=86, one=98, viewed=51, view=107, crop=2000),
     "masks": Need(0.77, texel=49, one=109, viewed=56, view=107),
@@ -70,6 +73,7 @@ TILED = {
     "views": Need(0.60, texel=10, view=4),
     "surface": Need(0.60, texel=10, view=4, sample=1200),
     "bake": Need(0.95, texel=20, view=4),
+    "finish": Need(1.75, texel=100, vgg=4200),
     "stylized": Need(0.65, texel=10, view=4),
     "fit": Need(0.75, texel=30, view=4, crop=2000),
     "masks": Need(0.70, texel=35, view=4),
@@ -167,6 +171,7 @@ class Counts(NamedTuple):
     own: int = 0
     packed: int = 0
     one: int = 0
+    vgg: int = 0
 
 
 def view_pixels(settings: Settings) -> int:
@@ -189,6 +194,7 @@ def counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> C
         *shown(settings, sets),
         own=own,
         one=settings.atlas.size**2,
+        vgg=0 if settings.finish.method == "off" else settings.finish.crops * settings.finish.crop_size**2,
     )
 
 
@@ -230,10 +236,11 @@ def as_drawn(size: int, pixels: int) -> int:
 
 
 def peaks(needs: Mapping[str, Need], count: Counts) -> dict[str, float]:
-    """GB of every stage."""
+    """GB of every stage; of the finish only where there is one."""
     return {
         stage: need.program + sum(getattr(need, each) * getattr(count, each) for each in Counts._fields) / 1e9
         for stage, need in needs.items()
+        if count.vgg or not need.vgg
     }
 
 

@@ -126,13 +126,23 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     add_paint_options(verb)
     add_generative_options(verb)
     verb.add_argument(
+        "--finish",
+        choices=["off", "vgg"],
+        help="vgg: after painting, move the albedo by style losses of VGG-19 on many rendered crops (needs --vgg; "
+        "default off)",
+    )
+    verb.add_argument(
         "--refine",
         choices=["auto", "off", "normal-roughness", "albedo", "all"],
-        help="which maps the differentiable fit may change (auto: none that the embedded stylizer painted)",
+        help="which maps the differentiable fit may change (auto: all; where the embedded stylizer paints, the albedo, "
+        "and nothing in drafts)",
     )
     verb.add_argument("--metallic", choices=["keep", "zero", "fit"], help="what becomes of the asset's own metalness")
     verb.add_argument(
-        "--vgg", type=Path, metavar="FILE", help="VGG-19 weights (.safetensors or .pth) for the style loss"
+        "--vgg",
+        type=Path,
+        metavar="FILE",
+        help="VGG-19 weights (.safetensors or .pth) for the style losses of finish and fit",
     )
     verb.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     verb.add_argument(
@@ -263,6 +273,7 @@ OPTIONS = {
     **GENERATIVE_OPTIONS,
     **DELIVERY_OPTIONS,
     **REPORT_OPTIONS,
+    "finish": "finish.method",
     "refine": "fit.refine",
     "metallic": "fit.metallic",
     "vgg": "fit.features",

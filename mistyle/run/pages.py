@@ -13,12 +13,13 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.files.own import read_own
 from mistyle.run import report_overlays
+from mistyle.run.finishing import finish_pair
 from mistyle.run.progress import Progress
 from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
-from mistyle.run.report_draw import draw, shown
+from mistyle.run.report_draw import close_up, draw, shown
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
-from mistyle.run.stages import FIRST, RETOUCH, STAGES
+from mistyle.run.stages import FINISH, FIRST, RETOUCH, STAGES
 from mistyle.run.style_look import look_facts
 from mistyle.run.summary import MEANINGS, figures, versions
 from mistyle.run.turntable import write_turn
@@ -26,8 +27,8 @@ from mistyle.stages.fit_judge import TOLERANCE, undone_where, worse
 
 SAME = "Under the same studio light"
 UNFITTED = (
-    "The painting's own relief and gloss. The views were drawn from these very maps, so a fit to the views has nothing "
-    "to add, and none ran: --refine all runs it."
+    "The painting's own relief and gloss. The views were drawn from these very maps, so a fit to them has little to "
+    "add, and none ran: --refine all runs it."
 )
 
 
@@ -47,7 +48,7 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         write_png(folder / "beauty.png", best)
     write_png(folder / "overview.png", side_by_side([bare, made.style.rgb, best]))
     report(0.8)
-    named = STAGES | RETOUCH | FIRST
+    named = STAGES | RETOUCH | FINISH | FIRST
     page = Report(
         title=made.job.name,
         mesh=made.job.mesh.name,
@@ -142,7 +143,8 @@ def steps(made: Any, refined: Sequence[Pair]) -> tuple[Step, ...]:
         ),
         columns=3,
     )
-    return (views, stylized, baked, *refining(made, refined, longest))
+    finish = () if made.finishing is None else (finish_step(made),)
+    return (views, stylized, baked, *finish, *refining(made, refined, longest))
 
 
 def refining(made: Any, pairs: Sequence[Pair], longest: int) -> tuple[Step, ...]:
@@ -170,6 +172,17 @@ def refining(made: Any, pairs: Sequence[Pair], longest: int) -> tuple[Step, ...]
         columns=3,
     )
     return (fit, repair)
+
+
+def finish_step(made: Any) -> Step:
+    """The stage 'finish': the painting before and after, and its figures."""
+    (before, after), moved = made.finishing.style, f"{made.finishing.moved:.3f} (sRGB, root mean square)"
+    return Step(
+        "Finish",
+        "Style losses of VGG-19 on many rendered crops, each compared with its own places in the painting.",
+        pairs=(finish_pair(made.asset, made.finishing, close_up(made.job.settings)),),
+        facts=(("style loss", f"{before:.4g} → {after:.4g}"), ("albedo moved by", moved)),
+    )
 
 
 def angle(camera: Camera) -> str:

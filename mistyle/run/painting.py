@@ -188,15 +188,16 @@ def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> Coats
     return run.record("surface", ["texels"], inputs, lambda r: coat(asset, style, atlas, s, r))
 
 
-def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View]) -> list[View]:
-    """The stylized views, drawn from the painted texture so that all agree by construction."""
+def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View], after: str) -> list[View]:
+    """The stylized views, drawn from the painted texture so that all agree by construction;
+    `after` is the stage that made it."""
     from mistyle.files.views import read_views, write_views
 
     def write(folder: Path, report: Report) -> None:
         drawn = unlit_views(asset, baked.maps, views, report)
         write_views(folder, drawn, (), paper_files=False)
 
-    return read_views(run.stage("stylized", ["bake", "views"], [], write))
+    return read_views(run.stage("stylized", [after, "views"], [], write))
 
 
 def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report) -> list[View]:

@@ -19,6 +19,7 @@ from mistyle.measure.baked_light import BakedLight
 from mistyle.run import asset_files
 from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
+from mistyle.run.finishing import Finishing, check_finish, finish_stage
 from mistyle.run.first_asset import write_first
 from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import fit_settings, inpainter_inputs, lights_of_views, opaque, release, texture_inpainter
@@ -49,6 +50,7 @@ class Made:
     folder: Path
     looks: tuple[StyleLook, ...]
     light: BakedLight | None
+    finishing: Finishing | None = None
 
 
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
@@ -67,6 +69,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     style = read_style(job.style, job.settings.colour)
     check_coat(job.settings.coat)
     check_generative(job.settings, progress.say)
+    check_finish(job.settings)
     if job.settings.stylizer != "embedded":
         from mistyle.run.sweep import refuse_what_is_not_kept
 
@@ -101,7 +104,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     atlas = texels_stage(run, asset)
     views = views_stage(run, asset, atlas)
     looks = style_looks(style, run.job.style.name, s, run.progress)
-    baked, stylized = painted_stages(run, asset, style, atlas, views)
+    baked, stylized, finishing = painted_stages(run, asset, style, atlas, views)
     painted = ["bake", "stylized"]
     if "stylized" in run.edited:
         baked, stylized = retouched_stage(run, asset, atlas, baked, stylized)
@@ -122,7 +125,7 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
     light = light_left(asset.mesh, atlas.texels, repaired.maps, s.seed)
-    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light)
+    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light, finishing)
 
 
 def refined_stages(
@@ -188,23 +191,26 @@ def masks_stage(run: Run, asset: Asset, atlas: Atlas, baked: Baked, fitted: Any)
 
 def painted_stages(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
-) -> tuple[Baked, list[View]]:
-    """From the style to the painted texture and its views: the stages 'surface', 'bake' and 'stylized'."""
+) -> tuple[Baked, list[View], Finishing | None]:
+    """From the style to the painted texture and its views: the stages 'surface', 'bake', 'finish' where it is wanted,
+    and 'stylized'."""
     s = run.job.settings
     if s.stylizer != "embedded":
         from mistyle.run.sweep import swept_stages
 
         swept = swept_stages(run, asset, style, atlas, views)
         write_first(run, asset, atlas, swept[0])
-        return swept
+        return *swept, None
     coats = surface_stage(run, asset, style, atlas)
     baked = run.record(
         "bake", ["views", "surface"], [s.bake, s.refined, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
     )
-    if not s.keeps_painting:
+    if not s.keeps_painting or s.finish.method != "off":
         write_first(run, asset, atlas, baked)
-    stylized = stylized_stage(run, asset, baked, views)
-    return baked, stylized
+    if s.finish.method == "off":
+        return baked, stylized_stage(run, asset, baked, views, "bake"), None
+    baked, finishing = finish_stage(run, asset, coats, atlas, baked)
+    return baked, stylized_stage(run, asset, baked, views, "finish"), finishing
 
 
 def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:

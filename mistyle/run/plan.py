@@ -43,7 +43,7 @@ from mistyle.run.budget import (
 )
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import Settings, thread_count
-from mistyle.run.stages import MATERIAL_STAGES, STAGES, Job, claim_run
+from mistyle.run.stages import FINISH, MATERIAL_STAGES, STAGES, Job, claim_run
 from mistyle.stages.recover_settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
 # Seconds on two cores, per unit named.
@@ -53,6 +53,7 @@ PER_SURFACE_SAMPLE = 1.3e-4
 PER_TEXEL = 1.0e-6
 PER_VIEW_PIXEL = 8.0e-7
 PER_CROP_PIXEL = 1.6e-6
+PER_VGG_PIXEL = 7e-6  # of a crop of the finish: twice forward, once back, to relu3_1
 # Of fits to pictures: a pixel read and made straight; a sample of one predicted, or stepped on; a texel in a picture; a
 # path of light between surfaces; a covered texel in one word of its neighbours.
 PER_READ_PIXEL = 8e-7
@@ -89,6 +90,7 @@ def plan(job: Job) -> dict[str, Any]:
         "views": pixels * (s.draw.samples(s.stylizer != "embedded") * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
         "surface": s.surface.samples * PER_SURFACE_SAMPLE,
         "bake": 2 * texels * PER_TEXEL + pixels * PER_VIEW_PIXEL,
+        **_finishing(s),
         "stylized": 2 * pixels * PER_VIEW_PIXEL,
         "fit": crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
         "masks": repaired * 0.3 * texels * PER_TEXEL,
@@ -99,7 +101,7 @@ def plan(job: Job) -> dict[str, Any]:
     return {
         "mesh": str(job.mesh),
         "style": str(job.style),
-        **_costs(job, STAGES, seconds, extent.sets),
+        **_costs(job, STAGES | FINISH, seconds, extent.sets),
         **_memory(s, lambda c: counts(c, extent.faces, extent.sets, extent.own), PLAIN, TILED, STYLED),
         "disk_gb": round((texels * BYTES_PER_TEXEL + 2 * pixels * BYTES_PER_VIEW_PIXEL) / 1e9, 2),
     }
@@ -227,6 +229,16 @@ def _extent(mesh: Path, uv: Literal["keep", "new", "auto"], max_faces: int, size
     from mistyle.files.read import read_extent
 
     return read_extent(mesh, uv=uv, max_faces=max_faces, size=size)
+
+
+def _finishing(settings: Settings) -> dict[str, float]:
+    """Seconds of the stage 'finish', where it is wanted, with the crops that judge it before and after."""
+    from mistyle.stages.finish_settings import JUDGED
+
+    chosen = settings.finish
+    if chosen.method == "off":
+        return {}
+    return {"finish": (chosen.steps + 2 * JUDGED) * chosen.crops * chosen.crop_size**2 * PER_VGG_PIXEL}
 
 
 def _reading(extent: Extent) -> float:

@@ -21,6 +21,7 @@ from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.stages.backproject import BakeSettings
+from mistyle.stages.finish_settings import FinishSettings
 from mistyle.stages.fit import FitSettings
 from mistyle.stages.inpaint import RepairSettings
 from mistyle.stages.mvst import SweepSettings
@@ -112,6 +113,7 @@ class Settings(BaseModel):
     sweep: SweepSettings = SweepSettings()
     atlas: AtlasSettings = AtlasSettings()
     bake: BakeSettings = BakeSettings()
+    finish: FinishSettings = FinishSettings()
     fit: FitSettings = FitSettings()
     repair: RepairSettings = RepairSettings()
     report: ReportSettings = ReportSettings()
@@ -124,12 +126,13 @@ class Settings(BaseModel):
 
     @property
     def refined(self) -> Literal["off", "normal-roughness", "albedo", "all"]:
-        """Which maps the fit may change. Of a surface that is painted once, its maps are the source of the views, and
-        the fit would find them again; it runs there only for what somebody asked of it by other settings."""
+        """Which maps the fit may change. Where the surface is painted once, `fit.refine_painted` says so, unless other
+        settings ask for the fit: its metallic, its own features, an inpainter."""
         if self.fit.refine != "auto":
             return self.fit.refine
-        wanted = self.fit.metallic == "fit" or self.fit.features is not None or self.inpainter != "fill"
-        return "all" if wanted or self.stylizer != "embedded" else "off"
+        features = self.fit.features is not None and self.finish.method == "off"
+        wanted = self.fit.metallic == "fit" or features or self.inpainter != "fill"
+        return "all" if wanted or self.stylizer != "embedded" else self.fit.refine_painted
 
     @property
     def keeps_painting(self) -> bool:
@@ -144,7 +147,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "rig": {"resolution": 512},
         "surface": {"samples": 80_000},
         "atlas": {"size": 1024},
-        "fit": {"iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},
+        "finish": {"steps": 20, "crops": 2},
+        "fit": {"refine_painted": "off", "iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},
         "report": {"frames": 12, "resolution": 320, "spp": 4},
     },
     "standard": {},

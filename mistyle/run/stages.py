@@ -38,6 +38,8 @@ REFINING = ("fit", "masks", "repair")
 FIRST = {"first asset": "write the first asset"}
 # Only where views were edited.
 RETOUCH = {"retouch": "lay the edited views into the texture"}
+# Only with --finish.
+FINISH = {"finish": "finish the painting"}
 # Those of `mistyle fit`.
 MATERIAL_STAGES = {
     "mesh": "read the mesh",
@@ -109,7 +111,7 @@ class Run(Generic[Work]):
     """Keeps the stages of one run folder; a class because it holds the folder's locks until it is closed."""
 
     def __init__(self, job: Work, progress: Progress, stages: dict[str, str] = STAGES) -> None:
-        stages = stages | RETOUCH if stages is STAGES else stages
+        stages = stages | RETOUCH | FINISH if stages is STAGES else stages
         if job.redo_from is not None and job.redo_from not in stages:
             raise UsageError(f"--from {job.redo_from}: there is no such stage; choose one of {', '.join(stages)}")
         self.job, self.progress, self.stages = job, progress, stages

@@ -124,6 +124,9 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
         "largest correlation of the log albedo with an axis of the normal or with openness",
         "lower",
     ),
+    "style_before": ("distance of VGG-19's statistics to the painting's, on crops that no step used, before", "lower"),
+    "style_after": ("the same after the finish", "lower"),
+    "moved": ("root mean square change of the albedo by the finish, sRGB units", ""),
     "detail": ("correlation of the render's fine lightness with the stylized views' after this phase", "higher"),
     "style": ("patch and Gram distance of the render to the stylized views after this phase", "lower"),
     "views": ("difference of a surface point between neighbouring views, over the picture's own detail", "lower"),
@@ -136,6 +139,13 @@ def light_figures(light: BakedLight | None) -> dict[str, float]:
         return {}
     ratio = {} if light.ratio is None else {"light_up_over_down": light.ratio}
     return ratio | {"light_correlation": light.strongest}
+
+
+def finish_figures(made: Any) -> dict[str, float]:
+    """What the finish did to the style loss and to the albedo; nothing where there was none."""
+    if made is None:
+        return {}
+    return {"finish.style_before": made.style[0], "finish.style_after": made.style[1], "finish.moved": made.moved}
 
 
 def figures(made: Any) -> dict[str, float]:
@@ -151,5 +161,6 @@ def figures(made: Any) -> dict[str, float]:
         "seen_share": share([s > 0 for s in made.baked.seen]),
         "repaired_share": share(made.repaired.mask),
         **light_figures(made.light),
+        **finish_figures(made.finishing),
         **{name: pair[made.fit.kept[name.partition(".")[0]]] for name, pair in made.fit.figures.items()},
     }

@@ -13,8 +13,13 @@ class FitSettings(BaseModel):
 
     refine: Literal["auto", "off", "normal-roughness", "albedo", "all"] = Field(
         default="auto",
-        description="which maps may change: those of phase 1, of phase 2, or of both; auto: none where the embedded "
-        "stylizer paints the surface, whose views tell nothing that its own maps do not, and all elsewhere",
+        description="which maps may change: those of phase 1, of phase 2, or of both; auto: `refine_painted` where the "
+        "embedded stylizer paints the surface, and all elsewhere",
+    )
+    refine_painted: Literal["off", "normal-roughness", "albedo", "all"] = Field(
+        default="albedo",
+        description="what auto refines of a painted surface, whose views are drawn from the maps that they would fit; "
+        "drafts: off",
     )
     painted: Literal["auto", "without-light", "with-light"] = Field(
         default="auto",
