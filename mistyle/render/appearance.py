@@ -357,7 +357,9 @@ def _surface_class(mi: Any) -> type:
 
         def _eval(self, si, wo, active, values):
             angles = bsdf.upright(si.wi, wo)
-            value = bsdf.layered(angles, *values, self.edge, self.coat, self.coat_roughness)
+            albedo, roughness, metallic, f0 = values
+            coat = (self.coat, self.coat_roughness)
+            value = bsdf.layered(angles, albedo, roughness, metallic, f0, self.edge, *coat)
             return dr.select(active & angles.valid, value, 0)
 
         def _strategy(self, values):
