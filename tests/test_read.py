@@ -27,7 +27,7 @@ SQUARE = FOUR + "vt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\n"
 
 # What every mesh of the collection of nasty ones does: faces (and a word from the notes), or a word of the refusal.
 NASTY = {
-    "Fox.glb": (576, "bind pose"),
+    "Fox.glb": (576, "pose of its joints"),
     "capsule.obj": (10200, "capsule.mtl is not there"),
     "chair_model.obj": (12756, "repeats many times"),
     "empty.obj": "no faces",

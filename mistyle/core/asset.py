@@ -132,7 +132,7 @@ class Source:
 
     primitives      in face order, together they cover `Mesh.faces`
     user_positions  `Mesh.positions` in the file's own units and axes, same order (glTF: world space, node transforms
-                    applied; a skinned mesh in its bind pose)
+                    applied; a skinned mesh in the pose of its joints)
     work_from_user  takes user_positions (homogeneous columns) to `Mesh.positions`
     old_uvs         the authored corner UVs as the file has them, v up; None when it has none
     uv              "kept" (bit-equal to old_uvs), "shifted" (moved by integers, or as texture transforms and wrap modes

@@ -1,4 +1,4 @@
-"""glTF to triangles: node transforms, skins in their bind pose, strips and fans, materials with their textures."""
+"""glTF to triangles: node transforms, skins in the pose of their joints, morphs, instances, strips, fans, materials."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path

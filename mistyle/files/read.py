@@ -94,9 +94,9 @@ def read_mesh(
     OBJ, PLY, STL, OFF, GLB, glTF and USD, each without merging or reordering vertices (STL, which repeats them, is
     joined and says so). Polygons become triangles in place. Missing normals are computed within creases of 50 degrees
     (glTF: flat, as it demands). One part per material and UDIM tile. Texture transforms, wrap modes and vertex colours
-    are resolved: the maps repeat at the mesh's UVs, the albedo has the colours in it. Not read: morph targets (the base
-    shape is), animations (a skinned mesh comes in its bind pose), Draco and meshopt compression without a plain copy
-    (refused).
+    are resolved: the maps repeat at the mesh's UVs, the albedo has the colours in it. Morph targets
+    stand at the file's own weights, a skinned mesh in the pose of its joints. Not read: animations, Draco and meshopt
+    compression without a plain copy (refused).
     """
     from mistyle.files.prepare import prepare
 
