@@ -56,7 +56,7 @@ class Painted:
     maps: tuple[Maps, ...]
     texels: tuple[Texels, ...]
     solution: Solution
-    only: tuple[Bool[np.ndarray, "h w"], ...] | None = None
+    only: tuple[Bool[np.ndarray, "_ _"], ...] | None = None
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Finished:
     moved   root mean square change of the covered texels' albedo, sRGB units
     """
 
-    albedo: tuple[Float[np.ndarray, "h w 3"], ...]
+    albedo: tuple[Float[np.ndarray, "_ _ 3"], ...]
     trace: tuple[float, ...]
     style: tuple[float, float]
     moved: float

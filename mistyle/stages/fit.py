@@ -63,13 +63,13 @@ class Fit:
     """
 
     maps: tuple[Maps, ...]
-    struggle: tuple[Float[np.ndarray, "h w"], ...]
-    touched: tuple[Float[np.ndarray, "h w"], ...]
+    struggle: tuple[Float[np.ndarray, "_ _"], ...]
+    touched: tuple[Float[np.ndarray, "_ _"], ...]
     trace: dict[str, list[float]]
     kept: dict[str, bool]
     figures: dict[str, tuple[float, float]]
     notes: tuple[str, ...]
-    agreed: tuple[Float[np.ndarray, "h w"], ...] = ()
+    agreed: tuple[Float[np.ndarray, "_ _"], ...] = ()
 
 
 def two_phase(

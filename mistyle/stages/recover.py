@@ -50,7 +50,7 @@ class Recovered:
     """
 
     maps: tuple[Maps, ...]
-    confidence: tuple[Float[np.ndarray, "h w"], ...]
+    confidence: tuple[Float[np.ndarray, "_ _"], ...]
     spread: tuple[dict[str, Float[np.ndarray, "h w"]], ...]
     seen: tuple[Int[np.ndarray, "h w"], ...]
     views: tuple[Int[np.ndarray, "h w"], ...]
