@@ -107,6 +107,9 @@ def test_a_job_goes_on_from_its_preview_and_reports_come_in_three_sizes(inputs, 
     page = (out / "report" / "index.html").read_text()
     # Frames of both looks, the poster, the pair, 16 views twice, four maps, their overlays, coverage and mask.
     assert page.count("data:image/webp") >= 2 * 4 + 1 + 2 + 32 + 4 + 2 + 2
+    progress = Heard()
+    pipeline.stylize(sized(job(inputs, out), detail="none"), progress)
+    assert any("shows an earlier run" in note for note in progress.notes) and (out / "report" / "index.html").is_file()
 
 
 def test_a_preview_of_a_larger_job_says_what_it_left_out_and_keeps_the_mesh(inputs, tmp_path, monkeypatch):  # noqa: F811

@@ -102,6 +102,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     from mistyle.run.colour import in_working_space, key_of
     from mistyle.run.deliver import check, deliver
     from mistyle.run.material_report import material_report, write_summary
+    from mistyle.run.summary import old_report
 
     files = input_files(job.mesh)
     s = job.settings
@@ -143,7 +144,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         shown = replace(captures, cameras=whole.cameras)
         run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, shown))
         made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
-        progress.note(*asset.source.notes, *placed.notes, *recovered.notes)
+        progress.note(*asset.source.notes, *placed.notes, *recovered.notes, *old_report(job))
         if s.report.detail != "none":
             inputs = [s.report, job.name]
             run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, made, progress, r))

@@ -61,7 +61,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     """
     from mistyle.run.colour import read_style
     from mistyle.run.deliver import check, deliver
-    from mistyle.run.summary import write_summary
+    from mistyle.run.summary import old_report, write_summary
 
     files = input_files(job.mesh)
     claim_run(job, STAGES, inputs_of(job))
@@ -77,7 +77,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     with Run(job, progress) as run, kept(job.settings, run.hidden.root) as look_again:
         start_engines(job.settings)
         made = _stages(run, files, style, look_again)
-        progress.note(*made.asset.source.notes, *style.notes, *made.fit.notes)
+        progress.note(*made.asset.source.notes, *style.notes, *made.fit.notes, *old_report(job))
         if job.settings.report.detail != "none":
             report_stage(run, made, progress)
         return deliver(job, progress) | write_summary(made, run)

@@ -65,6 +65,14 @@ def report_files(job: Any) -> dict[str, str]:
     return {"report": str(folder / "index.html"), "picture": str(folder / "overview.png")}
 
 
+def old_report(job: Any) -> tuple[str, ...]:
+    """A note where this run writes no report and an earlier one's lies there."""
+    folder = job.out / "report"
+    if job.settings.report.detail != "none" or not folder.exists():
+        return ()
+    return (f"{folder} shows an earlier run: --report none wrote no new one.",)
+
+
 def write_record(job: Any, record: dict[str, Any], progress: Progress) -> None:
     """Write the job's `run.json`; an edited one is set aside, and that is said."""
     aside = write_file(job.out, "run.json", (json.dumps(record, indent=1) + "\n").encode(), overwrite=job.overwrite)
