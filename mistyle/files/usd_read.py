@@ -156,8 +156,10 @@ def _raw(pieces: list[_Piece], materials: list[Found], notes: list[str], path: P
 def _pose(pxr: Any, stage: Any) -> None:
     """Put skinned meshes into the pose of their skeletons at the first time; the file stays as it is."""
     stage.SetEditTarget(stage.GetSessionLayer())
-    prims = list(stage.Traverse(pxr.Usd.TraverseInstanceProxies(pxr.Usd.PrimDefaultPredicate)))
-    moving = [p for p in prims if p.IsA(pxr.UsdSkel.Animation)]
+    # Each prototype once and not at every instance: nested instances of a small file may be millions.
+    prims = list(stage.Traverse())
+    shared = [prim for prototype in stage.GetPrototypes() for prim in pxr.Usd.PrimRange(prototype)]
+    moving = [p for p in (*prims, *shared) if p.IsA(pxr.UsdSkel.Animation)]
     times = [t for p in moving for a in p.GetAttributes() for t in a.GetTimeSamples()[:1]]
     first = min(times, default=0.0)
     for prim in prims:
