@@ -227,7 +227,7 @@ def test_views_of_another_size_and_lossy_ones_are_taken(inputs, out):
     assert redone(heard) == ["retouch", "fit", "masks", "repair", "asset", "report"]
     made, earlier = (load_record(out / "work" / stage / "record") for stage in ("retouch", "bake"))
     albedo, before = made.baked.maps[0].albedo, earlier.maps[0].albedo
-    red = (albedo[..., 0] > 0.6) & (albedo[..., 1] < 0.05)
+    red = (albedo[..., 0] > 0.3) & (albedo[..., 1] < 0.05)  # more paint than what lay there, where it is laid in softly
     assert 0.01 < red.mean() < 0.04
     # Resampling and compression alter every pixel a little; that is not taken for painting.
     assert (np.abs(albedo - before).max(axis=-1) > 1e-3).mean() < 1.5 * red.mean()
