@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks import common
-from benchmarks.look_light import GROUND, close_camera, sky
+from benchmarks.look_light import close_camera, encoded, sky
 from benchmarks.look_paint import DATA
 from benchmarks.look_sheets import lettered, write
 
@@ -149,14 +149,6 @@ def pictures(asset: Any, maps: Sequence[Any], front: tuple[float, float]) -> lis
         sun = Directional(unit, (KEY, KEY, KEY), frame="camera")
         result.append(shown(front, LARGE, [sun, Ambient((FILL, FILL, FILL))], CLOSE, "direct"))
     return result
-
-
-def encoded(picture: np.ndarray) -> np.ndarray:
-    """A linear premultiplied picture with alpha, over GROUND, as uint8 sRGB."""
-    from mistyle.core.image import srgb_from_linear
-    from mistyle.render.sheet import over
-
-    return np.round(255 * srgb_from_linear(np.clip(over(picture, GROUND), 0, 1))).astype(np.uint8)
 
 
 def difference(after: Sequence[np.ndarray], before: Sequence[np.ndarray]) -> dict[str, float]:

@@ -165,10 +165,7 @@ def _principled(a: Angles, roughness: Any, metallic: Any, specular: float) -> tu
 def _gltf(a: Angles, roughness: Any, metallic: Any, specular: float) -> tuple[Any, Any]:
     import drjit as dr
 
-    alpha2, edge = _alpha2(roughness), _schlick(a.cos_d)
-    visible = a.cos_o * _smith_root(a.cos_i, alpha2) + a.cos_i * _smith_root(a.cos_o, alpha2)
-    spread = dr.fma(alpha2, a.cos2_h, a.sin2_h)
-    lobe = alpha2 * a.cos_o / (2 * dr.pi * dr.square(spread) * visible)
+    edge, lobe = _schlick(a.cos_d), _lobe(a, _alpha2(roughness))
     tint, white = _metal(lobe, metallic, edge)
     fresnel = (2 * specular) * dr.fma(1 - GLTF_F0, edge, GLTF_F0)
     dielectric = 1 - metallic

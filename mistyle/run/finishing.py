@@ -22,7 +22,7 @@ WEIGHTS = "for example --vgg vgg19-normalised (see mistyle models), or --vgg vgg
 
 
 @dataclass(frozen=True)
-class Finishing:
+class FinishRecord:
     """How the painting was finished: its maps before and after, style loss before and after, and how far it moved."""
 
     before: tuple[Maps, ...]
@@ -62,7 +62,7 @@ def check_finish(settings: Settings) -> None:
     load_features(path, LEVELS)
 
 
-def finish_stage(run: Run, asset: Asset, coats: Coats, atlas: Atlas, baked: Baked) -> tuple[Baked, Finishing]:
+def finish_stage(run: Run, asset: Asset, coats: Coats, atlas: Atlas, baked: Baked) -> tuple[Baked, FinishRecord]:
     """The stage "finish": the painted albedo moved by VGG-19's style losses; normal and roughness as they were."""
     s = run.job.settings
     protect = [s.coat.protect] if s.coat.protect is not None else []
@@ -76,7 +76,7 @@ def finish_stage(run: Run, asset: Asset, coats: Coats, atlas: Atlas, baked: Bake
         f"{moved if kept else 'the painting stays as it was'}."
     )
     after = laid(baked, made)
-    return after, Finishing(baked.maps, after.maps, made.style, made.moved)
+    return after, FinishRecord(baked.maps, after.maps, made.style, made.moved)
 
 
 def finished(asset: Asset, coats: Coats, atlas: Atlas, baked: Baked, settings: Settings, report: Report) -> Finished:
@@ -100,7 +100,7 @@ def laid(baked: Baked, made: Finished) -> Baked:
     return replace(baked, maps=maps, begin=begin)
 
 
-def finish_pair(asset: Asset, finishing: Finishing, camera: Camera) -> Pair:
+def finish_pair(asset: Asset, finishing: FinishRecord, camera: Camera) -> Pair:
     """The painting before and after, without light, for the report."""
     from mistyle.render.unlit import unlit
     from mistyle.run.report_draw import shown

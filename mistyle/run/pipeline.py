@@ -19,7 +19,7 @@ from mistyle.measure.baked_light import BakedLight
 from mistyle.run import asset_files
 from mistyle.run.budget import Look, kept, size_of
 from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
-from mistyle.run.finishing import Finishing, check_finish, finish_stage
+from mistyle.run.finishing import FinishRecord, check_finish, finish_stage
 from mistyle.run.first_asset import write_first
 from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import fit_settings, inpainter_inputs, lights_of_views, opaque, release, texture_inpainter
@@ -50,7 +50,7 @@ class Made:
     folder: Path
     looks: tuple[StyleLook, ...]
     light: BakedLight | None
-    finishing: Finishing | None = None
+    finishing: FinishRecord | None = None
 
 
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
@@ -191,7 +191,7 @@ def masks_stage(run: Run, asset: Asset, atlas: Atlas, baked: Baked, fitted: Any)
 
 def painted_stages(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
-) -> tuple[Baked, list[View], Finishing | None]:
+) -> tuple[Baked, list[View], FinishRecord | None]:
     """From the style to the painted texture and its views: the stages 'surface', 'bake', 'finish' where it is wanted,
     and 'stylized'."""
     s = run.job.settings
