@@ -9,7 +9,7 @@ NEW_ENOUGH = "import sys; sys.exit(not (3, 11) <= sys.version_info[:2])"
 
 
 def main():
-    """Start with a Python that is new enough and leave the rest to the bootstrap; ends with the verb's exit code."""
+    """Start with a Python that is new enough, set up what is missing, then run the verb; ends with its exit code."""
     if sys.version_info < (3, 11):
         names = ("python3.13", "python3.12", "python3.11", "python3.14")
         # A name on the PATH need not run: pyenv puts a script there for each version that it knows of.
@@ -22,7 +22,27 @@ def main():
         os.execv(newer, [newer, "-m", "mistyle"] + sys.argv[1:])
     from mistyle.bootstrap import start
 
-    sys.exit(start(sys.argv[1:]))
+    sys.exit(start(sys.argv[1:], command_line, doctor))
+
+
+def command_line(arguments):
+    """Run a verb and return its exit code."""
+    from mistyle.core.children import end_with_asker
+
+    # Before the imports, which take seconds on a busy machine: a shard whose batch is gone must not linger in them.
+    end_with_asker()
+    try:
+        from mistyle.run.cli import main as run
+    except KeyboardInterrupt:
+        return 130
+    return run(arguments)
+
+
+def doctor(json):
+    """Print what this machine has and what is missing, without installed packages too; returns the exit code."""
+    from mistyle.run.doctor import main as report
+
+    return report(json)
 
 
 if __name__ == "__main__":

@@ -6,49 +6,48 @@ A wheel that is installed somewhere else runs in the environment that it was ins
 """
 
 import contextlib
-import glob
-import hashlib
-import json
 import os
 import signal
 import subprocess
 import sys
 import time
-import tomllib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.children import end_with_asker
+from mistyle.environment import (
+    ROOT,
+    SetupError,
+    home,
+    in_clone,
+    inside,
+    key,
+    llvm_ready,
+    packages_ready,
+    print_of,
+    python_of,
+    read_record,
+    ready,
+    say,
+    told,
+    write_record,
+)
 
-PACKAGE = Path(__file__).resolve().parent
-ROOT = PACKAGE.parent
-VENV = ROOT / ".venv"
-CONSTRAINTS = PACKAGE / "constraints.txt"
 ENTERED = "_MISTYLE_ENTERED"  # set for the process that the set-up hands over to
 HELP = "mistyle: a mesh and one style picture in; the same mesh with stylized, physically based textures out.\n"
-NEEDED_BYTES = 3_000_000_000
 
 
-class SetupError(Exception):
-    """The environment cannot be made; the message is one sentence with the way out. Exit code 4."""
-
-
-def say(line: str) -> None:
-    """One line of progress. Always on stderr: stdout belongs to --json."""
-    print(f"mistyle: {line}", file=sys.stderr, flush=True)
-
-
-def start(arguments: Sequence[str]) -> int:
+def start(arguments: Sequence[str], command_line: Callable[[list[str]], int], doctor: Callable[[bool], int]) -> int:
     """Make sure of everything, go over into .venv's Python, run the verb there and return its exit code.
 
-    `--system` lets apt-get install LLVM on the system; every other argument belongs to the verb.
+    `--system` lets apt-get install LLVM on the system; every other argument belongs to the verb. `command_line` runs a
+    verb. `doctor` prints what is missing, as JSON or as a table, where the set-up failed.
     """
     system = "--system" in arguments
     arguments = [a for a in arguments if a != "--system"]
     verb = next((a for a in arguments if not a.startswith("-")), "")
     if not verb or (verb != "test" and {"-h", "--help"} & set(arguments)):
-        return _help(arguments)
+        return _help(arguments, command_line)
     if verb == "test" and not in_clone():
         say("the tests are in the source repository, not in the installed package; run this in a clone")
         return 2
@@ -58,37 +57,25 @@ def start(arguments: Sequence[str]) -> int:
         say(str(error))
         if verb != "doctor":
             return 4
-        if not _inside() and _packages_ready(home(), read_record(home()), set()):
+        if not inside() and packages_ready(home(), read_record(home()), set()):
             return _over(arguments, dict(os.environ))
-        from mistyle.run import doctor
-
-        return doctor.main("--json" in arguments)
+        return doctor("--json" in arguments)
     except KeyboardInterrupt:
         say("interrupted; the same command goes on where the set-up stopped")
         return 130
-    return _tests(arguments) if verb == "test" else _command_line(arguments)
+    return _tests(arguments) if verb == "test" else command_line(arguments)
 
 
-def _help(arguments: list[str]) -> int:
+def _help(arguments: list[str], command_line: Callable[[list[str]], int]) -> int:
     """Answer at once, on a bare Python too: only where the command line cannot be imported it needs the packages."""
     try:
-        return _command_line(arguments)
+        return command_line(arguments)
     except ImportError as error:
         if not ready(home(), set()):
             print(f"{HELP}Not set up yet ({error}). `python3 -m mistyle doctor` does that, or any other verb.")
             return 0
     enter(arguments, extras=set())
-    return _command_line(arguments)
-
-
-def _command_line(arguments: list[str]) -> int:
-    # Before the imports, which take seconds on a busy machine: a shard whose batch is gone must not linger in them.
-    end_with_asker()
-    try:
-        from mistyle.run.cli import main
-    except KeyboardInterrupt:
-        return 130
-    return main(arguments)
+    return command_line(arguments)
 
 
 def _tests(arguments: list[str]) -> int:
@@ -98,45 +85,20 @@ def _tests(arguments: list[str]) -> int:
     return _hand_over([sys.executable, "-m", "pytest", *chosen], dict(os.environ), ROOT)
 
 
-def in_clone() -> bool:
-    """Whether this package stands in its repository (else it was installed as a wheel)."""
-    project = ROOT / "pyproject.toml"
-    return project.is_file() and '\nname = "mistyle"' in project.read_text(encoding="utf-8")
-
-
-def home() -> Path:
-    """Where the set-up keeps its notes and a private LLVM: .venv, or the user's cache for an installed wheel."""
-    if in_clone():
-        return VENV
-    cache = os.environ.get("LOCALAPPDATA") or os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(cache) / "mistyle"
-
-
-def python_of(folder: Path) -> Path:
-    """The Python to run with: the virtual environment's, or this one for an installed wheel."""
-    if not in_clone():
-        return Path(sys.executable)
-    return folder / ("Scripts/python.exe" if os.name == "nt" else "bin/python")
-
-
 def enter(arguments: Sequence[str], *, extras: set[str], system: bool = False) -> None:
     """Set up what is missing; return only inside the right Python with LLVM's variables set, else run it instead."""
-    folder, inside = home(), _inside()
-    if os.environ.pop(ENTERED, "") == str(folder) and inside:
+    folder, here = home(), inside()
+    if os.environ.pop(ENTERED, "") == str(folder) and here:
         return
     if system or not ready(folder, extras):
         set_up(folder, extras, system)
     record = read_record(folder)
     say(_banner(folder, record))
     environment = told(record["llvm"]["library"], record["llvm"]["folders"], os.environ)
-    if inside and environment.get("LD_LIBRARY_PATH") == os.environ.get("LD_LIBRARY_PATH"):
+    if here and environment.get("LD_LIBRARY_PATH") == os.environ.get("LD_LIBRARY_PATH"):
         os.environ.update(environment)
         return
     sys.exit(_over(arguments, environment))
-
-
-def _inside() -> bool:
-    return not in_clone() or os.path.realpath(sys.prefix) == os.path.realpath(VENV)
 
 
 def _over(arguments: Sequence[str], environment: dict[str, str]) -> int:
@@ -170,111 +132,6 @@ def _banner(folder: Path, record: dict[str, Any]) -> str:
     return f"{__version__} ({where}{compiler}{f'; not the active environment {active}' if foreign else ''})"
 
 
-# What is there already
-
-
-def read_record(folder: Path) -> dict[str, Any]:
-    """What an earlier set-up noted: key, extras, llvm (variant, library, folders, version, size, mtime)."""
-    with contextlib.suppress(OSError, ValueError):
-        record = json.loads((folder / "mistyle.json").read_text(encoding="utf-8"))
-        return record if isinstance(record, dict) else {}
-    return {}
-
-
-def write_record(folder: Path, record: dict[str, Any]) -> None:
-    part = folder / "mistyle.json.part"
-    part.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
-    os.replace(part, folder / "mistyle.json")
-
-
-def key(folder: Path) -> str:
-    """Changes when what has to be installed changes: the pins, the project, the place, the Python."""
-    digest = hashlib.sha256(CONSTRAINTS.read_bytes())
-    if in_clone():
-        project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-        digest.update(json.dumps(project, sort_keys=True).encode())
-    else:
-        from importlib.metadata import distributions
-
-        digest.update(str([d.version for d in distributions(name="drjit")]).encode())
-    # The link of a virtual environment may lead to another version after a system upgrade.
-    digest.update(f"{PACKAGE} {os.path.basename(os.path.realpath(python_of(folder)))}".encode())
-    return digest.hexdigest()
-
-
-def ready(folder: Path, extras: set[str]) -> bool:
-    """Whether nothing is left to do. A few milliseconds: compares hashes, starts no process."""
-    record = read_record(folder)
-    return _packages_ready(folder, record, extras) and _llvm_ready(record)
-
-
-def _packages_ready(folder: Path, record: dict[str, Any], extras: set[str]) -> bool:
-    if "key" not in record or not python_of(folder).exists():
-        return False
-    return record["key"] == key(folder) and extras <= set(record.get("extras", ()))
-
-
-def _llvm_ready(record: dict[str, Any]) -> bool:
-    llvm = record.get("llvm")
-    if not llvm:
-        return False
-    asked = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if asked and llvm["library"] and asked not in (llvm["library"], llvm.get("refused")):
-        return False
-    return not llvm["library"] or _print_of(llvm["library"]) == llvm["print"]
-
-
-def _print_of(library: str) -> list[int]:
-    with contextlib.suppress(OSError):
-        info = os.stat(library)
-        return [info.st_size, info.st_mtime_ns]
-    return []
-
-
-def told(library: str, folders: Sequence[str], base: Mapping[str, str]) -> dict[str, str]:
-    """`base` with what makes Dr.Jit load `library`; `folders` hold libraries that LLVM needs and the system lacks."""
-    result = dict(base)
-    if library:
-        result["DRJIT_LIBLLVM_PATH"] = library
-    if folders:
-        there = [f for f in result.get("LD_LIBRARY_PATH", "").split(os.pathsep) if f and f not in folders]
-        result["LD_LIBRARY_PATH"] = os.pathsep.join([*folders, *there])
-    return result
-
-
-def known_llvm() -> str:
-    """The LLVM that the set-up found, where it is still there; else nothing."""
-    record = read_record(home())
-    return record["llvm"]["library"] if _llvm_ready(record) else ""
-
-
-def use_llvm() -> bool:
-    """Tell Dr.Jit in this process about the LLVM that the set-up found; for scripts and tests that start without it.
-
-    Returns whether there is one. Has to run before the first import of drjit or mitsuba; changes nothing where
-    DRJIT_LIBLLVM_PATH is set already.
-    """
-    record = read_record(home())
-    if os.environ.get("DRJIT_LIBLLVM_PATH") or not _llvm_ready(record):
-        return bool(os.environ.get("DRJIT_LIBLLVM_PATH"))
-    os.environ.update(told(record["llvm"]["library"], record["llvm"]["folders"], os.environ))
-    if folders := record["llvm"]["folders"]:
-        _preload([path for folder in folders for path in sorted(glob.glob(f"{folder}/*.so.*"))])
-    return True
-
-
-def _preload(libraries: list[str]) -> None:
-    """Load libraries whose folder the loader was not told of at its start, each after those that it needs."""
-    import ctypes
-
-    left = [path for path in libraries if not os.path.islink(path)]
-    for _ in range(len(left)):
-        for path in list(left):
-            with contextlib.suppress(OSError):
-                ctypes.CDLL(path, mode=ctypes.RTLD_GLOBAL)
-                left.remove(path)
-
-
 # The set-up
 
 
@@ -289,7 +146,7 @@ def set_up(folder: Path, extras: set[str], system: bool) -> None:
         with _alone(folder), _stoppable():
             record = read_record(folder)
             extras = extras | set(record.get("extras", ()))
-            if not _packages_ready(folder, record, extras):
+            if not packages_ready(folder, record, extras):
                 if in_clone():
                     say("the packages come first: on a bare machine about 1 GB to fetch and 2 GB on the disk")
                     say(f"with the CUDA build of torch (a GPU, or no CPU build to be had) it adds {install.CUDA_SIZE}")
@@ -300,7 +157,7 @@ def set_up(folder: Path, extras: set[str], system: bool) -> None:
                 write_record(folder, record)
             if system and not llvm.install(say):
                 raise SetupError(f"apt-get could not install LLVM on the system; by hand: {llvm.command()}")
-            if system or not _llvm_ready(record):
+            if system or not llvm_ready(record):
                 write_record(folder, {**record, "llvm": _find_llvm(folder)})
     except OSError as error:
         raise SetupError(f"cannot set up {folder}: {error}; check the rights and the space there") from error
@@ -322,7 +179,7 @@ def _find_llvm(folder: Path) -> dict[str, Any]:
         )
     asked = os.environ.get("DRJIT_LIBLLVM_PATH")
     refused = {"refused": asked} if asked and asked != found.library else {}
-    return {**found._asdict(), "print": _print_of(found.library), **refused}
+    return {**found._asdict(), "print": print_of(found.library), **refused}
 
 
 @contextlib.contextmanager

@@ -14,8 +14,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import urljoin
 
-from mistyle.bootstrap import CONSTRAINTS, NEEDED_BYTES, ROOT, SetupError, in_clone, say, write_record
+from mistyle.environment import CONSTRAINTS, ROOT, SetupError, in_clone, say, write_record
 
+NEEDED_BYTES = 3_000_000_000
 CPU_WHEELS = "https://download.pytorch.org/whl/cpu"
 CUDA_WHEELS = "https://download.pytorch.org/whl/cu130"  # only Windows needs it: its plain wheels have no CUDA
 REGISTRY = "https://pypi.org/simple"

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
-from mistyle.bootstrap import told
+from mistyle.environment import told
 
 Say = Callable[[str], None]
 

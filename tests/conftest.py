@@ -9,7 +9,7 @@ from browser import NO_BROWSER
 from helpers import NO_DATA
 from hypothesis import settings
 
-from mistyle import bootstrap
+from mistyle import environment
 
 # Skips that CI accepts, by the beginning of their reason, and why. Where the environment variable CI is set, any
 # other skip fails the run: a test that never runs proves nothing.
@@ -19,7 +19,7 @@ ALLOWED_SKIPS = {
 }
 skipped: list[tuple[str, str]] = []
 
-bootstrap.use_llvm()
+environment.use_llvm()
 # Read when Ray is imported: the engine sets it, but here tests may import Ray before the engine does.
 os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
 settings.register_profile("mistyle", deadline=None, derandomize=True, database=None)

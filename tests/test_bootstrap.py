@@ -17,7 +17,7 @@ import pytest
 from helpers import ROOT
 from packaging.requirements import Requirement
 
-from mistyle import bootstrap
+from mistyle import bootstrap, environment
 
 HEAVY = {"numpy", "pydantic", "rich", "torch", "mitsuba", "trimesh", "cv2", "scipy"}
 HELP_SECONDS = 0.5  # of processor time, which other programs on the machine do not lengthen
@@ -34,11 +34,11 @@ def clone(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def place(clone: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The bootstrap module works in that copy; its .venv has a Python that is a link to this one."""
+    """The set-up works in that copy; its .venv has a Python that is a link to this one."""
     package = clone / "mistyle"
     for name, value in {"PACKAGE": package, "ROOT": clone, "VENV": clone / ".venv"}.items():
-        monkeypatch.setattr(bootstrap, name, value)
-    monkeypatch.setattr(bootstrap, "CONSTRAINTS", package / "constraints.txt")
+        monkeypatch.setattr(environment, name, value)
+    monkeypatch.setattr(environment, "CONSTRAINTS", package / "constraints.txt")
     for name in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH", "VIRTUAL_ENV", "CONDA_PREFIX"):
         monkeypatch.delenv(name, raising=False)
     (clone / ".venv/bin").mkdir(parents=True)
@@ -51,9 +51,9 @@ def finished(venv: Path, **changed: object) -> dict:
     library = venv / "libLLVM.so.19.1"
     library.write_bytes(b"library")
     llvm = {"variant": "llvm_ad_rgb", "library": str(library), "folders": [], "version": "19.1.7"}
-    llvm["print"] = bootstrap._print_of(str(library))
-    record = {"key": bootstrap.key(venv), "extras": ["test"], "llvm": llvm, **changed}
-    bootstrap.write_record(venv, record)
+    llvm["print"] = environment.print_of(str(library))
+    record = {"key": environment.key(venv), "extras": ["test"], "llvm": llvm, **changed}
+    environment.write_record(venv, record)
     return record
 
 
@@ -81,7 +81,7 @@ def test_help_answers_on_a_bare_python_without_set_up(clone):
 
 
 def test_nothing_heavy_is_imported_before_a_command_runs(clone):
-    names = "__main__", "bootstrap", "install", "llvm", "run.doctor", "run.cli"
+    names = "__main__", "bootstrap", "environment", "install", "llvm", "facts", "run.doctor", "run.cli"
     code = (
         f"import sys; sys.path.insert(0, '.'); {'; '.join(f'import mistyle.{n}' for n in names)}; print(*sys.modules)"
     )
@@ -90,11 +90,11 @@ def test_nothing_heavy_is_imported_before_a_command_runs(clone):
 
 
 def test_ready_only_as_long_as_nothing_changed(place):
-    assert not bootstrap.ready(place, set())
+    assert not environment.ready(place, set())
     finished(place)
-    assert bootstrap.ready(place, set())
-    assert bootstrap.ready(place, {"test"})
-    assert not bootstrap.ready(place, {"diffusion"})
+    assert environment.ready(place, set())
+    assert environment.ready(place, {"test"})
+    assert not environment.ready(place, {"diffusion"})
 
 
 @pytest.mark.parametrize("change", ["constraints", "dependencies", "library", "python", "record"])
@@ -102,7 +102,7 @@ def test_a_change_calls_for_the_set_up(place, change):
     finished(place)
     project = place.parent / "pyproject.toml"
     if change == "constraints":
-        bootstrap.CONSTRAINTS.write_text("numpy==2.0\n")
+        environment.CONSTRAINTS.write_text("numpy==2.0\n")
     if change == "dependencies":
         project.write_text(project.read_text().replace('"numpy>=2,<3"', '"numpy>=2.1,<3"'))
     if change == "library":
@@ -111,22 +111,22 @@ def test_a_change_calls_for_the_set_up(place, change):
         (place / "bin/python").unlink()
     if change == "record":
         (place / "mistyle.json").write_text("{")
-    assert not bootstrap.ready(place, set())
+    assert not environment.ready(place, set())
 
 
 def test_lint_settings_call_for_nothing(place):
     finished(place)
     project = place.parent / "pyproject.toml"
     project.write_text(project.read_text().replace("line-length = 120", "line-length = 100"))
-    assert bootstrap.ready(place, set())
+    assert environment.ready(place, set())
 
 
 def test_another_llvm_that_the_user_names_is_looked_at_once(place, monkeypatch):
     record = finished(place)
     monkeypatch.setenv("DRJIT_LIBLLVM_PATH", "/elsewhere/libLLVM.so")
-    assert not bootstrap.ready(place, set())
-    bootstrap.write_record(place, {**record, "llvm": {**record["llvm"], "refused": "/elsewhere/libLLVM.so"}})
-    assert bootstrap.ready(place, set())
+    assert not environment.ready(place, set())
+    environment.write_record(place, {**record, "llvm": {**record["llvm"], "refused": "/elsewhere/libLLVM.so"}})
+    assert environment.ready(place, set())
 
 
 def test_the_verb_goes_over_to_the_other_python(place, monkeypatch, capsys):
@@ -162,7 +162,7 @@ def without_llvm() -> dict[str, str]:
     return {k: v for k, v in os.environ.items() if k not in ("DRJIT_LIBLLVM_PATH", "LD_LIBRARY_PATH")}
 
 
-@pytest.mark.skipif(not bootstrap.known_llvm(), reason="the set-up found a GPU or was not run")
+@pytest.mark.skipif(not environment.known_llvm(), reason="the set-up found a GPU or was not run")
 def test_benchmarks_know_the_llvm_before_they_import_dr_jit():
     script = "import benchmarks, drjit, mitsuba; mitsuba.set_variant('llvm_ad_rgb'); print(drjit.detail.llvm_version())"
     line = [sys.executable, "-c", script]
@@ -178,14 +178,14 @@ def test_dr_jit_that_came_too_early_is_said(monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(device, "known_llvm", lambda: "/l/libLLVM.so.19.1")
     assert "/l/libLLVM.so.19.1" in device._missing("llvm_ad_rgb")
-    assert "mistyle.bootstrap.use_llvm()" in device._missing("llvm_ad_rgb")
+    assert "mistyle.environment.use_llvm()" in device._missing("llvm_ad_rgb")
 
 
 def test_private_folders_come_first_and_once():
-    once = bootstrap.told("/l/libLLVM.so", ["/l"], {"LD_LIBRARY_PATH": "/a:/b", "HOME": "/h"})
+    once = environment.told("/l/libLLVM.so", ["/l"], {"LD_LIBRARY_PATH": "/a:/b", "HOME": "/h"})
     assert once == {"DRJIT_LIBLLVM_PATH": "/l/libLLVM.so", "LD_LIBRARY_PATH": "/l:/a:/b", "HOME": "/h"}
-    assert bootstrap.told("/l/libLLVM.so", ["/l"], once) == once
-    assert bootstrap.told("", [], {"HOME": "/h"}) == {"HOME": "/h"}
+    assert environment.told("/l/libLLVM.so", ["/l"], once) == once
+    assert environment.told("", [], {"HOME": "/h"}) == {"HOME": "/h"}
 
 
 @pytest.mark.parametrize(("script", "code"), [("exit 7", 7), ("kill -TERM $$", -signal.SIGTERM)])

@@ -51,7 +51,7 @@ DECODERS = {
     "files/gltf_pose",
 }
 ALLOWED = {
-    "bootstrap": "pyproject.toml of the clone",
+    "environment": "pyproject.toml of the clone",
     "core/light": "scene files that come with mistyle",
     "core/memory": "arrays that mistyle wrote into a run's folder",
     "core/unwrap": "what its own child wrote into a folder of its own",

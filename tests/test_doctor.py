@@ -4,18 +4,18 @@ import json
 
 import pytest
 
-from mistyle import llvm
+from mistyle import facts, llvm
 from mistyle.run import doctor
 
 
 @pytest.fixture(scope="module")
-def rows() -> dict[str, doctor.Row]:
+def rows() -> dict[str, facts.Row]:
     """What it finds on the machine that runs the tests."""
-    return {row.name.strip(): row for row in doctor.rows()}
+    return {row.name.strip(): row for row in facts.rows(2)}
 
 
 def test_the_machine_that_runs_the_tests_can_do_the_main_job(rows):
-    assert doctor.works(list(rows.values()))
+    assert facts.works(list(rows.values()))
     assert {"mistyle", "Python", "system", "packages", "mitsuba", "GPU", "torch", "LLVM", "node"} <= set(rows)
     assert {"VGG-19 weights", "usd", "ray", "render farm", "diffusion stylizers"} <= set(rows)
     assert rows["mitsuba"].found.startswith("3.9.")
@@ -23,8 +23,8 @@ def test_the_machine_that_runs_the_tests_can_do_the_main_job(rows):
 
 
 def test_json_is_one_object_and_the_exit_code_tells(monkeypatch, capsys):
-    row = doctor.Row("LLVM", "none [bold]that[/bold] works", "missing", "brew install llvm")
-    monkeypatch.setattr(doctor, "rows", lambda: [row])
+    row = facts.Row("LLVM", "none [bold]that[/bold] works", "missing", "brew install llvm")
+    monkeypatch.setattr(facts, "rows", lambda _: [row])
     assert doctor.main(json=True) == 4
     report = json.loads(capsys.readouterr().out)
     assert not report["works"] and report["rows"] == [row._asdict()]
@@ -36,7 +36,7 @@ def test_json_is_one_object_and_the_exit_code_tells(monkeypatch, capsys):
 
 def test_without_a_working_variant_the_command_is_named(monkeypatch):
     monkeypatch.setattr(llvm, "probe", lambda *_: llvm.Answer(False, why="LLVM ERROR: Cannot select"))
-    found = {row.name.strip(): row for row in doctor._renderers()}
+    found = {row.name.strip(): row for row in facts._renderers()}
     assert found["llvm_ad_rgb"].state == "missing"
     assert found["llvm_ad_rgb"].fix == llvm.command()
     assert "Cannot select" in found["llvm_ad_rgb"].found
@@ -44,21 +44,21 @@ def test_without_a_working_variant_the_command_is_named(monkeypatch):
 
 def test_weights_that_are_named_but_absent_are_told(monkeypatch, tmp_path):
     monkeypatch.setenv("MISTYLE_VGG", str(tmp_path / "vgg.pth"))
-    assert doctor._weights().state == "optional" and "not there" in doctor._weights().found
+    assert facts._weights().state == "optional" and "not there" in facts._weights().found
     (tmp_path / "vgg.pth").touch()
-    assert doctor._weights().state == "ok"
+    assert facts._weights().state == "ok"
 
 
 def test_another_version_than_the_pinned_is_named(monkeypatch):
-    monkeypatch.setattr(doctor, "_version", lambda name: "0.0.1" if name == "scipy" else "")
-    assert doctor._packages()[0].state == "missing"
+    monkeypatch.setattr(facts, "_version", lambda name: "0.0.1" if name == "scipy" else "")
+    assert facts._packages()[0].state == "missing"
     monkeypatch.undo()
-    real = doctor._version
-    monkeypatch.setattr(doctor, "_version", lambda name: "0.0.1" if name == "scipy" else real(name))
-    assert "scipy 0.0.1 for" in doctor._packages()[0].found
+    real = facts._version
+    monkeypatch.setattr(facts, "_version", lambda name: "0.0.1" if name == "scipy" else real(name))
+    assert "scipy 0.0.1 for" in facts._packages()[0].found
 
 
 def test_torch_and_its_cuda_version_are_read_without_importing_it():
     import torch
 
-    assert doctor._torch_cuda() == (torch.version.cuda or "")
+    assert facts._torch_cuda() == (torch.version.cuda or "")

@@ -18,7 +18,7 @@ DOORS = {
     "ray": {"run"},
 }
 # What runs before anything is installed; every floor may ask it things.
-BARE = {"__init__", "__main__", "bootstrap", "install", "llvm"}
+BARE = {"__init__", "__main__", "bootstrap", "environment", "facts", "install", "llvm"}
 
 
 def imported(source: str, package: list[str], *, at_import: bool = False) -> set[str]:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from mistyle import bootstrap, install
+from mistyle import environment, install
 
 FAKE_PIP = """
 import sys, pathlib, sysconfig
@@ -74,7 +74,7 @@ def test_ours_is_made_anew_when_it_broke_and_keeps_its_llvm(venv):
 
 def test_a_folder_of_someone_else_is_left_alone(tmp_path):
     (tmp_path / "precious").write_text("")
-    with pytest.raises(bootstrap.SetupError, match="move it away"):
+    with pytest.raises(environment.SetupError, match="move it away"):
         install.make_venv(tmp_path, tmp_path / "bin/python")
     assert (tmp_path / "precious").exists()
 
@@ -82,7 +82,7 @@ def test_a_folder_of_someone_else_is_left_alone(tmp_path):
 def test_an_environment_of_an_older_python_is_refused(tmp_path):
     python = program(tmp_path / "bin/python", "echo 3 9")
     (tmp_path / "pyvenv.cfg").write_text("version = 3.9.1\n")
-    with pytest.raises(bootstrap.SetupError, match=r"Python 3\.9.*3\.11 or newer"):
+    with pytest.raises(environment.SetupError, match=r"Python 3\.9.*3\.11 or newer"):
         install.make_venv(tmp_path, python)
 
 
@@ -126,7 +126,7 @@ class Quiet(SimpleHTTPRequestHandler):
 def test_without_any_way_to_pip_the_command_is_named(venv, monkeypatch):
     for way in ("_ensurepip", "_disk", "_other_pip", "_registry", "_debian"):
         monkeypatch.setattr(install, way, lambda *_: iter(()))
-    with pytest.raises(bootstrap.SetupError, match=r"run: .*install.*3\.\d+"):
+    with pytest.raises(environment.SetupError, match=r"run: .*install.*3\.\d+"):
         install.ensure_pip(venv / "bin/python", venv)
 
 
@@ -207,7 +207,7 @@ def test_the_cuda_build_is_not_begun_on_a_disk_without_room(tmp_path, monkeypatc
     monkeypatch.setattr(install, "nvidia", lambda: True)
     monkeypatch.setattr(sys, "platform", "linux")
     monkeypatch.setattr(install.shutil, "disk_usage", lambda _: shutil._ntuple_diskusage(10e9, 6e9, 4e9))
-    with pytest.raises(bootstrap.SetupError, match=r"4\.0 GB of free disk space.*needs 4\.7 GB; make room"):
+    with pytest.raises(environment.SetupError, match=r"4\.0 GB of free disk space.*needs 4\.7 GB; make room"):
         install.install_torch(tmp_path / "bin/python", tmp_path)
 
 
@@ -244,9 +244,9 @@ def test_no_interpreter_is_left_running_when_pip_is_interrupted(tmp_path):
         "import sys; from pathlib import Path; from mistyle import bootstrap, install\n"
         "with bootstrap._stoppable(): install.pip(Path('python').absolute(), Path('.').absolute(), 'numpy')"
     )
-    environment = {**os.environ, "PYTHONPATH": str(bootstrap.ROOT)}
+    variables = {**os.environ, "PYTHONPATH": str(environment.ROOT)}
     line = [sys.executable, "-c", code]
-    with subprocess.Popen(line, cwd=tmp_path, env=environment, stderr=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(line, cwd=tmp_path, env=variables, stderr=subprocess.PIPE, text=True) as child:
         assert child.stderr and "unpacking" in child.stderr.readline()
         child.terminate()
         assert child.wait(timeout=20) == 75

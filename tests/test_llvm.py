@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from test_install import program
 
-from mistyle import bootstrap, llvm
+from mistyle import environment, llvm
 
 # A system that lacks libllvm and libatomic1, as apt-get describes it.
 APT = """
@@ -53,7 +53,7 @@ def system(tmp_path: Path) -> str:
 
 
 def test_the_installed_llvm_draws_a_pixel_and_garbage_does_not(tmp_path):
-    record = bootstrap.read_record(bootstrap.home()).get("llvm") or {"variant": "llvm_ad_rgb", "folders": []}
+    record = environment.read_record(environment.home()).get("llvm") or {"variant": "llvm_ad_rgb", "folders": []}
     library = os.environ.get("DRJIT_LIBLLVM_PATH", record.get("library", ""))
     answer = llvm.probe(sys.executable, llvm.Found(record["variant"], library, tuple(record["folders"])))
     assert answer.works, answer.why

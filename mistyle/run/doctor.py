@@ -1,207 +1,27 @@
 """`mistyle doctor`: what this machine has, what is missing, and the command that fixes each.
 
-Runs on a Python that has nothing installed, too, since that is when it is asked. Imports no heavy package: versions
-come from the packages' metadata, and each Mitsuba variant is tried in a process of its own.
+Runs on a Python that has nothing installed, too, since that is when it is asked.
 """
 
 import json as _json
-import os
-import platform
-import re
-import shutil
-import subprocess
-import sys
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
-from importlib.metadata import PackageNotFoundError, version
-from importlib.util import find_spec
-from pathlib import Path
-from typing import Literal, NamedTuple
 
-from mistyle import __version__, bootstrap, install, llvm
+from mistyle import __version__, facts
 from mistyle.core.cores import cores
+from mistyle.facts import Row, works
 
-State = Literal["ok", "missing", "optional"]
-
-VARIANTS = ("llvm_ad_rgb", "metal_ad_rgb" if sys.platform == "darwin" else "cuda_ad_rgb")
-# What each optional feature imports, and the names to install. Nothing in the main job needs them.
-OPTIONAL = {
-    "diffusion stylizers": (("diffusers", "transformers", "peft"), "diffusers transformers peft accelerate"),
-    "ray": (("ray",), "ray"),
-    "render farm": (("openjd",), "openjd-cli"),
-    "usd": (("pxr", "MaterialX"), "usd-core MaterialX"),
-}
 ENVIRONMENT_MISSING = 4
-
-
-class Row(NamedTuple):
-    """One finding. `fix` is a command (or a few words) where something can be done, else empty."""
-
-    name: str
-    found: str
-    state: State
-    fix: str = ""
-
-
-def rows() -> list[Row]:
-    """Everything that was looked at, in the order in which it is shown. Takes a second or two."""
-    return [*_machine(), *_packages(), *_renderers(), *_torch(), *_optional()]
-
-
-def works(found: Sequence[Row]) -> bool:
-    """Whether the main job can run."""
-    return all(row.state != "missing" for row in found)
 
 
 def main(json: bool = False) -> int:
     """Print the table (or one JSON object on stdout); 0 when the main job can run, else 4."""
-    found = rows()
+    found = facts.rows(cores())
     if json:
         table = [row._asdict() for row in found]
         print(_json.dumps({"version": __version__, "works": works(found), "rows": table}, indent=1))
     else:
         _print(found)
     return 0 if works(found) else ENVIRONMENT_MISSING
-
-
-def _machine() -> list[Row]:
-    system = f"{platform.system()} {platform.machine()}"
-    if hasattr(platform, "freedesktop_os_release"):
-        try:
-            system = f"{platform.freedesktop_os_release()['PRETTY_NAME']}, {system}"
-        except (OSError, KeyError):
-            pass
-    memory = _memory()
-    return [
-        Row("mistyle", f"{__version__} in {bootstrap.PACKAGE}", "ok"),
-        Row("Python", f"{platform.python_version()} ({sys.executable})", "ok"),
-        Row("system", f"{system}, {cores()} cores{f', {memory:.0f} GB' if memory else ''}", "ok"),
-    ]
-
-
-def _memory() -> float:
-    """Gigabytes of main memory; 0 where the system does not tell."""
-    try:
-        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 1e9
-    except (AttributeError, ValueError, OSError):
-        return 0.0
-
-
-def _packages() -> list[Row]:
-    pins = re.findall(r"^([\w.-]+)==([\w.]+)$", bootstrap.CONSTRAINTS.read_text(encoding="utf-8"), re.MULTILINE)
-    there = {name: _version(name) for name, _ in pins}
-    lost = [name for name in ("mitsuba", "torch", "numpy", "trimesh", "pydantic") if not there.get(name)]
-    if lost:
-        return [
-            Row("packages", f"missing: {', '.join(lost)}", "missing", "python3 -m mistyle doctor   (installs them)")
-        ]
-    other = [f"{n} {there[n]} for {pin}" for n, pin in pins if there[n] and there[n].split("+")[0] != pin]
-    if other:
-        project = f"-e {bootstrap.ROOT}" if bootstrap.in_clone() else "mistyle"
-        fix = f"{sys.executable} -m pip install -c {bootstrap.CONSTRAINTS} {project}"
-        return [Row("packages", f"not the tested versions: {', '.join(other)}", "optional", fix)]
-    return [Row("packages", f"{sum(map(bool, there.values()))} as pinned", "ok")]
-
-
-def _version(name: str) -> str:
-    try:
-        return version(name)
-    except PackageNotFoundError:
-        return ""
-
-
-def _renderers() -> list[Row]:
-    if not _version("mitsuba"):
-        return [Row("mitsuba", "not installed", "missing")]
-    library = os.environ.get("DRJIT_LIBLLVM_PATH", "")
-    tries = [llvm.Found(v, library if v.startswith("llvm") else "") for v in VARIANTS]
-    with ThreadPoolExecutor() as pool:
-        answers = dict(zip(VARIANTS, pool.map(lambda found: llvm.probe(sys.executable, found), tries), strict=True))
-    any_works = any(answer.works for answer in answers.values())
-    result = [Row("mitsuba", _version("mitsuba"), "ok")]
-    for variant, answer in answers.items():
-        state: State = "ok" if answer.works else "optional" if any_works else "missing"
-        if answer.works or variant.startswith("llvm"):
-            words = "renders and back-propagates" if answer.works else f"does not work: {answer.why}"
-            result.append(Row(f"  {variant}", words, state, "" if any_works else llvm.command()))
-        else:
-            result.append(Row(f"  {variant}", "does not answer", "optional"))
-    if answers["llvm_ad_rgb"].works:
-        result.append(Row("LLVM", f"{answers['llvm_ad_rgb'].version} ({library or 'found by Dr.Jit'})", "ok"))
-    else:
-        seen = ", ".join(map(str, llvm.candidates(bootstrap.home(), None))) or "none"
-        result.append(Row("LLVM", f"none that works; looked at {seen}", "optional" if any_works else "missing"))
-    return result
-
-
-def _torch() -> list[Row]:
-    gpu = _gpu()
-    there = [Row("GPU", gpu or "none that answers; everything runs on the CPU", "ok" if gpu else "optional")]
-    number = _version("torch")
-    if not number:
-        return [*there, Row("torch", "not installed", "missing")]
-    cuda = _torch_cuda()
-    row = Row("torch", f"{number} ({f'CUDA {cuda}' if cuda else 'CPU build'})", "ok")
-    if gpu and not cuda and install.nvidia():
-        row = Row("torch", f"{row.found}: an NVIDIA GPU answers, torch cannot use it", "optional", _afresh())
-    return [*there, row]
-
-
-def _afresh() -> str:
-    return f"rm -r {bootstrap.VENV} && python3 -m mistyle doctor   (sets up again, with the CUDA build)"
-
-
-def _torch_cuda() -> str:
-    """The CUDA version that torch was built for, read from its files: importing it takes seconds."""
-    spec = find_spec("torch")
-    file = Path(spec.origin).with_name("version.py") if spec and spec.origin else None
-    text = file.read_text(encoding="utf-8") if file and file.is_file() else ""
-    number = re.search(r"^cuda\b[^=]*= ['\"]([\d.]+)", text, re.MULTILINE)
-    return number[1] if number else ""
-
-
-def _gpu() -> str:
-    if sys.platform == "darwin" and platform.machine() == "arm64":
-        return "Apple (Metal)"
-    if not shutil.which("nvidia-smi"):
-        return ""
-    line = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
-    return "; ".join(_words(*line).splitlines())
-
-
-def _words(*line: str) -> str:
-    """What a program prints, or nothing when it fails or does not answer in time."""
-    try:
-        done = subprocess.run(line, capture_output=True, text=True, timeout=30)
-    except (OSError, subprocess.TimeoutExpired):
-        return ""
-    return done.stdout.strip() if done.returncode == 0 else ""
-
-
-def _optional() -> list[Row]:
-    pip = f"{bootstrap.python_of(bootstrap.home())} -m pip install -c {bootstrap.CONSTRAINTS}"
-    result = []
-    for name, (modules, packages) in OPTIONAL.items():
-        lost = [module for module in modules if find_spec(module) is None]
-        found = f"not installed: {', '.join(lost)}" if lost else "installed"
-        result.append(Row(name, found, "optional" if lost else "ok", f"{pip} {packages}" if lost else ""))
-    result.append(_weights())
-    node = _words("node", "--version") if shutil.which("node") else ""
-    fix = "" if node else "install Node.js (nodejs.org); only the tests' glTF validator uses it"
-    return [*result, Row("node", node or "not installed", "ok" if node else "optional", fix)]
-
-
-def _weights() -> Row:
-    path = os.environ.get("MISTYLE_VGG", "")
-    if path and Path(path).is_file():
-        return Row("VGG-19 weights", path, "ok")
-    fix = (
-        "put VGG-19 anywhere (.safetensors or .pth, in torchvision's layer order or the normalised one of Li et al.) "
-        "and name it: export MISTYLE_VGG=FILE, or mistyle stylize … --vgg FILE"
-    )
-    if path:
-        return Row("VGG-19 weights", f"MISTYLE_VGG names {path}, which is not there", "optional", fix)
-    return Row("VGG-19 weights", "none; the embedded features are used, which need none", "optional", fix)
 
 
 def _print(found: Sequence[Row]) -> None:

@@ -18,8 +18,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mistyle import __version__
-from mistyle.bootstrap import CONSTRAINTS, ROOT, home, in_clone, read_record
 from mistyle.core.errors import EnvironmentMissing, MistyleError
+from mistyle.environment import CONSTRAINTS, ROOT, home, in_clone, read_record
 from mistyle.files.output import claim, replace_files
 from mistyle.files.store import sha256_file
 from mistyle.run.progress import Progress
