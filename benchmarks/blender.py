@@ -47,7 +47,7 @@ def main() -> None:
 
 def compare(path: Path, blender: str, size: int, samples: int, pictures: Path | None) -> dict[str, float]:
     """Render one asset on both sides and measure how far apart the pictures are."""
-    from mistyle.files.read import read_mesh
+    from mistyle.files.read_mesh import read_mesh
 
     asset = read_mesh(path, uv="keep")
     camera = orbit(35.0, 15.0, distance=4.0, fov=30.0, size=(size, size))

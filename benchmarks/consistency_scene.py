@@ -65,7 +65,8 @@ def cameras(resolution: int) -> list[Camera]:
 
 def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, atlas: int) -> Scene:
     """Read, draw and guide; the scene is left in `folder` for the rows, which run in processes of their own."""
-    from mistyle.files.read import read_mesh, read_picture
+    from mistyle.files.read import read_picture
+    from mistyle.files.read_mesh import read_mesh
     from mistyle.render.draw import draw_views
     from mistyle.run.start import start_engines
     from mistyle.stages.texels import rasterise

@@ -51,7 +51,7 @@ class Outcome:
 
 
 def _mesh(path: Path) -> None:
-    from mistyle.files.read import read_mesh, read_references
+    from mistyle.files.read_mesh import read_mesh, read_references
 
     read_references(path)
     asset = read_mesh(path, uv="keep", max_faces=100_000)
@@ -64,7 +64,7 @@ def _patched(asset: Any) -> None:
     from mistyle.core.maps import flat_maps
     from mistyle.files.gltf import patch_glb
     from mistyle.files.gltf_alpha import cutouts
-    from mistyle.files.read import read_mesh
+    from mistyle.files.read_mesh import read_mesh
 
     parts = len(asset.mesh.parts)
     cutouts(asset)
@@ -200,7 +200,7 @@ def peak_reader_gb() -> float:
 def unwrapped(count: int, folder: Path, report: Callable[[str], None]) -> list[Outcome]:
     """Damaged meshes that get new texture coordinates: finite, in the unit square, one a corner; or refused."""
     from mistyle.core.errors import MistyleError
-    from mistyle.files.read import read_mesh
+    from mistyle.files.read_mesh import read_mesh
 
     chosen = [seed for seed in seeds() if seed.kind == "mesh"]
     found = []

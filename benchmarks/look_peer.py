@@ -50,7 +50,8 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     from benchmarks.consistency_scene import guided
     from mistyle.core.camera import RigSettings, rig
     from mistyle.core.image import linear_from_srgb
-    from mistyle.files.read import read_mesh, read_picture
+    from mistyle.files.read import read_picture
+    from mistyle.files.read_mesh import read_mesh
     from mistyle.files.views import write_views
     from mistyle.render.draw import draw_views as drawn
     from mistyle.run.settings import resolve

@@ -37,7 +37,7 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, to_json
 from mistyle.files.cameras import transforms
 from mistyle.files.captures import read_captures
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.measure.material_metrics import map_errors
 from mistyle.render.draw import tracer
 from mistyle.render.shade import Shade, pack

@@ -130,7 +130,8 @@ def run(quick: bool) -> dict[str, float]:
     from mistyle.files import reader_tasks
     from mistyle.files.images import write_png
     from mistyle.files.raw import spelled
-    from mistyle.files.read import MESHES, read_exr
+    from mistyle.files.read import read_exr
+    from mistyle.files.read_mesh import MESHES
     from mistyle.files.reader_process import ask
 
     with tempfile.TemporaryDirectory(prefix="mistyle-reader-") as folder:

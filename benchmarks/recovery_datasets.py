@@ -23,7 +23,7 @@ from mistyle.core.capture import Captures, shrunk, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps
 from mistyle.files.datasets import TENSOIR_LIGHTS, read_stanford_orb, read_tensoir
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.measure.material_metrics import align_channels, orb_mask, psnr_hdr, psnr_ldr
 from mistyle.render.scene import Frame
 from mistyle.stages.recover import recover

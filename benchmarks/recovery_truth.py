@@ -25,7 +25,7 @@ from mistyle.core.image import nearest_fill
 from mistyle.core.lanes import aligned
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.measure.material_metrics import texel_areas
 from mistyle.stages.texels import rasterise, start_maps
 

@@ -19,7 +19,8 @@ from benchmarks.common import finish, timed
 from mistyle.core.camera import RigSettings, rig
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.view import View
-from mistyle.files.read import read_mesh, read_picture
+from mistyle.files.read import read_picture
+from mistyle.files.read_mesh import read_mesh
 from mistyle.run import painting, start
 from mistyle.run.settings import Settings
 from mistyle.stages import fit

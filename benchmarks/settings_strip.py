@@ -16,7 +16,8 @@ from PIL import Image
 from mistyle.core.camera import RigSettings, rig
 from mistyle.core.image import srgb_from_linear
 from mistyle.files.images import write_png
-from mistyle.files.read import read_mesh, read_picture
+from mistyle.files.read import read_picture
+from mistyle.files.read_mesh import read_mesh
 from mistyle.render.unlit import unlit
 from mistyle.run import painting, start
 from mistyle.run.settings import Settings

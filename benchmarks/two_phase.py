@@ -31,7 +31,8 @@ from mistyle.core.capture import in_memory
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.core.light import Directional, Lights, has_soft, lights
 from mistyle.core.maps import Maps
-from mistyle.files.read import read_mesh, read_picture
+from mistyle.files.read import read_picture
+from mistyle.files.read_mesh import read_mesh
 from mistyle.measure.material_metrics import map_errors
 from mistyle.run import start
 from mistyle.run.settings import Settings

@@ -29,7 +29,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.files.cameras import transforms
 from mistyle.files.captures import read_captures
 from mistyle.files.images import write_png
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
 

@@ -15,7 +15,7 @@ from mistyle.core.asset import Asset, Shading
 from mistyle.core.camera import orbit
 from mistyle.core.light import Ambient
 from mistyle.files.gltf import patch_glb
-from mistyle.files.read import load_gltf, read_mesh
+from mistyle.files.read_mesh import load_gltf, read_mesh
 from mistyle.render import appearance, lookdev
 from mistyle.render.lookdev import material_maps
 

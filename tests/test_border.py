@@ -22,7 +22,8 @@ from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.files import bounds, lending, reader_process, wire
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.raw import RawMap, Textures, Tile
-from mistyle.files.read import read_exr, read_json, read_mesh, read_npy, read_picture, read_size, read_toml, read_yaml
+from mistyle.files.read import read_exr, read_json, read_npy, read_picture, read_size, read_toml, read_yaml
+from mistyle.files.read_mesh import read_mesh
 
 posix = os.name == "posix"
 

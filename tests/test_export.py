@@ -15,7 +15,7 @@ from mistyle.core.maps import flat_maps
 from mistyle.files import textures
 from mistyle.files.gltf import write_glb
 from mistyle.files.images import encode_png
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.stages import export
 from mistyle.stages.export import write_asset
 from mistyle.stages.texels import rasterise

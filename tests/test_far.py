@@ -10,7 +10,7 @@ import trimesh
 from gltf_cases import no_texels, quarters
 
 from mistyle.core.mesh import local_origin
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.files.usd import library
 from mistyle.run.deliver import export
 from mistyle.stages.export import write_asset

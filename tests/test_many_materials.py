@@ -16,7 +16,7 @@ from mistyle.core.camera import RigSettings, rig
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.paths import scenes
-from mistyle.files.read import read_extent, read_mesh
+from mistyle.files.read_mesh import read_extent, read_mesh
 from mistyle.render import device, draw, lookdev, pages
 from mistyle.render import scene as scenery
 from mistyle.run import budget, verbs

@@ -17,7 +17,7 @@ from mistyle.core.maps import flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.files.images import write_png
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.files.views import read_views, write_views
 from mistyle.render import draw, shade
 from mistyle.run.charts import Chart, svg

@@ -18,7 +18,8 @@ from mistyle.files.mesh_formats import read_off, read_stl
 from mistyle.files.obj_read import read_obj
 from mistyle.files.ply_read import read_ply
 from mistyle.files.polygons import fan, triangulate
-from mistyle.files.read import read_json, read_mesh
+from mistyle.files.read import read_json
+from mistyle.files.read_mesh import read_mesh
 
 # float32 positions in the unit sphere
 FLOAT32 = 1e-6

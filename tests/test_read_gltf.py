@@ -20,7 +20,7 @@ from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
 from mistyle.files.gltf_read import read_gltf, world_matrices
 from mistyle.files.raw import Corners
-from mistyle.files.read import load_gltf, read_mesh
+from mistyle.files.read_mesh import load_gltf, read_mesh
 
 Tree = dict[str, Any]
 TYPES = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121, "i2": 5122, "i1": 5120}

@@ -13,7 +13,7 @@ from mistyle.files.mesh_formats import read_off, read_stl
 from mistyle.files.obj_read import read_obj
 from mistyle.files.ply_read import read_ply
 from mistyle.files.raw import Raw
-from mistyle.files.read import read_mesh, read_references
+from mistyle.files.read_mesh import read_mesh, read_references
 
 POINTS = ["-1 -1 0", "1 -1 0", "1 1 0", "-1 1 0"]
 BYTES = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 64, 200]])

@@ -20,7 +20,7 @@ from mistyle.core.retexture import carry, fetch, turn_normals
 from mistyle.core.unwrap import estimated_seconds, unwrap
 from mistyle.core.uvs import islands, signed_areas
 from mistyle.core.xatlas_worker import cut_overlaps, landscape, lay_flat, mend, pack, unmirror
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 
 SIZE = 1024
 # xatlas lets borders that cross each other by less than a texel in a thousand through.

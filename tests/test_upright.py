@@ -6,7 +6,7 @@ from helpers import ROOT, data
 
 from mistyle.core.upright import lies_on_its_side
 from mistyle.files.prepare import SIDEWAYS
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 
 Z_UP = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # (x, y, z) with Y up -> (x, -z, y)
 

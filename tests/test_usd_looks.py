@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from mistyle.files.raw import Raw
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.files.usd_read import metres, read_usd
 
 pxr = pytest.importorskip("pxr")

@@ -11,7 +11,7 @@ from PIL import Image
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.normals import area_vectors
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 from mistyle.files.usd_read import read_usd
 
 pxr = pytest.importorskip("pxr")

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from mistyle.core.raster import fragments
 from mistyle.core.uvs import arrange, group_rows, islands, judge, shift, signed_areas, tiles
-from mistyle.files.read import read_mesh
+from mistyle.files.read_mesh import read_mesh
 
 # A shift adds an integer of at most a few tiles in float32: half a unit in the last place at 16.
 SHIFT_ROUNDING = 1e-6

@@ -13,7 +13,7 @@ from mistyle.files.bounds import beside, read_bytes
 from mistyle.files.glb import Buffers, Tree, values
 from mistyle.files.gltf_check import data_uri
 from mistyle.files.gltf_infos import image_of, set_of, texture_transform, wrap_of
-from mistyle.files.read import load_gltf, read_gltf_alpha
+from mistyle.files.read_mesh import load_gltf, read_gltf_alpha
 
 
 @dataclass(frozen=True)

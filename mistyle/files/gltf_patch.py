@@ -24,7 +24,7 @@ from mistyle.files.gltf_infos import shadeless
 from mistyle.files.gltf_tidy import drop_unused
 from mistyle.files.gltf_vertices import Patch, rewrite, triangles
 from mistyle.files.images import encode_png
-from mistyle.files.read import load_gltf
+from mistyle.files.read_mesh import load_gltf
 from mistyle.files.textures import Pictures, add_textures, drop_emission, drop_extension, part_stems, set_textures
 
 # Texture coordinates that were shifted by integers differ in their last bits; a texel of 16384 is 6e-5.

@@ -1,7 +1,7 @@
 """JSON that mistyle wrote itself: markers of finished stages, lists of files, records, locks, plans.
 
 It is read in this process, but bounded, since a disk may have damaged it and a shared folder may be anyone's. What a
-stranger hands in goes through files/read.py instead.
+stranger hands in goes through files/read.py and files/read_mesh.py instead.
 """
 
 import json

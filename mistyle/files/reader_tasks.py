@@ -31,7 +31,7 @@ AGAIN = "Write it again"
 
 
 def mesh(path: Path, reader: str, max_faces: int) -> Raw | Indexed:
-    """The mesh with all its textures decoded. `reader` is "module:function" of (path, max_faces), files/read.py."""
+    """The mesh with all its textures decoded. `reader` is "module:function", of files/read_mesh.py."""
     module, _, function = reader.partition(":")
     if not module.startswith("mistyle.files."):
         raise ValueError(f"{reader} is no reader of mistyle")

@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.image import luminance, srgb_from_linear
+from mistyle.measure.colour_difference import delta_e, lab
 from mistyle.measure.flip_bands import Pair, flip_maps
-from mistyle.measure.metrics import delta_e, lab
 
 PPD = 3840 * math.pi / 180  # 0.7 m from a display of 3840 pixels and 0.7 m
 SMALL = 1e-2  # keeps relative errors of black pixels finite

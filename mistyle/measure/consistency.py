@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.image import dilate, erode, gaussian
 from mistyle.core.view import View
+from mistyle.measure.colour_difference import lab
 from mistyle.measure.lpips import Lpips
-from mistyle.measure.metrics import lab
 from mistyle.measure.overlap import Overlap, overlap, seen_here, seen_there
 
 SHORT, LONG = (

@@ -4,7 +4,6 @@ Pictures are float arrays (h, w, 3), sRGB-encoded 0..1 unless a name says linear
 pixels is NaN. Higher is better for psnr, ssim, detail_correlation, edge_recall and coverage; lower for the others.
 """
 
-import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,14 +11,10 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.image import dilate, erode, gaussian, linear_from_srgb, resize
+from mistyle.core.image import dilate, erode, gaussian, resize
 from mistyle.core.view import View
+from mistyle.measure.colour_difference import delta_e, lab
 from mistyle.measure.overlap import DEPTH_TOLERANCE, Overlap, overlap, seen_here, seen_there
-
-XYZ_FROM_LINEAR = np.array(
-    [[0.4123908, 0.3575843, 0.1804808], [0.2126390, 0.7151687, 0.0721923], [0.0193308, 0.1191948, 0.9505322]]
-)
-D65 = XYZ_FROM_LINEAR.sum(axis=1)
 
 PATCH = 5
 SCALES = (1, 2, 4)
@@ -61,24 +56,6 @@ def ciede2000(
     """Mean CIE Delta E 2000 (ISO/CIE 11664-6, all factors 1) over the mask, from CIELAB with the D65 white."""
     difference = delta_e(lab(reference), lab(test))
     return float(difference[mask].mean() if mask is not None else difference.mean())
-
-
-def delta_e(a: Float[np.ndarray, "*n 3"], b: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n"]:
-    """CIE Delta E 2000 between CIELAB colours."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it announces at import that matplotlib is not there
-        from colour.difference import delta_E_CIE2000
-
-    return np.asarray(delta_E_CIE2000(a, b), dtype=np.float64)
-
-
-def lab(picture: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """CIELAB (L 0..100) of an sRGB picture, white D65."""
-    xyz = linear_from_srgb(picture) @ XYZ_FROM_LINEAR.T / D65
-    f = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
-    return np.stack(
-        [116 * f[..., 1] - 16, 500 * (f[..., 0] - f[..., 1]), 200 * (f[..., 1] - f[..., 2])], axis=-1
-    ).astype(np.float32)
 
 
 def patch_distance(

@@ -29,7 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.names import ASSET, distinct, safe_name
-from mistyle.files.read import MESHES
+from mistyle.files.read_mesh import MESHES
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import merge, validate
 

@@ -29,7 +29,7 @@ from mistyle.run.compare_limits import broken, without_effect
 from mistyle.run.compare_pictures import Written, thumbnail, worst_regions, write_pictures
 from mistyle.run.compare_records import CompareJob, Row, columns, csv_text, junit_text, number, row_record
 from mistyle.run.progress import Progress, grouped
-from mistyle.run.summary import peak_gb, versions
+from mistyle.run.versions import peak_gb, versions
 
 ALPHA = (
     "EXR and HDR are taken as premultiplied; straight alpha (PNG, TIFF, WebP) is multiplied in, in linear light. "

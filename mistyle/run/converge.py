@@ -27,7 +27,7 @@ from mistyle.run.charts import Chart
 from mistyle.run.progress import Progress
 from mistyle.run.render_files import Shot, Subject
 from mistyle.run.renderers import Renderer, left_out, renderer, shots, subject
-from mistyle.run.summary import versions
+from mistyle.run.versions import versions
 
 FILES = ("converge.json", "converge.csv", "index.html")
 METRICS = ("relmse", "smape", "flip")

@@ -26,7 +26,7 @@ class Finished:
 
 def read_finished(place: Path) -> Finished:
     """The asset of a run folder, an asset folder or a <name>.json. Raises InputRefused."""
-    from mistyle.files.read import read_mesh
+    from mistyle.files.read_mesh import read_mesh
 
     folder, manifest = read_listing(place)
     stems = [(str(part["name"]), str(part["textures"])) for part in manifest["parts"]]

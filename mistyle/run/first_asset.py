@@ -17,7 +17,7 @@ from mistyle.run import asset_files
 from mistyle.run.edits import UNEDITED
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
-from mistyle.run.summary import merged_peaks, merged_seconds, write_record
+from mistyle.run.record import merged_peaks, merged_seconds, write_record
 
 STATE = "painted and baked; not fitted, not repaired"
 

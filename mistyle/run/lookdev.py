@@ -133,7 +133,7 @@ def files_of_sheet(settings: LookSettings, mp4: bool) -> list[str]:
 
 def read_subject(place: Path) -> Subject:
     """A mesh file, or the asset of a run folder with what the run knows of its texels. Raises InputRefused."""
-    from mistyle.files.read import read_mesh
+    from mistyle.files.read_mesh import read_mesh
     from mistyle.run.renderers import finished_asset
 
     path = finished_asset(place) if place.is_dir() else place

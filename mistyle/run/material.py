@@ -102,7 +102,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     from mistyle.run.colour import in_working_space, key_of
     from mistyle.run.deliver import check, deliver
     from mistyle.run.material_report import material_report, write_summary
-    from mistyle.run.summary import old_report
+    from mistyle.run.record import old_report
 
     files = input_files(job.mesh)
     s = job.settings

@@ -11,13 +11,14 @@ from mistyle.run import report_overlays
 from mistyle.run.charts import Chart
 from mistyle.run.pages import file_list, heat, map_shots, setting_groups, side_by_side
 from mistyle.run.progress import Progress
+from mistyle.run.record import earlier, merged_peaks, merged_seconds, report_files, write_record
 from mistyle.run.report import Figure, MapSet, Note, Pair, Report, Shot, Step, Timing, write_report
 from mistyle.run.report_draw import draw
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
 from mistyle.run.stages import MATERIAL_STAGES, Run
-from mistyle.run.summary import earlier, merged_peaks, merged_seconds, peak_gb, report_files, versions, write_record
 from mistyle.run.turntable import write_turn
+from mistyle.run.versions import peak_gb, versions
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "seen_share": ("share of the covered texels that at least one reference sees", "higher"),

@@ -21,8 +21,9 @@ from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
 from mistyle.run.stages import FINISH, FIRST, RETOUCH, STAGES
 from mistyle.run.style_look import look_facts
-from mistyle.run.summary import MEANINGS, figures, versions
+from mistyle.run.summary import MEANINGS, figures
 from mistyle.run.turntable import write_turn
+from mistyle.run.versions import versions
 from mistyle.stages.fit_judge import TOLERANCE, undone_where, worse
 
 SAME = "Under the same studio light"

@@ -61,7 +61,8 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     """
     from mistyle.run.colour import read_style
     from mistyle.run.deliver import check, deliver
-    from mistyle.run.summary import old_report, write_summary
+    from mistyle.run.record import old_report
+    from mistyle.run.summary import write_summary
 
     files = input_files(job.mesh)
     claim_run(job, STAGES, inputs_of(job))

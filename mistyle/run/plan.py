@@ -226,7 +226,7 @@ def extent_of(mesh: Path, settings: Any) -> Extent:
 @lru_cache(maxsize=64)  # a batch names few meshes many times
 def _extent(mesh: Path, uv: Literal["keep", "new", "auto"], max_faces: int, size: int, stamps: object) -> Extent:
     """`stamps` tells a file that was changed from what it was."""
-    from mistyle.files.read import read_extent
+    from mistyle.files.read_mesh import read_extent
 
     return read_extent(mesh, uv=uv, max_faces=max_faces, size=size)
 

@@ -99,7 +99,7 @@ def subject(path: Path, folder: Path, renderers: Sequence[Renderer], threads: in
         if any(r.kind == "blender" for r in renderers):
             raise UsageError(f"{path}: Cycles reads no Mitsuba scenes; give a GLB, or leave out blender:cycles")
         return Subject(path, folder, threads=threads)
-    from mistyle.files.read import read_mesh
+    from mistyle.files.read_mesh import read_mesh
 
     asset = read_mesh(path, uv="auto")
     return Subject(path, folder, asset, any(r.kind == "other mitsuba" for r in renderers), threads)
@@ -117,7 +117,7 @@ def left_out(found: Subject) -> list[str]:
     """What a glTF asks for that Mitsuba's side does not draw: emission, transparency, material extensions."""
     if found.path.suffix.lower() not in (".glb", ".gltf"):
         return []
-    from mistyle.files.read import load_gltf
+    from mistyle.files.read_mesh import load_gltf
 
     names: set[str] = set()
     for material in load_gltf(found.path)[0].get("materials", []):

@@ -36,7 +36,7 @@ class TooLarge:
 
 def page_model(glb: Path) -> Model | TooLarge:
     """The asset for a page, unless its vertices and faces alone would take more than MOST_GEOMETRY bytes there."""
-    from mistyle.files.read import load_gltf
+    from mistyle.files.read_mesh import load_gltf
 
     tree, buffers = load_gltf(glb)
     model = Model(glb.name, tree, buffers)

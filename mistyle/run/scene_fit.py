@@ -20,12 +20,13 @@ from mistyle.files.output import claim, keep_folder
 from mistyle.files.store import atomic_write, digest
 from mistyle.run import checkpoint
 from mistyle.run.progress import Progress
+from mistyle.run.record import write_record
 from mistyle.run.scene_references import read_reference, reference_files
 from mistyle.run.scene_report import changes, figures, noise_text, write_page
 from mistyle.run.scene_settings import SceneSettings
 from mistyle.run.settings import thread_count
 from mistyle.run.stages import program
-from mistyle.run.summary import peak_gb, versions, write_record
+from mistyle.run.versions import peak_gb, versions
 
 FOLDERS = ("scene", "pictures", "report", "work")
 DRAWN_SPP = 64

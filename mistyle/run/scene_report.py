@@ -9,7 +9,7 @@ import numpy as np
 from mistyle.run.charts import Chart
 from mistyle.run.material_report import difference, encoded
 from mistyle.run.report import Figure, Note, Pair, Report, Shot, Step, write_report
-from mistyle.run.summary import versions
+from mistyle.run.versions import versions
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "psnr_before": ("mean PSNR of the sensors' pictures before the fit (sRGB, peak 1), dB", "higher"),

@@ -1,0 +1,36 @@
+"""What a result was made with, and how much memory it took: for `run.json`, `compare.json` and the reports."""
+
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+from mistyle import __version__
+from mistyle.core import memory
+
+PACKAGES = (
+    "mitsuba",
+    "drjit",
+    "torch",
+    "numpy",
+    "scipy",
+    "trimesh",
+    "xatlas",
+    "OpenEXR",
+    "opencv-contrib-python-headless",
+    "pillow",
+)
+
+
+def peak_gb() -> float:
+    """Peak resident memory of this process or of its largest child, GB."""
+    return memory.highest() / 1e9
+
+
+def versions() -> dict[str, str]:
+    """What the result was made with."""
+    found = {"mistyle": __version__, "python": platform.python_version(), "system": platform.platform()}
+    for name in PACKAGES:
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "missing"
+    return found
