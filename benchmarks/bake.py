@@ -8,10 +8,12 @@ padded albedo. Baking reads neither normal, uv nor part of a view: the views her
 import numpy as np
 
 from benchmarks.common import arguments, finish, peak_gb, timed
-from mistyle.core.camera import Camera, RigSettings, pixel_centres, rig
+from mistyle.core.camera import Camera, pixel_centres, rig
 from mistyle.core.mesh import Mesh
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.stages.backproject import BakeSettings, bake
+from mistyle.stages.backproject import bake
+from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.texels import rasterise
 
 # Centre and radius.

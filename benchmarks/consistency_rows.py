@@ -86,7 +86,8 @@ def per_view(scene: Scene) -> Row:
 
 def swept(scene: Scene) -> Row:
     """The same, each view from what the earlier ones show of its surface (paper 4.1.3)."""
-    from mistyle.stages.mvst import SweepSettings, sweep
+    from mistyle.stages.mvst import sweep
+    from mistyle.stages.sweep_settings import SweepSettings
 
     start = time.perf_counter()
     done = sweep(scene.views, view_stylizer(scene), SweepSettings(), scene.settings.seed, keeps_outlines=True)

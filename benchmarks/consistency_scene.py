@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 
 from mistyle.core.asset import Asset, Picture
-from mistyle.core.camera import Camera, RigSettings, orbit
+from mistyle.core.camera import Camera, orbit
 from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels, flat_maps
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.files.records import load_record, save_record
 from mistyle.run.settings import Settings, resolve

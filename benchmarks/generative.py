@@ -220,7 +220,8 @@ def painted_views(job: Any, views: list[Any], kept: Path, resumed: bool) -> list
     """The sweep over the views; resumed: stopped in the last one and begun again with networks loaded anew."""
     from mistyle.backends import diffusion
     from mistyle.core.errors import Stopped
-    from mistyle.stages.mvst import SweepSettings, sweep
+    from mistyle.stages.mvst import sweep
+    from mistyle.stages.sweep_settings import SweepSettings
 
     key = diffusion.key(job, views)
 

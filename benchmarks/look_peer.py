@@ -48,14 +48,16 @@ def baked_peer(program: Path, piece: Piece, cache: Path, quick: bool = False) ->
 def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int, int]) -> None:
     """Stylize every view with EbSynth, each after the ones before it, and leave them in `folder`/views."""
     from benchmarks.consistency_scene import guided
-    from mistyle.core.camera import RigSettings, rig
+    from mistyle.core.camera import rig
     from mistyle.core.image import linear_from_srgb
+    from mistyle.core.rig_settings import RigSettings
     from mistyle.files.read import read_picture
     from mistyle.files.read_mesh import read_mesh
     from mistyle.files.views import write_views
     from mistyle.render.draw import draw_views as drawn
     from mistyle.run.settings import resolve
-    from mistyle.stages.lift import WarpSettings, lift
+    from mistyle.stages.lift import lift
+    from mistyle.stages.sweep_settings import WarpSettings
     from mistyle.surface.chosen import settled
     from mistyle.surface.settings import SurfaceSettings
 
@@ -88,7 +90,7 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
 def before(lifted: Sequence[Any], view: Any, picture: np.ndarray) -> np.ndarray:
     """What earlier views show in this one, encoded; where they show nothing, `picture`, which was made without them."""
     from mistyle.core.image import srgb_from_linear
-    from mistyle.stages.lift import WarpSettings
+    from mistyle.stages.sweep_settings import WarpSettings
     from mistyle.stages.warp import composite
 
     prior = composite(lifted, view, WarpSettings())

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera, RigSettings, look_at, rig
+from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera, look_at, rig
 from mistyle.core.light import (
     Ambient,
     Directional,
@@ -26,6 +26,7 @@ from mistyle.core.light import (
 )
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
+from mistyle.core.rig_settings import RigSettings
 from mistyle.files.read import read_hdr
 from mistyle.render import device
 from mistyle.render.scene import Frame, object_shapes, passes, sensor_dict

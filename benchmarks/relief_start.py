@@ -16,8 +16,9 @@ import numpy as np
 from PIL import Image
 
 from benchmarks.common import finish, timed
-from mistyle.core.camera import RigSettings, rig
+from mistyle.core.camera import rig
 from mistyle.core.image import srgb_from_linear
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh

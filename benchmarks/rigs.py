@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.common import finish, timed
-from mistyle.core.camera import Camera, RigSettings, rig
+from mistyle.core.camera import Camera, rig
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.rigs import candidate_cameras, overlaps, visit
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))

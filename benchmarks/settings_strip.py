@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from mistyle.core.camera import RigSettings, rig
+from mistyle.core.camera import rig
 from mistyle.core.image import srgb_from_linear
+from mistyle.core.rig_settings import RigSettings
 from mistyle.files.images import write_png
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh

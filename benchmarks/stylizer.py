@@ -26,7 +26,8 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     import numpy as np
 
     from mistyle.backends.embedded import solve_surface
-    from mistyle.core.camera import RigSettings, rig
+    from mistyle.core.camera import rig
+    from mistyle.core.rig_settings import RigSettings
     from mistyle.core.view import View
     from mistyle.files.read import read_picture
     from mistyle.files.records import load_record

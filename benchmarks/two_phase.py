@@ -38,9 +38,9 @@ from mistyle.run import start
 from mistyle.run.settings import Settings
 from mistyle.stages.fit import two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
-from mistyle.stages.inpaint import RepairSettings
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.repair_settings import RepairSettings
 
 KINDS = {"lit": "phase1", "soft": "paper"}
 DARK = 0.02  # linear albedo under which a logarithm says nothing of light

@@ -15,17 +15,19 @@ from jaxtyping import Float
 
 from benchmarks.recovery_pictures import Shot, render
 from mistyle.core.asset import Asset, Picture
-from mistyle.core.camera import Camera, RigSettings, rig
+from mistyle.core.camera import Camera, rig
 from mistyle.core.image import nearest_fill
 from mistyle.core.light import SOFT, Environment, Lights, bake_environment
 from mistyle.core.maps import Maps, Texels
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
 from mistyle.measure.material_metrics import texel_areas
 from mistyle.run import painting
 from mistyle.run.made import Atlas
 from mistyle.run.settings import Settings
-from mistyle.stages.backproject import BakeSettings, backproject, fill
+from mistyle.stages.backproject import backproject, fill
+from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.coat import lay_relief
 from mistyle.stages.texels import pad
 

@@ -12,9 +12,11 @@ import numpy as np
 
 from benchmarks.bake import SPHERES, draw
 from benchmarks.common import arguments, finish, peak_gb, timed
-from mistyle.core.camera import RigSettings, pixel_centres, rig, world_from_px
+from mistyle.core.camera import pixel_centres, rig, world_from_px
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.stages.warp import WarpSettings, composite, lift, splat
+from mistyle.stages.sweep_settings import WarpSettings
+from mistyle.stages.warp import composite, lift, splat
 
 
 def with_normals(view: View) -> View:

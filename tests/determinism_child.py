@@ -168,8 +168,9 @@ def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any
     """The stylizer of single views, the warp between them, and the bake from views."""
     from mistyle.run.sweep import stylizer_of
     from mistyle.stages.backproject import bake
-    from mistyle.stages.lift import WarpSettings, lift
+    from mistyle.stages.lift import lift
     from mistyle.stages.mvst import sweep
+    from mistyle.stages.sweep_settings import WarpSettings
     from mistyle.stages.warp import composite
 
     chosen = settings.model_copy(update={"stylizer": "embedded-view"})

@@ -9,7 +9,6 @@ from mistyle.core.camera import (
     MITSUBA_FROM_OPENCV,
     OPENGL_FROM_OPENCV,
     Camera,
-    RigSettings,
     in_frame,
     look_at,
     of_corners,
@@ -22,6 +21,7 @@ from mistyle.core.camera import (
     world_from_px,
     zoom,
 )
+from mistyle.core.rig_settings import RigSettings
 
 # float64 projections of points a few units away: rounding only.
 EXACT = 1e-9

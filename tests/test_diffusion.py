@@ -14,7 +14,8 @@ from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings
 from mistyle.core.camera import orbit
 from mistyle.core.errors import EnvironmentMissing, InputRefused, Stopped, UsageError
 from mistyle.core.view import Prior, View
-from mistyle.stages.mvst import SweepSettings, sweep
+from mistyle.stages.mvst import sweep
+from mistyle.stages.sweep_settings import SweepSettings
 
 torch.set_num_threads(1)
 SIDE = 32

@@ -21,7 +21,8 @@ from mistyle.run import pipeline
 from mistyle.run.progress import Progress
 from mistyle.run.settings import resolve
 from mistyle.run.stages import Job
-from mistyle.stages.mvst import SweepSettings, sweep
+from mistyle.stages.mvst import sweep
+from mistyle.stages.sweep_settings import SweepSettings
 from mistyle.surface import view_samples
 from mistyle.surface.samples import GRID
 

@@ -7,14 +7,16 @@ import pytest
 import torch
 from test_seam import sphere
 
-from mistyle.core.camera import RigSettings, rig
+from mistyle.core.camera import rig
 from mistyle.core.image import gaussian, linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Directional
 from mistyle.core.maps import Maps, Texels, flat_maps
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.render import deferred, device, draw, seam
 from mistyle.stages import fit_judge, fit_table
-from mistyle.stages.fit import FitSettings, shrinkage, two_phase
+from mistyle.stages.fit import shrinkage, two_phase
+from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION = 128, 112

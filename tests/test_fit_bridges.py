@@ -8,10 +8,11 @@ from helpers import data
 from test_fit import QUICK, RESOLUTION, SIZE, correlation, painting
 from test_seam import sphere
 
-from mistyle.core.camera import RigSettings, rig
+from mistyle.core.camera import rig
 from mistyle.core.image import gaussian, srgb_from_linear
 from mistyle.core.light import Directional, lights
 from mistyle.core.maps import flat_maps
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.render import device, draw
 from mistyle.run.settings import PRESETS

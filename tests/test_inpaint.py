@@ -10,7 +10,8 @@ from scipy import ndimage
 
 from mistyle.backends.fill import _harmonic, grow, inpainter
 from mistyle.core.maps import Maps, Texels, flat_maps
-from mistyle.stages.inpaint import RepairSettings, blend_weights, radius, repair, struggle_mask
+from mistyle.stages.inpaint import blend_weights, radius, repair, struggle_mask
+from mistyle.stages.repair_settings import RepairSettings
 
 BARE = RepairSettings(dilation=0, blend=0, smooth=0, outlier=0, agreement=0.3)
 

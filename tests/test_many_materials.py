@@ -12,10 +12,11 @@ from test_seam import random_maps, torus
 
 from mistyle.core import memory
 from mistyle.core.asset import Material
-from mistyle.core.camera import RigSettings, rig
+from mistyle.core.camera import rig
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.paths import scenes
+from mistyle.core.rig_settings import RigSettings
 from mistyle.files.read_mesh import read_extent, read_mesh
 from mistyle.render import device, draw, lookdev, pages
 from mistyle.render import scene as scenery

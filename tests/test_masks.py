@@ -12,7 +12,8 @@ from test_warp import BALL, at, see
 from mistyle.backends import masks
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.core.image import overlap, srgb_from_linear
-from mistyle.stages.mvst import SweepSettings, sweep
+from mistyle.stages.mvst import sweep
+from mistyle.stages.sweep_settings import SweepSettings
 
 
 class Session:

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from test_warp import BALL, at, colours, see
 
-from mistyle.core.camera import RigSettings, angular_order, rig
+from mistyle.core.camera import angular_order, rig
 from mistyle.core.image import erode, match_histogram, overlap, srgb_from_linear
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import Prior, View
 from mistyle.stages.mvst import Painted as PaintedView
-from mistyle.stages.mvst import SweepSettings, sweep, towards, visiting
+from mistyle.stages.mvst import sweep, towards, visiting
+from mistyle.stages.sweep_settings import SweepSettings
 
 SETTINGS = SweepSettings()
 
@@ -34,7 +36,8 @@ class Noise:
 
 def disagreement(views: list[View]) -> float:
     """Mean difference between a view and its neighbour carried into it."""
-    from mistyle.stages.warp import WarpSettings, lift, warp
+    from mistyle.stages.sweep_settings import WarpSettings
+    from mistyle.stages.warp import lift, warp
 
     plain = WarpSettings(erosion=0, fill=0)
     errors = []

@@ -11,7 +11,8 @@ from mistyle.backends.diffusion_settings import LIGHTING, ModelSettings, Paint3d
 from mistyle.core.errors import EnvironmentMissing
 from mistyle.core.maps import Texels, flat_maps
 from mistyle.core.mesh import Mesh
-from mistyle.stages.inpaint import RepairSettings, repair
+from mistyle.stages.inpaint import repair
+from mistyle.stages.repair_settings import RepairSettings
 from mistyle.stages.texels import rasterise
 
 torch.set_num_threads(1)

@@ -7,9 +7,10 @@ import pytest
 import trimesh
 
 from mistyle.core import rigs
-from mistyle.core.camera import RigSettings, orbit
+from mistyle.core.camera import orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh
+from mistyle.core.rig_settings import RigSettings
 from mistyle.render.draw import tracer
 from mistyle.render.visible import face_on
 from mistyle.run.settings import resolve

@@ -12,11 +12,12 @@ from scipy.spatial import KDTree
 from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, spread_on, strokes  # noqa: F401
 
 from mistyle.core.asset import Asset, Material, Picture, Source
-from mistyle.core.camera import RigSettings, resized, rig
+from mistyle.core.camera import resized, rig
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import bilinear
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import face_areas
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.tangents import corner_tangents
 from mistyle.files.images import write_png
 from mistyle.render.draw import gbuffer, tracer

@@ -28,7 +28,7 @@ from mistyle.stages import fit_lit
 from mistyle.stages.fit import Fit, two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
 from mistyle.stages.fit_settings import FitSettings
-from mistyle.stages.inpaint import RepairSettings
+from mistyle.stages.repair_settings import RepairSettings
 from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, SLOPE = 48, 56, 0.2

@@ -10,7 +10,8 @@ from mistyle.core.image import dilate, distance_to
 from mistyle.core.view import View
 from mistyle.stages import warp as warp_module
 from mistyle.stages.lift import depth_tolerance, discontinuities
-from mistyle.stages.warp import WarpSettings, angle, composite, lift, splat, warp
+from mistyle.stages.sweep_settings import WarpSettings
+from mistyle.stages.warp import angle, composite, lift, splat, warp
 
 BALL = (0.0, 0.0, 0.0, 0.9)
 BARE = WarpSettings(fill=0, erosion=0, facing=0.0, sharpness=0.0, look_up=False)  # the scatter alone

@@ -7,43 +7,14 @@ Conversions to OpenGL (x right, y up, z backward) and to Mitsuba (x left, y up, 
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
-from pydantic import BaseModel, ConfigDict, Field
+
+from mistyle.core.rig_settings import RigSettings
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
-
-
-class RigSettings(BaseModel):
-    """Where the views are taken from (paper 4.1.1)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    kind: Literal["paper", "turntable", "nbv", "file"] = Field(
-        default="paper", description="'nbv': as few views as the mesh needs (next best view)"
-    )
-    file: Path | None = Field(
-        default=None, description="for kind 'file': a camera.json or transforms.json in working units"
-    )
-    views: int = Field(default=16, ge=1, le=256, description="number of turntable views; the paper's rig always has 16")
-    distance: float = Field(default=4.0, gt=1.0, description="camera distance; the mesh has bounding-sphere radius 1")
-    fov: float = Field(default=30.0, gt=1.0, lt=120.0, description="vertical and horizontal field of view, degrees")
-    resolution: int = Field(default=1024, ge=16, le=8192, description="pixels along each side")
-    most_views: int = Field(default=32, ge=1, le=256, description="for kind 'nbv': the most views")
-    facing: float = Field(
-        default=0.4,
-        gt=0.0,
-        lt=1.0,
-        description="for kind 'nbv': the face-on weight (cosine) with which some view must see every place",
-    )
-    overlap: float = Field(
-        default=0.4, ge=0.0, lt=1.0, description="for kind 'nbv': the share that neighbouring views have in common"
-    )
-    candidates: int = Field(default=500, ge=4, le=4096, description="for kind 'nbv': cameras to choose from")
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.camera import Camera, RigSettings, orbit
+from mistyle.core.camera import Camera, orbit
+from mistyle.core.rig_settings import RigSettings
 
 GOLDEN_ANGLE = 180 * (3 - 5**0.5)
 STARTS = 8  # first views that are tried, the most seeing ones

@@ -6,8 +6,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.run.settings import ReadSettings, ReportSettings
+from mistyle.stages.atlas_settings import AtlasSettings
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.texels import AtlasSettings
 
 LEAST_OVERLAP = 0.8  # of the mesh's outline with alpha or masks
 

@@ -16,16 +16,16 @@ from typing import Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, Paint3dSettings, TrainSettings
-from mistyle.core.camera import RigSettings
 from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.rig_settings import RigSettings
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
-from mistyle.stages.backproject import BakeSettings
+from mistyle.stages.atlas_settings import AtlasSettings
+from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.finish_settings import FinishSettings
-from mistyle.stages.fit import FitSettings
-from mistyle.stages.inpaint import RepairSettings
-from mistyle.stages.mvst import SweepSettings
-from mistyle.stages.texels import AtlasSettings
+from mistyle.stages.fit_settings import FitSettings
+from mistyle.stages.repair_settings import RepairSettings
+from mistyle.stages.sweep_settings import SweepSettings
 from mistyle.surface.settings import CoatSettings, SurfaceSettings
 
 READ_SAMPLES = 8  # per pixel of a view that a stylizer reads

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.camera import RigSettings, rig
+from mistyle.core.camera import rig
+from mistyle.core.rig_settings import RigSettings
 from mistyle.files.output import claim, replace_files
 from mistyle.run.preview import ATLAS, lit_views, painted_maps, reduced, rows_of
 from mistyle.run.progress import Progress

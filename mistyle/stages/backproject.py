@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core import memory
 from mistyle.core.camera import Camera
@@ -13,6 +12,7 @@ from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.normals import area_vectors
 from mistyle.core.view import View
+from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.gaps import fill_in_place
 from mistyle.stages.texels import pad_in_place, threaded
 
@@ -20,19 +20,6 @@ DEPTH_NOISE = 0.0005  # what depth maps may be off by: float32 through a file an
 STEEP = 4.0  # depth per width of a surface seen at 76 degrees
 BAND = 64  # rows of a view handled at a time
 ROWS = 2**16  # texels handled at a time; their intermediate arrays then stay in the cache
-
-
-class BakeSettings(BaseModel):
-    """When a view may paint a texel (paper 4.1.4)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    depth_tolerance: float = Field(
-        default=0.05, gt=0, le=1, description="largest difference between a texel's and the view's depth"
-    )
-    window: int = Field(
-        default=5, ge=1, le=31, description="pixels across in which a silhouette pixel looks for its pure colour"
-    )
 
 
 @dataclass(frozen=True)

@@ -41,8 +41,6 @@ from mistyle.stages import fit_judge, fit_table
 from mistyle.stages.fit_run import Loss, Phase, Run, Shot, World
 from mistyle.stages.fit_settings import FitSettings
 
-__all__ = ["Fit", "FitSettings", "two_phase"]
-
 DARK = 0.01  # radiance of the clay below which a ratio means nothing
 
 

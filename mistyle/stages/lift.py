@@ -4,51 +4,15 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core.camera import Camera
 from mistyle.core.image import dilate
 from mistyle.core.view import View
+from mistyle.stages.sweep_settings import WarpSettings
 
 STEEP = 4.0  # depth per width of a surface seen at 76 degrees
 NEAR_EDGE = 3  # pixels about a depth step of the source in which a rim counts as one of occlusion
 PURE = 0.995  # coverage from which a pixel shows one surface only
-
-
-class WarpSettings(BaseModel):
-    """How earlier views are carried into a later one (paper 4.1.3)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    fill: int = Field(default=3, ge=0, le=16, description="holes this many pixels from a painted pixel are filled")
-    erosion: int | None = Field(
-        default=None,
-        ge=0,
-        le=200,
-        description="pixels (at 1024 across) cut off beside occlusion shadows, where outlines may have moved; "
-        "left out: 20, or 2 for a stylizer that keeps outlines",
-    )
-    depth_tolerance: float = Field(
-        default=0.05, gt=0, le=1, description="largest difference in depth that still is the same surface"
-    )
-    facing: float = Field(
-        default=0.2,
-        ge=0,
-        lt=1,
-        description="cosine below which a source sees a surface too flatly to say anything about it",
-    )
-    sharpness: float = Field(
-        default=0.5,
-        ge=0,
-        le=1,
-        description="least cosine at which a source must have seen a surface, in shares of that of the view it is "
-        "carried to: what would only be stretched is painted anew",
-    )
-    look_up: bool = Field(
-        default=True,
-        description="take colours bilinearly from where the view's own surface lies in the source, instead of those of "
-        "the points that landed",
-    )
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,9 @@ import zipfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
-from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core.camera import Camera, angular_order
 from mistyle.core.image import (
@@ -25,43 +23,15 @@ from mistyle.core.image import (
 )
 from mistyle.core.view import Prior, View
 from mistyle.files.store import atomic_write, digest
-from mistyle.stages.lift import PURE, Lifted, WarpSettings, lift
+from mistyle.stages.lift import PURE, Lifted, lift
 from mistyle.stages.outline import follow
+from mistyle.stages.sweep_settings import SweepSettings
 from mistyle.stages.warp import composite
 
 Stylizer = Callable[[View, Prior | None, np.random.Generator], np.ndarray]
 Masker = Callable[[View], np.ndarray]
 STILL_EROSION = 2  # pixels (at 1024 across), for a stylizer that keeps outlines
 FEATHER = 8.0  # pixels from the prior over which the histogram match sets in
-
-
-class SweepSettings(BaseModel):
-    """How views are painted one after another (paper 4.1.3)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    order: Literal["angular", "paper", "given"] = Field(
-        default="angular",
-        description="angular: nearest to the views done; paper: ascending |azimuth| + |elevation|; given: the rig's",
-    )
-    histogram: float = Field(
-        default=0.0,
-        ge=0.0,
-        le=1.0,
-        description="how far the colours of later views are moved to the first one's distribution; the paper's is 1",
-    )
-    segmenter: Path | None = Field(
-        default=None,
-        description="ONNX file that finds the foreground of a stylized view, or birefnet, which `mistyle models` "
-        "lists; left out: the rendered mask",
-    )
-    follow_outline: bool | None = Field(
-        default=None,
-        description="move a view's depth to the outline that a segmenter finds in it before it is carried elsewhere; "
-        "left out: for stylizers that may move outlines",
-    )
-    mask_erosion: int = Field(default=1, ge=0, le=64, description="pixels by which the rendered coverage is cut back")
-    warp: WarpSettings = WarpSettings()
 
 
 @dataclass(frozen=True)

@@ -6,9 +6,10 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.camera import Camera, RigSettings
+from mistyle.core.camera import Camera
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
+from mistyle.core.rig_settings import RigSettings
 from mistyle.core.rigs import candidate_cameras, choose
 
 SAMPLES = 20_000

@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core import memory
 from mistyle.core.asset import Material
@@ -27,15 +26,6 @@ from mistyle.core.uvs import islands
 
 ROWS = 2**17  # texels handled at a time; the intermediate arrays then stay in the cache
 BAND_TEXELS = 2**20  # and where only the temporaries of large atlases count
-
-
-class AtlasSettings(BaseModel):
-    """The texture sets that are painted (paper 4.1.4 uses 4096)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    size: int = Field(default=2048, ge=16, le=16384, description="texels along each side of every texture set")
-    padding: int = Field(default=16, ge=0, le=1024, description="texels by which islands are continued outwards")
 
 
 def bands(height: int, width: int, count: int = BAND_TEXELS) -> Iterator[slice]:

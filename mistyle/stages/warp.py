@@ -25,10 +25,11 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.camera import Camera
 from mistyle.core.image import bilinear, dilate, erode
 from mistyle.core.view import Prior, View
-from mistyle.stages.lift import Lifted, WarpSettings, cosines, depth_tolerance, lift, transformed
+from mistyle.stages.lift import Lifted, cosines, depth_tolerance, lift, transformed
+from mistyle.stages.sweep_settings import WarpSettings
 from mistyle.stages.texels import threaded
 
-__all__ = ["Lifted", "WarpSettings", "angle", "composite", "lift", "splat", "warp"]
+__all__ = ["Lifted", "angle", "composite", "lift", "splat", "warp"]
 
 EROSION = 20  # the paper's, where `erosion` is not set
 EROSION_AT = 1024  # the width of view for which `erosion` is meant

@@ -1,0 +1,16 @@
+"""What a user may choose about painting texels from views."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class BakeSettings(BaseModel):
+    """When a view may paint a texel (paper 4.1.4)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    depth_tolerance: float = Field(
+        default=0.05, gt=0, le=1, description="largest difference between a texel's and the view's depth"
+    )
+    window: int = Field(
+        default=5, ge=1, le=31, description="pixels across in which a silhouette pixel looks for its pure colour"
+    )

@@ -1,0 +1,42 @@
+"""What a user may choose about the repair."""
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class RepairSettings(BaseModel):
+    """Which texels are painted again and how they are joined (paper 4.3)."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    deviations: float = Field(
+        default=0.5,
+        ge=0,
+        le=10,
+        description="a texel struggles above mean + this many standard deviations (the paper's 0.5)",
+    )
+    outlier: float = Field(
+        default=4.0,
+        ge=0,
+        le=100,
+        description="and above this many times the median: of views that agree, mean and deviation alone mark a third; "
+        "0: no such limit (the paper)",
+    )
+    agreement: float = Field(
+        default=0.7,
+        ge=0,
+        le=1,
+        description="and only where the views contradict one another: |sum| of the gradients at most this share of "
+        "the sum of |gradients|; 1: wherever the gradients are large (the paper)",
+    )
+    dilation: float = Field(
+        default=0.004, ge=0, le=0.1, description="radius of the mask's max-pooling as a share of the atlas's side"
+    )
+    smooth: float = Field(
+        default=0.004,
+        ge=0,
+        le=0.1,
+        description="share of the atlas's side over which gradients are averaged: a lone texel does not struggle",
+    )
+    blend: float = Field(
+        default=0.003, ge=0, le=0.1, description="half the width of the blended boundary as a share of the atlas's side"
+    )
