@@ -15,7 +15,7 @@ from mistyle.core.maps import Maps, Texels, flat_maps
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.files.records import load_record, save_record
-from mistyle.run.settings import Settings, resolve
+from mistyle.run.stylize_settings import Settings, resolve
 from mistyle.surface import style as styles
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))

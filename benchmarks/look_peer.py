@@ -55,7 +55,7 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     from mistyle.files.read_mesh import read_mesh
     from mistyle.files.views import write_views
     from mistyle.render.draw import draw_views as drawn
-    from mistyle.run.settings import resolve
+    from mistyle.run.stylize_settings import resolve
     from mistyle.stages.lift import lift
     from mistyle.stages.sweep_settings import WarpSettings
     from mistyle.surface.chosen import settled

@@ -41,7 +41,7 @@ from mistyle.files.read_mesh import read_mesh
 from mistyle.measure.material_metrics import map_errors
 from mistyle.render.draw import tracer
 from mistyle.render.shade import Shade, pack
-from mistyle.run.budget import material_gb
+from mistyle.run.material_budget import material_gb
 from mistyle.run.material_settings import MaterialSettings
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import blocks

@@ -23,7 +23,7 @@ from mistyle.core.view import View
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
 from mistyle.run import painting, start
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages import fit
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"

@@ -21,7 +21,7 @@ from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
 from mistyle.render.unlit import unlit
 from mistyle.run import painting, start
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 STRIPS: dict[str, tuple[dict[str, Any], ...]] = {

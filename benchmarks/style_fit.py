@@ -36,7 +36,7 @@ from mistyle.core.camera import rig
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.run.settings import Settings, resolve
+from mistyle.run.stylize_settings import Settings, resolve
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 VGG = DATA / "weights" / "vgg19_normalised_relu3_1.pth"

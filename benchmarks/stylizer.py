@@ -32,7 +32,7 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     from mistyle.files.read import read_picture
     from mistyle.files.records import load_record
     from mistyle.run import painting, start
-    from mistyle.run.settings import resolve
+    from mistyle.run.stylize_settings import resolve
 
     settings = resolve(
         None, None, {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}

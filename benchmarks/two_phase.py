@@ -35,7 +35,7 @@ from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
 from mistyle.measure.material_metrics import map_errors
 from mistyle.run import start
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages.fit import two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
 from mistyle.stages.recover import recover

@@ -25,7 +25,7 @@ from mistyle.core.view import View
 from mistyle.measure.material_metrics import texel_areas
 from mistyle.run import painting
 from mistyle.run.made import Atlas
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages.backproject import backproject, fill
 from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.coat import lay_relief

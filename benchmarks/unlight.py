@@ -21,7 +21,7 @@ from mistyle.core.view import View
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
 from mistyle.run import painting, start, sweep
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages.mvst import Painted
 
 ROOT = Path(__file__).parents[1]

@@ -33,8 +33,8 @@ def stylize(
     from mistyle.core.names import asset_name
     from mistyle.run.pipeline import stylize as run
     from mistyle.run.progress import Progress
-    from mistyle.run.settings import resolve
-    from mistyle.run.stages import Job
+    from mistyle.run.stylize_job import Job
+    from mistyle.run.stylize_settings import resolve
 
     mesh, style = Path(mesh), Path(style)
     job = Job(mesh, style, Path(out), resolve(preset, None, settings), asset_name(name, mesh.stem, style.stem))
@@ -62,7 +62,8 @@ def fit(
     from pathlib import Path
 
     from mistyle.core.names import asset_name
-    from mistyle.run.material import MaterialJob, fit_material
+    from mistyle.run.material import fit_material
+    from mistyle.run.material_job import MaterialJob
     from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
     from mistyle.run.progress import Progress
     from mistyle.run.settings import resolve

@@ -256,8 +256,8 @@ def scene_fitted(made: Stages) -> None:
 
 def main(out: Path, threads: int, budget: float) -> None:
     from mistyle.core import memory
-    from mistyle.run.settings import resolve
     from mistyle.run.start import start_engines
+    from mistyle.run.stylize_settings import resolve
 
     settings = resolve("draft", None, SETTINGS | {"threads": threads}, {})
     start_engines(settings)

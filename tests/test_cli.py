@@ -34,7 +34,8 @@ def test_every_verb_explains_itself(verb, capsys):
 
 def test_options_name_existing_settings():
     from mistyle.run.cli import OPTIONS
-    from mistyle.run.settings import Settings, known_keys
+    from mistyle.run.settings import known_keys
+    from mistyle.run.stylize_settings import Settings
 
     assert set(OPTIONS.values()) <= set(known_keys(Settings))
 

@@ -10,7 +10,7 @@ from test_metrics import noise, plane_view
 
 from benchmarks import consistency_judge, consistency_peer, consistency_scene
 from mistyle.core.asset import Picture
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 from mistyle.surface import style as styles
 
 # Instead of EbSynth: checks its arguments as EbSynth would, and answers with the target's colour guide.

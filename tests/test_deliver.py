@@ -17,14 +17,14 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.files import output
 from mistyle.files.packing import TARGETS
 from mistyle.run.batch_jobs import Record
-from mistyle.run.batch_plan import Plan
+from mistyle.run.batch_plan import Plan, with_delivery
 from mistyle.run.cli import main, parser
-from mistyle.run.deliver import deliver, export, with_delivery
+from mistyle.run.deliver import deliver, export
 from mistyle.run.deliver_settings import FORMATS
 from mistyle.run.finished import read_finished
 from mistyle.run.options import DELIVERY_OPTIONS, asset_name, said_settings
 from mistyle.run.progress import Progress
-from mistyle.run.settings import Settings, resolve
+from mistyle.run.stylize_settings import Settings, resolve
 from mistyle.stages.export import write_asset
 
 OCCLUSION = np.linspace(0.2, 1, 256, dtype=np.float32).reshape(16, 16)

@@ -20,8 +20,9 @@ from mistyle.core.maps import flat_maps
 from mistyle.run.generative import inpainter_inputs
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Progress
-from mistyle.run.settings import resolve
-from mistyle.run.stages import Job, Run
+from mistyle.run.stages import Run
+from mistyle.run.stylize_job import STAGES, Job
+from mistyle.run.stylize_settings import resolve
 from mistyle.stages.fit import Fit
 from mistyle.stages.texels import rasterise
 
@@ -123,7 +124,7 @@ def test_nothing_is_left_on_the_device_when_a_stage_asks_what_is_free(tmp_path, 
     def report(done: float) -> None:
         held.append(standin.bytes_alive())
 
-    with standin.device(monkeypatch) as found, Run(job, Progress(quiet=True)) as run:
+    with standin.device(monkeypatch) as found, Run(job, Progress(quiet=True), STAGES) as run:
         run.keys["surface"] = "k"
         swept(run, asset, style, atlas, [views_of.view()], report)
         assert len(found) == 2 and max(held) > 0 == standin.bytes_alive(), "stylizer and training asked"

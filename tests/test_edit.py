@@ -19,8 +19,8 @@ from mistyle.files.records import load_record
 from mistyle.run import pipeline
 from mistyle.run.progress import Progress
 from mistyle.run.retouch import EXACT, LOSSY, differs
-from mistyle.run.settings import resolve
-from mistyle.run.stages import STAGES, Job
+from mistyle.run.stylize_job import STAGES, Job
+from mistyle.run.stylize_settings import resolve
 
 TINY = {
     "rig": {"kind": "turntable", "views": 6, "resolution": 96},

@@ -19,8 +19,8 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
 from mistyle.run import pipeline
 from mistyle.run.progress import Progress
-from mistyle.run.settings import resolve
-from mistyle.run.stages import Job
+from mistyle.run.stylize_job import Job
+from mistyle.run.stylize_settings import resolve
 from mistyle.stages.mvst import sweep
 from mistyle.stages.sweep_settings import SweepSettings
 from mistyle.surface import view_samples

@@ -21,8 +21,8 @@ from mistyle.run import pipeline
 from mistyle.run.cli import main
 from mistyle.run.finishing import check_finish
 from mistyle.run.progress import Progress
-from mistyle.run.settings import resolve
-from mistyle.run.stages import Job
+from mistyle.run.stylize_job import Job
+from mistyle.run.stylize_settings import resolve
 from mistyle.stages import finish_style
 from mistyle.stages.finish import Film, Finishing, Painted, finish, own_directions, shape_edges
 from mistyle.stages.finish_settings import FinishSettings

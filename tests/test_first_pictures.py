@@ -14,7 +14,7 @@ from mistyle.run.cli import main
 from mistyle.run.finished import read_finished
 from mistyle.run.progress import Progress
 from mistyle.run.report_pictures import Encoder
-from mistyle.run.settings import resolve
+from mistyle.run.stylize_settings import resolve
 
 
 class Heard(Progress):

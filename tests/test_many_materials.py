@@ -20,10 +20,10 @@ from mistyle.core.rig_settings import RigSettings
 from mistyle.files.read_mesh import read_extent, read_mesh
 from mistyle.render import device, draw, lookdev, pages
 from mistyle.render import scene as scenery
-from mistyle.run import budget, verbs
+from mistyle.run import budget, stylize_budget, verbs
 from mistyle.run.cli import main
 from mistyle.run.progress import Progress
-from mistyle.run.settings import resolve
+from mistyle.run.stylize_settings import resolve
 
 STYLE = str(scenes() / "demo_style.png")
 SMALL = {"rig": {"kind": "turntable", "views": 2, "resolution": 32}, "draw": {"spp": 1}, "atlas": {"size": 32}}
@@ -157,7 +157,7 @@ def test_a_budget_changes_no_picture_and_no_texture(tmp_path, monkeypatch):
     free = made(tmp_path / "free")
     assert tight == [False] * 4
     # As if every array in memory were far too much for this machine, and arrays in files were not.
-    tiled = (*budget.RENDER_TILED.values(), *budget.BAKE_TILED.values())
+    tiled = (*stylize_budget.RENDER_TILED.values(), *stylize_budget.BAKE_TILED.values())
     monkeypatch.setattr(budget, "peaks", lambda needs, count: {k: 0.1 if n in tiled else 1e6 for k, n in needs.items()})
     assert made(tmp_path / "kept") == free and len(free) > 10
     assert tight[4:] == [True] * 4
@@ -214,18 +214,18 @@ def test_a_job_too_large_for_its_budget_is_refused_before_it_begins(tmp_path, ve
 
 def test_the_machines_memory_bounds_a_job_that_was_given_none(monkeypatch):
     asked = resolve("draft", None, {"atlas": {"size": 4096}}, {})
-    whole = max(budget.peaks(budget.PLAIN, budget.counts(asked)).values())
+    whole = max(budget.peaks(stylize_budget.PLAIN, stylize_budget.counts(asked)).values())
     monkeypatch.setattr(memory, "limit", lambda: None)
-    assert not budget.tiles(asked) and budget.memory_gb(asked) == pytest.approx(whole, abs=0.01)
+    assert not stylize_budget.tiles(asked) and stylize_budget.memory_gb(asked) == pytest.approx(whole, abs=0.01)
     monkeypatch.setattr(memory, "limit", lambda: int(1.01 * whole / budget.SHARE * 1e9))
-    assert not budget.tiles(asked)
+    assert not stylize_budget.tiles(asked)
     monkeypatch.setattr(memory, "limit", lambda: int(0.8 * whole / budget.SHARE * 1e9))
-    assert budget.tiles(asked) and budget.memory_gb(asked) <= 0.8 * whole + 0.01
+    assert stylize_budget.tiles(asked) and stylize_budget.memory_gb(asked) <= 0.8 * whole + 0.01
     # A budget in words of one's own counts more than the machine.
-    assert not budget.tiles(asked.model_copy(update={"memory": whole + 1}))
+    assert not stylize_budget.tiles(asked.model_copy(update={"memory": whole + 1}))
     monkeypatch.setattr(memory, "limit", lambda: int(1e9))
     with pytest.raises(UsageError) as caught:
-        budget.tiles(asked)
+        stylize_budget.tiles(asked)
     text = str(caught.value)
     assert "there are 1.0 GB of memory here, 0.9 GB of them for a job: the job needs" in text
     assert "give it --memory" in text and "--set atlas.size=2048" in text

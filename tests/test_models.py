@@ -361,7 +361,7 @@ def test_pictures_reach_clip_whole(rng):
 def test_single_files_are_found_by_their_models_names(tmp_path, monkeypatch, capsys):
     from mistyle.measure.features import load_features
     from mistyle.run.generative import fit_settings, named
-    from mistyle.run.settings import resolve
+    from mistyle.run.stylize_settings import resolve
 
     folder = tiny_models.folder()
     for name, file in (("vgg19", "vgg19-dcbb9e9d.pth"), ("birefnet", "BiRefNet-general-epoch_244.onnx")):
@@ -393,7 +393,7 @@ def test_single_files_are_found_by_their_models_names(tmp_path, monkeypatch, cap
 
 def test_the_paper_preset_names_what_it_lacks_and_what_needs_nothing(tmp_path, monkeypatch):
     from mistyle.run.generative import check
-    from mistyle.run.settings import resolve
+    from mistyle.run.stylize_settings import resolve
 
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(EnvironmentMissing, match=r"vgg19.* --preset fine"):

@@ -36,13 +36,14 @@ def test_notes_of_the_mesh_are_printed_at_the_end_and_in_json(verb_inputs, tmp_p
 
 
 def test_a_note_made_in_a_stage_is_said_again_where_the_stage_is_taken_over(tmp_path):
-    from mistyle.run.settings import resolve
-    from mistyle.run.stages import Job, Run
+    from mistyle.run.stages import Run
+    from mistyle.run.stylize_job import STAGES, Job
+    from mistyle.run.stylize_settings import resolve
 
     job = Job(tmp_path / "m.obj", tmp_path / "s.png", tmp_path / "out", resolve("draft", None, {}, {}), "x")
     for _ in range(2):
         progress = Progress(quiet=True)
-        with Run(job, progress) as run:
+        with Run(job, progress, STAGES) as run:
             run.stage("views", [], [], lambda folder, report, say=progress.note: say("a part was left out"))
         assert progress.notes == ["a part was left out"]
     assert progress.reused == ["views"]

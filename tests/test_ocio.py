@@ -205,13 +205,16 @@ def test_references_and_their_environment_maps_come_in_too(rng):
 
 
 def test_the_environment_names_the_config(monkeypatch):
-    from mistyle.run.settings import ReadSettings, resolve
+    from mistyle.run.job_settings import ReadSettings
+    from mistyle.run.settings import resolve as settings_of
+    from mistyle.run.stylize_settings import resolve
 
     assert resolve("draft", None, {}, {"OCIO": CONFIG}).colour.config == CONFIG
     assert resolve("draft", None, {}, {}).colour.config is None
     # Kinds of job without colour spaces of their own are left alone.
     assert (
-        resolve("standard", None, {}, {"OCIO": CONFIG}, root=ReadSettings, presets={"standard": {}}) == ReadSettings()
+        settings_of("standard", None, {}, {"OCIO": CONFIG}, root=ReadSettings, presets={"standard": {}})
+        == ReadSettings()
     )
     # Unnamed spaces leave the result as it is: the config is no part of its key then.
     assert key_of(ColourSettings(config=CONFIG)) == key_of(ColourSettings())

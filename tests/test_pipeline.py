@@ -15,8 +15,8 @@ import mistyle
 from mistyle.core.errors import InputRefused, Stopped, UsageError
 from mistyle.run import painting, pipeline
 from mistyle.run.progress import Progress
-from mistyle.run.settings import resolve
-from mistyle.run.stages import FIRST, REFINING, STAGES, Job
+from mistyle.run.stylize_job import FIRST, REFINING, STAGES, Job
+from mistyle.run.stylize_settings import resolve
 
 TINY = {
     "rig": {"resolution": 128},

@@ -7,12 +7,14 @@ import pytest
 
 from mistyle.core import memory
 from mistyle.core.errors import UsageError
-from mistyle.run import budget
+from mistyle.run import budget, material_budget, stylize_budget
 from mistyle.run.cli import main
+from mistyle.run.material_job import MATERIAL_STAGES
 from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
 from mistyle.run.options import gigabytes
-from mistyle.run.settings import Settings, resolve
-from mistyle.run.stages import FINISH, MATERIAL_STAGES, STAGES
+from mistyle.run.settings import resolve as settings_of
+from mistyle.run.stylize_job import FINISH, STAGES
+from mistyle.run.stylize_settings import Settings, resolve
 
 
 def job(**more) -> Settings:
@@ -33,13 +35,13 @@ def test_what_is_no_amount_of_memory(text):
 
 
 def test_every_stage_has_its_needs():
-    assert set(budget.PLAIN) == set(budget.TILED) == {*STAGES, *FINISH}
-    assert set(budget.MATERIAL) <= set(MATERIAL_STAGES)
+    assert set(stylize_budget.PLAIN) == set(stylize_budget.TILED) == {*STAGES, *FINISH}
+    assert set(material_budget.MATERIAL) <= set(MATERIAL_STAGES)
 
 
 def test_more_of_anything_needs_no_less():
     fitted = {"refine": "all"}
-    least = budget.memory_gb(job(fit=fitted))
+    least = stylize_budget.memory_gb(job(fit=fitted))
     more = [
         {"atlas": {"size": 4096}},
         {"rig": {"resolution": 2048}},
@@ -48,71 +50,71 @@ def test_more_of_anything_needs_no_less():
         {"report": {"frames": 240, "resolution": 2048}},
     ]
     for change in more:
-        assert budget.memory_gb(job(**{"fit": fitted} | change)) > least, change
+        assert stylize_budget.memory_gb(job(**{"fit": fitted} | change)) > least, change
     # Files take the place of memory: what has to be there all the same is less.
-    counts = budget.counts(job(atlas={"size": 8192}))
-    plain, tiled = (budget.peaks(needs, counts) for needs in (budget.PLAIN, budget.TILED))
+    counts = stylize_budget.counts(job(atlas={"size": 8192}))
+    plain, tiled = (budget.peaks(needs, counts) for needs in (stylize_budget.PLAIN, stylize_budget.TILED))
     assert max(tiled.values()) < 0.6 * max(plain.values())
 
 
 def test_a_budget_that_is_large_enough_changes_nothing_and_a_small_one_tiles():
     large = {"atlas": {"size": 4096}}
-    whole = budget.memory_gb(job(**large))
-    assert not budget.tiles(job(**large)) and not budget.tiles(job(**large, memory=whole + 0.1))
-    assert budget.tiles(job(**large, memory=whole - 0.5))
-    assert budget.memory_gb(job(**large, memory=whole - 0.5)) <= whole - 0.5
+    whole = stylize_budget.memory_gb(job(**large))
+    assert not stylize_budget.tiles(job(**large)) and not stylize_budget.tiles(job(**large, memory=whole + 0.1))
+    assert stylize_budget.tiles(job(**large, memory=whole - 0.5))
+    assert stylize_budget.memory_gb(job(**large, memory=whole - 0.5)) <= whole - 0.5
     # Two texture sets are twice the texels.
-    assert budget.tiles(job(**large, memory=whole + 0.1), sets=2)
+    assert stylize_budget.tiles(job(**large, memory=whole + 0.1), sets=2)
 
 
 def test_the_refusal_names_what_would_work():
     asked = job(atlas={"size": 8192}, memory=1.0)
     with pytest.raises(UsageError) as caught:
-        budget.tiles(asked)
+        stylize_budget.tiles(asked)
     text = str(caught.value)
     smallest = float(text.split("give it --memory ")[1].split("G")[0])
-    assert budget.tiles(job(atlas={"size": 8192}, memory=smallest))
+    assert stylize_budget.tiles(job(atlas={"size": 8192}, memory=smallest))
     with pytest.raises(UsageError):
-        budget.tiles(job(atlas={"size": 8192}, memory=smallest - 0.2))
+        stylize_budget.tiles(job(atlas={"size": 8192}, memory=smallest - 0.2))
     assert "--set atlas.size=4096" in text
     need = float(text.rsplit("which needs ", 1)[1].split()[0])
-    assert budget.tiles(job(atlas={"size": 4096}, memory=need))
+    assert stylize_budget.tiles(job(atlas={"size": 4096}, memory=need))
 
 
 def test_a_fit_to_pictures_keeps_less_of_their_samples_or_is_refused():
-    settings = resolve("draft", None, {}, {}, MaterialSettings, MATERIAL_PRESETS)
+    settings = settings_of("draft", None, {}, {}, root=MaterialSettings, presets=MATERIAL_PRESETS)
     pixels = [1024**2] * 48
-    assert budget.check_material(settings, pixels) is settings
-    free = budget.material_gb(settings, pixels)
-    kept = budget.check_material(settings.model_copy(update={"memory": free - 1}), pixels)
+    assert material_budget.check_material(settings, pixels) is settings
+    free = material_budget.material_gb(settings, pixels)
+    kept = material_budget.check_material(settings.model_copy(update={"memory": free - 1}), pixels)
     assert 0 < kept.recover.memory < settings.recover.memory
-    assert budget.material_gb(kept, pixels) <= free - 0.9
+    assert material_budget.material_gb(kept, pixels) <= free - 0.9
     with pytest.raises(UsageError, match=r"--memory 0\.5G: the fit needs .* even if it keeps nothing"):
-        budget.check_material(settings.model_copy(update={"memory": 0.5}), pixels)
+        material_budget.check_material(settings.model_copy(update={"memory": 0.5}), pixels)
 
 
 def test_a_large_mesh_is_refused_by_a_budget_in_words_only(monkeypatch):
     """What reading and unwrapping take is not known well enough to refuse a job that nobody bounded."""
     monkeypatch.setattr(memory, "limit", lambda: int(8e9))
-    assert not budget.tiles(job(), faces=5_000_000)
+    assert not stylize_budget.tiles(job(), faces=5_000_000)
     with pytest.raises(UsageError, match="in its stage 'mesh'"):
-        budget.tiles(job(memory=8.0), faces=5_000_000)
+        stylize_budget.tiles(job(memory=8.0), faces=5_000_000)
 
 
 def test_the_machines_memory_cuts_nothing_of_a_fit(monkeypatch):
     """A fit that keeps fewer samples may leave out steps: only who gives a budget may ask for that."""
-    settings = resolve("draft", None, {}, {}, MaterialSettings, MATERIAL_PRESETS)
+    settings = settings_of("draft", None, {}, {}, root=MaterialSettings, presets=MATERIAL_PRESETS)
     pixels = [1024**2] * 48
-    whole = budget.material_gb(settings, pixels)
+    whole = material_budget.material_gb(settings, pixels)
     monkeypatch.setattr(memory, "limit", lambda: int((whole + 0.1) / budget.SHARE * 1e9))
-    assert budget.check_material(settings, pixels) is settings
+    assert material_budget.check_material(settings, pixels) is settings
     monkeypatch.setattr(memory, "limit", lambda: int((whole - 1) / budget.SHARE * 1e9))
     with pytest.raises(UsageError, match=r"the fit needs .* GB; give it --memory .* fewer of the pictures' samples"):
-        budget.check_material(settings, pixels)
-    assert budget.check_material(settings.model_copy(update={"memory": whole - 1}), pixels).recover.memory < 4
+        material_budget.check_material(settings, pixels)
+    assert material_budget.check_material(settings.model_copy(update={"memory": whole - 1}), pixels).recover.memory < 4
     monkeypatch.setattr(memory, "limit", lambda: int(0.6e9))
     with pytest.raises(UsageError, match="even if it keeps nothing"):
-        budget.check_material(settings, pixels)
+        material_budget.check_material(settings, pixels)
 
 
 def test_the_command_line_plans_and_refuses(tmp_path, capsys):

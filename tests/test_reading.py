@@ -6,7 +6,7 @@ import pytest
 from helpers import data, fixed_surface
 
 from mistyle.core.errors import UsageError
-from mistyle.run.settings import resolve
+from mistyle.run.stylize_settings import resolve
 from mistyle.surface import edges, style, synthesis
 from mistyle.surface.chosen import FROM_PAINTING, flat, graphic, resolved, settled
 from mistyle.surface.reading import read_style

@@ -6,7 +6,9 @@ import pytest
 
 from mistyle.core.errors import UsageError
 from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
-from mistyle.run.settings import PRESETS, Settings, as_toml, assignments, known_keys, resolve
+from mistyle.run.settings import as_toml, assignments, known_keys
+from mistyle.run.settings import resolve as settings_of
+from mistyle.run.stylize_settings import PRESETS, Settings, resolve
 
 
 def test_later_layers_win(tmp_path):
@@ -44,7 +46,7 @@ def test_wrong_settings_are_refused_with_their_path(said, expected):
 @pytest.mark.parametrize("name", ["subsamples", "joint_subsamples"])
 def test_samples_a_pixel_are_square_numbers(name):
     with pytest.raises(UsageError, match=rf"recover\.{name} = 24: expected a square number: 1, 4, 9"):
-        resolve(None, None, {"recover": {name: 24}}, {}, MaterialSettings, MATERIAL_PRESETS)
+        settings_of(None, None, {"recover": {name: 24}}, {}, root=MaterialSettings, presets=MATERIAL_PRESETS)
 
 
 def test_the_guilty_layer_is_named(tmp_path):
@@ -75,7 +77,7 @@ def test_every_known_key_can_be_printed():
 
 
 def test_views_take_the_samples_that_their_use_needs():
-    from mistyle.run.settings import DrawSettings
+    from mistyle.run.stylize_settings import DrawSettings
 
     assert (DrawSettings().samples(read=False), DrawSettings().samples()) == (1, 8)
     assert (DrawSettings(spp=3).samples(read=False), DrawSettings(spp=3).samples()) == (3, 3)

@@ -23,7 +23,7 @@ from mistyle.files.images import write_png
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.render.unlit import unlit
 from mistyle.run import options, painting, preview, start, variations
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages import coat
 from mistyle.stages.texels import rasterise
 from mistyle.surface import cells, guides, linefield, lookup, samples, style, synthesis

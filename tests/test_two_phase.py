@@ -21,7 +21,7 @@ from mistyle.render.shade import Shade, pack
 from mistyle.run import pipeline
 from mistyle.run.generative import lights_of_views
 from mistyle.run.made import Atlas, Baked
-from mistyle.run.settings import Settings, resolve
+from mistyle.run.stylize_settings import Settings, resolve
 from mistyle.run.summary import MEANINGS
 from mistyle.stages import fit as stages_fit
 from mistyle.stages import fit_lit

@@ -163,8 +163,8 @@ def describe(summary: dict[str, Any]) -> str:
 
 def dry_run(plan: Plan, choices: Choices) -> dict[str, Any]:
     """What the batch would do: estimated seconds, disk and memory of every job that is not done yet."""
-    from mistyle.run.plan import plan as plan_style
-    from mistyle.run.plan import plan_material
+    from mistyle.run.material_plan import plan_material
+    from mistyle.run.stylize_plan import plan as plan_style
 
     rows = []
     for job in plan.jobs:

@@ -5,8 +5,8 @@ elsewhere says so with path maps.
 """
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -15,7 +15,7 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.files.output import write_file
 from mistyle.files.own import read_own
 from mistyle.run.batch_jobs import Record
-from mistyle.run.settings import validate
+from mistyle.run.settings import merge, validate
 
 PLAN = "plan.json"
 VERSION = 1
@@ -117,3 +117,20 @@ def indices(text: str, count: int) -> tuple[int, ...]:
     if wrong:
         raise UsageError(f"--index {text}: the plan has {count} shards, numbered from 0; there is no {wrong[0]}")
     return tuple(dict.fromkeys(found))
+
+
+def with_delivery(plan: Plan, said: Mapping[str, Any]) -> Plan:
+    """A batch's plan in which every job delivers what the command line says. UsageError where a job cannot."""
+    from mistyle.run import deliver
+    from mistyle.run.material_settings import MaterialSettings
+    from mistyle.run.stylize_settings import Settings
+
+    if not said:
+        return plan
+    jobs = []
+    for job in plan.jobs:
+        root = MaterialSettings if job.kind == "fit" else Settings
+        settings = validate(merge(job.settings, said), "command line", root)
+        deliver.check(settings)
+        jobs.append(job.model_copy(update={"settings": settings.model_dump(mode="json")}))
+    return replace(plan, jobs=tuple(jobs))

@@ -282,7 +282,8 @@ OPTIONS = {
 
 def _settings(options: argparse.Namespace, preset: str | None = None) -> Any:
     """The resolved settings of a command."""
-    from mistyle.run.settings import merge, resolve
+    from mistyle.run.settings import merge
+    from mistyle.run.stylize_settings import resolve
 
     return resolve(options.preset or preset, options.config, merge(_rig(options), said_settings(options, OPTIONS)))
 
@@ -330,7 +331,7 @@ def _print_config(options: argparse.Namespace) -> int:
 
 
 def _job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> Any:
-    from mistyle.run.stages import Job
+    from mistyle.run.stylize_job import Job
 
     settings = _settings(options, preset)
     called = name or asset_name(options, mesh.stem, style.stem)
@@ -339,8 +340,8 @@ def _job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | Non
 
 def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
     from mistyle.run.pipeline import stylize
-    from mistyle.run.plan import plan
     from mistyle.run.progress import Progress
+    from mistyle.run.stylize_plan import plan
 
     job = _job(options, mesh, style, preset, name)
     settings = job.settings
@@ -380,7 +381,7 @@ def _render(options: argparse.Namespace) -> int:
     _need(options, "mesh", "out")
     settings = _settings(options)
     if options.dry_run:
-        from mistyle.run.plan import plan_render
+        from mistyle.run.stylize_plan import plan_render
         from mistyle.run.verbs import claim_views
 
         claim_views(options.mesh, options.out, settings, options.overwrite)
@@ -402,7 +403,7 @@ def _bake(options: argparse.Namespace) -> int:
     _need(options, "mesh", "views", "out")
     settings, called = _settings(options), asset_name(options, options.mesh.stem)
     if options.dry_run:
-        from mistyle.run.plan import plan_bake
+        from mistyle.run.stylize_plan import plan_bake
         from mistyle.run.verbs import claim_baked
 
         claim_baked(options.mesh, options.views, options.out, called, options.overwrite)

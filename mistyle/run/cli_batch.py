@@ -175,7 +175,7 @@ def _batch(options: argparse.Namespace) -> int:
         only=tuple(options.only),
         watch=options.watch and sys.stderr.isatty(),
     )
-    from mistyle.run.deliver import with_delivery
+    from mistyle.run.batch_plan import with_delivery
 
     given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
     plan = with_delivery(given, said_settings(options, DELIVERY_OPTIONS))
@@ -229,8 +229,7 @@ def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
 
 def _farm(options: argparse.Namespace) -> int:
     from mistyle.run.batch import Choices, planned, say, threads_each
-    from mistyle.run.batch_plan import path_maps
-    from mistyle.run.deliver import with_delivery
+    from mistyle.run.batch_plan import path_maps, with_delivery
     from mistyle.run.farm import export
 
     choices = Choices(workers=options.workers, threads=options.threads)

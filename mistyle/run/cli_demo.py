@@ -57,7 +57,8 @@ def demo(options: argparse.Namespace, make_job: MakeJob, run_job: Callable[..., 
 
 
 def _plans(options: argparse.Namespace, jobs: list[Any]) -> int:
-    from mistyle.run.plan import describe_plan, plan
+    from mistyle.run.plan import describe_plan
+    from mistyle.run.stylize_plan import plan
 
     plans = {job.out.name: plan(job) for job in jobs}
     if options.json:

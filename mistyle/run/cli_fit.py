@@ -220,8 +220,10 @@ def _fit_scene(options: argparse.Namespace) -> int:
 
 
 def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
-    from mistyle.run.material import MaterialJob, fit_material
-    from mistyle.run.plan import describe_plan, plan_material
+    from mistyle.run.material import fit_material
+    from mistyle.run.material_job import MaterialJob
+    from mistyle.run.material_plan import plan_material
+    from mistyle.run.plan import describe_plan
     from mistyle.run.progress import Progress
 
     job = MaterialJob(

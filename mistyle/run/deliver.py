@@ -11,7 +11,6 @@ Deliveries of other names lie in the same folder untouched; the same name again 
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -137,22 +136,6 @@ def named_files(chosen: Delivery) -> list[str]:
     endings = {"glb": (".glb",), "usd": (".usda", ".usdz"), "mtlx": (".mtlx",), "obj": (".obj", ".mtl")}
     every = (".export.json", *(e for f in chosen.formats for e in endings.get(f, ())))
     return [f"{chosen.name}{ending}" for ending in every]
-
-
-def with_delivery(plan: Any, said: Mapping[str, Any]) -> Any:
-    """A batch's plan in which every job delivers what the command line says. UsageError where a job cannot."""
-    from mistyle.run.material_settings import MaterialSettings
-    from mistyle.run.settings import Settings, merge, validate
-
-    if not said:
-        return plan
-    jobs = []
-    for job in plan.jobs:
-        root = MaterialSettings if job.kind == "fit" else Settings
-        settings = validate(merge(job.settings, said), "command line", root)
-        check(settings)
-        jobs.append(job.model_copy(update={"settings": settings.model_dump(mode="json")}))
-    return replace(plan, jobs=tuple(jobs))
 
 
 def check(settings: Any) -> None:

@@ -12,8 +12,8 @@ from mistyle.core.maps import Maps
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
 from mistyle.run.report import Pair, Shot
-from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages.coat import Coats
 from mistyle.stages.finish import Finished
 

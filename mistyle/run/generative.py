@@ -11,8 +11,8 @@ from mistyle.core.errors import EnvironmentMissing, UsageError
 from mistyle.core.light import Lights, SceneLights, lights
 from mistyle.core.view import View
 from mistyle.run.progress import Report
-from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.inpaint import Inpainter
 from mistyle.stages.mvst import Stylizer

@@ -7,7 +7,7 @@ fit itself from its last checkpoint.
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -20,34 +20,18 @@ from mistyle.core.light import Lights, SceneLights
 from mistyle.core.maps import Maps, Texels
 from mistyle.files.textures import part_stems
 from mistyle.run import checkpoint
-from mistyle.run.budget import check_material, size_of, with_setting
+from mistyle.run.budget import size_of, with_setting
 from mistyle.run.edits import asset_stage, tell_edits
 from mistyle.run.inputs import input_files
+from mistyle.run.material_budget import check_material
 from mistyle.run.material_files import scene, write
+from mistyle.run.material_job import MATERIAL_STAGES, MaterialJob
 from mistyle.run.material_outlines import fix_of, tell_placed
 from mistyle.run.material_pictures import look_through, looked
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 from mistyle.run.progress import Progress, Report
-from mistyle.run.stages import MATERIAL_STAGES, Run, claim_run
+from mistyle.run.stages import Run, claim_run
 from mistyle.run.start import read, start_engines
-
-
-@dataclass(frozen=True)
-class MaterialJob:
-    """What to fit and to what. `lights` and `masks` are files beside or instead of those in the references' folder;
-    lights "unknown" are solved for."""
-
-    mesh: Path
-    references: Path
-    out: Path
-    settings: MaterialSettings
-    name: str
-    lights: Path | Literal["unknown"] | None = None
-    masks: Path | None = None
-    exposure: Path | None = None
-    pictures: Path | None = None
-    redo_from: str | None = None
-    overwrite: bool = False
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,7 @@ from typing import Any, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
-from mistyle.run.settings import ReadSettings, ReportSettings
+from mistyle.run.job_settings import ReadSettings, ReportSettings
 from mistyle.stages.atlas_settings import AtlasSettings
 from mistyle.stages.recover_settings import RecoverSettings
 

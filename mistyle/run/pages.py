@@ -19,8 +19,8 @@ from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting
 from mistyle.run.report_draw import close_up, draw, shown
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
-from mistyle.run.stages import FINISH, FIRST, RETOUCH, STAGES
 from mistyle.run.style_look import look_facts
+from mistyle.run.stylize_job import FINISH, FIRST, RETOUCH, STAGES
 from mistyle.run.summary import MEANINGS, figures
 from mistyle.run.turntable import write_turn
 from mistyle.run.versions import versions

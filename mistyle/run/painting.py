@@ -16,8 +16,8 @@ from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
-from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages.coat import Coats
 from mistyle.surface.guides import Content
 from mistyle.surface.linefield import Course

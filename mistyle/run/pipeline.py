@@ -27,10 +27,12 @@ from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
 from mistyle.run.painting import bake, check_coat, coat_files, stylized_stage, surface_stage, unlit_views
 from mistyle.run.progress import Progress, Report
-from mistyle.run.settings import Settings
-from mistyle.run.stages import REFINING, STAGES, Job, Run, claim_run
+from mistyle.run.stages import Run, claim_run
 from mistyle.run.start import draw, mesh_stage, start_engines, texels_stage
 from mistyle.run.style_look import StyleLook, style_looks
+from mistyle.run.stylize_budget import PLAIN, STYLED, TILED, counts
+from mistyle.run.stylize_job import EVERY_STAGE, REFINING, STAGES, Job
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages.light_left import light_left
 
 
@@ -75,7 +77,10 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
         from mistyle.run.sweep import refuse_what_is_not_kept
 
         refuse_what_is_not_kept(job.settings)
-    with Run(job, progress) as run, kept(job.settings, run.hidden.root) as look_again:
+    with (
+        Run(job, progress, EVERY_STAGE) as run,
+        kept(job.settings, run.hidden.root, counts, PLAIN, TILED, STYLED) as look_again,
+    ):
         start_engines(job.settings)
         made = _stages(run, files, style, look_again)
         progress.note(*made.asset.source.notes, *style.notes, *made.fit.notes, *old_report(job))

@@ -21,9 +21,11 @@ from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas
 from mistyle.run.painting import check_coat, coat, painted, raised, surface_stage
 from mistyle.run.progress import Progress, Report
-from mistyle.run.settings import Settings
-from mistyle.run.stages import PREVIEW_STAGES, Job, Run, claim_run
+from mistyle.run.stages import Run, claim_run
 from mistyle.run.start import lay_out, mesh_stage, start_engines, texels_stage
+from mistyle.run.stylize_budget import PLAIN, STYLED, TILED, counts
+from mistyle.run.stylize_job import PREVIEW_STAGES, Job
+from mistyle.run.stylize_settings import Settings
 
 SAMPLES, ATLAS = 80_000, 1024  # at most: those of the preset draft
 SIDE = 448  # pixels of a view, and of a map where there are few
@@ -46,7 +48,10 @@ def preview(job: Job, progress: Progress) -> dict[str, Any]:
     claim_run(job, PREVIEW_STAGES, inputs_of(job))
     style = read_style(job.style, s.colour)
     check_coat(s.coat)
-    with Run(job, progress, PREVIEW_STAGES) as run, kept(s, run.hidden.root) as look_again:
+    with (
+        Run(job, progress, PREVIEW_STAGES) as run,
+        kept(s, run.hidden.root, counts, PLAIN, TILED, STYLED) as look_again,
+    ):
         start_engines(s)
         asset = mesh_stage(run, files)
         look_again(*size_of(asset))

@@ -15,7 +15,7 @@ from mistyle.core.view import View
 from mistyle.run.made import Atlas, Baked, Retouched
 from mistyle.run.painting import unlit_views
 from mistyle.run.progress import Report
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 
 # Steps of 8 bits that a pixel must differ by to be new, its least coverage, the width of the outline's rim that is not
 # looked at, and how many such pixels must touch: of an exact file, and of one whose compression or size alters all

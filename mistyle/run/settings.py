@@ -1,6 +1,4 @@
-"""All settings of a job in one place: the root record only lists one record per stage, and the presets.
-
-Other kinds of job have a root record of their own (run/material_settings.py) and are resolved by the same functions.
+"""Settings of any kind of job from their layers: a root record lists one record per stage, and has presets.
 
 Precedence, lowest first: defaults, preset, `--config FILE`, the environment (MISTYLE_VGG, OCIO, MISTYLE_SET), the
 command line.
@@ -11,189 +9,12 @@ import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ValidationError
 
-from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, Paint3dSettings, TrainSettings
 from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.core.rig_settings import RigSettings
-from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
-from mistyle.stages.atlas_settings import AtlasSettings
-from mistyle.stages.bake_settings import BakeSettings
-from mistyle.stages.finish_settings import FinishSettings
-from mistyle.stages.fit_settings import FitSettings
-from mistyle.stages.repair_settings import RepairSettings
-from mistyle.stages.sweep_settings import SweepSettings
-from mistyle.surface.settings import CoatSettings, SurfaceSettings
-
-READ_SAMPLES = 8  # per pixel of a view that a stylizer reads
-
-
-class ReadSettings(BaseModel):
-    """How the mesh is read."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    uv: Literal["keep", "new", "auto"] = Field(
-        default="auto", description="authored UVs: keep, replace, or replace where unusable"
-    )
-    up: Literal["y", "z"] = Field(default="y", description="the axis of the user's file that points up")
-    max_faces: int = Field(default=5_000_000, ge=1, description="meshes with more faces are refused")
-    lit: bool = Field(default=False, description="unlit glTF materials become lit ones in the asset")
-
-
-class DrawSettings(BaseModel):
-    """How the views of the mesh are rendered (paper 4.1.1)."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    spp: int = Field(
-        default=0,
-        ge=0,
-        le=65536,
-        description="samples per pixel of the rendered views; 0: 8 where a stylizer reads their colours, else 1",
-    )
-    scene: Path | None = Field(
-        default=None, description="a Mitsuba scene with a shape called 'object' in place of scenes/paper_views.xml"
-    )
-    paper_files: bool = Field(default=False, description="also write the 8-bit depth maps and Canny edges of the paper")
-
-    def samples(self, read: bool = True) -> int:
-        """Samples per pixel of views whose colours are `read` by what comes next, or are for people only."""
-        return self.spp or (READ_SAMPLES if read else 1)
-
-
-class ReportSettings(BaseModel):
-    """The pictures of the report."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    detail: Literal["none", "page", "full"] = Field(
-        default="full",
-        description="full also writes the turntable's frames and a path-traced picture; page only the page and its "
-        "overview; none nothing",
-    )
-    frames: int = Field(default=24, ge=4, le=240, description="turntable frames")
-    resolution: int = Field(default=448, ge=64, le=4096, description="pixels of a turntable frame")
-    spp: int = Field(default=8, ge=1, le=4096, description="samples per pixel of a turntable frame")
-
-
-class Settings(BaseModel):
-    """One job: a mesh, a style, and how."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
-    threads: int = Field(
-        default=0, ge=0, le=1024, description="threads of the renderer and of torch; 0 takes all cores"
-    )
-    memory: float = Field(
-        default=0,
-        ge=0,
-        le=100_000,
-        description="GB of main memory that the job may take (then large arrays lie in files of its work folder where "
-        "they must, with the same result; a job that cannot keep it is refused); 0: nine tenths of what there is",
-    )
-    variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
-    stylizer: Literal["embedded", "embedded-view", "diffusion"] = Field(
-        default="embedded",
-        description="embedded paints the surface once; embedded-view paints one view after another, each going on from "
-        "those before; diffusion does so with SDXL (needs models)",
-    )
-    inpainter: Literal["fill", "paint3d"] = Field(
-        default="fill", description="fill takes the painting again; paint3d is Stable Diffusion (needs models)"
-    )
-    read: ReadSettings = ReadSettings()
-    rig: RigSettings = RigSettings()
-    draw: DrawSettings = DrawSettings()
-    surface: SurfaceSettings = SurfaceSettings()
-    coat: CoatSettings = CoatSettings()
-    sweep: SweepSettings = SweepSettings()
-    atlas: AtlasSettings = AtlasSettings()
-    bake: BakeSettings = BakeSettings()
-    finish: FinishSettings = FinishSettings()
-    fit: FitSettings = FitSettings()
-    repair: RepairSettings = RepairSettings()
-    report: ReportSettings = ReportSettings()
-    deliver: DeliverSettings = DeliverSettings()
-    colour: ColourSettings = ColourSettings()
-    models: ModelSettings = ModelSettings()
-    train: TrainSettings = TrainSettings()
-    diffusion: DiffusionSettings = DiffusionSettings()
-    paint3d: Paint3dSettings = Paint3dSettings()
-
-    @property
-    def refined(self) -> Literal["off", "normal-roughness", "albedo", "all"]:
-        """Which maps the fit may change. Where the surface is painted once, `fit.refine_painted` says so, unless other
-        settings ask for the fit: its metallic, its own features, an inpainter."""
-        if self.fit.refine != "auto":
-            return self.fit.refine
-        features = self.fit.features is not None and self.finish.method == "off"
-        wanted = self.fit.metallic == "fit" or features or self.inpainter != "fill"
-        return "all" if wanted or self.stylizer != "embedded" else self.fit.refine_painted
-
-    @property
-    def keeps_painting(self) -> bool:
-        """Whether nothing after the bake changes the maps: the fit is off, and a repair would take the painting
-        again."""
-        return self.refined == "off" and self.stylizer == "embedded" and self.inpainter == "fill"
-
-
-# The ways to run a job; the defaults of the records are the standard ones.
-PRESETS: dict[str, dict[str, Any]] = {
-    "draft": {
-        "rig": {"resolution": 512},
-        "surface": {"samples": 80_000},
-        "atlas": {"size": 1024},
-        "finish": {"steps": 20, "crops": 2},
-        "fit": {"refine_painted": "off", "iterations1": 40, "iterations2": 40, "crops": 2, "crop_size": 192},
-        "report": {"frames": 12, "resolution": 320, "spp": 4},
-    },
-    "standard": {},
-    "fine": {
-        "draw": {"paper_files": True},
-        "surface": {"samples": 1_000_000},
-        "atlas": {"size": 4096},
-        "fit": {"refine": "all", "iterations1": 400, "iterations2": 600, "crops": 8, "lights": "together"},
-        "diffusion": {"content": "per-view"},
-    },
-    # To the letter, where README lists departures too; its steps of the fit are not given, they are those of `fine`.
-    "paper": {
-        "stylizer": "diffusion",
-        "inpainter": "paint3d",
-        "draw": {"paper_files": True},
-        "sweep": {
-            "order": "paper",
-            "histogram": 1.0,
-            "segmenter": "birefnet",
-            "follow_outline": False,
-            "warp": {"look_up": False, "facing": 0.0, "sharpness": 0.0},
-        },
-        "atlas": {"size": 4096},
-        "fit": {
-            "refine": "all",
-            "painted": "with-light",
-            "unlight": 0.0,
-            "solve": False,
-            "lights": "together",
-            "features": "vgg19",
-            "bridge": "wrap",
-            "iterations1": 400,
-            "iterations2": 600,
-            "crops": 8,
-            "tv_from": "style",
-            "judge": False,
-        },
-        "repair": {"agreement": 1.0, "outlier": 0.0},
-        "train": {"loss_mode": "sum"},
-        "diffusion": {"content": "per-view"},
-    },
-}
-# The demo has three minutes: the draft with finer strokes and a larger texture.
-PRESETS["demo"] = PRESETS["draft"] | {"surface": {"samples": 150_000}, "atlas": {"size": 2048}}
-
 
 # Settings by their earlier names.
 RENAMED = {"surface.style_scale": "surface.stroke_scale"}
@@ -280,8 +101,9 @@ def resolve(
     config: Path | None,
     command_line: Mapping[str, Any],
     environment: Mapping[str, str] = os.environ,
-    root: type[Root] = Settings,
-    presets: Mapping[str, Mapping[str, Any]] = PRESETS,
+    *,
+    root: type[Root],
+    presets: Mapping[str, Mapping[str, Any]],
 ) -> Root:
     """The settings of a job after every layer; each layer is checked alone so that the message names the guilty one."""
     layers: list[tuple[str, Mapping[str, Any]]] = []

@@ -23,8 +23,10 @@ from mistyle.files.store import LOCK, atomic_write, digest, sha256_file
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import Plan
 from mistyle.run.inputs import input_files
+from mistyle.run.material_job import MATERIAL_STAGES
 from mistyle.run.progress import Progress
-from mistyle.run.stages import MATERIAL_STAGES, STAGES, claim_run, program
+from mistyle.run.stages import claim_run, program
+from mistyle.run.stylize_job import STAGES
 
 SHARDS = "shards"
 
@@ -134,7 +136,7 @@ def job_of(plan: Plan, record: Record) -> Any:
     """The `Job` or `MaterialJob` that a record of the plan says."""
     out = plan.out / record.name
     if record.kind == "fit":
-        from mistyle.run.material import MaterialJob
+        from mistyle.run.material_job import MaterialJob
         from mistyle.run.material_settings import MaterialSettings
 
         assert record.references is not None
@@ -142,8 +144,8 @@ def job_of(plan: Plan, record: Record) -> Any:
         settings = MaterialSettings.model_validate(record.settings)
         given = (record.mesh, record.references, out, settings, record.name, lights, record.masks, record.exposure)
         return MaterialJob(*given, overwrite=plan.overwrite)
-    from mistyle.run.settings import Settings
-    from mistyle.run.stages import Job
+    from mistyle.run.stylize_job import Job
+    from mistyle.run.stylize_settings import Settings
 
     assert record.style is not None
     settings = Settings.model_validate(record.settings)

@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import MappingProxyType
@@ -17,60 +16,11 @@ from mistyle.files.records import load_record, save_record
 from mistyle.files.store import digest
 from mistyle.run import edits
 from mistyle.run.progress import Progress, Report
-from mistyle.run.settings import Settings, thread_count
+from mistyle.run.settings import thread_count
 
-STAGES = {
-    "mesh": "read the mesh",
-    "texels": "lay out the texture",
-    "views": "render the views",
-    "surface": "paint the surface",
-    "bake": "bake the texture",
-    "stylized": "draw the stylized views",
-    "fit": "fit normal, roughness and albedo",
-    "masks": "mark what the fit left open",
-    "repair": "repair what the fit left open",
-    "asset": "write the asset",
-    "report": "write the report",
-}
-# Those that a job leaves out where nothing after the bake changes the maps.
-REFINING = ("fit", "masks", "repair")
-# Before fit and repair, in the place of "asset".
-FIRST = {"first asset": "write the first asset"}
-# Only where views were edited.
-RETOUCH = {"retouch": "lay the edited views into the texture"}
-# Only with --finish.
-FINISH = {"finish": "finish the painting"}
-# Those of `mistyle fit`.
-MATERIAL_STAGES = {
-    "mesh": "read the mesh",
-    "texels": "lay out the texture",
-    "cameras": "place the cameras",
-    "pictures": "look through the pictures",
-    "light": "find the light",
-    "recover": "fit the material",
-    "measure": "measure the fit",
-    "asset": "write the asset",
-    "scene": "write the Mitsuba scene",
-    "report": "write the report",
-}
-# Those of `mistyle stylize --preview`.
-PREVIEW_STAGES = {name: STAGES[name] for name in ("mesh", "texels", "surface")} | {"preview": "draw the preview"}
-# These stand in the run folder itself, for people; the others in work/.
 NOTHING: Mapping[str, Any] = MappingProxyType({})
+# These stand in the run folder itself, for people; the others in work/.
 VISIBLE = ("views", "stylized", "masks", "asset", "scene", "report", "preview")
-
-
-@dataclass(frozen=True)
-class Job:
-    """What to do and where: one mesh, one style picture, one run folder."""
-
-    mesh: Path
-    style: Path
-    out: Path
-    settings: Settings
-    name: str
-    redo_from: str | None = None
-    overwrite: bool = False
 
 
 @runtime_checkable
@@ -110,8 +60,7 @@ def claim_run(job: Kept, stages: Iterable[str], inputs: Sequence[Path]) -> None:
 class Run(Generic[Work]):
     """Keeps the stages of one run folder; a class because it holds the folder's locks until it is closed."""
 
-    def __init__(self, job: Work, progress: Progress, stages: dict[str, str] = STAGES) -> None:
-        stages = stages | RETOUCH | FINISH if stages is STAGES else stages
+    def __init__(self, job: Work, progress: Progress, stages: Mapping[str, str]) -> None:
         if job.redo_from is not None and job.redo_from not in stages:
             raise UsageError(f"--from {job.redo_from}: there is no such stage; choose one of {', '.join(stages)}")
         self.job, self.progress, self.stages = job, progress, stages

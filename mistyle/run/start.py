@@ -11,9 +11,11 @@ from mistyle.core.camera import Camera, rig
 from mistyle.core.cores import use_threads
 from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.mesh import Mesh
+from mistyle.run.job_settings import ReadSettings
 from mistyle.run.made import Atlas
 from mistyle.run.progress import Report
-from mistyle.run.settings import ReadSettings, Settings, thread_count
+from mistyle.run.settings import thread_count
+from mistyle.run.stylize_settings import Settings
 
 
 def start_engines(settings: Any) -> str:

@@ -6,7 +6,7 @@ from typing import Any
 
 from mistyle.core.asset import Picture
 from mistyle.run.progress import Progress
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 from mistyle.surface.chosen import FROM_PAINTING, settled
 from mistyle.surface.reading import StyleReading, read_style
 from mistyle.surface.settings import ResolvedSettings

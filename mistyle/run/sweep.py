@@ -11,8 +11,8 @@ from mistyle.core.errors import UsageError
 from mistyle.core.view import View
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
-from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
+from mistyle.run.stylize_settings import Settings
 from mistyle.stages.mvst import Masker, Painted, Stylizer, Swept, finished, sweep
 
 KEPT = "sweep"  # the folder in work/ that holds the views of an unfinished sweep

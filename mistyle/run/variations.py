@@ -14,7 +14,7 @@ from mistyle.core.rig_settings import RigSettings
 from mistyle.files.output import claim, replace_files
 from mistyle.run.preview import ATLAS, lit_views, painted_maps, reduced, rows_of
 from mistyle.run.progress import Progress
-from mistyle.run.settings import Settings
+from mistyle.run.stylize_settings import Settings
 
 SAMPLES, RESOLUTION = 40_000, 384
 VIEWS = (0, 13)  # of the paper's rig: front right and front left

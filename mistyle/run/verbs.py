@@ -10,27 +10,17 @@ from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.files.output import claim, read_written, replace_files
-from mistyle.run.budget import (
-    BAKE,
-    BAKE_TILED,
-    BAKED,
-    DRAWN,
-    RENDER,
-    RENDER_TILED,
-    bake_counts,
-    kept,
-    render_counts,
-    size_of,
-)
+from mistyle.run.budget import kept, size_of
 from mistyle.run.inputs import input_files
 from mistyle.run.material_outlines import tell_views
 from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
 from mistyle.run.plan import existing
 from mistyle.run.progress import Progress
-from mistyle.run.settings import Settings
-from mistyle.run.stages import Job
 from mistyle.run.start import draw, lay_out_one, own_maps, read, start_engines
+from mistyle.run.stylize_budget import BAKE, BAKE_TILED, BAKED, DRAWN, RENDER, RENDER_TILED, bake_counts, render_counts
+from mistyle.run.stylize_job import Job
+from mistyle.run.stylize_settings import Settings
 
 
 def render_views(

@@ -1,0 +1,33 @@
+"""How any kind of job reads its mesh and shows its result: two records of settings that several kinds have."""
+
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class ReadSettings(BaseModel):
+    """How the mesh is read."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    uv: Literal["keep", "new", "auto"] = Field(
+        default="auto", description="authored UVs: keep, replace, or replace where unusable"
+    )
+    up: Literal["y", "z"] = Field(default="y", description="the axis of the user's file that points up")
+    max_faces: int = Field(default=5_000_000, ge=1, description="meshes with more faces are refused")
+    lit: bool = Field(default=False, description="unlit glTF materials become lit ones in the asset")
+
+
+class ReportSettings(BaseModel):
+    """The pictures of the report."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    detail: Literal["none", "page", "full"] = Field(
+        default="full",
+        description="full also writes the turntable's frames and a path-traced picture; page only the page and its "
+        "overview; none nothing",
+    )
+    frames: int = Field(default=24, ge=4, le=240, description="turntable frames")
+    resolution: int = Field(default=448, ge=64, le=4096, description="pixels of a turntable frame")
+    spp: int = Field(default=8, ge=1, le=4096, description="samples per pixel of a turntable frame")

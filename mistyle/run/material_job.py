@@ -1,0 +1,38 @@
+"""A job of `fit`: what it is given, and its stages by name."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mistyle.run.material_settings import MaterialSettings
+
+MATERIAL_STAGES = {
+    "mesh": "read the mesh",
+    "texels": "lay out the texture",
+    "cameras": "place the cameras",
+    "pictures": "look through the pictures",
+    "light": "find the light",
+    "recover": "fit the material",
+    "measure": "measure the fit",
+    "asset": "write the asset",
+    "scene": "write the Mitsuba scene",
+    "report": "write the report",
+}
+
+
+@dataclass(frozen=True)
+class MaterialJob:
+    """What to fit and to what. `lights` and `masks` are files beside or instead of those in the references' folder;
+    lights "unknown" are solved for."""
+
+    mesh: Path
+    references: Path
+    out: Path
+    settings: MaterialSettings
+    name: str
+    lights: Path | Literal["unknown"] | None = None
+    masks: Path | None = None
+    exposure: Path | None = None
+    pictures: Path | None = None
+    redo_from: str | None = None
+    overwrite: bool = False

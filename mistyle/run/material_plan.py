@@ -1,0 +1,87 @@
+"""What a fit to pictures will do and cost, before it does it (`--dry-run`); see run/plan.py."""
+
+from typing import Any
+
+from mistyle.run.budget import peaks
+from mistyle.run.material_budget import (
+    COVERED,
+    MATERIAL,
+    SEEN,
+    SHOWN,
+    check_material,
+    looked_at,
+    material_counts,
+    material_gb,
+)
+from mistyle.run.material_job import MATERIAL_STAGES
+from mistyle.run.plan import (
+    BYTES_PER_TEXEL,
+    PER_BOUNCED_PATH,
+    PER_JOINT,
+    PER_LOOK,
+    PER_OBSERVATION,
+    PER_READ_PIXEL,
+    PER_SAMPLE_RAY,
+    PER_SMOOTHED,
+    PER_TEXEL,
+    costs,
+    extent_of,
+    reading,
+)
+from mistyle.run.stages import claim_run
+from mistyle.stages.recover_settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
+
+
+def plan_material(job: Any) -> dict[str, Any]:
+    """The same for a `MaterialJob`, whose cameras, lights and pictures' headers are read and refused as it does.
+
+    How much of the pictures shows the object is not known yet: the shares of run/material_budget.py are taken.
+    """
+    from mistyle.render.indirect import MOST
+    from mistyle.run.material import inputs_of, pixels_of, references_of
+    from mistyle.stages.recover_solve import STARTS
+
+    s, extent = job.settings, extent_of(job.mesh, job.settings)
+    claim_run(job, MATERIAL_STAGES, inputs_of(job))
+    size = extent.faces, extent.sets, extent.own
+    sizes = pixels_of(references_of(job))
+    texels = extent.sets * s.atlas.size**2
+    chosen = check_material(s, sizes, *size)
+    averaged = looked_at(s, sizes)
+    looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
+    solves = s.recover.solver != "pictures"
+    rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
+    begun = solves * (1 + len(estimated[0]))
+    steps, joint = descent_steps(s.recover), joint_steps(s.recover)
+    samples = solves * sum(sum(part) for part in estimated)
+    again = joint_estimates(s.recover)
+    samples += sum(again)
+    paths = samples * sum(min(n, MOST**2) for n in averaged)
+    words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
+    seconds = {
+        "mesh": reading(extent),
+        "texels": texels * PER_TEXEL,
+        "cameras": 1,
+        "pictures": sum(sizes) * PER_READ_PIXEL,
+        "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
+        + (begun * len(STARTS) / 2 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
+        + paths * PER_BOUNCED_PATH
+        + joint * max(1, len(again)) * SHOWN * sum(averaged) * PER_JOINT
+        + words * COVERED * texels * PER_SMOOTHED,
+        "measure": 2 * looked * PER_LOOK,
+        "asset": 2 * texels * PER_TEXEL,
+        "scene": 2 * texels * PER_TEXEL,
+        "report": 5 + s.report.frames * s.report.resolution**2 * s.report.spp * PER_SAMPLE_RAY,
+    }
+    kept = sum(12 * n for n, whole in zip(averaged, sizes, strict=True) if n < whole)
+    return {
+        "mesh": str(job.mesh),
+        "references": str(job.references),
+        "pictures": len(sizes),
+        "megapixels": round(sum(sizes) / 1e6, 1),
+        **costs(job, MATERIAL_STAGES, seconds, extent.sets),
+        "memory_gb": material_gb(chosen, sizes, *size),
+        "in_files": False,
+        "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, *size)),
+        "disk_gb": round((texels * BYTES_PER_TEXEL + kept) / 1e9, 2),
+    }
