@@ -3,11 +3,12 @@
 import argparse
 import json
 import sys
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import UsageError
-from mistyle.run.options import add_overwrite_option, examples
+from mistyle.run.options import add_overwrite_option, examples, given_defines
 
 
 def add_compare(verbs: Any) -> None:
@@ -71,9 +72,59 @@ def add_converge(verbs: Any) -> None:
 
 
 def _converge(options: argparse.Namespace) -> int:
-    from mistyle.run.converge import run_converge
+    from mistyle.run.converge import ConvergeJob, converge
+    from mistyle.run.progress import Progress
 
-    return run_converge(options)
+    names = [n.strip() for text in options.renderers for n in _split(text) if n.strip()]
+    if not names or options.out is None:
+        raise UsageError("converge needs SCENE, --with A,B and -o OUT")
+    if options.seeds < 2 or options.max_spp < 2 or options.size < 1:
+        raise UsageError("--seeds and --max-spp are 2 at least: intervals and slopes need two points")
+    job = ConvergeJob(
+        scene=options.scene,
+        renderers=tuple(names),
+        out=options.out,
+        max_spp=options.max_spp,
+        seeds=options.seeds,
+        size=options.size,
+        lights=options.lights,
+        sensor=options.sensor,
+        defines=given_defines(options.defines),
+        reference=options.reference,
+        reference_spp=options.reference_spp or 0,
+        threads=options.threads or 0,
+        blender=options.blender,
+        overwrite=options.overwrite,
+    )
+    progress = Progress()
+    _tell_curves(options, converge(job, progress))
+    progress.tell_notes()
+    return 0
+
+
+def _split(text: str) -> list[str]:
+    """A,B at commas; a command, which may hold commas of its own, stands alone."""
+    return [text] if "=" in text else text.split(",")
+
+
+def _tell_curves(options: argparse.Namespace, record: dict[str, Any]) -> None:
+    """Print the errors, slopes and efficiencies of every renderer."""
+    from mistyle.run.converge import METRICS, without_nan
+
+    if options.json:
+        print(json.dumps(without_nan(record)))
+        return
+    for row in record["curves"]:
+        print(f"{row['renderer']}  (against {record['reference']})")
+        for k, spp in enumerate(row["spp"]):
+            cells = "  ".join(f"{m} {row[m][k][0]:.4g} ± {row[m][k][1]:.2g}" for m in METRICS)
+            print(f"  {spp:>6} spp  {row['seconds'][k][0]:8.3f} s  {cells}")
+        print("  slopes  " + "  ".join(f"{m} {v[0]:.3f} ± {v[1]:.2g}" for m, v in row["slope"].items()))
+    for name, ratio in record["efficiency"].items():
+        print(
+            f"{name}: {ratio['ratio']:.3g} ({ratio['low']:.3g} to {ratio['high']:.3g}) times as efficient as the first"
+        )
+    print(f"page      {options.out / 'index.html'}")
 
 
 def _add_what(verb: argparse.ArgumentParser) -> None:
@@ -141,9 +192,7 @@ def run_compare(options: argparse.Namespace) -> int:
     if options.render is not None:
         if options.pictures:
             raise UsageError("give either pictures or --render FILE --with A --with B, not both")
-        from mistyle.run.compare_render import run_render
-
-        return run_render(options)
+        return _compare_renders(options)
     if options.approve:
         return _approve(options)
     job = job_of(options)
@@ -151,6 +200,32 @@ def run_compare(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
 
     return told(options, compare(job, Progress()))
+
+
+def _compare_renders(options: argparse.Namespace) -> int:
+    if len(options.renderers) < 2:
+        raise UsageError("--render needs two renderers: --with A --with B; the first one is the reference")
+    if options.out is None:
+        raise UsageError("compare needs -o OUT")
+    if min(options.spp, options.size, options.seeds, options.views) < 1:
+        raise UsageError("--spp, --size, --seeds and --views are 1 at least")
+    from mistyle.run.compare_render import RenderJob, compare_renders
+    from mistyle.run.progress import Progress
+
+    job = RenderJob(
+        file=options.render,
+        renderers=tuple(options.renderers),
+        out=options.out,
+        lights=tuple(name for name in options.lights.split(",") if name),
+        spp=options.spp,
+        size=options.size,
+        seeds=options.seeds,
+        views=options.views,
+        threads=options.threads or 0,
+        blender=options.blender,
+        overwrite=options.overwrite,
+    )
+    return told(options, compare_renders(job, partial(job_of, options), Progress()))
 
 
 def _list() -> int:

@@ -19,6 +19,7 @@ from mistyle.run.options import (
     add_report_option,
     asset_name,
     examples,
+    given_defines,
     said_settings,
 )
 
@@ -184,7 +185,7 @@ def material_settings(options: argparse.Namespace) -> Any:
 def _fit_scene(options: argparse.Namespace) -> int:
     """List a scene's parameters, or fit them."""
     from mistyle.run.progress import Progress
-    from mistyle.run.scene_fit import SceneJob, describe, fit_scene, given_defines, list_row, listed, loaded
+    from mistyle.run.scene_fit import SceneJob, describe, fit_scene, list_row, listed, loaded
     from mistyle.run.scene_report import row_text
     from mistyle.run.scene_settings import SCENE_PRESETS, SceneSettings
     from mistyle.run.settings import as_toml, resolve

@@ -4,25 +4,23 @@ Each renderer draws every shot with several seeds. The means are compared as pic
 pictures of the same thing is tested from the seeds. OUT/renders/<renderer>/<shot>.exr are the means.
 """
 
-import argparse
 import shutil
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
-from mistyle.core.errors import UsageError
 from mistyle.core.names import safe_name
 from mistyle.files.images import write_exr
 from mistyle.files.output import claim
 from mistyle.files.store import atomic_write
 from mistyle.measure.compare_stats import Tested, same_picture
-from mistyle.run.cli_compare import job_of, told
 from mistyle.run.compare import FILES, compare
 from mistyle.run.compare_pictures import DIVERGING, mapped, webp
+from mistyle.run.compare_records import CompareJob
 from mistyle.run.progress import Progress
 from mistyle.run.render_files import Shot
 from mistyle.run.renderers import Rendered, Renderer, left_out, renderer, shots, subject
@@ -30,32 +28,50 @@ from mistyle.run.renderers import Rendered, Renderer, left_out, renderer, shots,
 LEVEL = 0.01
 
 
-def run_render(options: argparse.Namespace) -> int:
-    """The whole verb."""
-    if len(options.renderers) < 2:
-        raise UsageError("--render needs two renderers: --with A --with B; the first one is the reference")
-    if options.out is None:
-        raise UsageError("compare needs -o OUT")
-    if min(options.spp, options.size, options.seeds, options.views) < 1:
-        raise UsageError("--spp, --size, --seeds and --views are 1 at least")
-    chosen = [renderer(text, options.blender) for text in options.renderers]
-    claim(options.out, FILES, inputs=[options.render], overwrite=options.overwrite)
-    progress = Progress()
+@dataclass(frozen=True)
+class RenderJob:
+    """What several renderers draw: an asset or a scene file under each of `lights`, and where the comparison goes.
+
+    renderers  as on the command line, such as mitsuba:path; the first is the reference
+    seeds      independent renders of a shot; from two on they are tested
+    views      cameras around an asset
+    threads    of blender:cycles, 0: all
+    blender    the Python that has bpy
+    """
+
+    file: Path
+    renderers: tuple[str, ...]
+    out: Path
+    lights: tuple[str, ...]
+    spp: int
+    size: int
+    seeds: int
+    views: int
+    threads: int = 0
+    blender: str | None = None
+    overwrite: bool = False
+
+
+def compare_renders(
+    job: RenderJob, compared: Callable[[Path, tuple[Path, ...]], CompareJob], progress: Progress
+) -> dict[str, Any]:
+    """Draw and compare; returns what compare.json holds. `compared` makes the comparison of the first renderer's folder
+    of pictures with those of the others."""
+    chosen = [renderer(text, job.blender) for text in job.renderers]
+    claim(job.out, FILES, inputs=[job.file], overwrite=job.overwrite)
     with TemporaryDirectory(prefix="mistyle-") as work:
-        folders, tests, context = _draw(options, chosen, Path(work), progress)
-        job = job_of(options, folders[0], tuple(folders[1:]))
-        job = replace(job, titles=(f"{options.render.name} by {chosen[0].name}", *(r.name for r in chosen[1:])))
-        record = compare(job, progress, context, lambda folder: _keep(folder, folders, tests))
-    return told(options, record)
+        folders, tests, context = _draw(job, chosen, Path(work), progress)
+        titles = (f"{job.file.name} by {chosen[0].name}", *(r.name for r in chosen[1:]))
+        pictures = replace(compared(folders[0], tuple(folders[1:])), titles=titles)
+        return compare(pictures, progress, context, lambda folder: _keep(folder, folders, tests))
 
 
-def _draw(options, chosen: Sequence[Renderer], work: Path, progress: Progress):
+def _draw(job: RenderJob, chosen: Sequence[Renderer], work: Path, progress: Progress):
     """Render everything; returns a folder of pictures per renderer, the tests, and what the page says about it."""
-    lights = [name for name in options.lights.split(",") if name]
-    what = subject(options.render, work / "files", chosen, options.threads or 0)
+    what = subject(job.file, work / "files", chosen, job.threads)
     what.folder.mkdir(parents=True, exist_ok=True)
-    every = shots(what, lights, options.views, options.size)
-    seeds = list(range(options.seeds))
+    every = shots(what, job.lights, job.views, job.size)
+    seeds = list(range(job.seeds))
     folders = [work / f"{k}_{safe_name(r.name)}" for k, r in enumerate(chosen)]
     drawn: dict[tuple[str, str], Rendered] = {}
     with progress.stage("render", f"render {len(every)} shot(s) by {len(chosen)} renderers") as report:
@@ -63,20 +79,20 @@ def _draw(options, chosen: Sequence[Renderer], work: Path, progress: Progress):
             for j, (how, folder) in enumerate(zip(chosen, folders, strict=True)):
                 # Seeds of different renderers must not meet: two versions of one renderer would share their noise.
                 own = [1 + 1000 * j + s for s in seeds]
-                drawn[folder.name, shot.name] = how.draw(what, shot, options.spp, own)
+                drawn[folder.name, shot.name] = how.draw(what, shot, job.spp, own)
                 _save(folder / f"{shot.name}.exr", drawn[folder.name, shot.name])
                 report((k * len(chosen) + j + 1) / (len(every) * len(chosen)))
-    tests = _tests(every, folders, drawn) if options.seeds > 1 else []
+    tests = _tests(every, folders, drawn) if job.seeds > 1 else []
     versions = {r.name: drawn[f.name, every[0].name] for r, f in zip(chosen, folders, strict=True)}
     context = {
-        "rendered": f"{options.render.name}, {options.spp} samples a pixel, {options.seeds} seed(s), shots "
+        "rendered": f"{job.file.name}, {job.spp} samples a pixel, {job.seeds} seed(s), shots "
         + ", ".join(s.name for s in every),
         "renderers": "; ".join(f"{n} = {v.version}, {np.mean(v.seconds):.2f} s a picture" for n, v in versions.items()),
     }
     missing = left_out(what) if any("mitsuba" in r.kind for r in chosen) else []
     if missing:
         context["not drawn by Mitsuba here"] = ", ".join(missing)
-        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {options.render.name} here.")
+        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {job.file.name} here.")
     if tests:
         context["z-test"] = "; ".join(f"{name}: {said(found)}" for name, found in tests)
     return folders, tests, context

@@ -4,12 +4,11 @@ OUT/converge.json and .csv   every measurement; slopes, efficiency and their int
 OUT/index.html               the same with plots
 """
 
-import argparse
 import csv
 import io
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -58,30 +57,54 @@ class Converged:
     efficiency: tuple[float, ...]
 
 
-def run_converge(options: argparse.Namespace) -> int:
-    """The whole verb."""
-    names = [n.strip() for text in options.renderers for n in _split(text) if n.strip()]
-    if not names or options.out is None:
-        raise UsageError("converge needs SCENE, --with A,B and -o OUT")
-    if options.seeds < 2 or options.max_spp < 2 or options.size < 1:
-        raise UsageError("--seeds and --max-spp are 2 at least: intervals and slopes need two points")
-    chosen = [renderer(text, options.blender) for text in names]
-    inputs = [path for path in (options.scene, options.reference) if path is not None]
-    claim(options.out, FILES, inputs=inputs, overwrite=options.overwrite)
-    counts = [2**k for k in range(int(math.log2(options.max_spp)) + 1)]
-    progress = Progress()
+@dataclass(frozen=True)
+class ConvergeJob:
+    """What is measured, how often, and where the result goes.
+
+    renderers      as on the command line, such as mitsuba:path
+    lights         of an asset: the name of a light, or a file
+    sensor         of a scene file: the number of its sensor
+    defines        of a scene file: its parameters
+    reference      the converged picture; None: the first renderer makes it with `reference_spp` samples a pixel
+    reference_spp  0: 16 times max_spp
+    threads        of blender:cycles, 0: all
+    blender        the Python that has bpy
+    """
+
+    scene: Path
+    renderers: tuple[str, ...]
+    out: Path
+    max_spp: int
+    seeds: int
+    size: int
+    lights: str
+    sensor: int
+    defines: Mapping[str, str]
+    reference: Path | None = None
+    reference_spp: int = 0
+    threads: int = 0
+    blender: str | None = None
+    overwrite: bool = False
+
+
+def converge(job: ConvergeJob, progress: Progress) -> dict[str, Any]:
+    """Measure and write; returns what converge.json holds."""
+    chosen = [renderer(text, job.blender) for text in job.renderers]
+    inputs = [path for path in (job.scene, job.reference) if path is not None]
+    claim(job.out, FILES, inputs=inputs, overwrite=job.overwrite)
+    counts = [2**k for k in range(int(math.log2(job.max_spp)) + 1)]
     with TemporaryDirectory(prefix="mistyle-") as work:
-        path = _defined(options.scene, options.defines, Path(work))
-        what = subject(path, Path(work), chosen, options.threads or 0)
-        shot = shots(what, [options.lights], 1, options.size)[options.sensor]
-        reference, said = _reference(options, what, shot, chosen[0], progress)
-        found, drew = measure(what, shot, chosen, counts, options.seeds, reference, progress)
+        path = _defined(job.scene, job.defines, Path(work))
+        what = subject(path, Path(work), chosen, job.threads)
+        shot = shots(what, [job.lights], 1, job.size)[job.sensor]
+        reference, said = _reference(job, what, shot, chosen[0], progress)
+        found, drew = measure(what, shot, chosen, counts, job.seeds, reference, progress)
     missing = left_out(what) if any("mitsuba" in r.kind for r in chosen) else []
     if missing:
-        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {options.scene.name} here.")
+        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {job.scene.name} here.")
     record = summary(found, [r.name for r in chosen], counts) | {
-        "scene": str(options.scene),
-        "defines": list(options.defines),
+        "scene": str(job.scene),
+        "defines": [f"{name}={value}" for name, value in job.defines.items()],
         "shot": shot.name,
         "reference": said,
         "definitions": definitions_of(),
@@ -89,44 +112,38 @@ def run_converge(options: argparse.Namespace) -> int:
         "versions": versions(),
         "notes": progress.notes,
     }
-    how = {"inputs": inputs, "overwrite": options.overwrite}
-    replace_files(options.out, "converge", lambda folder: write(folder, record, found), **how)
-    _tell(options, record)
-    progress.tell_notes()
-    return 0
+    how = {"inputs": inputs, "overwrite": job.overwrite}
+    replace_files(job.out, "converge", lambda folder: write(folder, record, found), **how)
+    return record
 
 
-def _defined(scene: Path, pairs: Sequence[str], work: Path) -> Path:
-    """The scene file with its parameters as -D gives them, for every renderer; itself without any."""
-    if not pairs:
+def _defined(scene: Path, defines: Mapping[str, str], work: Path) -> Path:
+    """The scene file with its parameters as given, for every renderer; itself without any."""
+    if not defines:
         return scene
     from mistyle.render.scene_text import resolved
-    from mistyle.run.scene_fit import given_defines
 
     if scene.suffix.lower() != ".xml":
-        raise UsageError(f"-D {pairs[0]}: {scene.name} has no parameters; -D belongs to Mitsuba scene files (.xml)")
+        name, value = next(iter(defines.items()))
+        said = f"-D {name}={value}"
+        raise UsageError(f"{said}: {scene.name} has no parameters; -D belongs to Mitsuba scene files (.xml)")
     if not scene.is_file():
         raise InputRefused(f"{scene}: found nothing; expected a Mitsuba scene file. Check the path.")
     path = work / scene.name
-    path.write_bytes(resolved(scene, given_defines(pairs), path))
+    path.write_bytes(resolved(scene, defines, path))
     return path
 
 
-def _split(text: str) -> list[str]:
-    """A,B at commas; a command, which may hold commas of its own, stands alone."""
-    return [text] if "=" in text else text.split(",")
-
-
-def _reference(options, what: Subject, shot: Shot, first: Renderer, progress: Progress):
+def _reference(job: ConvergeJob, what: Subject, shot: Shot, first: Renderer, progress: Progress):
     """The picture that errors are measured against, and a sentence about it."""
-    if options.reference is not None:
+    if job.reference is not None:
         from mistyle.files.read import read_frame
 
-        layer = read_frame(options.reference).layer("beauty")
+        layer = read_frame(job.reference).layer("beauty")
         if layer is None:
-            raise InputRefused(f"{options.reference}: found no R, G and B; expected the converged picture.")
-        return layer.values(), f"{options.reference.name}, as given"
-    spp = options.reference_spp or 16 * options.max_spp
+            raise InputRefused(f"{job.reference}: found no R, G and B; expected the converged picture.")
+        return layer.values(), f"{job.reference.name}, as given"
+    spp = job.reference_spp or 16 * job.max_spp
     with progress.stage("reference", f"reference: {first.name}, {spp} samples a pixel"):
         parts = max(1, spp // 1024)
         seeds = [FIRST_SEED + k for k in range(parts)]
@@ -226,16 +243,16 @@ def write(out: Path, record: dict[str, Any], found: Sequence[Measurement]) -> No
     for m in found:
         writer.writerow([m.renderer, m.spp, m.seed, repr(m.seconds), *(repr(m.values[k]) for k in METRICS)])
     atomic_write(out / "converge.csv", text.getvalue().encode())
-    atomic_write(out / "converge.json", (json.dumps(_no_nan(record), indent=1, allow_nan=False) + "\n").encode())
+    atomic_write(out / "converge.json", (json.dumps(without_nan(record), indent=1, allow_nan=False) + "\n").encode())
     atomic_write(out / "index.html", page(record).encode())
 
 
-def _no_nan(value: Any) -> Any:
+def without_nan(value: Any) -> Any:
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {k: _no_nan(v) for k, v in value.items()}
-    return [_no_nan(v) for v in value] if isinstance(value, list) else value
+        return {k: without_nan(v) for k, v in value.items()}
+    return [without_nan(v) for v in value] if isinstance(value, list) else value
 
 
 def charts(record: dict[str, Any]) -> list[Chart]:
@@ -286,20 +303,3 @@ def page(record: dict[str, Any]) -> str:
         style=Markup(style),
         style_hash=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
     )
-
-
-def _tell(options: argparse.Namespace, record: dict[str, Any]) -> None:
-    if options.json:
-        print(json.dumps(_no_nan(record)))
-        return
-    for row in record["curves"]:
-        print(f"{row['renderer']}  (against {record['reference']})")
-        for k, spp in enumerate(row["spp"]):
-            cells = "  ".join(f"{m} {row[m][k][0]:.4g} ± {row[m][k][1]:.2g}" for m in METRICS)
-            print(f"  {spp:>6} spp  {row['seconds'][k][0]:8.3f} s  {cells}")
-        print("  slopes  " + "  ".join(f"{m} {v[0]:.3f} ± {v[1]:.2g}" for m, v in row["slope"].items()))
-    for name, ratio in record["efficiency"].items():
-        print(
-            f"{name}: {ratio['ratio']:.3g} ({ratio['low']:.3g} to {ratio['high']:.3g}) times as efficient as the first"
-        )
-    print(f"page      {options.out / 'index.html'}")

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core import names
+from mistyle.core.errors import UsageError
 
 PRESET_HELP = (
     "draft: about a minute; standard (default); fine: 4096² and more steps; paper: the paper to the letter, with its "
@@ -221,3 +222,14 @@ def said_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict
     if name and "{" in name and "formats" in names:
         said = merge(said, {"deliver": {"name": name}})
     return merge(said, assignments(getattr(options, "set", []), "--set"))
+
+
+def given_defines(pairs: Sequence[str]) -> dict[str, str]:
+    """NAME=VALUE as -D has them."""
+    result = {}
+    for pair in pairs:
+        name, equals, value = pair.partition("=")
+        if not equals or not name:
+            raise UsageError(f"-D {pair}: expected NAME=VALUE, as the mitsuba command has it")
+        result[name] = value
+    return result

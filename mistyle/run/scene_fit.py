@@ -168,17 +168,6 @@ def _descended(job: SceneJob, file: Any, keys, numbers, read, key: str, progress
         )
 
 
-def given_defines(pairs: Sequence[str]) -> dict[str, str]:
-    """NAME=VALUE as -D has them."""
-    result = {}
-    for pair in pairs:
-        name, equals, value = pair.partition("=")
-        if not equals or not name:
-            raise UsageError(f"-D {pair}: expected NAME=VALUE, as the mitsuba command has it")
-        result[name] = value
-    return result
-
-
 def describe(found: Sequence[Any]) -> str:
     """The parameters as a table for people: what can be fitted first, then why the rest cannot."""
     free = [p for p in found if p.reason is None]
