@@ -209,7 +209,7 @@ def _encoded(a, b, mask, names: Sequence[str], viewing: Viewing, maps: dict[str,
     if "psnr" in names:
         values["psnr"] = _decibels(_mean_square(a, b, mask), 1.0)
     if "ssim" in names:
-        values["ssim"] = _ssim(a, b, mask)
+        values["ssim"] = ssim(a, b, mask)
     if "de2000" in names or "de2000_p95" in names:
         maps["de2000"] = ciede_map(a, b)
         inside = maps["de2000"][mask]
@@ -324,12 +324,15 @@ def _relative(a, b, mask) -> dict[str, float]:
     return {"relmse": square / count, "smape": absolute / count}
 
 
-def _ssim(a, b, mask) -> float:
-    """In bands that overlap by the window, so that large pictures need little memory."""
+def ssim(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> float:
+    """SSIM of two sRGB-encoded pictures, mean over the mask; NaN where the window of 11 pixels does not fit.
+
+    Bands overlap by the window, so that large pictures need little memory.
+    """
     from skimage.metrics import structural_similarity
 
     if min(a.shape[:2]) < 11:
-        return math.nan  # the window does not fit
+        return math.nan
     total, reach, band = 0.0, 5, 512
     for start in range(0, len(a), band):
         low, high = max(0, start - reach), min(len(a), start + band + reach)
