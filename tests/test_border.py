@@ -48,7 +48,7 @@ DECODERS = {
     *("files/pictures", "files/hdr", "files/layers", "files/obj_read", "files/mesh_formats", "files/gltf_read"),
     *("files/gltf_check", "files/gltf_materials", "files/colmap", "files/references", "files/reader_tasks"),
     *("files/usd_read", "files/usd_layers", "files/usd_materials", "files/mtl_read", "files/ply_read"),
-    "files/gltf_pose",
+    *("files/gltf_pose", "files/usd_stage", "files/usd_mesh"),
 }
 ALLOWED = {
     "bootstrap": "pyproject.toml of the clone",

@@ -20,8 +20,9 @@ from mistyle.core.asset import Asset, Primitive
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.files.materialx import Look
 from mistyle.files.usd import define_material, library
-from mistyle.files.usd_read import Polygons, mesh_prims, open_stage, polygons, uv_primvar
+from mistyle.files.usd_mesh import Polygons, polygons, uv_primvar
 from mistyle.files.usd_shapes import is_shape
+from mistyle.files.usd_stage import mesh_prims, open_stage
 
 SET = "look"
 
