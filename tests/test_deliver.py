@@ -17,7 +17,7 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.files import output
 from mistyle.files.packing import TARGETS
 from mistyle.run.batch_jobs import Record
-from mistyle.run.batch_plan import Plan
+from mistyle.run.batch_plan import BatchPlan
 from mistyle.run.cli import main, parser
 from mistyle.run.deliver import deliver, export, with_delivery
 from mistyle.run.deliver_settings import FORMATS
@@ -319,10 +319,10 @@ def test_the_command_line_says_it_for_stylize_fit_and_batch(tmp_path):
     batch = parser().parse_args(["batch", "jobs.toml", "-o", "out", "--target", "arnold", "--name", "x_v{v}"])
     said = said_settings(batch, DELIVERY_OPTIONS)
     jobs = (Record(name="a", kind="stylize", mesh=Path("m.obj"), settings=settings_of({}).model_dump(mode="json")),)
-    changed = with_delivery(Plan(tmp_path, jobs), said)
+    changed = with_delivery(BatchPlan(tmp_path, jobs), said)
     assert changed.jobs[0].settings["deliver"]["target"] == ["arnold"]
     assert Settings.model_validate(changed.jobs[0].settings).deliver.name == "x_v{v}"
-    plan = Plan(tmp_path, jobs)
+    plan = BatchPlan(tmp_path, jobs)
     assert with_delivery(plan, {}) is plan
     with pytest.raises(SystemExit):
         parser().parse_args(["batch", "jobs.toml", "--name", "alike"])

@@ -18,7 +18,7 @@ from mistyle.render import sheet
 from mistyle.render.sheet_aovs import aovs, density
 from mistyle.run import sheet_canvas
 from mistyle.run.cli import main
-from mistyle.run.sheet_canvas import Panel, Row, Sheet, compose, fitted
+from mistyle.run.sheet_canvas import Panel, PanelRow, Sheet, compose, fitted
 from mistyle.run.turntable import write_turn
 
 CYAN = 17
@@ -203,7 +203,7 @@ def test_density_is_told_against_the_median(tmp_path):
 
 def test_the_canvas_keeps_pictures_as_they_are_and_aligns_them():
     grey = [np.full((40, w, 3), v, np.float32) for w, v in ((60, 0.2), (50, 0.4), (50, 0.6))]
-    rows = (Row("a heading", tuple(Panel(p, "name", "+1") for p in grey)), Row("one", (Panel(grey[0], "n"),)))
+    rows = (PanelRow("a heading", tuple(Panel(p, "name", "+1") for p in grey)), PanelRow("one", (Panel(grey[0], "n"),)))
     picture = compose(Sheet("title", ("a line",), rows, "foot"), 200, 0.5)
     left = sheet_canvas.measures(0.5)["margin"]
     assert picture.shape[1] == 200 + 2 * left

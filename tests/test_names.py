@@ -26,11 +26,11 @@ from mistyle.files.packing import TARGETS, TextureSet
 from mistyle.files.textures import part_stems
 from mistyle.files.usd import library
 from mistyle.run import deliver_files
-from mistyle.run.batch_jobs import Job, _names
+from mistyle.run.batch_jobs import BatchJob, _names
 from mistyle.run.cli import main
 from mistyle.run.deliver import export
 from mistyle.run.deliver_settings import TEXTURES
-from mistyle.run.finished import Finished
+from mistyle.run.finished import FinishedAsset
 from mistyle.run.options import asset_name
 from mistyle.stages.export import write_asset
 
@@ -239,7 +239,7 @@ def test_no_two_sets_of_a_delivery_share_a_file(parts, pattern):
     tiles = [int(names.split_tile(part)[1][1:] or 1001) for part in parts]
     planes = (np.zeros((1, 1, 3), np.float32),) * 2 + (np.zeros((1, 1), np.float32),) * 3
     sets = tuple(TextureSet(s, t, *planes) for s, t in zip(part_stems("ball", parts), tiles, strict=True))
-    finished = Finished(bumpy_sphere(4), sets, {"name": "ball"}, Path())
+    finished = FinishedAsset(bumpy_sphere(4), sets, {"name": "ball"}, Path())
     pattern = deliver_files._tiled(pattern, finished.sets)
     labels = deliver_files.set_labels(pattern, "木" * 26, finished)
     for target in TARGETS.values():
@@ -270,7 +270,7 @@ def test_names_of_assets_and_jobs_are_file_names_before_the_work_begins(tmp_path
     assert main([*command, "--name", "木" * 83]) == 2
     assert "249 bytes of UTF-8, expected" in capsys.readouterr().err and not (tmp_path / "out").exists()
     called = [LONG, LONG, "Chair", "chair", "my chair", "con", "con"]
-    jobs = [Job(mesh=Path(f"{k}.obj"), style=Path("s.png"), name=name) for k, name in enumerate(called)]
+    jobs = [BatchJob(mesh=Path(f"{k}.obj"), style=Path("s.png"), name=name) for k, name in enumerate(called)]
     made = _names(jobs)
     assert len({n.lower() for n in made}) == len(made) and all(names.is_safe(n) for n in made)
     assert made[2:5] == ["Chair", "chair-2", "my-chair"]

@@ -496,9 +496,13 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
     torn = asset.mesh.corner_uvs.copy()
     torn[1] += 0.25
     asset = dataclasses.replace(asset, mesh=dataclasses.replace(asset.mesh, corner_uvs=torn))
-    from mistyle.files.materialx import Look
+    from mistyle.files.materialx import TexturedMaterial
 
-    looks = [Look("material", *(f"textures/b_wave_{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))]
+    looks = [
+        TexturedMaterial(
+            "material", *(f"textures/b_wave_{m}.png" for m in ("albedo", "normal", "roughness", "metallic"))
+        )
+    ]
     write_look(tmp_path / "out" / "torn.usda", None, asset, looks, "wave", beside=tmp_path / "out")
     assert complaints(tmp_path / "out" / "torn.usda") == []
     check(asset, tmp_path / "out" / "torn.usda", 3)
@@ -506,11 +510,13 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
 
 def test_a_sphere_gets_no_look(tmp_path):
     """It has no faces that a layer could bind materials to, or give coordinates."""
-    from mistyle.files.materialx import Look
+    from mistyle.files.materialx import TexturedMaterial
     from mistyle.files.usd_look import write_look
 
     asset = read_mesh(stage(tmp_path / "a.usda", 'def Sphere "Ball" {}\n'), size=64)
-    looks = [Look("material", *(f"textures/{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))]
+    looks = [
+        TexturedMaterial("material", *(f"textures/{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))
+    ]
     with pytest.raises(InputRefused, match="Ball is a Sphere"):
         write_look(tmp_path / "look.usda", None, asset, looks, "wave", beside=tmp_path)
 

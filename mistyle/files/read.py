@@ -20,14 +20,14 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset, Picture, Pixels
 from mistyle.files.bounds import refuse
-from mistyle.files.layers import Frame, frame_of
+from mistyle.files.layers import LayeredPicture, frame_of
 from mistyle.files.pictures import picture_of
 from mistyle.files.raw import Extent, Raw, spelled
 from mistyle.files.reader_process import ask
 
 __all__ = [
     "MESHES",
-    "Frame",
+    "LayeredPicture",
     "Picture",
     "load_gltf",
     "read_colmap",
@@ -153,7 +153,7 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
     return {name: np.asarray(plane, np.float32) for name, plane in ask("exr", Path(path)).items()}
 
 
-def read_frame(path: Path) -> Frame:
+def read_frame(path: Path) -> LayeredPicture:
     """A picture to compare: the layers of an .exr (of all its parts, whatever their windows) by name, or the one layer
     of an .hdr, PNG, JPEG, WebP or TIFF; linear Rec.709, premultiplied, NaN and infinities kept.
 

@@ -18,7 +18,7 @@ import numpy as np
 
 from mistyle.core.asset import Asset, Primitive
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
-from mistyle.files.materialx import Look
+from mistyle.files.materialx import TexturedMaterial
 from mistyle.files.usd import define_material, library
 from mistyle.files.usd_mesh import Polygons, polygons, uv_primvar
 from mistyle.files.usd_shapes import is_shape
@@ -28,7 +28,7 @@ SET = "look"
 
 
 def write_look(
-    path: Path, before: str | None, asset: Asset, looks: Sequence[Look], variant: str, *, beside: Path
+    path: Path, before: str | None, asset: Asset, looks: Sequence[TexturedMaterial], variant: str, *, beside: Path
 ) -> None:
     """Write the layer `path` (.usda): `before` with one variant more, or a new one; the new variant is selected.
 
@@ -179,7 +179,7 @@ def _cut(pxr: Any, stage: Any, prim: Any, shape: Polygons) -> None:
 
 
 def _bind(
-    pxr: Any, stage: Any, name: str, part: np.ndarray, shape: Polygons, names: Any, looks: Sequence[Look]
+    pxr: Any, stage: Any, name: str, part: np.ndarray, shape: Polygons, names: Any, looks: Sequence[TexturedMaterial]
 ) -> None:
     """Bind a mesh, or a subset per part in the place of the source's own subsets."""
     api = pxr.UsdShade.MaterialBindingAPI

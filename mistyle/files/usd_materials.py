@@ -14,7 +14,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.retexture import Wrap
 from mistyle.files.pictures import MAX_PICTURE_BYTES, Budget, alpha_map, decode
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
-from mistyle.files.usd_layers import Place, bytes_of, locate, place_of
+from mistyle.files.usd_layers import PackagedFile, bytes_of, locate, place_of
 
 CHANNELS = {"r": (0,), "g": (1,), "b": (2,), "rgb": (0, 1, 2), "a": ()}
 INPUTS = {"albedo": "diffuseColor", "roughness": "roughness", "metallic": "metallic", "normal": "normal"}
@@ -35,7 +35,7 @@ class UsdTexture:
     """A UsdUVTexture: its file as named by the layer at `anchor`, value = scale * texel + bias, the channels used."""
 
     file: str
-    anchor: Place
+    anchor: PackagedFile
     space: str
     scale: tuple[float, ...] | None
     bias: tuple[float, ...] | None
@@ -276,7 +276,7 @@ def _load(textures: dict[str, UsdTexture], root: Path, budget: Budget, tile: int
     return maps, tuple(notes)
 
 
-def _texels(kind: str, texture: UsdTexture, place: Place, budget: Budget, notes: list[str]) -> np.ndarray | None:
+def _texels(kind: str, texture: UsdTexture, place: PackagedFile, budget: Budget, notes: list[str]) -> np.ndarray | None:
     """One map as `Material` has it; None with a note where it is not there or cannot be used."""
     chosen = CHANNELS[texture.channel]
     if not chosen:
@@ -294,7 +294,7 @@ def _texels(kind: str, texture: UsdTexture, place: Place, budget: Budget, notes:
     return _meant(kind, texture, pixels, chosen)
 
 
-def _alpha(texture: UsdTexture, place: Place, notes: list[str]) -> Float[np.ndarray, "h w"] | None:
+def _alpha(texture: UsdTexture, place: PackagedFile, notes: list[str]) -> Float[np.ndarray, "h w"] | None:
     """A map that is a texture's alpha; 1 where it has none."""
     data = bytes_of(place, MAX_PICTURE_BYTES)
     if data is None:
@@ -304,7 +304,7 @@ def _alpha(texture: UsdTexture, place: Place, notes: list[str]) -> Float[np.ndar
     return np.clip(alpha_map(data, str(place)) * np.float32(scale) + np.float32(bias), 0, 1)
 
 
-def _light(place: Place, notes: list[str]) -> np.ndarray | None:
+def _light(place: PackagedFile, notes: list[str]) -> np.ndarray | None:
     """An EXR texture's first three channels; a single one counts for all."""
     from mistyle.files.hdr import read_exr
 

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.image import luminance, srgb_from_linear
-from mistyle.measure.flip_bands import Pair, flip_maps
+from mistyle.measure.flip_bands import FlipPair, flip_maps
 from mistyle.measure.metrics import delta_e, lab
 
 PPD = 3840 * math.pi / 180  # 0.7 m from a display of 3840 pixels and 0.7 m
@@ -130,7 +130,7 @@ class Viewing:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MetricValues:
     """Values by metric, error maps (h w) by metric (flip, hdr_flip, de2000), and HDR-FLIP's exposures."""
 
     values: Mapping[str, float]
@@ -156,7 +156,7 @@ def measure_colour(
     names: Sequence[str] = COLOUR,
     viewing: Viewing | None = None,
     progress: Callable[[float], None] = lambda done: None,
-) -> Measured:
+) -> MetricValues:
     """The metrics `names` of two linear pictures that are finite inside the mask. NaN where the mask is empty.
 
     Raises ValueError where a pixel inside the mask is not finite.
@@ -164,18 +164,18 @@ def measure_colour(
     viewing = viewing or Viewing()
     values, maps = dict.fromkeys(names, math.nan), {}
     if not mask.any():
-        return Measured(values, maps, viewing.exposures)
+        return MetricValues(values, maps, viewing.exposures)
     a, b = _inside(reference, test, mask)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ValueError("a pixel inside the mask is NaN or infinite")
     exposures = viewing.exposures
-    jobs: dict[str, Pair] = {}
+    jobs: dict[str, FlipPair] = {}
     if "hdr_flip" in names:
         exposures = exposures or flip_exposures(a, mask)
-        jobs["hdr_flip"] = Pair(a, b, exposures)
+        jobs["hdr_flip"] = FlipPair(a, b, exposures)
     looks = (encoded(a), encoded(b)) if set(names) & ENCODED else None
     if "flip" in names and looks is not None:
-        jobs["flip"] = Pair(*looks)
+        jobs["flip"] = FlipPair(*looks)
 
     def others() -> None:
         values.update(_linear(a, b, mask, names, viewing))
@@ -190,7 +190,7 @@ def measure_colour(
     else:
         others()
     progress(1.0)
-    return Measured(values, maps, exposures)
+    return MetricValues(values, maps, exposures)
 
 
 def _linear(a, b, mask, names: Sequence[str], viewing: Viewing) -> dict[str, float]:
@@ -225,17 +225,17 @@ def measure_data(
     test: Float[np.ndarray, "h w c"],
     mask: Bool[np.ndarray, "h w"],
     names: Sequence[str] = DATA,
-) -> Measured:
+) -> MetricValues:
     """rmse, mae, max_error and (of three channels) angle of layers that are not colours; finite inside the mask."""
     values = {n: math.nan for n in names if n in DATA and (n != "angle" or reference.shape[2] == 3)}
     if not mask.any():
-        return Measured(values)
+        return MetricValues(values)
     a, b = reference[mask].astype(np.float64), test[mask].astype(np.float64)
     gap = np.abs(a - b)
     found = {"rmse": np.sqrt((gap**2).mean()), "mae": gap.mean(), "max_error": gap.max()}
     if "angle" in values:
         found["angle"] = _angle(a, b)
-    return Measured({n: float(found[n]) for n in values})
+    return MetricValues({n: float(found[n]) for n in values})
 
 
 def _angle(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> float:

@@ -25,7 +25,7 @@ from mistyle.measure.compare_metrics import definitions, measure_colour
 from mistyle.measure.compare_stats import interval, slope
 from mistyle.run.charts import Chart
 from mistyle.run.progress import Progress
-from mistyle.run.render_files import Shot, Subject
+from mistyle.run.render_files import RenderView, Subject
 from mistyle.run.renderers import Renderer, left_out, renderer, shots, subject
 from mistyle.run.summary import versions
 
@@ -117,7 +117,7 @@ def _split(text: str) -> list[str]:
     return [text] if "=" in text else text.split(",")
 
 
-def _reference(options, what: Subject, shot: Shot, first: Renderer, progress: Progress):
+def _reference(options, what: Subject, shot: RenderView, first: Renderer, progress: Progress):
     """The picture that errors are measured against, and a sentence about it."""
     if options.reference is not None:
         from mistyle.files.read import read_frame
@@ -137,7 +137,7 @@ def _reference(options, what: Subject, shot: Shot, first: Renderer, progress: Pr
 
 def measure(
     what: Subject,
-    shot: Shot,
+    shot: RenderView,
     chosen: Sequence[Renderer],
     counts: Sequence[int],
     seeds: int,

@@ -25,7 +25,7 @@ from mistyle.files.store import atomic_write, digest, sha256_file
 from mistyle.run.colour import key_of, light_space, picture_space
 from mistyle.run.deliver_files import Delivery, fields_for, write_delivery
 from mistyle.run.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
-from mistyle.run.finished import Finished, read_finished, read_listing
+from mistyle.run.finished import FinishedAsset, read_finished, read_listing
 from mistyle.run.stages import program
 
 
@@ -116,7 +116,7 @@ def _whole(out: Path, name: str, of: str) -> bool:
         return False
 
 
-def _deliver(new: Path, out: Path, finished: Finished, chosen: Delivery, of: str) -> None:
+def _deliver(new: Path, out: Path, finished: FinishedAsset, chosen: Delivery, of: str) -> None:
     """Fill the folder. UsageError where this delivery would replace a file of another one."""
     record: dict[str, Any] = write_delivery(new, out, finished, chosen) | {"of": of}
     path = new / f"{chosen.name}.export.json"

@@ -21,7 +21,7 @@ from typing import Any
 
 from mistyle.core.children import PARENT
 from mistyle.core.errors import EnvironmentMissing, MistyleError
-from mistyle.run.batch_plan import PLAN, Plan
+from mistyle.run.batch_plan import PLAN, BatchPlan
 from mistyle.run.shard import SHARDS
 
 # Exit codes that a program gives itself; a shell reports a signal as 128 + its number.
@@ -47,14 +47,14 @@ class Ended:
 Watch = Callable[[int, Ended | None], None]
 
 
-def command(plan: Plan, index: int, maps: Sequence[tuple[str, str]] = ()) -> list[str]:
+def command(plan: BatchPlan, index: int, maps: Sequence[tuple[str, str]] = ()) -> list[str]:
     """The process of one shard."""
     options = [part for source, target in maps for part in ("--path-map", f"{source}={target}")]
     options += ["--overwrite"] * plan.overwrite
     return [sys.executable, "-m", "mistyle", "shard", str(plan.out / PLAN), "--index", str(index), *options]
 
 
-def log_of(plan: Plan, index: int) -> Path:
+def log_of(plan: BatchPlan, index: int) -> Path:
     """Where a shard's words go."""
     return plan.out / SHARDS / f"{plan.jobs[index].name}.log"
 
@@ -64,7 +64,9 @@ def crashed(code: int) -> bool:
     return code in CRASHES or (code < 0 and -code not in (signal.SIGTERM, signal.SIGINT))
 
 
-def local(plan: Plan, todo: Sequence[int], workers: int, watch: Watch, timeout: float | None = None) -> list[Ended]:
+def local(
+    plan: BatchPlan, todo: Sequence[int], workers: int, watch: Watch, timeout: float | None = None
+) -> list[Ended]:
     """Run shards as processes of this machine, `workers` at a time; their threads are a setting of each job.
 
     On Ctrl-C or a request to stop, every shard is asked to stop and given time for its checkpoint.
@@ -135,7 +137,7 @@ class _Children:
     stopping: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def run(self, plan: Plan, index: int, plain: bool, timeout: float | None) -> int:
+    def run(self, plan: BatchPlan, index: int, plain: bool, timeout: float | None) -> int:
         with _surroundings(plain) as environment:
             with self.lock:
                 if self.stopping:
@@ -213,7 +215,7 @@ def _waited(child: subprocess.Popen, timeout: float | None) -> int:
         return stopped(child)
 
 
-def last_lines(plan: Plan, index: int, count: int = 5) -> str:
+def last_lines(plan: BatchPlan, index: int, count: int = 5) -> str:
     """The end of a shard's log, for a person; where it crashed, Python's innermost calls. The last try's."""
     try:
         text = log_of(plan, index).read_text(encoding="utf-8", errors="replace")
@@ -225,7 +227,7 @@ def last_lines(plan: Plan, index: int, count: int = 5) -> str:
 
 
 def ray(
-    plan: Plan,
+    plan: BatchPlan,
     todo: Sequence[int],
     threads: int,
     watch: Watch,
@@ -316,5 +318,5 @@ def _ray_shard(index: int, line: list[str], log: str, begun: str, timeout: float
     return _tried(index, run, timeout)
 
 
-def _begun(plan: Plan, index: int) -> Path:
+def _begun(plan: BatchPlan, index: int) -> Path:
     return plan.out / SHARDS / f".{plan.jobs[index].name}.begun"

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from mistyle.files.output import claim, keep_folder, replace_files
 from mistyle.files.store import atomic_write
-from mistyle.run.batch_plan import PLAN, Plan, write_plan
+from mistyle.run.batch_plan import PLAN, BatchPlan, write_plan
 from mistyle.run.shard import SHARDS, claim_batch
 
 Form = Literal["openjd", "sbatch", "commands"]
@@ -20,7 +20,7 @@ SHARD_GRACE = 60  # seconds between the request to stop and the end
 
 
 def export(
-    plan: Plan,
+    plan: BatchPlan,
     folder: Path,
     form: Form,
     *,
@@ -57,7 +57,7 @@ def export(
     return [folder / name for name in files]
 
 
-def _line(plan: Plan, program: str, index: str, maps: Sequence[tuple[str, str]]) -> str:
+def _line(plan: BatchPlan, program: str, index: str, maps: Sequence[tuple[str, str]]) -> str:
     """One shard as a line for a shell; `index` may be a variable of that shell."""
     from mistyle.run.batch_plan import replaced
 
@@ -67,7 +67,7 @@ def _line(plan: Plan, program: str, index: str, maps: Sequence[tuple[str, str]])
     return f"{program} shard {shlex.quote(place)} --index {index} {shlex.join(options)}".rstrip()
 
 
-def _sbatch(plan: Plan, threads: int, memory_gb: float, gpus: int, program: str, maps) -> str:
+def _sbatch(plan: BatchPlan, threads: int, memory_gb: float, gpus: int, program: str, maps) -> str:
     from mistyle.run.batch_plan import replaced
 
     logs = replaced(str(plan.out / "shards"), maps)
@@ -93,7 +93,9 @@ def _sbatch(plan: Plan, threads: int, memory_gb: float, gpus: int, program: str,
     )
 
 
-def _openjd(plan: Plan, threads: int, memory_gb: float, gpus: int, chunk: int, program: str, maps) -> dict[str, str]:
+def _openjd(
+    plan: BatchPlan, threads: int, memory_gb: float, gpus: int, chunk: int, program: str, maps
+) -> dict[str, str]:
     """template.yaml (as JSON, which is YAML), parameter_values.yaml and asset_references.yaml of a job bundle."""
     amounts: list[dict[str, Any]] = [
         {"name": "amount.worker.vcpu", "min": threads},

@@ -24,7 +24,7 @@ from mistyle.files.output import claim, replace_files
 from mistyle.files.store import atomic_write, sha256_file
 from mistyle.run.progress import Progress
 from mistyle.run.report_overlays import MAGENTA, viridis
-from mistyle.run.sheet_canvas import PANEL, Panel, Row, Sheet, beside, compose, measures, panel_widths
+from mistyle.run.sheet_canvas import PANEL, Panel, PanelRow, Sheet, beside, compose, measures, panel_widths
 
 VIEW_TRANSFORM = "sRGB (Rec.709), no tone curve"
 USUAL = 560  # pixels of a hero picture for which the sheet's type is made
@@ -48,7 +48,7 @@ class LookSettings(BaseModel):
 
 
 @dataclass(frozen=True)
-class Subject:
+class SheetSubject:
     """What the sheet shows: the asset, its file, and pictures per texture set of what is known of its texels."""
 
     asset: Asset
@@ -131,7 +131,7 @@ def files_of_sheet(settings: LookSettings, mp4: bool) -> list[str]:
     return names
 
 
-def read_subject(place: Path) -> Subject:
+def read_subject(place: Path) -> SheetSubject:
     """A mesh file, or the asset of a run folder with what the run knows of its texels. Raises InputRefused."""
     from mistyle.files.read import read_mesh
     from mistyle.run.renderers import finished_asset
@@ -139,7 +139,7 @@ def read_subject(place: Path) -> Subject:
     path = finished_asset(place) if place.is_dir() else place
     asset = read_mesh(path)
     known = texel_knowledge(place, len(asset.mesh.parts)) if place.is_dir() else {}
-    return Subject(asset, path, known)
+    return SheetSubject(asset, path, known)
 
 
 def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
@@ -170,7 +170,7 @@ def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
 
 
 def sheet(
-    subject: Subject, stage: Any, lights: Sequence[Any], settings: LookSettings, day: str, report: Callable
+    subject: SheetSubject, stage: Any, lights: Sequence[Any], settings: LookSettings, day: str, report: Callable
 ) -> tuple[Sheet, int, float]:
     """What `compose` wants: the sheet with all its pictures drawn, the width of its rows, and the scale of its type."""
     from mistyle.render import sheet as drawing
@@ -209,10 +209,10 @@ def sheet(
         light = type(lights[2].light)(**{**vars(lights[2].light), "turn": lights[2].light.turn + angle})
         turned.append(Panel(shot(*drawing.CAMERAS["3/4"], light, step), f"{angle:.0f}°"))
     rows = (
-        Row("Three lights, each exposed so that the grey ball is 18 %", tuple(heroes)),
-        Row("Soft studio from five sides: the asset turns, the light stands still", tuple(cameras)),
-        Row("What lies behind", tuple(strip)),
-        Row(f"{lights[2].name}, turned about the asset", tuple(turned)),
+        PanelRow("Three lights, each exposed so that the grey ball is 18 %", tuple(heroes)),
+        PanelRow("Soft studio from five sides: the asset turns, the light stands still", tuple(cameras)),
+        PanelRow("What lies behind", tuple(strip)),
+        PanelRow(f"{lights[2].name}, turned about the asset", tuple(turned)),
     )
     return Sheet(subject.path.stem, facts(subject), rows, burn_in(subject, settings, day)), width, scale
 
@@ -230,7 +230,7 @@ def shown(picture: np.ndarray) -> np.ndarray:
     return np.concatenate([colour, alpha], axis=-1).astype(np.float32)
 
 
-def facts(subject: Subject) -> tuple[str, ...]:
+def facts(subject: SheetSubject) -> tuple[str, ...]:
     """What the asset is, in a line, and what reading it had to change."""
     mesh, sizes = subject.asset.mesh, []
     for material in subject.asset.materials:
@@ -242,7 +242,7 @@ def facts(subject: Subject) -> tuple[str, ...]:
     return (line, *subject.asset.source.notes[:2])
 
 
-def burn_in(subject: Subject, settings: LookSettings, day: str) -> str:
+def burn_in(subject: SheetSubject, settings: LookSettings, day: str) -> str:
     """The line at the foot of the sheet."""
     digest = sha256_file(subject.path)[:16]
     parts = (subject.path.name, f"sha256 {digest}", day, f"mistyle {__version__}")
