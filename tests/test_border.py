@@ -138,7 +138,7 @@ def test_the_rules_can_be_broken():
     assert decoding(ast.parse("import numpy as np\nnp.load('a.npy')")) == ["np.load (line 2)"]
     assert borrowed(ast.parse("from mistyle.files.pictures import read_picture"))
     assert borrowed(ast.parse("from mistyle.files import hdr")) and borrowed(ast.parse("import mistyle.files.hdr"))
-    assert not borrowed(ast.parse("from mistyle.files.layers import Frame"))
+    assert not borrowed(ast.parse("from mistyle.files.layers import LayeredPicture"))
 
 
 def test_what_is_excused_is_there():
