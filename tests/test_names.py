@@ -28,7 +28,7 @@ from mistyle.files.usd import library
 from mistyle.run import deliver_files
 from mistyle.run.batch_jobs import BatchJob, _names
 from mistyle.run.cli import main
-from mistyle.run.deliver import export
+from mistyle.run.deliver import DeliveryRequest, export
 from mistyle.run.deliver_settings import TEXTURES
 from mistyle.run.finished import FinishedAsset
 from mistyle.run.options import asset_name
@@ -198,7 +198,7 @@ def test_two_materials_stay_two_in_every_format(tmp_path, parts):
     pytest.importorskip("MaterialX")
     name = names.asset_name(None, "木" * 42, "石" * 41)
     run = written(tmp_path / "run", name, *parts)
-    files = export(run, run / "delivered", formats=FORMATS, target="unreal")
+    files = export(run, run / "delivered", DeliveryRequest(formats=FORMATS, target="unreal"))
     assert len({names.folded(str(p)) for p in files}) == len(files)
     out = run / "delivered"
     below, above = np.bincount(bumpy_sphere(4).mesh.part).tolist()
@@ -220,11 +220,13 @@ def test_two_materials_stay_two_in_every_format(tmp_path, parts):
 def test_a_pattern_that_lets_two_maps_be_one_file_is_refused(tmp_path):
     run = written(tmp_path / "run", "ball", "a", "b")
     with pytest.raises(UsageError, match=r"two maps would both be albedo\.png; put \{asset\} and \{udim\} into it"):
-        export(run, tmp_path / "out", formats=["maps"], names="{map}.{ext}")
+        export(run, tmp_path / "out", DeliveryRequest(formats=["maps"], names="{map}.{ext}"))
     with pytest.raises(UsageError, match="--texture-name 'y+.*expected at most"):
-        export(run, tmp_path / "out", formats=["maps"], names="y" * 150 + "{asset}_{map}.{ext}")
+        export(run, tmp_path / "out", DeliveryRequest(formats=["maps"], names="y" * 150 + "{asset}_{map}.{ext}"))
     assert not (tmp_path / "out").exists()
-    made = export(run, tmp_path / "out", formats=["maps"], names="y" * 80 + "{asset}{map}{asset}.{ext}")
+    made = export(
+        run, tmp_path / "out", DeliveryRequest(formats=["maps"], names="y" * 80 + "{asset}{map}{asset}.{ext}")
+    )
     files = [p.name for p in made if p.suffix == ".png"]
     assert len(files) == 10 and all(len(f) <= names.WRITTEN for f in files)
 
@@ -255,7 +257,9 @@ def test_a_version_survives_long_names(tmp_path):
     ones = [np.ones((8, 8), np.float32)] * 2
     write_asset(tmp_path / "asset", "a", asset, maps, ones, [no_texels(8)] * 2, provenance=told)
     pattern, out = "{mesh}_{style}_v{v:03}", tmp_path / "out"
-    made = [export(tmp_path, out, formats=["glb"], name=pattern, target=t) for t in ("blender", "unreal")]
+    made = [
+        export(tmp_path, out, DeliveryRequest(formats=["glb"], name=pattern, target=t)) for t in ("blender", "unreal")
+    ]
     glbs = [next(p.stem for p in files if p.suffix == ".glb") for files in made]
     assert [g[-5:] for g in glbs] == ["_v001", "_v002"] and all(len(g.encode()) <= names.ASSET for g in glbs)
     assert "木" in glbs[0] and "石" in glbs[0]

@@ -100,10 +100,8 @@ def _run(plan: BatchPlan, todo: Sequence[int], choices: Choices, reused: int) ->
         if not todo:
             return []
         if choices.engine == "ray":
-            return engines.ray(
-                plan, todo, threads_each(choices), watch, address=choices.address, gpus=choices.gpus,
-                wait=choices.wait, timeout=choices.timeout,
-            )  # fmt: skip
+            cluster = engines.RayCluster(choices.address, threads_each(choices), choices.gpus, choices.wait)
+            return engines.ray(plan, todo, cluster, watch, choices.timeout)
         return engines.local(plan, todo, min(workers_of(choices), len(todo)), watch, choices.timeout)
 
 

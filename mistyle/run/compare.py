@@ -54,6 +54,20 @@ class ComparisonState:
     exposures: dict[tuple[str, str], tuple[float, float, int]] = field(default_factory=dict)
 
 
+@dataclass(frozen=True)
+class _LayerPair:
+    """One layer of two pictures over the same window, and the files that it comes from."""
+
+    match: Match
+    frames: tuple[LayeredPicture, LayeredPicture]
+    planes: Planes
+
+    @property
+    def high(self) -> bool:
+        """Whether the values of either picture may exceed 1."""
+        return self.frames[0].high or self.frames[1].high
+
+
 def compare(
     job: CompareJob,
     progress: Progress,
@@ -108,10 +122,8 @@ def _one(job: CompareJob, match: Match, folder: Path, found: ComparisonState, re
         names, notes = chosen_layers(reference, test, job.layers)
         mask = _mask(job, reference)
         for k, name in enumerate(names):
-            both = planes(reference, test, name, job.window, mask)
-            _layer(
-                job, match, (reference, test), both, notes, folder, found, lambda d, k=k: report((k + d) / len(names))
-            )
+            pair = _LayerPair(match, (reference, test), planes(reference, test, name, job.window, mask))
+            _layer(job, pair, notes, folder, found, lambda d, k=k: report((k + d) / len(names)))
             notes = []
     except InputRefused as error:
         if alone:
@@ -127,16 +139,15 @@ def _mask(job: CompareJob, reference: LayeredPicture) -> np.ndarray | None:
 
 def _layer(
     job: CompareJob,
-    match: Match,
-    frames: tuple[LayeredPicture, LayeredPicture],
-    both: Planes,
+    pair: _LayerPair,
     notes: Sequence[str],
     folder: Path,
     found: ComparisonState,
     report: Callable[[float], None],
 ) -> None:
-    high = frames[0].high or frames[1].high
-    measured = _measure(job, match, frames, both, high, found, report)
+    """Compare one layer: its row in `found`, and its pictures in `folder`."""
+    match, frames, both, high = pair.match, pair.frames, pair.planes, pair.high
+    measured = _measure(job, pair, found, report)
     odd = int(both.odd.sum())
     failures = [] if job.allow_nonfinite or not odd else [_nonfinite(both)]
     if not both.mask.any():
@@ -167,17 +178,20 @@ def _layer(
     found.rows.append(row)
 
 
-def _measure(job, match, frames, both: Planes, high: bool, found: ComparisonState, report) -> MetricValues:
+def _measure(
+    job: CompareJob, pair: _LayerPair, found: ComparisonState, report: Callable[[float], None]
+) -> MetricValues:
+    both = pair.planes
     if job.protocol is not None:
-        return MetricValues(_protocol(job, frames, both) if both.kind == "colour" else {})
+        return MetricValues(_protocol(job, pair.frames, both) if both.kind == "colour" else {})
     if both.kind == "data":
         return metrics.measure_data(both.reference, both.test, both.mask, job.metrics)
-    names = [n for n in job.metrics if METRICS[n].kind == "colour" and (high or n != "hdr_flip")]
+    names = [n for n in job.metrics if METRICS[n].kind == "colour" and (pair.high or n != "hdr_flip")]
     if job.viewing.lpips is None:
         names = [n for n in names if n != "lpips"]
     viewing = job.viewing
     if "hdr_flip" in names and viewing.exposures is None:
-        key = (match.name, both.layer)
+        key = (pair.match.name, both.layer)
         if key not in found.exposures:
             usable = (both.mask | both.odd) & np.isfinite(both.reference).all(axis=-1)
             found.exposures[key] = metrics.flip_exposures(both.reference, usable)

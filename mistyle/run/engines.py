@@ -226,24 +226,32 @@ def last_lines(plan: BatchPlan, index: int, count: int = 5) -> str:
     return "\n".join(lines[-count:] if crash is None else lines[max(crash - 2, 0) : crash + count])
 
 
-def ray(
-    plan: BatchPlan,
-    todo: Sequence[int],
-    threads: int,
-    watch: Watch,
-    *,
-    address: str | None = None,
-    gpus: float = 0.0,
-    wait: float = 300.0,
-    timeout: float | None = None,
-) -> list[Ended]:
-    """Run shards on a Ray cluster: `address` of a running one ("auto"), or None for one of this machine's own.
+@dataclass(frozen=True)
+class RayCluster:
+    """A Ray cluster and the share of it that each shard takes.
 
-    Each takes `threads` cores and `gpus` (a share is allowed). A lost worker's shard is started again, three times at
-    most. Where nothing has begun after `wait` seconds the cluster cannot serve what is asked for: MistyleError, instead
-    of waiting for ever. A cluster of our own listens on the loopback address only and asks for a token. All machines
+    address  of a running cluster ("auto"); None starts one on this machine
+    threads  cores of a shard
+    gpus     GPUs of a shard; fractions are allowed
+    wait     seconds after which a cluster that has begun no shard counts as unable to serve
+    """
+
+    address: str | None = None
+    threads: int = 1
+    gpus: float = 0.0
+    wait: float = 300.0
+
+
+def ray(
+    plan: BatchPlan, todo: Sequence[int], cluster: RayCluster, watch: Watch, timeout: float | None = None
+) -> list[Ended]:
+    """Run shards on a Ray cluster.
+
+    A lost worker's shard is started again, three times at most. MistyleError where no shard has begun after
+    `cluster.wait` seconds. A cluster of our own listens on the loopback address only and asks for a token. All machines
     must see the plan's folder at the same place.
     """
+    address = cluster.address
     if address is None:
         # Read when Ray is imported; without it Ray takes 127.0.0.1 for the machine's own address and listens on all.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
@@ -264,12 +272,16 @@ def ray(
     else:
         library.init(address=address, log_to_driver=False)
     try:
-        return _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout)
+        return _on_ray(library, plan, todo, cluster, watch, timeout)
     finally:
         library.shutdown()
 
 
-def _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout) -> list[Ended]:
+def _on_ray(
+    library: Any, plan: BatchPlan, todo: Sequence[int], cluster: RayCluster, watch: Watch, timeout: float | None
+) -> list[Ended]:
+    """`ray` on the cluster that `library` is connected to."""
+    threads, gpus, wait = cluster.threads, cluster.gpus, cluster.wait
     offered = library.cluster_resources()
     for name, asked in (("CPU", threads), ("GPU", gpus)):
         if asked > offered.get(name, 0):

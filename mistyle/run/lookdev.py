@@ -43,6 +43,7 @@ class LookSettings(BaseModel):
     turntable: int = Field(default=0, ge=0, le=720, description="frames of a turntable; 0: none")
     hdri_turn: int = Field(default=0, ge=0, le=720, description="frames of the light's turn; 0: none")
     frame: int = Field(default=512, ge=32, le=4096, description="pixels of a turntable's frame")
+    mp4: bool = Field(default=False, description="the turntables as mp4 too (needs mistyle[video])")
     threads: int = Field(default=0, ge=0, le=1024, description="threads; 0 takes all cores")
     variant: str = Field(default="auto", description="the Mitsuba variant")
 
@@ -64,7 +65,6 @@ def lookdev(
     *,
     hdri: Path | None = None,
     date: str | None = None,
-    mp4: bool = False,
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Draw the sheet of a mesh file or run folder into `out`; returns the paths of what was written.
@@ -72,16 +72,15 @@ def lookdev(
     `hdri` is an .hdr or .exr environment map for the third light; `date` stands in the burn-in (else the day on which
     the asset's file was last changed, UTC). The same asset, settings and thread count give the same pictures.
     """
-    from mistyle.files.images import write_exr, write_png
     from mistyle.files.read import read_radiance
     from mistyle.render import sheet as drawing
     from mistyle.run.start import start_engines
-    from mistyle.run.turntable import encoder, write_turn
+    from mistyle.run.turntable import encoder
 
-    if mp4:
+    if settings.mp4:
         encoder()
     inputs = [place, *([hdri] if hdri is not None else [])]
-    claim(out, files_of_sheet(settings, mp4), inputs=inputs, overwrite=overwrite)
+    claim(out, files_of_sheet(settings), inputs=inputs, overwrite=overwrite)
     start_engines(settings)
     with progress.stage("read", "read the asset"):
         subject = read_subject(place)
@@ -94,40 +93,58 @@ def lookdev(
     with progress.stage("sheet", "draw the sheet") as report:
         day = date or datetime.datetime.fromtimestamp(subject.path.stat().st_mtime, datetime.UTC).date().isoformat()
         picture = compose(*sheet(subject, stage, lights, settings, day, report))
-    written = {"sheet": str(out / "lookdev.png"), "exr": str(out / "lookdev.exr")}
-    turns = {
-        "turntable": (settings.turntable, stage.turn, lights[0]),
-        "light_turn": (settings.hdri_turn, stage.light_turn, lights[2]),
-    }
+    written = {"sheet": "lookdev.png", "exr": "lookdev.exr"}
     record = {"asset": subject.path.name, "sha256": sha256_file(subject.path), "date": day, "mistyle": __version__}
     record |= {
-        "settings": settings.model_dump(mode="json"),
+        "settings": settings.model_dump(mode="json", exclude={"mp4"}),
         "view": VIEW_TRANSFORM,
         "hdri": hdri.name if hdri else None,
     }
     record["exposure_stops"] = {rig.name: round(rig.stops, 3) for rig in lights}
 
     def fill(folder: Path) -> None:
-        write_png(folder / "lookdev.png", srgb_from_linear(np.clip(picture, 0, 1)))
-        write_exr(folder / "lookdev.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)), half=True)
-        for name, (frames, draw, rig) in turns.items():
-            if frames:
-                with progress.stage(name, TURNS[name]) as report:
-                    drawn = draw(frames, rig.light, settings.frame, max(settings.spp // 2, 1), settings.seed, report)
-                    paths = write_turn(folder / name, [shown(p) for p in drawn], mp4)
-                    written[name] = str(out / paths[-1].relative_to(folder))
+        write_sheet(folder, picture)
+        written.update(write_turns(folder, stage, lights, settings, progress))
         atomic_write(folder / "lookdev.json", (json.dumps(record, indent=1) + "\n").encode())
 
     replace_files(out, "lookdev", fill, inputs=inputs, overwrite=overwrite)
-    return written
+    return {name: str(out / file) for name, file in written.items()}
 
 
-def files_of_sheet(settings: LookSettings, mp4: bool) -> list[str]:
+def write_sheet(folder: Path, picture: np.ndarray) -> None:
+    """Write the linear sheet (h w 3) as lookdev.png (sRGB, clipped) and lookdev.exr (half floats)."""
+    from mistyle.files.images import write_exr, write_png
+
+    write_png(folder / "lookdev.png", srgb_from_linear(np.clip(picture, 0, 1)))
+    write_exr(folder / "lookdev.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)), half=True)
+
+
+def write_turns(
+    folder: Path, stage: Any, lights: Sequence[Any], settings: LookSettings, progress: Progress
+) -> dict[str, str]:
+    """Draw and write the turntables that the settings ask for; returns the film of each, relative to the folder."""
+    from mistyle.run.turntable import write_turn
+
+    turns = {
+        "turntable": (settings.turntable, stage.turn, lights[0]),
+        "light_turn": (settings.hdri_turn, stage.light_turn, lights[2]),
+    }
+    films = {}
+    for name, (frames, draw, rig) in turns.items():
+        if frames:
+            with progress.stage(name, TURNS[name]) as report:
+                drawn = draw(frames, rig.light, settings.frame, max(settings.spp // 2, 1), settings.seed, report)
+                paths = write_turn(folder / name, [shown(p) for p in drawn], settings.mp4)
+                films[name] = str(paths[-1].relative_to(folder))
+    return films
+
+
+def files_of_sheet(settings: LookSettings) -> list[str]:
     """What a sheet with these settings consists of."""
     names = ["lookdev.png", "lookdev.exr", "lookdev.json"]
     for name, frames in (("turntable", settings.turntable), ("light_turn", settings.hdri_turn)):
         if frames:
-            names += [*(f"{name}/{k:03}.png" for k in range(frames)), f"{name}.webp", *([f"{name}.mp4"] * mp4)]
+            names += [*(f"{name}/{k:03}.png" for k in range(frames)), f"{name}.webp", *([f"{name}.mp4"] * settings.mp4)]
     return names
 
 
