@@ -18,7 +18,7 @@ from mistyle.core.cores import cores
 from mistyle.core.paths import scenes
 from mistyle.run import engines
 from mistyle.run.batch import Choices, planned, run_batch
-from mistyle.run.batch_plan import Plan, write_plan
+from mistyle.run.batch_plan import BatchPlan, write_plan
 from mistyle.run.shard import outcome
 
 MESHES, STYLES = ("spot.obj", "teapot.obj"), ("starry_night", "great_wave", "mosaic", "woodcut")
@@ -53,7 +53,7 @@ def _list(paths: list[Path]) -> str:
     return "[" + ", ".join(f'"{p.as_posix()}"' for p in paths) + "]"
 
 
-def shell_loop(plan: Plan) -> None:
+def shell_loop(plan: BatchPlan) -> None:
     """What anyone would write: for i in ...; do mistyle shard plan.json --index $i; done."""
     path = write_plan(plan)
     loop = f'for i in $(seq 0 {len(plan.jobs) - 1}); do "$0" -m mistyle shard "$1" --index $i || exit 1; done'

@@ -6,11 +6,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks import consistency_metrics as consistency
 from benchmarks.common import lettered
 from benchmarks.consistency_peer import save
 from benchmarks.consistency_rows import texture
 from benchmarks.consistency_scene import LPIPS, VGG, Scene, blank_maps, encoded
-from mistyle.measure import consistency, metrics
+from mistyle.measure import metrics
 from mistyle.measure.features import load_features
 from mistyle.measure.lpips import load_lpips
 
@@ -46,14 +47,14 @@ def judged(
     shapes = [np.repeat(0.5 + 0.25 * d[..., None], 3, axis=-1) for d in scene.detail]
     figures["detail_corr"] = consistency.guide_correlation(pictures, scene.detail, masks)
     figures["clay_corr"] = mean(map(metrics.detail_correlation, pictures, scene.clay, masks))
-    figures["edge_recall_over_chance"] = mean(map(metrics.edge_recall, pictures, shapes, masks))
+    figures["edge_recall_over_chance"] = mean(map(consistency.edge_recall, pictures, shapes, masks))
     figures["covered"] = 1.0
     if albedo is None:
         albedo, label, figures["covered"] = texture(scene, list(pictures))
         found = zip(albedo, label, scene.texels, strict=True)
         figures["view_seam_ratio"] = mean(consistency.border_ratio(a, v, t.island) for a, v, t in found)
     figures["seam_raw"] = seams(scene, albedo)
-    figures["seam_floor"] = mean(map(metrics.seam_ratio, views, blind or pictures))
+    figures["seam_floor"] = mean(map(consistency.seam_ratio, views, blind or pictures))
     figures["seam_ratio"] = figures["seam_raw"] / figures["seam_floor"]
     return {k: v for k, v in figures.items() if np.isfinite(v)}
 
@@ -95,13 +96,13 @@ def halves(scene: Scene) -> dict[str, float]:
 
 
 def seams(scene: Scene, albedo: list[np.ndarray]) -> float:
-    """`metrics.seam_ratio` of the texture drawn in every view, mean over the views that show a seam."""
+    """`seam_ratio` of the texture drawn in every view, mean over the views that show a seam."""
     from mistyle.run.painting import unlit_views
     from mistyle.stages.texels import pad
 
     padded = [pad(a, t, scene.settings.atlas.padding) for a, t in zip(albedo, scene.texels, strict=True)]
     drawn = unlit_views(scene.asset, blank_maps(scene, padded), scene.views, lambda done: None)
-    return mean(metrics.seam_ratio(view, encoded(view)) for view in drawn)
+    return mean(consistency.seam_ratio(view, encoded(view)) for view in drawn)
 
 
 def mean(values) -> float:

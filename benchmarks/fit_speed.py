@@ -348,7 +348,7 @@ def solver(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     """Texels per second of the per-texel solver: on all threads and on one, and by finite differences."""
     import drjit as dr
 
-    from mistyle.render.texel_speed import throughput
+    from benchmarks.texel_speed import throughput
 
     device.use()
     texels, every = (8192 if quick else 65536), dr.thread_count()

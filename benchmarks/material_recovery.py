@@ -27,13 +27,13 @@ import numpy as np
 
 from benchmarks import recovery_pictures as drawing
 from benchmarks import recovery_report as report
+from benchmarks.material_metrics import best_constant, confident, map_errors, mean_errors, relight_errors
 from benchmarks.recovery_ours import ours
 from benchmarks.recovery_pictures import Shot
 from benchmarks.recovery_rivals import naive, write_job
 from benchmarks.recovery_truth import ASSETS, UV, Truth, data_folder, find_asset, seen, truth
 from mistyle.core.errors import MistyleError, UsageError
 from mistyle.core.maps import Maps
-from mistyle.measure.material_metrics import best_constant, confident, map_errors, mean_errors, relight_errors
 from mistyle.render.scene import Frame
 
 LEAST_VIEWS = 3

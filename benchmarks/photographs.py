@@ -26,19 +26,20 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from jaxtyping import Float
 
 from benchmarks import recovery_pictures as drawing
 from benchmarks.common import finish
+from benchmarks.material_metrics import map_errors
 from benchmarks.recovery_truth import data_folder, find_asset, truth
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.capture import Captures, in_memory, shrunk
-from mistyle.core.distortion import Lens, undistort
+from mistyle.core.distortion import Lens, distort
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, to_json
 from mistyle.files.cameras import transforms
 from mistyle.files.captures import read_captures
 from mistyle.files.read_mesh import read_mesh
-from mistyle.measure.material_metrics import map_errors
 from mistyle.render.draw import tracer
 from mistyle.render.shade import Shade, pack
 from mistyle.run.material_budget import material_gb
@@ -134,6 +135,28 @@ def _pictures(asset, shots) -> Iterator[np.ndarray]:
                       subsamples=1, memory=0)  # fmt: skip
         shade.table = table
         yield shade.image(0)
+
+
+def undistort(lens: Lens, sent: Float[np.ndarray, "*n 2"], steps: int = 20) -> Float[np.ndarray, "*n 2"]:
+    """The inverse of `distort`, by Newton's method; NaN where it finds no tangent within 1e-9."""
+    (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
+    target = np.asarray(sent, float)
+    found = target.copy()
+    with np.errstate(all="ignore"):
+        for _ in range(steps):
+            x, y = found[..., 0], found[..., 1]
+            r2 = x * x + y * y
+            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+            slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # of `radial`, by r², twice
+            xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+            yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+            xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
+            off = distort(lens, found) - target
+            determinant = xx * yy - xy * xy
+            step = np.stack([yy * off[..., 0] - xy * off[..., 1], xx * off[..., 1] - xy * off[..., 0]], axis=-1)
+            found = found - step / determinant[..., None]
+        miss = np.abs(distort(lens, found) - target).max(axis=-1, keepdims=True)
+    return np.where(miss < 1e-9, found, np.nan)
 
 
 def _bent(lens: Lens, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
+from benchmarks.datasets import TENSOIR_LIGHTS, read_stanford_orb, read_tensoir
+from benchmarks.material_metrics import align_channels, orb_mask, psnr_hdr, psnr_ldr
 from benchmarks.recovery_pictures import Shot, render
 from benchmarks.recovery_truth import fitted_size
 from mistyle.core.align import moved
@@ -22,9 +24,7 @@ from mistyle.core.asset import Asset
 from mistyle.core.capture import Captures, shrunk, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps
-from mistyle.files.datasets import TENSOIR_LIGHTS, read_stanford_orb, read_tensoir
 from mistyle.files.read_mesh import read_mesh
-from mistyle.measure.material_metrics import align_channels, orb_mask, psnr_hdr, psnr_ldr
 from mistyle.render.scene import Frame
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings

@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 
 from benchmarks import recovery_pictures as drawing
+from benchmarks.material_metrics import mean_errors, relight_errors
 from benchmarks.recovery_ours import ours
 from benchmarks.recovery_rivals import naive, write_job
 from benchmarks.recovery_truth import truth
 from mistyle.core.maps import Maps
-from mistyle.measure.material_metrics import mean_errors, relight_errors
 from mistyle.render.scene import Frame
 
 # From the quickest to the defaults.

@@ -19,6 +19,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from benchmarks.material_metrics import texel_areas
 from mistyle.core.camera import Camera, in_frame, px_from_world
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import nearest_fill
@@ -26,7 +27,6 @@ from mistyle.core.lanes import aligned
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.files.read_mesh import read_mesh
-from mistyle.measure.material_metrics import texel_areas
 from mistyle.stages.texels import rasterise, start_maps
 
 UV = Literal["auto", "new"]

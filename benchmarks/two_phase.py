@@ -24,6 +24,7 @@ from PIL import Image
 from benchmarks import two_phase_struggle as struggle
 from benchmarks import two_phase_truth as known
 from benchmarks.common import finish, parser, timed
+from benchmarks.material_metrics import map_errors
 from benchmarks.recovery_truth import Truth, data_folder, seen
 from benchmarks.two_phase_truth import Painted, silent
 from mistyle.core.camera import Camera
@@ -33,7 +34,6 @@ from mistyle.core.light import Directional, Lights, has_soft, lights
 from mistyle.core.maps import Maps
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
-from mistyle.measure.material_metrics import map_errors
 from mistyle.run import start
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.fit import two_phase, view_mask

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from benchmarks.material_metrics import texel_areas
 from benchmarks.recovery_pictures import Shot, render
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.camera import Camera, rig
@@ -22,7 +23,6 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
-from mistyle.measure.material_metrics import texel_areas
 from mistyle.run import painting
 from mistyle.run.made import Atlas
 from mistyle.run.stylize_settings import Settings

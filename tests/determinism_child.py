@@ -153,7 +153,9 @@ def export(made: Stages, asset: Any, atlas: Any, maps: list[Any], settings: Any)
     write_asset(made.out / "asset", "bell", asset, padded, open_sky, atlas.texels, provenance={"seed": 0})
     made.note("asset: GLB, EXR, PNG", made.out / "asset")
     formats = [f for f in deliver.FORMATS if f != "usd" or usd_is_there()]
-    deliver.export(made.out / "asset", made.out / "delivered", formats=formats, target="unity-hdrp")
+    deliver.export(
+        made.out / "asset", made.out / "delivered", deliver.DeliveryRequest(formats=formats, target="unity-hdrp")
+    )
     for kind in ("usda", "usdz", "mtlx", "obj", "png"):
         made.note(f"delivered {kind}", [*sorted((made.out / "delivered").rglob(f"*.{kind}"))])
 

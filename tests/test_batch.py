@@ -16,7 +16,7 @@ from mistyle.run.batch import Choices, describe, describe_dry_run, dry_run, plan
 from mistyle.run.batch_jobs import read_jobs
 from mistyle.run.batch_page import write_page
 from mistyle.run.batch_plan import PLAN, indices, path_maps, read_plan, replaced, write_plan
-from mistyle.run.farm import export
+from mistyle.run.farm import ShardNeeds, export
 from mistyle.run.shard import finished, key_of, marker, outcome
 
 CUBE = """v -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\nv -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1
@@ -405,10 +405,10 @@ def test_the_dry_run_knows_fits_and_what_will_be_refused(props, tmp_path):
 def test_slurm_and_command_lines_name_every_shard(props, tmp_path):
     plan = planned(props, tmp_path / "out with space", Choices(threads=1))
     maps = ((str(tmp_path), "/vol"),)
-    (lines,) = export(plan, tmp_path / "farm", "commands", threads=2, maps=maps)
+    (lines,) = export(plan, tmp_path / "farm", "commands", ShardNeeds(threads=2, maps=maps))
     assert len(lines.read_text().splitlines()) == 4
     assert "'/vol/out with space/plan.json' --index 3 --path-map" in lines.read_text()
-    (script,) = export(plan, tmp_path / "farm", "sbatch", threads=2, memory_gb=6, gpus=1)
+    (script,) = export(plan, tmp_path / "farm", "sbatch", ShardNeeds(threads=2, memory_gb=6, gpus=1))
     text = script.read_text()
     for words in ("--array=0-3", "--cpus-per-task=2", "--mem=6144M", "--gres=gpu:1", "${SLURM_ARRAY_TASK_ID}"):
         assert words in text
@@ -419,7 +419,7 @@ def test_the_bundle_is_a_valid_job_template(props, tmp_path):
     """Open Job Description's own program checks it."""
     pytest.importorskip("openjd.cli")
     plan = planned(props, tmp_path / "out", Choices(threads=1))
-    files = export(plan, tmp_path / "farm", "openjd", threads=2, memory_gb=6, gpus=1, chunk=2)
+    files = export(plan, tmp_path / "farm", "openjd", ShardNeeds(threads=2, memory_gb=6, gpus=1, chunk=2))
     assert [f.name for f in files] == ["template.yaml", "parameter_values.yaml", "asset_references.yaml"]
     openjd = Path(sys.executable).with_name("openjd")
     checked = subprocess.run(

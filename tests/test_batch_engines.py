@@ -16,7 +16,7 @@ from mistyle.core.paths import scenes
 from mistyle.run import engines
 from mistyle.run.batch import Choices, planned, run_batch
 from mistyle.run.batch_plan import PLAN
-from mistyle.run.farm import export
+from mistyle.run.farm import ShardNeeds, export
 from mistyle.run.shard import marker
 
 
@@ -79,7 +79,7 @@ def test_open_job_description_makes_the_same_bytes(local, tmp_path):
     pytest.importorskip("openjd.cli")
     plan = plan_in(tmp_path / "out")
     python = f"{sys.executable} -m mistyle"
-    template = export(plan, tmp_path / "farm", "openjd", threads=1, chunk=2, program=python)[0]
+    template = export(plan, tmp_path / "farm", "openjd", ShardNeeds(threads=1, chunk=2, program=python))[0]
     line = [
         Path(sys.executable).with_name("openjd"), "run", template, "--step", "Shards",
         "--job-param", f"Plan={plan.out / PLAN}", "--extensions", "TASK_CHUNKING",

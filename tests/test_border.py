@@ -49,7 +49,7 @@ DECODERS = {
     *("files/pictures", "files/hdr", "files/layers", "files/obj_read", "files/mesh_formats", "files/gltf_read"),
     *("files/gltf_check", "files/gltf_materials", "files/colmap", "files/references", "files/reader_tasks"),
     *("files/usd_read", "files/usd_layers", "files/usd_materials", "files/mtl_read", "files/ply_read"),
-    "files/gltf_pose",
+    *("files/gltf_pose", "files/usd_stage", "files/usd_mesh"),
 }
 ALLOWED = {
     "environment": "pyproject.toml of the clone",
@@ -75,7 +75,7 @@ ALLOWED = {
     "stages/mvst": "views that a run kept in its own folder",
 }
 # Names of decoding modules that others may import: records, and what only looks at paths or checked trees.
-TYPES = {"Frame", "Layer", "Window", "BEAUTY", "SparsePoints", "find_model", "data_uri"}
+TYPES = {"LayeredPicture", "Layer", "Window", "BEAUTY", "SparsePoints", "find_model", "data_uri"}
 TYPES |= {"frame_of", "picture_of"}  # arithmetic on what was decoded
 
 
@@ -139,7 +139,7 @@ def test_the_rules_can_be_broken():
     assert decoding(ast.parse("import numpy as np\nnp.load('a.npy')")) == ["np.load (line 2)"]
     assert borrowed(ast.parse("from mistyle.files.pictures import read_picture"))
     assert borrowed(ast.parse("from mistyle.files import hdr")) and borrowed(ast.parse("import mistyle.files.hdr"))
-    assert not borrowed(ast.parse("from mistyle.files.layers import Frame"))
+    assert not borrowed(ast.parse("from mistyle.files.layers import LayeredPicture"))
 
 
 def test_what_is_excused_is_there():

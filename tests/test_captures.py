@@ -8,9 +8,10 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.photographs import undistort
 from mistyle.core.camera import Camera, orbit, pixel_centres
 from mistyle.core.capture import in_memory
-from mistyle.core.distortion import Lens, distort, pinhole, px_in_photograph, resample, undistort
+from mistyle.core.distortion import Lens, distort, pinhole, px_in_photograph, resample
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Ambient, Directional, Environment, Point

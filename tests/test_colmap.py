@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.photographs import undistort
 from mistyle.core.camera import Camera, pixel_centres, px_from_world
-from mistyle.core.distortion import distort, undistort
+from mistyle.core.distortion import distort
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
 from mistyle.files.captures import camera_space, read_captures, sparse_points

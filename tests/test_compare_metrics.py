@@ -240,3 +240,23 @@ def test_stanford_orb_ssim_window_of_three(rng):
     black = protocols.stanford_orb(0.5 + 0.4 * a, np.zeros_like(a), np.ones((30, 26), np.float32))
     grey = -10 * math.log10(float(((0.5 - protocols._orb_encoded(np.float64(0.5) + 0.4 * a)) ** 2).mean()))
     assert black["psnr_l"] == pytest.approx(grey, abs=1e-4)  # never below that of constant grey
+
+
+def test_ssim_is_one_for_equal_pictures_and_by_hand_for_flat_ones(rng):
+    a, whole = smooth(rng, 96, 96), np.ones((96, 96), bool)
+    assert metrics.ssim(a, a, whole) == pytest.approx(1)
+    assert metrics.ssim(a, smooth(rng, 96, 96), whole) < 0.5
+    # Without structure only the luminance term is left: (2 x y + C1) / (x² + y² + C1), C1 = 0.01².
+    x, y = np.full((32, 32, 3), 0.4, np.float32), np.full((32, 32, 3), 0.8, np.float32)
+    assert metrics.ssim(x, y, whole[:32, :32]) == pytest.approx((0.64 + 1e-4) / (0.8 + 1e-4), rel=1e-4)
+
+
+def test_flip_runs_from_zero_to_one(rng):
+    a = smooth(rng, 96, 96)
+    assert flip_bands.flip_map(a, a, metrics.PPD).mean() == pytest.approx(0, abs=1e-6)
+    # The largest colour difference that FLIP knows is blue against green.
+    blue, green = np.zeros((64, 64, 3), np.float32), np.zeros((64, 64, 3), np.float32)
+    blue[..., 2], green[..., 1] = 1, 1
+    assert flip_bands.flip_map(blue, green, metrics.PPD).mean() > 0.95
+    small = flip_bands.flip_map(a, np.clip(a + 0.02, 0, 1), metrics.PPD).mean()
+    assert 0 < small < 0.2

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from test_metrics import noise, plane_view
 
+from benchmarks import consistency_metrics as consistency
 from mistyle.core.image import gaussian
-from mistyle.measure import consistency, metrics
+from mistyle.measure import metrics
 from mistyle.measure.overlap import overlap
 
 GREY, LIGHT = (np.full((96, 96, 3), v, np.float32) for v in (0.4, 0.5))

@@ -7,12 +7,12 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.datasets import read_stanford_orb, read_tensoir
 from mistyle.core.camera import OPENGL_FROM_OPENCV, Camera, orbit, pixel_centres, px_from_world
 from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Environment, environment_radiance
-from mistyle.files.datasets import read_stanford_orb, read_tensoir
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.read import read_npy
 

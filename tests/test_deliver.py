@@ -17,9 +17,9 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.files import output
 from mistyle.files.packing import TARGETS
 from mistyle.run.batch_jobs import Record
-from mistyle.run.batch_plan import Plan, with_delivery
+from mistyle.run.batch_plan import BatchPlan, with_delivery
 from mistyle.run.cli import main, parser
-from mistyle.run.deliver import deliver, export
+from mistyle.run.deliver import DeliveryRequest, deliver, export
 from mistyle.run.deliver_settings import FORMATS
 from mistyle.run.finished import read_finished
 from mistyle.run.options import DELIVERY_OPTIONS, asset_name, said_settings
@@ -78,7 +78,7 @@ def test_an_edited_albedo_is_what_is_delivered(single, tmp_path):
 @pytest.mark.parametrize("target", sorted(TARGETS))
 def test_every_target_writes_what_its_program_reads(single, tmp_path, target):
     maps = quarters()
-    files = {p.name: p for p in export(single, tmp_path / "out", formats=["maps"], target=target)}
+    files = {p.name: p for p in export(single, tmp_path / "out", DeliveryRequest(formats=["maps"], target=target))}
     record = json.loads(files["tile.export.json"].read_text())
     assert {Path(e["file"]).name for e in record["files"]} == set(files) - {"tile.export.json"}
     if target in ("houdini", "arnold"):
@@ -106,13 +106,17 @@ def test_every_target_writes_what_its_program_reads(single, tmp_path, target):
 
 
 def test_names_follow_the_pattern_and_tell_sets_apart(made, tmp_path):
-    files = [p.name for p in export(made, tmp_path / "a", formats=["maps"], target="arnold")]
+    files = [p.name for p in export(made, tmp_path / "a", DeliveryRequest(formats=["maps"], target="arnold"))]
     assert "ball_lower_half_albedo.exr" in files and "ball_upper_half_normal.exr" in files
-    named = export(made, tmp_path / "b", formats=["maps"], target="arnold", names="x_{asset}-{map}_v003.{udim}.{ext}")
+    named = export(
+        made,
+        tmp_path / "b",
+        DeliveryRequest(formats=["maps"], target="arnold", names="x_{asset}-{map}_v003.{udim}.{ext}"),
+    )
     assert "x_ball_lower_half-albedo_v003.1001.exr" in [p.name for p in named]
     for wrong in ("{asset}.{ext}", "{map}.{ext}/..", "{map}.{ext}{0}", "{asset}_{map}"):
         with pytest.raises(UsageError, match="--texture-name"):
-            export(made, tmp_path / "c", formats=["maps"], names=wrong)
+            export(made, tmp_path / "c", DeliveryRequest(formats=["maps"], names=wrong))
 
 
 @pytest.mark.parametrize("target", ["blender", "unreal", "houdini"])
@@ -120,7 +124,7 @@ def test_usd_has_nothing_against_it_and_shows_the_mesh(made, tmp_path, target):
     pytest.importorskip("pxr")
     from mistyle.files import usd
 
-    export(made, tmp_path / "out", formats=["usd"], target=target)
+    export(made, tmp_path / "out", DeliveryRequest(formats=["usd"], target=target))
     stage_file = tmp_path / "out" / "ball.usda"
     assert usd.complaints(stage_file) == []
     pxr = usd.library()
@@ -145,7 +149,7 @@ def test_usd_has_nothing_against_it_and_shows_the_mesh(made, tmp_path, target):
 @pytest.mark.parametrize("target", ["blender", "arnold"])
 def test_materialx_validates(made, tmp_path, target):
     mx = pytest.importorskip("MaterialX")
-    export(made, tmp_path / "out", formats=["mtlx"], target=target)
+    export(made, tmp_path / "out", DeliveryRequest(formats=["mtlx"], target=target))
     document = mx.createDocument()
     mx.readFromXmlFile(document, str(tmp_path / "out" / "ball.mtlx"))
     library = mx.createDocument()
@@ -172,7 +176,7 @@ def test_materialx_validates(made, tmp_path, target):
 
 
 def test_obj_comes_back_as_the_same_mesh(made, tmp_path):
-    export(made, tmp_path / "out", formats=["obj"], target="blender")
+    export(made, tmp_path / "out", DeliveryRequest(formats=["obj"], target="blender"))
     finished = read_finished(made)
     loaded: Any = trimesh.load(tmp_path / "out" / "ball.obj", process=False, force="mesh")
     area = np.linalg.norm(np.cross(*np.diff(loaded.vertices[loaded.faces], axis=1).transpose(1, 0, 2)), axis=1).sum()
@@ -191,39 +195,45 @@ def test_obj_comes_back_as_the_same_mesh(made, tmp_path):
 def test_all_formats_at_once_and_again(single, tmp_path):
     pytest.importorskip("pxr")
     out = tmp_path / "out"
-    first = {p.relative_to(out): p.read_bytes() for p in export(single, out, formats=FORMATS, target="unreal")}
+    first = {
+        p.relative_to(out): p.read_bytes()
+        for p in export(single, out, DeliveryRequest(formats=FORMATS, target="unreal"))
+    }
     names = {p.name for p in first}
     assert {"tile.glb", "tile.usda", "tile.usdz", "tile.mtlx", "tile.obj", "tile.mtl"} <= names
     # Unreal's own normal map beside the one that the materials in files want.
     assert {"tile_normal_dx.png", "tile_normal.png", "tile_orm.png", "tile_roughness.png"} <= names
-    again = {p.relative_to(out): p.read_bytes() for p in export(single, out, formats=FORMATS, target="unreal")}
+    again = {
+        p.relative_to(out): p.read_bytes()
+        for p in export(single, out, DeliveryRequest(formats=FORMATS, target="unreal"))
+    }
     assert again.keys() == first.keys()
     assert [str(p) for p in first if again[p] != first[p] and p.suffix != ".usdz"] == []
 
 
 def test_what_cannot_be_delivered_is_refused(made, tmp_path):
     with pytest.raises(InputRefused, match="found no asset"):
-        export(tmp_path, tmp_path / "out", formats=["glb"])
+        export(tmp_path, tmp_path / "out", DeliveryRequest(formats=["glb"]))
     with pytest.raises(UsageError, match="'fbx' cannot be written"):
-        export(made, tmp_path / "out", formats=["fbx"])
+        export(made, tmp_path / "out", DeliveryRequest(formats=["fbx"]))
     with pytest.raises(UsageError, match="'maya' cannot be written"):
-        export(made, tmp_path / "out", formats=["glb"], target="maya")
+        export(made, tmp_path / "out", DeliveryRequest(formats=["glb"], target="maya"))
     mine = tmp_path / "mine"
     mine.mkdir()
     (mine / "ball.glb").write_text("mine")
     with pytest.raises(UsageError, match="mistyle did not write this file"):
-        export(made, mine, formats=["glb"])
+        export(made, mine, DeliveryRequest(formats=["glb"]))
     assert (mine / "ball.glb").read_text() == "mine" and len(list(mine.iterdir())) == 1
     (tmp_path / "broken.json").write_text("{}")
     with pytest.raises(InputRefused, match="not the list"):
-        export(tmp_path / "broken.json", tmp_path / "out", formats=["glb"])
+        export(tmp_path / "broken.json", tmp_path / "out", DeliveryRequest(formats=["glb"]))
     elsewhere = {"name": "ball", "parts": [{"name": "ball", "textures": "../../secret"}], "files": []}
     (tmp_path / "broken.json").write_text(json.dumps(elsewhere))
     with pytest.raises(InputRefused, match="no name of a file"):
-        export(tmp_path / "broken.json", tmp_path / "out", formats=["glb"])
+        export(tmp_path / "broken.json", tmp_path / "out", DeliveryRequest(formats=["glb"]))
     (tmp_path / "broken.json").write_text("[" * 100_000)
     with pytest.raises(InputRefused, match="nested without end"):
-        export(tmp_path / "broken.json", tmp_path / "out", formats=["glb"])
+        export(tmp_path / "broken.json", tmp_path / "out", DeliveryRequest(formats=["glb"]))
     assert not (tmp_path / "out").exists()
 
 
@@ -233,45 +243,47 @@ def contents(folder: Path) -> dict[Path, bytes]:
 
 def test_versions_go_up_and_nothing_delivered_is_overwritten(single, tmp_path):
     run, out = Path(shutil.copytree(single, tmp_path / "run")), tmp_path / "out"
-    first = export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}")
+    first = export(run, out, DeliveryRequest(formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}"))
     assert {p.name for p in first} >= {"thing_look_v001.glb", "thing_look_v001_albedo.png"}
     kept = contents(out)
     # The same asset again is the same delivery.
-    assert export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}") == first
+    assert export(run, out, DeliveryRequest(formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}")) == first
     assert contents(out) == kept
     # Another program, or an edited texture, is a new one; the earlier files stay as they are.
-    export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}", target="unreal")
+    export(run, out, DeliveryRequest(formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}", target="unreal"))
     Image.new("RGB", (16, 16), (255, 0, 0)).save(run / "asset" / "textures" / "tile_albedo.png")
-    third = export(run, out, formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}")
+    third = export(run, out, DeliveryRequest(formats=["glb", "maps"], name="{mesh}_{style}_v{v:03}"))
     assert "thing_look_v003.glb" in {p.name for p in third}
     assert all(p.read_bytes() == content for p, content in kept.items())
     # A gap is not filled, and a file without its list counts too.
     (out / "thing_look_v003.export.json").unlink()
-    assert "thing_look_v004.glb" in {p.name for p in export(run, out, formats=["glb"], name="{mesh}_{style}_v{v:03}")}
+    assert "thing_look_v004.glb" in {
+        p.name for p in export(run, out, DeliveryRequest(formats=["glb"], name="{mesh}_{style}_v{v:03}"))
+    }
 
 
 def test_other_deliveries_in_the_folder_stay_and_are_not_replaced(made, single, tmp_path):
     out = tmp_path / "out"
-    export(made, out, formats=["glb", "maps"])
+    export(made, out, DeliveryRequest(formats=["glb", "maps"]))
     before = contents(out)
-    export(single, out, formats=["glb", "maps"])
+    export(single, out, DeliveryRequest(formats=["glb", "maps"]))
     assert all(p.read_bytes() == content for p, content in before.items())
     # The same name again replaces its own files only.
-    export(made, out, formats=["glb"])
+    export(made, out, DeliveryRequest(formats=["glb"]))
     left = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     assert "textures/tile_albedo.png" in left and "textures/ball_lower_half_albedo.png" not in left
-    export(single, tmp_path / "plain", formats=["maps"], names="{map}.{ext}")
+    export(single, tmp_path / "plain", DeliveryRequest(formats=["maps"], names="{map}.{ext}"))
     with pytest.raises(UsageError, match="another delivery's file"):
-        export(single, tmp_path / "plain", formats=["maps"], names="{map}.{ext}", name="second")
+        export(single, tmp_path / "plain", DeliveryRequest(formats=["maps"], names="{map}.{ext}", name="second"))
     assert (tmp_path / "plain" / "textures" / "albedo.png").is_file()
 
 
 @pytest.mark.parametrize("name", ["{x}", "{v.__class__}", "a/{v}", "", "{asset!r}", "{v:>9999}", "{0}", "{"])
 def test_names_are_plain_patterns(single, tmp_path, name):
     with pytest.raises(UsageError, match="--name"):
-        export(single, tmp_path / "out", formats=["glb"], name=name)
+        export(single, tmp_path / "out", DeliveryRequest(formats=["glb"], name=name))
     with pytest.raises(UsageError, match="cut off before its version"):
-        export(single, tmp_path / "out", formats=["glb"], name="x" * 90 + "_v{v}")
+        export(single, tmp_path / "out", DeliveryRequest(formats=["glb"], name="x" * 90 + "_v{v}"))
 
 
 def settings_of(deliver: dict[str, Any], environment=None) -> Settings:
@@ -319,10 +331,10 @@ def test_the_command_line_says_it_for_stylize_fit_and_batch(tmp_path):
     batch = parser().parse_args(["batch", "jobs.toml", "-o", "out", "--target", "arnold", "--name", "x_v{v}"])
     said = said_settings(batch, DELIVERY_OPTIONS)
     jobs = (Record(name="a", kind="stylize", mesh=Path("m.obj"), settings=settings_of({}).model_dump(mode="json")),)
-    changed = with_delivery(Plan(tmp_path, jobs), said)
+    changed = with_delivery(BatchPlan(tmp_path, jobs), said)
     assert changed.jobs[0].settings["deliver"]["target"] == ["arnold"]
     assert Settings.model_validate(changed.jobs[0].settings).deliver.name == "x_v{v}"
-    plan = Plan(tmp_path, jobs)
+    plan = BatchPlan(tmp_path, jobs)
     assert with_delivery(plan, {}) is plan
     with pytest.raises(SystemExit):
         parser().parse_args(["batch", "jobs.toml", "--name", "alike"])

@@ -12,7 +12,7 @@ from gltf_cases import no_texels, quarters
 from mistyle.core.mesh import local_origin
 from mistyle.files.read_mesh import read_mesh
 from mistyle.files.usd import library
-from mistyle.run.deliver import export
+from mistyle.run.deliver import DeliveryRequest, export
 from mistyle.stages.export import write_asset
 
 # Where the middle is, and how far the mesh reaches from there: UTM, and a national grid with a wide tile.
@@ -44,7 +44,7 @@ def delivered(folder: Path, points: np.ndarray, up: Any = "y") -> Path:
     asset = read_mesh(write_obj(folder / "site.obj", points), uv="keep", up=up)
     ones = np.ones((16, 16), np.float32)
     write_asset(folder / "asset", "site", asset, [quarters()], [ones], [no_texels()], provenance={})
-    export(folder, folder / "out", formats=["usd", "obj", "glb"])
+    export(folder, folder / "out", DeliveryRequest(formats=["usd", "obj", "glb"]))
     return folder / "out"
 
 
@@ -106,9 +106,9 @@ def test_a_delivered_obj_that_was_turned_says_so(tmp_path):
     out = delivered(tmp_path, points, up="z")
     np.testing.assert_allclose(obj_points(out / "site.obj"), points[:, [0, 2, 1]] * [1, 1, -1], atol=1e-6)
     for formats, count in ((["obj"], 1), (["glb"], 0)):
-        export(tmp_path, tmp_path / "again", formats=formats, note=lambda *s: said.extend(s))
+        export(tmp_path, tmp_path / "again", DeliveryRequest(formats=formats), note=lambda *s: said.extend(s))
         assert len(said) == count
         assert json.loads((tmp_path / "again" / "site.export.json").read_text())["notes"] == said
         said.clear()
-    export(tmp_path, tmp_path / "again", formats=["obj"], note=lambda *s: said.extend(s))
+    export(tmp_path, tmp_path / "again", DeliveryRequest(formats=["obj"]), note=lambda *s: said.extend(s))
     assert "site.obj has Y up" in said[0] and "from Z up to Y up" in said[0]

@@ -19,7 +19,7 @@ from mistyle.render import sheet
 from mistyle.render.sheet_aovs import aovs, density
 from mistyle.run import sheet_canvas
 from mistyle.run.cli import main
-from mistyle.run.sheet_canvas import Panel, Row, Sheet, compose, fitted
+from mistyle.run.sheet_canvas import Panel, PanelRow, Sheet, compose, fitted
 from mistyle.run.turntable import write_turn
 
 CYAN = 17
@@ -76,6 +76,21 @@ def test_the_grey_ball_is_18_percent_and_the_chrome_ball_a_mirror(under_white):
     np.testing.assert_allclose(sheet.ball_mean(under_white, "chrome", SMALL), 1.0, atol=0.001)
 
 
+def patch_means(picture: np.ndarray, scale: float = 1.0) -> np.ndarray:
+    """The mean linear colours of the chart's patches, (24, 3), in the order of `colour_checker`."""
+    columns, rows = sheet.PATCHES
+    found = np.zeros((rows, columns, 3), np.float32)
+    for row in range(rows):
+        for column in range(columns):
+            x = sheet.CHART_CENTRE[0] + sheet.CHART_SIZE[0] * ((column + 0.5) / columns - 0.5)
+            y = sheet.CHART_CENTRE[1] - sheet.CHART_SIZE[1] * ((row + 0.5) / rows - 0.5)
+            px, py = sheet.pixel_of(x, y, scale)
+            reach = 0.25 * sheet.CHART_SIZE[0] / columns * sheet.UNIT * sheet.column_camera(scale).focal / 40.0
+            block = picture[int(py - reach) : int(py + reach) + 1, int(px - reach) : int(px + reach) + 1, :3]
+            found[row, column] = block.mean(axis=(0, 1))
+    return np.rot90(found, 1).reshape(24, 3)
+
+
 def test_the_chart_shows_the_published_colours(under_white):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -83,7 +98,7 @@ def test_the_chart_shows_the_published_colours(under_white):
 
         chart = colour.CCS_COLOURCHECKERS["ColorChecker24 - After November 2014"]
         published = colour.XYZ_to_Lab(colour.xyY_to_XYZ(np.array(list(chart.data.values()))), chart.illuminant)
-    apart = difference(lab(sheet.patch_means(under_white, SMALL), chart.illuminant), published)
+    apart = difference(lab(patch_means(under_white, SMALL), chart.illuminant), published)
     inside = np.arange(24) != CYAN
     assert apart[inside].max() < 0.3, apart
     # Cyan lies outside Rec.709: its red cannot be reflected, and nothing else is clipped.
@@ -189,7 +204,7 @@ def test_density_is_told_against_the_median(tmp_path):
 
 def test_the_canvas_keeps_pictures_as_they_are_and_aligns_them():
     grey = [np.full((40, w, 3), v, np.float32) for w, v in ((60, 0.2), (50, 0.4), (50, 0.6))]
-    rows = (Row("a heading", tuple(Panel(p, "name", "+1") for p in grey)), Row("one", (Panel(grey[0], "n"),)))
+    rows = (PanelRow("a heading", tuple(Panel(p, "name", "+1") for p in grey)), PanelRow("one", (Panel(grey[0], "n"),)))
     picture = compose(Sheet("title", ("a line",), rows, "foot"), 200, 0.5)
     left = sheet_canvas.measures(0.5)["margin"]
     assert picture.shape[1] == 200 + 2 * left

@@ -18,16 +18,6 @@ def random_picture(rng, channels=3, size=24, count=2):
     return torch.from_numpy(rng.random((count, channels, size, size)).astype(np.float32))
 
 
-def test_total_variation_by_hand():
-    assert float(losses.total_variation(torch.full((3, 4, 5), 0.7))) == 0
-    step = torch.tensor([[[0.0, 0.0, 1.0], [0.0, 0.0, 1.0]]])
-    # Horizontal differences 0 1 0 1: mean 1/2; vertical all 0.
-    assert float(losses.total_variation(step)) == pytest.approx(0.5)
-    checks = torch.tensor([[[0.0, 2.0], [3.0, 1.0]]])
-    # |2|, |-2| across; |3|, |-1| down.
-    assert float(losses.total_variation(checks)) == pytest.approx(2 + 2)
-
-
 def test_sliced_wasserstein_of_a_permutation_is_zero(rng):
     pixels = torch.from_numpy(rng.random((500, 3)).astype(np.float32))
     shuffled = pixels[torch.from_numpy(rng.permutation(500))]

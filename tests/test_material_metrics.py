@@ -5,9 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from benchmarks import material_metrics as mm
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
-from mistyle.measure import material_metrics as mm
 from mistyle.stages.texels import rasterise
 
 

@@ -26,11 +26,11 @@ from mistyle.files.packing import TARGETS, TextureSet
 from mistyle.files.textures import part_stems
 from mistyle.files.usd import library
 from mistyle.run import deliver_files
-from mistyle.run.batch_jobs import Job, _names
+from mistyle.run.batch_jobs import BatchJob, _names
 from mistyle.run.cli import main
-from mistyle.run.deliver import export
+from mistyle.run.deliver import DeliveryRequest, export
 from mistyle.run.deliver_settings import TEXTURES
-from mistyle.run.finished import Finished
+from mistyle.run.finished import FinishedAsset
 from mistyle.run.options import asset_name
 from mistyle.stages.export import write_asset
 
@@ -198,7 +198,7 @@ def test_two_materials_stay_two_in_every_format(tmp_path, parts):
     pytest.importorskip("MaterialX")
     name = names.asset_name(None, "木" * 42, "石" * 41)
     run = written(tmp_path / "run", name, *parts)
-    files = export(run, run / "delivered", formats=FORMATS, target="unreal")
+    files = export(run, run / "delivered", DeliveryRequest(formats=FORMATS, target="unreal"))
     assert len({names.folded(str(p)) for p in files}) == len(files)
     out = run / "delivered"
     below, above = np.bincount(bumpy_sphere(4).mesh.part).tolist()
@@ -220,11 +220,13 @@ def test_two_materials_stay_two_in_every_format(tmp_path, parts):
 def test_a_pattern_that_lets_two_maps_be_one_file_is_refused(tmp_path):
     run = written(tmp_path / "run", "ball", "a", "b")
     with pytest.raises(UsageError, match=r"two maps would both be albedo\.png; put \{asset\} and \{udim\} into it"):
-        export(run, tmp_path / "out", formats=["maps"], names="{map}.{ext}")
+        export(run, tmp_path / "out", DeliveryRequest(formats=["maps"], names="{map}.{ext}"))
     with pytest.raises(UsageError, match="--texture-name 'y+.*expected at most"):
-        export(run, tmp_path / "out", formats=["maps"], names="y" * 150 + "{asset}_{map}.{ext}")
+        export(run, tmp_path / "out", DeliveryRequest(formats=["maps"], names="y" * 150 + "{asset}_{map}.{ext}"))
     assert not (tmp_path / "out").exists()
-    made = export(run, tmp_path / "out", formats=["maps"], names="y" * 80 + "{asset}{map}{asset}.{ext}")
+    made = export(
+        run, tmp_path / "out", DeliveryRequest(formats=["maps"], names="y" * 80 + "{asset}{map}{asset}.{ext}")
+    )
     files = [p.name for p in made if p.suffix == ".png"]
     assert len(files) == 10 and all(len(f) <= names.WRITTEN for f in files)
 
@@ -239,7 +241,7 @@ def test_no_two_sets_of_a_delivery_share_a_file(parts, pattern):
     tiles = [int(names.split_tile(part)[1][1:] or 1001) for part in parts]
     planes = (np.zeros((1, 1, 3), np.float32),) * 2 + (np.zeros((1, 1), np.float32),) * 3
     sets = tuple(TextureSet(s, t, *planes) for s, t in zip(part_stems("ball", parts), tiles, strict=True))
-    finished = Finished(bumpy_sphere(4), sets, {"name": "ball"}, Path())
+    finished = FinishedAsset(bumpy_sphere(4), sets, {"name": "ball"}, Path())
     pattern = deliver_files._tiled(pattern, finished.sets)
     labels = deliver_files.set_labels(pattern, "木" * 26, finished)
     for target in TARGETS.values():
@@ -255,7 +257,9 @@ def test_a_version_survives_long_names(tmp_path):
     ones = [np.ones((8, 8), np.float32)] * 2
     write_asset(tmp_path / "asset", "a", asset, maps, ones, [no_texels(8)] * 2, provenance=told)
     pattern, out = "{mesh}_{style}_v{v:03}", tmp_path / "out"
-    made = [export(tmp_path, out, formats=["glb"], name=pattern, target=t) for t in ("blender", "unreal")]
+    made = [
+        export(tmp_path, out, DeliveryRequest(formats=["glb"], name=pattern, target=t)) for t in ("blender", "unreal")
+    ]
     glbs = [next(p.stem for p in files if p.suffix == ".glb") for files in made]
     assert [g[-5:] for g in glbs] == ["_v001", "_v002"] and all(len(g.encode()) <= names.ASSET for g in glbs)
     assert "木" in glbs[0] and "石" in glbs[0]
@@ -270,7 +274,7 @@ def test_names_of_assets_and_jobs_are_file_names_before_the_work_begins(tmp_path
     assert main([*command, "--name", "木" * 83]) == 2
     assert "249 bytes of UTF-8, expected" in capsys.readouterr().err and not (tmp_path / "out").exists()
     called = [LONG, LONG, "Chair", "chair", "my chair", "con", "con"]
-    jobs = [Job(mesh=Path(f"{k}.obj"), style=Path("s.png"), name=name) for k, name in enumerate(called)]
+    jobs = [BatchJob(mesh=Path(f"{k}.obj"), style=Path("s.png"), name=name) for k, name in enumerate(called)]
     made = _names(jobs)
     assert len({n.lower() for n in made}) == len(made) and all(names.is_safe(n) for n in made)
     assert made[2:5] == ["Chair", "chair-2", "my-chair"]

@@ -17,7 +17,7 @@ from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Directional, Environment
 from mistyle.files.images import write_exr
 from mistyle.run.colour import in_working_space, key_of, read_style
-from mistyle.run.deliver import export
+from mistyle.run.deliver import DeliveryRequest, export
 from mistyle.run.deliver_settings import ColourSettings
 from mistyle.stages.export import write_asset
 
@@ -137,8 +137,8 @@ def planes(path: Path) -> np.ndarray:
 
 def test_delivered_textures_are_converted_and_tagged(run, tmp_path):
     colour = ColourSettings(space="ACEScg", config=CONFIG)
-    export(run, tmp_path / "aces", formats=["maps", "mtlx"], target="houdini", colour=colour)
-    export(run, tmp_path / "plain", formats=["maps", "mtlx"], target="houdini")
+    export(run, tmp_path / "aces", DeliveryRequest(formats=["maps", "mtlx"], target="houdini", colour=colour))
+    export(run, tmp_path / "plain", DeliveryRequest(formats=["maps", "mtlx"], target="houdini"))
     aces, flat = (planes(tmp_path / k / "textures" / "tile_albedo.exr") for k in ("aces", "plain"))
     np.testing.assert_allclose(aces, flat @ AP1_FROM_REC709.T, atol=2e-3)
     told = header(tmp_path / "aces" / "textures" / "tile_albedo.exr")
@@ -159,7 +159,9 @@ def test_usd_says_what_its_float_textures_are(run, tmp_path):
     pytest.importorskip("pxr")
     from mistyle.files.usd import complaints, library
 
-    export(run, tmp_path / "out", formats=["usd"], target="houdini", colour=ColourSettings(space="ACEScg"))
+    export(
+        run, tmp_path / "out", DeliveryRequest(formats=["usd"], target="houdini", colour=ColourSettings(space="ACEScg"))
+    )
     assert complaints(tmp_path / "out" / "tile.usda") == []
     stage = library().Usd.Stage.Open(str(tmp_path / "out" / "tile.usda"))
     albedo = next(p for p in stage.Traverse() if p.GetName() == "diffuseColor")

@@ -7,7 +7,7 @@ import pytest
 from test_warp import at, see
 
 from mistyle.core.image import dilate, erode, gaussian
-from mistyle.stages.outline import carried, displacement, follow, outline_error, signed
+from mistyle.stages.outline import carried, displacement, distance_to, follow, signed
 
 SIZE = 192
 
@@ -19,6 +19,16 @@ def thing(size: int = SIZE) -> np.ndarray:
     for cx, cy, r in ((0.5, 0.5, 0.2), (0.65, 0.35, 0.1), (0.35, 0.4, 0.09), (0.42, 0.72, 0.08), (0.6, 0.72, 0.08)):
         mask |= (x - cx) ** 2 + (y - cy) ** 2 < r * r
     return mask
+
+
+def outline_error(a: np.ndarray, b: np.ndarray) -> float:
+    """Mean distance between two outlines in pixels: that of each outline pixel to the other outline, both ways."""
+    total, count = 0.0, 0
+    for one, other in ((a, b), (b, a)):
+        rim = one & (distance_to(~one) < 1.5)
+        total += float(np.maximum(np.abs(signed(other)[rim]) - 0.5, 0).sum())
+        count += int(rim.sum())
+    return total / count if count else 0.0
 
 
 def waves(shift: float, rng: np.random.Generator) -> np.ndarray:

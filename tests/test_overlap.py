@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from test_metrics import plane_view
 
+from benchmarks import consistency_metrics as consistency
 from mistyle.core.camera import px_from_world, world_from_px
-from mistyle.measure import consistency
 from mistyle.measure.overlap import _axes, overlap, pixel_steps, seen_here, seen_there
 
 FINER = 8  # lookups along each side of a pixel, which make its mean

@@ -14,15 +14,15 @@ from PIL import Image
 
 from mistyle.run import report as module
 from mistyle.run.report import (
+    BeforeAfter,
     Figure,
     File,
     MapSet,
     Note,
     Overlay,
-    Pair,
     Report,
+    ReportPicture,
     Setting,
-    Shot,
     Step,
     Timing,
     seconds,
@@ -70,8 +70,8 @@ class Page(HTMLParser):
 def sample(rng: np.random.Generator, text: str = "word") -> Report:
     """A report with something in every part; `text` stands wherever a text can."""
 
-    def shot(*shape: int, sharp: bool = False) -> Shot:
-        return Shot(rng.random(shape).astype(np.float32), text, text, sharp)
+    def shot(*shape: int, sharp: bool = False) -> ReportPicture:
+        return ReportPicture(rng.random(shape).astype(np.float32), text, text, sharp)
 
     overlays = (Overlay(text, rng.random((64, 64, 4)).astype(np.float32), text),)
     frames = tuple(rng.integers(0, 256, (40, 40, 4)).astype(np.uint8) for _ in range(6))
@@ -86,7 +86,14 @@ def sample(rng: np.random.Generator, text: str = "word") -> Report:
         facts=((text, text),),
         notes=(Note(text), Note(text, warning=True)),
         steps=(
-            Step(text, text, text, (Pair(shot(30, 30, 3), shot(30, 30, 4), text),), (shot(20, 20),), ((text, text),)),
+            Step(
+                text,
+                text,
+                text,
+                (BeforeAfter(shot(30, 30, 3), shot(30, 30, 4), text),),
+                (shot(20, 20),),
+                ((text, text),),
+            ),
             Step("Second", shots=(shot(20, 20, sharp=True), shot(9, 21, 3)), columns=2),
         ),
         maps=(MapSet(text, (shot(64, 64, 3), shot(64, 64)), overlays), MapSet("other", (shot(64, 64, 3),))),
@@ -180,7 +187,7 @@ def test_controls_can_be_reached_and_named_without_a_mouse(tmp_path, rng):
 
 
 def test_a_report_of_the_least(tmp_path, rng):
-    bare = Report("t", "m", "s", Shot(rng.random((4, 4, 3)), "p"), (rng.random((4, 4, 3)),))
+    bare = Report("t", "m", "s", ReportPicture(rng.random((4, 4, 3)), "p"), (rng.random((4, 4, 3)),))
     _, page = page_of(tmp_path / "r.html", bare)
     assert page.all("table") == [] and page.all("details") == [] and len(page.all("img")) == 2
     assert [a["id"] for a in page.all("section")] == ["top"]
@@ -196,7 +203,7 @@ def test_frames_must_agree(tmp_path, rng):
 
 
 def test_large_pictures_are_scaled_until_the_file_is_small_enough(tmp_path, rng, monkeypatch):
-    noise = Shot(rng.integers(0, 256, (500, 500, 3)).astype(np.uint8), "noise")
+    noise = ReportPicture(rng.integers(0, 256, (500, 500, 3)).astype(np.uint8), "noise")
     report = replace(sample(rng), maps=(MapSet("", (noise,)),))
     write_report(tmp_path / "whole.html", report)
     whole = (tmp_path / "whole.html").stat().st_size

@@ -9,12 +9,12 @@ from test_seam import sphere
 
 from benchmarks import two_phase_struggle as struggle
 from benchmarks import two_phase_truth as known
+from benchmarks.material_metrics import map_errors, texel_areas
 from benchmarks.two_phase import light_left
 from mistyle.core.asset import Asset, Picture, Source
 from mistyle.core.light import Directional, lights
 from mistyle.core.maps import flat_maps
 from mistyle.core.paths import scenes
-from mistyle.measure.material_metrics import map_errors, texel_areas
 from mistyle.render import device
 from mistyle.render.draw import tracer
 from mistyle.render.shade import Shade, pack

@@ -9,7 +9,8 @@ from PIL import Image
 
 from mistyle.files.raw import Raw
 from mistyle.files.read_mesh import read_mesh
-from mistyle.files.usd_read import metres, read_usd
+from mistyle.files.usd_read import read_usd
+from mistyle.files.usd_stage import metres
 
 pxr = pytest.importorskip("pxr")
 

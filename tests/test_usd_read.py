@@ -257,14 +257,14 @@ def test_a_usd_mesh_goes_through_the_one_reader(tmp_path):
 
 
 def test_what_we_wrote_comes_back(tmp_path):
-    from mistyle.run.deliver import export
+    from mistyle.run.deliver import DeliveryRequest, export
     from mistyle.stages.export import write_asset
 
     occlusion = np.ones((16, 16), np.float32)
     write_asset(
         tmp_path / "asset", "ball", bumpy_sphere(), [quarters()] * 2, [occlusion] * 2, [no_texels()] * 2, provenance={}
     )
-    export(tmp_path, tmp_path / "out", formats=["usd"], target="blender")
+    export(tmp_path, tmp_path / "out", DeliveryRequest(formats=["usd"], target="blender"))
     for ending in ("usda", "usdz"):
         found = read_mesh(tmp_path / "out" / f"ball.{ending}", uv="keep")
         glb = read_mesh(tmp_path / "asset" / "ball.glb", uv="keep")
@@ -423,14 +423,18 @@ def test_a_look_layer_holds_a_variant_per_style_over_the_untouched_source(tmp_pa
     from pxr import UsdGeom, UsdShade
 
     from mistyle.files.usd import complaints
-    from mistyle.run.deliver import export
+    from mistyle.run.deliver import DeliveryRequest, export
 
     source = painted(tmp_path)
     before = source.read_bytes()
-    files = export(run_of(tmp_path / "one", source, "wave"), tmp_path / "out", formats=["usd"], target="blender")
+    files = export(
+        run_of(tmp_path / "one", source, "wave"), tmp_path / "out", DeliveryRequest(formats=["usd"], target="blender")
+    )
     layer = tmp_path / "out" / "a_look.usda"
     assert layer in files and not list((tmp_path / "out").glob("*.usdz"))
-    export(run_of(tmp_path / "two", source, "night"), tmp_path / "out", formats=["usd"], target="houdini")
+    export(
+        run_of(tmp_path / "two", source, "night"), tmp_path / "out", DeliveryRequest(formats=["usd"], target="houdini")
+    )
     assert source.read_bytes() == before and complaints(layer) == []
     assert list(opened(layer, "wave").GetRootLayer().subLayerPaths) == ["../a.usda"]
     for variant, ending in (("wave", "png"), ("night", "exr")):
@@ -461,13 +465,13 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
 
     from mistyle.files.usd import complaints
     from mistyle.files.usd_look import write_look
-    from mistyle.run.deliver import export
+    from mistyle.run.deliver import DeliveryRequest, export
 
     extra = '    float3 xformOp:scale = (-1, 1, 1)\n    uniform token[] xformOpOrder = ["xformOp:scale"]\n'
     extra += '    normal3f[] normals = [(0, 0, 1), (0, 0, 1)] ( interpolation = "uniform" )\n'
     source = stage(tmp_path / "b.usda", mesh(orientation=orientation, extra=extra))
     run_of(tmp_path / "run", source, "wave", uv="auto")
-    export(tmp_path / "run", tmp_path / "out", formats=["usd"])
+    export(tmp_path / "run", tmp_path / "out", DeliveryRequest(formats=["usd"]))
     layer = tmp_path / "out" / "b_look.usda"
     asset = read_mesh(source)
     assert complaints(layer) == [] and asset.source.uv == "new"
@@ -496,9 +500,13 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
     torn = asset.mesh.corner_uvs.copy()
     torn[1] += 0.25
     asset = dataclasses.replace(asset, mesh=dataclasses.replace(asset.mesh, corner_uvs=torn))
-    from mistyle.files.materialx import Look
+    from mistyle.files.materialx import TexturedMaterial
 
-    looks = [Look("material", *(f"textures/b_wave_{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))]
+    looks = [
+        TexturedMaterial(
+            "material", *(f"textures/b_wave_{m}.png" for m in ("albedo", "normal", "roughness", "metallic"))
+        )
+    ]
     write_look(tmp_path / "out" / "torn.usda", None, asset, looks, "wave", beside=tmp_path / "out")
     assert complaints(tmp_path / "out" / "torn.usda") == []
     check(asset, tmp_path / "out" / "torn.usda", 3)
@@ -506,11 +514,13 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
 
 def test_a_sphere_gets_no_look(tmp_path):
     """It has no faces that a layer could bind materials to, or give coordinates."""
-    from mistyle.files.materialx import Look
+    from mistyle.files.materialx import TexturedMaterial
     from mistyle.files.usd_look import write_look
 
     asset = read_mesh(stage(tmp_path / "a.usda", 'def Sphere "Ball" {}\n'), size=64)
-    looks = [Look("material", *(f"textures/{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))]
+    looks = [
+        TexturedMaterial("material", *(f"textures/{m}.png" for m in ("albedo", "normal", "roughness", "metallic")))
+    ]
     with pytest.raises(InputRefused, match="Ball is a Sphere"):
         write_look(tmp_path / "look.usda", None, asset, looks, "wave", beside=tmp_path)
 
@@ -528,21 +538,21 @@ def test_a_look_needs_the_source_and_the_run(tmp_path):
     import shutil
 
     from mistyle.core.errors import UsageError
-    from mistyle.run.deliver import export
+    from mistyle.run.deliver import DeliveryRequest, export
 
     source = painted(tmp_path)
     run_of(tmp_path / "run", source, "wave")
     moved = tmp_path / "moved.usda"
     source.rename(moved)
     with pytest.raises(UsageError, match="--source"):
-        export(tmp_path / "run", tmp_path / "out", formats=["usd"])
-    export(tmp_path / "run", tmp_path / "out", formats=["usd"], source=moved)
+        export(tmp_path / "run", tmp_path / "out", DeliveryRequest(formats=["usd"]))
+    export(tmp_path / "run", tmp_path / "out", DeliveryRequest(formats=["usd"], source=moved))
     moved.write_text(moved.read_text().replace("[4, 3]", "[4]").replace("0, 1, 2, 3, 3, 2, 4", "0, 1, 2, 3"))
     with pytest.raises(InputRefused, match="no longer the mesh"):
-        export(tmp_path / "run", tmp_path / "other", formats=["usd"], source=moved)
+        export(tmp_path / "run", tmp_path / "other", DeliveryRequest(formats=["usd"], source=moved))
     shutil.rmtree(tmp_path / "run" / "work")
     with pytest.raises(InputRefused, match="whole run folder"):
-        export(tmp_path / "run", tmp_path / "third", formats=["usd"], source=moved)
+        export(tmp_path / "run", tmp_path / "third", DeliveryRequest(formats=["usd"], source=moved))
 
 
 def test_damaged_bytes_are_refused_or_read_and_never_more(tmp_path, rng):

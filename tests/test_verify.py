@@ -15,7 +15,7 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.run import verify_checks
 from mistyle.run.blender import blender_command, find_blender
 from mistyle.run.cli import main
-from mistyle.run.deliver import export
+from mistyle.run.deliver import DeliveryRequest, export
 from mistyle.run.verify import Rendering, compared, file_checks, table, verify
 from mistyle.run.verify_surfaces import surface_checks
 from mistyle.stages.export import write_asset
@@ -32,7 +32,7 @@ def good(tmp_path_factory) -> Path:
     write_asset(
         folder / "asset", "ball", bumpy_sphere(), [quarters()] * 2, [ones] * 2, [no_texels()] * 2, provenance={}
     )
-    export(folder, folder / "delivered" / "blender", formats=FORMATS, target="blender")
+    export(folder, folder / "delivered" / "blender", DeliveryRequest(formats=FORMATS, target="blender"))
     return folder
 
 

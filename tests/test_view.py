@@ -22,7 +22,16 @@ from mistyle.files.read import shrink_picture
 from mistyle.run import cli_lookdev, report_model
 from mistyle.run.cli import main
 from mistyle.run.report import Report, write_report
-from mistyle.run.report_model import VENDOR, VIEWER, VIEWER_SHA256, Model, TooLarge, packed, page_model, viewer_script
+from mistyle.run.report_model import (
+    VENDOR,
+    VIEWER,
+    VIEWER_SHA256,
+    PageModel,
+    TooLarge,
+    packed,
+    page_model,
+    viewer_script,
+)
 
 RED = (200, 24, 16)
 
@@ -80,7 +89,7 @@ def test_the_page_allows_two_scripts_and_no_address(tmp_path, glb):
 
 def test_the_packed_asset_is_the_asset_with_small_textures(glb):
     model = page_model(glb)
-    assert isinstance(model, Model)
+    assert isinstance(model, PageModel)
     text = packed(model, 64)
     assert text == packed(model, 64)
     back = trimesh.load(io.BytesIO(gzip.decompress(base64.b64decode(text))), file_type="glb", force="mesh")

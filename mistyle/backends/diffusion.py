@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.backends import models, models_check
-from mistyle.backends.consislora_make import NETWORKS, Halves, forecast, identity, lora_key, make_all, paths, steps_left
+from mistyle.backends.consislora_make import NETWORKS, Halves, forecast, identity, lora_key, make_all
 from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, TrainSettings
 from mistyle.backends.models_list import ENCODER, LOOSE_NEEDED
 from mistyle.core.errors import UsageError
@@ -98,15 +98,6 @@ def announcement(settings: ModelSettings, training: TrainSettings, chosen: Diffu
     looks = chosen.steps + (views - 1) * (chosen.steps * chosen.repeats + int(chosen.refinement * chosen.steps))
     trained = f"at most {forecast(steps, training.resolution)}" if steps else "no LoRA is trained"
     return f"diffusion: {trained}; then {looks:,} denoising steps over {views} views"
-
-
-def training_left(job: Job, views: Sequence[View]) -> int:
-    """Training steps that a job still takes."""
-    left = 0
-    for kind, name, rgb, word in lessons(job, views):
-        key = lora_key(kind, rgb, word, job.training, job.models, job.seed)
-        left += steps_left(kind, paths(job.loras, name, key), key, job.training)
-    return left
 
 
 def key(job: Job, views: Sequence[View]) -> str:

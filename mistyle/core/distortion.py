@@ -75,28 +75,6 @@ def distort(lens: Lens, tangents: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray
     return np.where((r2 < _reach(lens))[..., None], sent, np.nan)
 
 
-def undistort(lens: Lens, sent: Float[np.ndarray, "*n 2"], steps: int = 20) -> Float[np.ndarray, "*n 2"]:
-    """The inverse of `distort`, by Newton's method; NaN where it finds no tangent within 1e-9."""
-    (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
-    target = np.asarray(sent, float)
-    found = target.copy()
-    with np.errstate(all="ignore"):
-        for _ in range(steps):
-            x, y = found[..., 0], found[..., 1]
-            r2 = x * x + y * y
-            radial = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
-            slope = 2 * (k1 + r2 * (2 * k2 + 3 * k3 * r2))  # of `radial`, by r², twice
-            xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-            yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-            xy = slope * x * y + 2 * p1 * x + 2 * p2 * y
-            off = distort(lens, found) - target
-            determinant = xx * yy - xy * xy
-            step = np.stack([yy * off[..., 0] - xy * off[..., 1], xx * off[..., 1] - xy * off[..., 0]], axis=-1)
-            found = found - step / determinant[..., None]
-        miss = np.abs(distort(lens, found) - target).max(axis=-1, keepdims=True)
-    return np.where(miss < 1e-9, found, np.nan)
-
-
 def px_in_photograph(lens: Lens, px: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
     """Pixel coordinates in the photograph of pixel coordinates of its `pinhole`; NaN where the lens sees nothing."""
     focal, centre, _ = pinhole(lens)

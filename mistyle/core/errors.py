@@ -25,12 +25,6 @@ class EnvironmentMissing(MistyleError):
     exit_code = 4
 
 
-class QualityGateFailed(MistyleError):
-    """A limit that the user set was not kept."""
-
-    exit_code = 5
-
-
 class Stopped(MistyleError):
     """The run was asked to stop; running the same command again goes on from the last finished stage."""
 

@@ -16,8 +16,9 @@ with "space" that it is in the working space; another's is in whatever space its
 scales the world of its reconstruction: stored = applied_scale * (applied_transform @ original). That is undone here.
 
 Every camera describes either the pixels that a picture file stores or those of the upright picture, which a viewer
-shows (EXIF orientation): `Frame.pixels` says which. COLMAP and the readers of transforms.json (nerfstudio, instant-ngp)
-ignore the orientation, so their cameras describe stored pixels. A camera.json describes what one sees: upright pixels.
+shows (EXIF orientation): `CameraFrame.pixels` says which. COLMAP and the readers of transforms.json (nerfstudio,
+instant-ngp) ignore the orientation, so their cameras describe stored pixels. A camera.json describes what one sees:
+upright pixels.
 """
 
 import math
@@ -96,7 +97,7 @@ class _Transforms(BaseModel):
 
 
 @dataclass(frozen=True)
-class Frame:
+class CameraFrame:
     """One photograph of a model of cameras: its name (unique), its files as the model names them, its pose, its lens,
     and which pixels of the files these two describe (the module's text)."""
 
@@ -174,7 +175,7 @@ def read_cameras(path: Path, size: tuple[int, int] = (1024, 1024)) -> list[Camer
     return [Camera(f.world_from_cam, f.lens.focal[0], f.lens.centre, f.lens.size, f.name) for f in frames]
 
 
-def read_frames(path: Path, size_of: Callable[[str], tuple[int, int]]) -> list[Frame]:
+def read_frames(path: Path, size_of: Callable[[str], tuple[int, int]]) -> list[CameraFrame]:
     """The frames of a `transforms.json` with their lenses (k1 k2 k3 p1 p2), in the file's order and the space before
     nerfstudio's `applied_transform` and `applied_scale`.
 
@@ -259,7 +260,7 @@ def _frame(
     size_of: Callable[[str], tuple[int, int]],
     original: Float[np.ndarray, "4 4"],
     path: Path,
-) -> Frame:
+) -> CameraFrame:
     where = f"view '{name}'"
 
     def number(key: str) -> float | None:
@@ -290,7 +291,7 @@ def _frame(
     centre = (width / 2 if cx is None else float(cx), height / 2 if cy is None else float(cy))
     lens = Lens((float(fx), float(fy)), centre, (height, width), (k1, k2, k3), (p1, p2))
     there = moved_camera(Camera(matrix, float(fx), centre, (height, width), name), original).world_from_cam
-    return Frame(name, known.file_path, known.mask_path, there, lens, "stored")
+    return CameraFrame(name, known.file_path, known.mask_path, there, lens, "stored")
 
 
 def _camera(entry: ViewEntry, path: Path) -> Camera:

@@ -7,7 +7,7 @@ with square pixels: encoded values go through the exact sRGB curve, a lens's dis
 resampled away.
 
 A camera describes either stored pixels or upright ones (EXIF orientation, see files/cameras.py): the picture and the
-mask of a view are both read so, `Shot.pixels`.
+mask of a view are both read so, `CapturedPicture.pixels`.
 
 Which pixels count: finite, not saturated (an encoded channel at its maximum), wholly inside the alpha (a pixel that the
 object covers in part shows the background too) and inside the user's mask.
@@ -34,7 +34,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Lights, lights_of_views
 from mistyle.files.bounds import inside, refuse
-from mistyle.files.cameras import PIXELS, SPACE, Frame, ViewEntry, read_entries, read_frames
+from mistyle.files.cameras import PIXELS, SPACE, CameraFrame, ViewEntry, read_entries, read_frames
 from mistyle.files.capture_files import (
     COPY,
     HAND_IN,
@@ -65,7 +65,7 @@ TRANSFORMS = ("transforms.json", "transforms_train.json")
 
 
 @dataclass(frozen=True)
-class Shot:
+class CapturedPicture:
     """One picture on disk.
 
     camera       the pinhole camera that it is resampled to
@@ -131,7 +131,7 @@ def read_shots(
     masks: Path | None = None,
     exposure: Path | Mapping[str, float] | None = None,
     pictures: Path | None = None,
-) -> tuple[Shot, ...]:
+) -> tuple[CapturedPicture, ...]:
     """The pictures of a folder with cameras, masks and exposures; sizes are checked, see `read_captures`."""
     kind, file = _source(Path(path))
     elsewhere = None if pictures is None else picture_folder(Path(pictures))
@@ -162,7 +162,7 @@ def read_shots(
     return tuple(result)
 
 
-def reading_notes(path: Path, shots: Sequence[Shot]) -> tuple[str, ...]:
+def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ...]:
     """Sentences about how the pictures and cameras of `read_shots` were understood."""
     notes = []
     tagged = [sum(shot.orientation[k] > 1 for shot in shots) for k in (0, 1)]
@@ -203,7 +203,7 @@ def sparse_points(path: Path) -> SparsePoints | None:
     return read_colmap_points(file) if kind == "colmap" else None
 
 
-def load_shot(shot: Shot, saturation: float = 1.0, coverage: float = 0.999) -> Loaded:
+def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 0.999) -> Loaded:
     """Linear radiance as the shot's pinhole camera sees it, and which pixels count; 0 where one does not."""
     rgb, alpha, usable = _decoded(shot, saturation)
     if alpha is not None:
@@ -216,7 +216,7 @@ def load_shot(shot: Shot, saturation: float = 1.0, coverage: float = 0.999) -> L
     return resample(shot.lens, rgb, usable)
 
 
-def silhouette(shot: Shot) -> Bool[np.ndarray, "h w"]:
+def silhouette(shot: CapturedPicture) -> Bool[np.ndarray, "h w"]:
     """Where the object is, by the user's mask, else by the picture's alpha (at least half), in the pinhole camera.
 
     Refused: a picture without either.
@@ -228,7 +228,7 @@ def silhouette(shot: Shot) -> Bool[np.ndarray, "h w"]:
     return found
 
 
-def outline_of(shot: Shot) -> Bool[np.ndarray, "h w"] | None:
+def outline_of(shot: CapturedPicture) -> Bool[np.ndarray, "h w"] | None:
     """As `silhouette`; None for a picture that has neither alpha nor mask."""
     if shot.mask is not None:
         covered = _inside(shot.mask, shot.pixels)
@@ -288,7 +288,7 @@ def _home(path: Path) -> Path:
     return Path(path) if Path(path).is_dir() else Path(path).parent
 
 
-def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -> Shot:
+def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -> CapturedPicture:
     """A view of our camera.json: its EXR, or the picture that was edited or added (as files/views.py has it)."""
     folder = file.parent
     if elsewhere is not None:
@@ -301,16 +301,16 @@ def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -
     picture = standing_picture(folder, camera, entry, exr if exr.is_file() else None, HAND_IN)
     lens = Lens((camera.focal, camera.focal), camera.centre, camera.size)
     alpha_of = exr if picture is not None and exr.is_file() else None
-    return Shot(camera, lens, picture or exr, PIXELS, alpha_of=alpha_of)
+    return CapturedPicture(camera, lens, picture or exr, PIXELS, alpha_of=alpha_of)
 
 
-def _shot(frame: Frame, picture: Path, mask: Path | None) -> Shot:
+def _shot(frame: CameraFrame, picture: Path, mask: Path | None) -> CapturedPicture:
     focal, centre, size = pinhole(frame.lens)
     camera = Camera(frame.world_from_cam, focal, centre, size, frame.name)
-    return Shot(camera, frame.lens, picture, frame.pixels, mask)
+    return CapturedPicture(camera, frame.lens, picture, frame.pixels, mask)
 
 
-def _checked(picture: Path, shot: Shot) -> int:
+def _checked(picture: Path, shot: CapturedPicture) -> int:
     """The EXIF orientation of a picture or mask that has the size of its view's camera; refused where it has not."""
     height, width, orientation = read_stored_size(picture)
     if shot.pixels == "upright" and orientation > 4:
@@ -367,7 +367,7 @@ def _factors(exposure: Path | Mapping[str, float] | None, names: list[str]) -> l
 
 
 def _decoded(
-    shot: Shot, saturation: float
+    shot: CapturedPicture, saturation: float
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, Bool[np.ndarray, "h w"]]:
     """Linear colours (still premultiplied in an EXR), alpha, and where they are finite and not saturated."""
     if shot.picture.suffix.lower() == ".exr":
@@ -382,7 +382,7 @@ def _decoded(
     return linear_from_srgb(picture.rgb), alpha, np.asarray((picture.rgb < saturation).all(axis=-1))
 
 
-def _alpha(shot: Shot, decoded: Picture | None = None) -> Float[np.ndarray, "h w"] | None:
+def _alpha(shot: CapturedPicture, decoded: Picture | None = None) -> Float[np.ndarray, "h w"] | None:
     """The alpha of the picture (`decoded`, where it is at hand), or of the EXR that it took the place of."""
     if shot.picture.suffix.lower() == ".exr":
         return read_exr(shot.picture).get("A")

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from mistyle.core.distortion import Lens
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import read_bytes, refuse
-from mistyle.files.cameras import MAX_SIDE, Frame, check_rotation, unique_names
+from mistyle.files.cameras import MAX_SIDE, CameraFrame, check_rotation, unique_names
 
 # By the number in binary files: the name in text files and the number of parameters.
 MODELS = (
@@ -48,8 +48,10 @@ def find_model(path: Path) -> Path | None:
     return None
 
 
-def read_model(folder: Path) -> list[Frame]:
-    """The registered images of a model as frames, ordered by the images' names; `Frame.picture` is COLMAP's own name.
+def read_model(folder: Path) -> list[CameraFrame]:
+    """The registered images of a model as frames, ordered by the images' names.
+
+    `CameraFrame.picture` is COLMAP's own name.
 
     Refused: camera models other than SIMPLE_PINHOLE, PINHOLE, SIMPLE_RADIAL, RADIAL and OPENCV, by their names;
     damaged files; images of cameras that are not there; no images at all.
@@ -65,7 +67,7 @@ def read_model(folder: Path) -> list[Frame]:
         if camera not in lenses:
             raise refuse(path, f"camera {camera} of the image {picture!r}", "one of cameras' numbers", AGAIN)
         # COLMAP reads the pixels as they are stored, whatever EXIF says of the orientation.
-        frames.append(Frame(name, picture, None, _world_from_cam(pose, picture, path), lenses[camera], "stored"))
+        frames.append(CameraFrame(name, picture, None, _world_from_cam(pose, picture, path), lenses[camera], "stored"))
     return frames
 
 

@@ -15,7 +15,7 @@ from pydantic import ValidationError
 from mistyle.files import bounds
 from mistyle.files.bounds import MAX_DEPTH, MAX_JSON_BYTES, beside, read_bytes, read_part, refuse
 from mistyle.files.glb import Buffers
-from mistyle.files.gltf_schema import Buffer, Document
+from mistyle.files.gltf_schema import Document, JsonBuffer
 
 AGAIN = "Export the file again"
 DECOMPRESS = (
@@ -198,7 +198,7 @@ def _unpack(path: Path, say: Callable[[str], None]) -> tuple[dict[str, Any], mem
     return parse_json(text.rstrip(b"\0"), path), binary
 
 
-def _buffer(buffer: Buffer, binary: bytes | memoryview | None, path: Path) -> bytes | memoryview:
+def _buffer(buffer: JsonBuffer, binary: bytes | memoryview | None, path: Path) -> bytes | memoryview:
     if buffer.uri is None:
         if binary is None:
             raise refuse(path, "a buffer without bytes", "a binary chunk or a file", AGAIN)

@@ -24,7 +24,7 @@ from mistyle.files.gltf_infos import (
     wrap_of,
 )
 from mistyle.files.gltf_shading import GLOSSY, extension, number, shading_of, triple
-from mistyle.files.pictures import Budget, alpha_of, texture
+from mistyle.files.pictures import Budget, alpha_map, alpha_of, texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 
 Tree = dict[str, Any]
@@ -101,9 +101,7 @@ def _load(
             maps["specular"] = RawMap(pixels, **lookup, kind="colour")
             glossy = extension(tree["materials"][index]["extensions"], GLOSSY)
             gloss = np.float32(number(glossy, "glossinessFactor", 1.0, 0.0, 1.0))
-            alpha = alpha_of(data, where)
-            alpha = np.ones((2, 2), np.float32) if alpha is None else alpha
-            maps["roughness"] = RawMap(1 - alpha * gloss, **lookup, kind="data")
+            maps["roughness"] = RawMap(1 - alpha_map(data, where) * gloss, **lookup, kind="data")
         elif name == "normal":
             # Without TANGENT the frames follow the place of the lookup (as three.js and Khronos' viewer have it).
             frame: Tree = dict(scale=float(info.get("scale", 1.0)))

@@ -18,14 +18,14 @@ from mistyle.files.gltf_pose import INSTANCING, instances, joint_matrices, mirro
 from mistyle.files.gltf_vertices import triangles
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_indices, check_positions, too_many
-from mistyle.files.raw import Corners, Indexed, Raw
+from mistyle.files.raw import Corners, Indexed, Raw, RawMaterial
 
 Tree = dict[str, Any]
 MAX_INSTANCED = 500_000  # faces up to which all instances of a node are read
 
 
 @dataclass(frozen=True)
-class _Piece:
+class _PrimitivePiece:
     """One primitive under one node; `uvs` are those of its base set."""
 
     node: int
@@ -72,21 +72,11 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
             "Export the mesh itself, visible and as triangles",
         )
     used = sorted({p.material for p in pieces})
-    if -1 in used:
-        notes.append(
-            "A primitive has no material: it is drawn matt and grey, as Blender draws it, and painted as a white "
-            "dielectric of roughness 0.5; glTF's default is white rough metal."
-        )
-    place = {m: i for i, m in enumerate(used)}
     counts = [len(p.faces) for p in pieces]
     # All of it goes from one process to another, in as few bytes as hold it.
     kind = np.min_scalar_type(-len(used))
-    material = np.repeat(np.array([place[p.material] for p in pieces], kind), counts)
-    budget = Budget(path)
-    materials = tuple(read_material(tree, buffers, path, m, _other_sets(pieces, m), budget) for m in used)
-    if -1 in used and any(p.material < 0 and p.colours is not None for p in pieces):
-        # Vertex colours are a statement, which glTF's default material shows.
-        materials = (replace(materials[0], shading=Shading(stated="colour")), *materials[1:])
+    material = np.repeat(np.array([used.index(p.material) for p in pieces], kind), counts)
+    materials = _materials(tree, buffers, path, pieces, used, notes)
     starts = np.cumsum([0, *counts])
     primitives = tuple(
         Primitive(p.node, p.mesh, p.primitive, int(a), int(b), p.material, p.texcoord, -1, p.first_vertex)
@@ -106,19 +96,41 @@ def read_gltf(path: Path, max_faces: int) -> Indexed:
         notes=tuple(dict.fromkeys(notes)),
     )
     uvs = _joined([p.uvs or _same_for_all(len(p.faces), [np.nan] * 2) for p in pieces], faces)
-    colours = None
-    if any(p.colours is not None and (p.colours.values != 1).any() for p in pieces):
-        colours = _joined([p.colours or _same_for_all(len(p.faces), [1.0] * 3) for p in pieces], faces)
-    alphas = None
-    if any(p.alphas is not None and (p.alphas.values != 1).any() for p in pieces):
-        alphas = _joined([p.alphas or _same_for_all(len(p.faces), [1.0]) for p in pieces], faces)
     return Indexed(
         raw,
         _joined([p.normals for p in pieces], faces),
         uvs if np.isfinite(uvs.values).any() else None,
-        colours,
-        alphas,
+        _factors([p.colours for p in pieces], counts, 3, faces),
+        _factors([p.alphas for p in pieces], counts, 1, faces),
     )
+
+
+def _materials(
+    tree: Tree, buffers: Buffers, path: Path, pieces: list[_PrimitivePiece], used: list[int], notes: list[str]
+) -> tuple[RawMaterial, ...]:
+    """The materials `used` by the pieces, by their numbers in the file; -1 is a primitive without one."""
+    budget = Budget(path)
+    materials = tuple(read_material(tree, buffers, path, m, _other_sets(pieces, m), budget) for m in used)
+    if -1 not in used:
+        return materials
+    notes.append(
+        "A primitive has no material: it is drawn matt and grey, as Blender draws it, and painted as a white "
+        "dielectric of roughness 0.5; glTF's default is white rough metal."
+    )
+    if any(p.material < 0 and p.colours is not None for p in pieces):
+        # Vertex colours are a statement, which glTF's default material shows.
+        materials = (replace(materials[0], shading=Shading(stated="colour")), *materials[1:])
+    return materials
+
+
+def _factors(
+    found: list[Corners | None], counts: list[int], width: int, faces: Int[np.ndarray, "f 3"]
+) -> Corners | None:
+    """Factors of all pieces' corners, 1 for pieces without; None where every factor is 1."""
+    if not any(corners is not None and (corners.values != 1).any() for corners in found):
+        return None
+    ones = [1.0] * width
+    return _joined([c or _same_for_all(count, ones) for c, count in zip(found, counts, strict=True)], faces)
 
 
 def _same_for_all(faces: int, values: list[float]) -> Corners:
@@ -135,8 +147,8 @@ def _joined(corners: list[Corners], faces: Int[np.ndarray, "f 3"]) -> Corners:
 
 def _pieces(
     tree: Tree, buffers: Buffers, path: Path, max_faces: int, notes: list[str]
-) -> tuple[list[_Piece], list[np.ndarray]]:
-    pieces: list[_Piece] = []
+) -> tuple[list[_PrimitivePiece], list[np.ndarray]]:
+    pieces: list[_PrimitivePiece] = []
     positions: list[np.ndarray] = []
     world = world_matrices(tree)
     faces = vertices = 0
@@ -213,7 +225,9 @@ def _flattened(matrix: Float[np.ndarray, "4 4"]) -> bool:
     return bool(second <= 1e-9 * first)
 
 
-def _piece(tree: Tree, buffers: Buffers, path: Path, where: _Place, number: int, index, notes: list[str]) -> _Piece:
+def _piece(
+    tree: Tree, buffers: Buffers, path: Path, where: _Place, number: int, index, notes: list[str]
+) -> _PrimitivePiece:
     """One primitive's corners in world space, v up; the winding is turned where the node mirrors space."""
     node = tree["nodes"][where.node]
     primitive = tree["meshes"][node["mesh"]]["primitives"][number]
@@ -241,7 +255,7 @@ def _piece(tree: Tree, buffers: Buffers, path: Path, where: _Place, number: int,
     base = base_set(tree, primitive.get("material"))
     colours = _colours(tree, buffers, attributes["COLOR_0"], path) if "COLOR_0" in attributes else None
     through = "material" in primitive and sees_through(tree, primitive["material"])
-    return _Piece(
+    return _PrimitivePiece(
         node=where.node,
         mesh=node["mesh"],
         primitive=number,
@@ -353,14 +367,14 @@ def world_matrices(tree: Tree) -> list[Float[np.ndarray, "4 4"]]:
     return world
 
 
-def _other_sets(pieces: list[_Piece], material: int) -> dict[int, Float[np.ndarray, "f 3 2"]]:
+def _other_sets(pieces: list[_PrimitivePiece], material: int) -> dict[int, Float[np.ndarray, "f 3 2"]]:
     """The UV sets besides the base that a material's textures use, for all faces; NaN where a face has none."""
     numbers = {n for p in pieces if p.material == material for n in p.other_uvs}
     nothing = [np.full((len(p.faces), 3, 2), np.nan, np.float32) for p in pieces]
     return {n: np.concatenate([p.other_uvs.get(n, no) for p, no in zip(pieces, nothing, strict=True)]) for n in numbers}
 
 
-def _twins(pieces: list[_Piece], starts: Int[np.ndarray, " n"]) -> Int[np.ndarray, " f"] | None:
+def _twins(pieces: list[_PrimitivePiece], starts: Int[np.ndarray, " n"]) -> Int[np.ndarray, " f"] | None:
     """For each face the first face that the file's same primitive gave; instances share the file's UVs. None where
     there are no instances."""
     if len({(piece.mesh, piece.primitive) for piece in pieces}) == len(pieces):

@@ -9,20 +9,20 @@ from mistyle.files.bounds import MAX_FILE_BYTES, MAX_NODES
 MAX_ELEMENTS = 100_000_000  # of one accessor
 
 
-class Part(BaseModel):
+class JsonObject(BaseModel):
     model_config = ConfigDict(extra="allow", strict=True)
 
 
 Index = Field(ge=0, le=2**31)
 
 
-class Sparse(Part):
-    class Indices(Part):
+class JsonSparse(JsonObject):
+    class Indices(JsonObject):
         bufferView: int = Index
         byteOffset: int = Field(0, ge=0)
         componentType: int
 
-    class Values(Part):
+    class Values(JsonObject):
         bufferView: int = Index
         byteOffset: int = Field(0, ge=0)
 
@@ -31,29 +31,29 @@ class Sparse(Part):
     values: Values
 
 
-class Accessor(Part):
+class JsonAccessor(JsonObject):
     bufferView: int | None = Field(None, ge=0)
     byteOffset: int = Field(0, ge=0)
     componentType: int
     count: int = Field(ge=1, le=MAX_ELEMENTS)
     type: str
     normalized: bool = False
-    sparse: Sparse | None = None
+    sparse: JsonSparse | None = None
 
 
-class View(Part):
+class JsonBufferView(JsonObject):
     buffer: int = Index
     byteOffset: int = Field(0, ge=0)
     byteLength: int = Field(ge=1)
     byteStride: int | None = Field(None, ge=1, le=252)
 
 
-class Buffer(Part):
+class JsonBuffer(JsonObject):
     byteLength: int = Field(ge=1, le=MAX_FILE_BYTES)
     uri: str | None = None
 
 
-class Primitive(Part):
+class JsonPrimitive(JsonObject):
     attributes: dict[str, int]
     indices: int | None = Field(None, ge=0)
     material: int | None = Field(None, ge=0)
@@ -62,12 +62,12 @@ class Primitive(Part):
     extensions: dict[str, Any] = {}
 
 
-class Mesh(Part):
-    primitives: list[Primitive]
+class JsonMesh(JsonObject):
+    primitives: list[JsonPrimitive]
     name: str | None = None
 
 
-class Node(Part):
+class JsonNode(JsonObject):
     children: list[int] = []
     mesh: int | None = Field(None, ge=0)
     skin: int | None = Field(None, ge=0)
@@ -79,75 +79,75 @@ class Node(Part):
     name: str | None = None
 
 
-class Skin(Part):
+class JsonSkin(JsonObject):
     joints: list[int] = Field(min_length=1)
     inverseBindMatrices: int | None = Field(None, ge=0)
 
 
-class Scene(Part):
+class JsonScene(JsonObject):
     nodes: list[int] = []
 
 
-class Info(Part):
+class JsonTextureInfo(JsonObject):
     index: int = Index
     texCoord: int = Field(0, ge=0, le=64)
     scale: float = 1.0
     extensions: dict[str, Any] = {}
 
 
-class Metallic(Part):
+class JsonMetallicRoughness(JsonObject):
     baseColorFactor: list[float] = Field([1.0, 1.0, 1.0, 1.0], min_length=4, max_length=4)
-    baseColorTexture: Info | None = None
+    baseColorTexture: JsonTextureInfo | None = None
     metallicFactor: float = 1.0
     roughnessFactor: float = 1.0
-    metallicRoughnessTexture: Info | None = None
+    metallicRoughnessTexture: JsonTextureInfo | None = None
 
 
-class Material(Part):
+class JsonMaterial(JsonObject):
     name: str | None = None
-    pbrMetallicRoughness: Metallic | None = None
-    normalTexture: Info | None = None
-    emissiveTexture: Info | None = None
+    pbrMetallicRoughness: JsonMetallicRoughness | None = None
+    normalTexture: JsonTextureInfo | None = None
+    emissiveTexture: JsonTextureInfo | None = None
     emissiveFactor: list[float] = Field([0.0, 0.0, 0.0], min_length=3, max_length=3)
     extensions: dict[str, Any] = {}
 
 
-class Sampler(Part):
+class JsonSampler(JsonObject):
     wrapS: int = 10497
     wrapT: int = 10497
 
 
-class Texture(Part):
+class JsonTexture(JsonObject):
     sampler: int | None = Field(None, ge=0)
     source: int | None = Field(None, ge=0)
     extensions: dict[str, Any] = {}
 
 
-class Image(Part):
+class JsonImage(JsonObject):
     uri: str | None = None
     bufferView: int | None = Field(None, ge=0)
     mimeType: str | None = None
 
 
-class Asset(Part):
+class JsonAsset(JsonObject):
     version: str
 
 
-class Document(Part):
+class Document(JsonObject):
     """The whole file."""
 
-    asset: Asset
-    accessors: list[Accessor] = []
-    bufferViews: list[View] = []
-    buffers: list[Buffer] = []
-    meshes: list[Mesh] = []
-    nodes: list[Node] = Field([], max_length=MAX_NODES)
-    skins: list[Skin] = []
-    scenes: list[Scene] = []
+    asset: JsonAsset
+    accessors: list[JsonAccessor] = []
+    bufferViews: list[JsonBufferView] = []
+    buffers: list[JsonBuffer] = []
+    meshes: list[JsonMesh] = []
+    nodes: list[JsonNode] = Field([], max_length=MAX_NODES)
+    skins: list[JsonSkin] = []
+    scenes: list[JsonScene] = []
     scene: int | None = Field(None, ge=0)
-    materials: list[Material] = []
-    textures: list[Texture] = []
-    images: list[Image] = []
-    samplers: list[Sampler] = []
+    materials: list[JsonMaterial] = []
+    textures: list[JsonTexture] = []
+    images: list[JsonImage] = []
+    samplers: list[JsonSampler] = []
     extensionsUsed: list[str] = []
     extensionsRequired: list[str] = []

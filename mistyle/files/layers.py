@@ -64,7 +64,7 @@ class Layer:
 
 
 @dataclass(frozen=True)
-class Frame:
+class LayeredPicture:
     """A picture file. `high` where its values are not bounded by 1 (EXR, HDR); `chromaticities` as its header has them
     (Rec.709 where it has none)."""
 
@@ -79,7 +79,7 @@ class Frame:
         return next((layer for layer in self.layers if layer.name.casefold() == name.casefold()), None)
 
 
-def read_frame(path: Path) -> Frame:
+def read_frame(path: Path) -> LayeredPicture:
     """An .exr or .hdr; see files/read.py."""
     path = Path(path)
     kind = path.suffix.lower()
@@ -88,11 +88,11 @@ def read_frame(path: Path) -> Frame:
     if kind == ".hdr":
         rgb = hdr.read_hdr(path)
         whole = (0, 0, rgb.shape[1], rgb.shape[0])
-        return Frame(path, (Layer(BEAUTY, ("R", "G", "B"), _planes(rgb), "colour", whole, whole),), True)
+        return LayeredPicture(path, (Layer(BEAUTY, ("R", "G", "B"), _planes(rgb), "colour", whole, whole),), True)
     raise refuse(path, f"a file ending in '{kind}'", "an .exr or .hdr", "Read it as a picture")
 
 
-def frame_of(picture: Picture) -> Frame:
+def frame_of(picture: Picture) -> LayeredPicture:
     """A plain picture as a frame; its rgb is linearised and premultiplied."""
     whole = (0, 0, picture.rgb.shape[1], picture.rgb.shape[0])
     linear = linear_rows(picture.rgb)
@@ -101,14 +101,14 @@ def frame_of(picture: Picture) -> Frame:
         linear *= picture.alpha[..., None]
         layers.append(Layer("alpha", ("A",), (picture.alpha,), "data", whole, whole))
     layers.insert(0, Layer(BEAUTY, ("R", "G", "B"), _planes(linear), "colour", whole, whole))
-    return Frame(picture.path, tuple(layers), False, notes=picture.notes)
+    return LayeredPicture(picture.path, tuple(layers), False, notes=picture.notes)
 
 
 def _planes(rgb: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, ...]:
     return tuple(rgb[..., k] for k in range(rgb.shape[2]))
 
 
-def _read_exr(path: Path) -> Frame:
+def _read_exr(path: Path) -> LayeredPicture:
     parts = hdr.parts_of_exr(path)
     groups = [group for part in parts for group in _groups(part, len(parts) > 1, path)]
     beauty = next((name for name, *_ in groups if name.rpartition(".")[2].casefold() in BEAUTY_NAMES), None)
@@ -117,7 +117,7 @@ def _read_exr(path: Path) -> Frame:
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:
         raise refuse(path, f"two layers called {twice[0]!r}", "names that tell layers apart", "Rename one of them")
-    return Frame(path, tuple(layers), True, _chromaticities(parts[0].header, path))
+    return LayeredPicture(path, tuple(layers), True, _chromaticities(parts[0].header, path))
 
 
 def _groups(part: Any, several: bool, path: Path) -> list[tuple[str, dict[str, np.ndarray], Window, Window]]:

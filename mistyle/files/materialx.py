@@ -16,7 +16,7 @@ from mistyle.files.store import atomic_write
 
 
 @dataclass(frozen=True)
-class Look:
+class TexturedMaterial:
     """A material and its images: file names as the document names them. The albedo is sRGB, or light in `space` (None:
     linear Rec.709). `name` is an identifier (core/names.py); `title` is the user's name for it, or ""."""
 
@@ -30,7 +30,7 @@ class Look:
     title: str = ""
 
 
-def write_materialx(path: Path, looks: Sequence[Look]) -> None:
+def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:
     """Write the document; texture coordinates have v up, as MaterialX has them. Normal maps are tangent space, +Y."""
     root = Element("materialx", version="1.39", colorspace="lin_rec709")
     names = [look.name for look in looks]

@@ -57,7 +57,7 @@ class Statement:
 
 
 @dataclass(frozen=True)
-class Entry:
+class MtlEntry:
     """One material as its library has it: the last value of every statement by its keyword in small letters.
 
     roots    folders that texture names are relative to: the library's, then the mesh's
@@ -71,20 +71,20 @@ class Entry:
     spelled: dict[str, str]
 
 
-def read_library(library: Path, mesh: Path) -> tuple[dict[str, Entry], tuple[str, ...]]:
+def read_library(library: Path, mesh: Path) -> tuple[dict[str, MtlEntry], tuple[str, ...]]:
     """The materials by name, and notes. A file that is not UTF-8 is read as Windows-1252 (or Latin-1)."""
     lines = unmarked(read_bytes(library, MAX_LIBRARY_BYTES)).splitlines()
     texts, plain = decoded(*lines)
     roots = tuple(dict.fromkeys((library.parent.resolve(), mesh.parent.resolve())))
-    entries: dict[str, Entry] = {}
-    current = Entry("", library, roots, {}, {})
+    entries: dict[str, MtlEntry] = {}
+    current = MtlEntry("", library, roots, {}, {})
     for line in texts:
         keyword, *rest = line.split(None, 1)[:2] or ("#",)
         if keyword.startswith("#") or not rest:
             continue
         if keyword.lower() == "newmtl":
             name = rest[0].strip()
-            current = entries.setdefault(name, Entry(name, library, roots, {}, {}))
+            current = entries.setdefault(name, MtlEntry(name, library, roots, {}, {}))
         else:
             current.values[keyword.lower()] = rest[0].strip()
             current.spelled[keyword.lower()] = keyword
@@ -92,7 +92,7 @@ def read_library(library: Path, mesh: Path) -> tuple[dict[str, Entry], tuple[str
     return entries, notes
 
 
-def material(entry: Entry, budget: Budget) -> RawMaterial:
+def material(entry: MtlEntry, budget: Budget) -> RawMaterial:
     """Kd counts where there is no map_Kd (many exporters write Kd 0 or 0.8 beside a texture), Pr and Pm likewise."""
     named = {TEXTURES[k]: statement(v) for k, v in entry.values.items() if k in TEXTURES}
     bump = next((statement(entry.values[k]) for k in BUMPS if k in entry.values), None)
@@ -112,7 +112,7 @@ def material(entry: Entry, budget: Budget) -> RawMaterial:
     )
 
 
-def unread(entries: Sequence[Entry]) -> list[str]:
+def unread(entries: Sequence[MtlEntry]) -> list[str]:
     """Notes on the statements of materials that change how they look and were not read."""
     notes, left = [], {}
     for entry in entries:
@@ -127,7 +127,7 @@ def unread(entries: Sequence[Entry]) -> list[str]:
     return [*notes, *said]
 
 
-def _changes(entry: Entry, key: str) -> bool:
+def _changes(entry: MtlEntry, key: str) -> bool:
     if key not in entry.values:
         return False
     if key == "ns":  # the exponent of Ks; Pr says it better
@@ -142,13 +142,13 @@ def _changes(entry: Entry, key: str) -> bool:
         return True
 
 
-def _colour(entry: Entry) -> list[float]:
+def _colour(entry: MtlEntry) -> list[float]:
     """Kd: three numbers, or one for all."""
     grey = _numbers(entry, "kd", [1.0])
     return grey * 3 if len(entry.values.get("kd", "").split()) == 1 else _numbers(entry, "kd", [1.0] * 3)
 
 
-def _numbers(entry: Entry, key: str, default: list[float]) -> list[float]:
+def _numbers(entry: MtlEntry, key: str, default: list[float]) -> list[float]:
     try:
         found = [float(x) for x in entry.values.get(key, "").split()[: len(default)]]
     except ValueError:
@@ -193,7 +193,7 @@ def tile_name(file: str, tile: int) -> str | None:
     return re.sub(marked, str(tile), file) if re.search(marked, file) else None
 
 
-def _load(textures: dict[str, Statement], entry: Entry, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
+def _load(textures: dict[str, Statement], entry: MtlEntry, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
     maps: dict[str, RawMap] = {}
     notes: list[str] = []
     for name, said in textures.items():

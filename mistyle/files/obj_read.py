@@ -10,7 +10,7 @@ from mistyle.core.asset import Primitive
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import read_bytes, refuse
 from mistyle.files.colours import coloured, linear_colours
-from mistyle.files.mtl_read import Entry, material, read_library, unread
+from mistyle.files.mtl_read import MtlEntry, material, read_library, unread
 from mistyle.files.nearby import decoded, mesh_folders, named_file, unmarked
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_positions, parse_numbers, too_many, triangulate
@@ -235,7 +235,7 @@ def file_names(statement: str, path: Path) -> list[str]:
 def _materials(names: list[str], lines: dict[bytes, list], path: Path) -> tuple[tuple[RawMaterial, ...], list[str]]:
     """The material of every name that faces use ("" where none is stated), and notes."""
     files, notes = library_files(lines[b"mtllib"], path)
-    library: dict[str, Entry] = {}
+    library: dict[str, MtlEntry] = {}
     for file in files:
         try:
             entries, said = read_library(file, path)
@@ -257,7 +257,7 @@ def _materials(names: list[str], lines: dict[bytes, list], path: Path) -> tuple[
     return tuple(made), notes
 
 
-def _entry_of(name: str, library: dict[str, Entry], stated: bool, notes: list[str]) -> Entry | None:
+def _entry_of(name: str, library: dict[str, MtlEntry], stated: bool, notes: list[str]) -> MtlEntry | None:
     """A name's material: its own, else the only one of that name in other letters, else the only one at all where the
     file states none."""
     if name in library:

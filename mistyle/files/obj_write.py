@@ -8,12 +8,12 @@ from jaxtyping import Float
 
 from mistyle.core.mesh import Mesh
 from mistyle.core.rows import distinct
-from mistyle.files.materialx import Look
+from mistyle.files.materialx import TexturedMaterial
 from mistyle.files.store import atomic_write
 
 
 def write_obj(
-    path: Path, mesh: Mesh, positions: Float[np.ndarray, "v 3"], tiles: Sequence[int], looks: Sequence[Look]
+    path: Path, mesh: Mesh, positions: Float[np.ndarray, "v 3"], tiles: Sequence[int], looks: Sequence[TexturedMaterial]
 ) -> None:
     """Write `path` and the .mtl beside it: the mesh with its own `positions`, one material per part.
 
@@ -46,7 +46,7 @@ def _digits(positions: Float[np.ndarray, "v 3"]) -> int:
     return min(9 + max(far - 1, 0), 17)
 
 
-def _materials(looks: Sequence[Look]) -> str:
+def _materials(looks: Sequence[TexturedMaterial]) -> str:
     lines = []
     for look in looks:
         lines += [

@@ -166,6 +166,12 @@ def alpha_of(data: bytes, where: str) -> Float[np.ndarray, "h w"] | None:
     return alpha if (alpha < 1).any() else None
 
 
+def alpha_map(data: bytes, where: str) -> Float[np.ndarray, "h w"]:
+    """A map that is the alpha 0..1 of a texture: 1 everywhere where it has none."""
+    alpha = alpha_of(data, where)
+    return np.ones((2, 2), np.float32) if alpha is None else alpha
+
+
 def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
     """The opened (not decoded) image after the header checks."""
     from PIL import Image

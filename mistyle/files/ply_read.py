@@ -40,7 +40,7 @@ class _Property:
 
 
 @dataclass(frozen=True)
-class _Element:
+class _PlyElement:
     name: str
     count: int
     properties: tuple[_Property, ...]
@@ -154,7 +154,7 @@ def _load(file: str, path: Path, budget: Budget, tile: int) -> tuple[Maps, tuple
     return {"albedo": entry}, tuple(notes)
 
 
-def _colours(tables: dict, elements: list[_Element], triangles, polygon) -> Float[np.ndarray, "f 3 3"] | None:
+def _colours(tables: dict, elements: list[_PlyElement], triangles, polygon) -> Float[np.ndarray, "f 3 3"] | None:
     """Linear colours of the corners, by vertex or by face; None where the file has none."""
     for name in ("vertex", "face"):
         kinds = {p.name: p for element in elements if element.name == name for p in element.properties}
@@ -189,12 +189,12 @@ def _uvs_of(vertex, face, sizes, triangles, pick) -> Float[np.ndarray, "f 3 2"] 
     return None
 
 
-def _ply_header(data: bytes, path: Path) -> tuple[list[_Element], str, int]:
+def _ply_header(data: bytes, path: Path) -> tuple[list[_PlyElement], str, int]:
     """Elements, byte order ("<", ">" or "ascii") and where the data begin."""
     end = re.search(rb"\bend_header[ \t]*\r?\n", data[:MAX_HEADER])
     if not data.startswith(b"ply") or end is None:
         raise refuse(path, "no PLY header", "a text from 'ply' to 'end_header'", AGAIN)
-    elements: list[_Element] = []
+    elements: list[_PlyElement] = []
     form = ""
     for line in data[: end.start()].decode("ascii", "replace").splitlines()[1:]:
         words = line.split()
@@ -202,7 +202,7 @@ def _ply_header(data: bytes, path: Path) -> tuple[list[_Element], str, int]:
             if words[:1] == ["format"]:
                 form = {"ascii": "ascii", "binary_little_endian": "<", "binary_big_endian": ">"}[words[1]]
             elif words[:1] == ["element"]:
-                elements.append(_Element(words[1], int(words[2]), ()))
+                elements.append(_PlyElement(words[1], int(words[2]), ()))
             elif words[:1] == ["property"]:
                 new = (
                     _Property(words[4], TYPES[words[3]], TYPES[words[2]])
@@ -210,7 +210,7 @@ def _ply_header(data: bytes, path: Path) -> tuple[list[_Element], str, int]:
                     else _Property(words[2], TYPES[words[1]], None)
                 )
                 last = elements[-1]
-                elements[-1] = _Element(last.name, last.count, (*last.properties, new))
+                elements[-1] = _PlyElement(last.name, last.count, (*last.properties, new))
         except (KeyError, IndexError, ValueError) as error:
             raise refuse(path, f"the header line {line[:80]!r}", "PLY 1.0", AGAIN) from error
     if not form or any(e.count < 0 for e in elements):
@@ -221,7 +221,7 @@ def _ply_header(data: bytes, path: Path) -> tuple[list[_Element], str, int]:
     return elements, form, end.end()
 
 
-def _ply_ascii(data: bytes, elements: list[_Element], path: Path) -> dict[str, dict]:
+def _ply_ascii(data: bytes, elements: list[_PlyElement], path: Path) -> dict[str, dict]:
     numbers = parse_numbers(data, path, "its data")
     tables, at = {}, 0
     for element in elements:
@@ -240,7 +240,7 @@ def _ply_ascii(data: bytes, elements: list[_Element], path: Path) -> dict[str, d
     return tables
 
 
-def _ply_rows(element: _Element, numbers: np.ndarray, at: int, path: Path) -> tuple[dict, int]:
+def _ply_rows(element: _PlyElement, numbers: np.ndarray, at: int, path: Path) -> tuple[dict, int]:
     """An ASCII element with lists, row by row."""
     flat: dict[str, list] = {p.name: [] for p in element.properties}
     sizes: dict[str, list] = {p.name: [] for p in element.properties if p.count}
@@ -259,7 +259,7 @@ def _ply_rows(element: _Element, numbers: np.ndarray, at: int, path: Path) -> tu
     return {n: (np.array(sizes[n], np.int64), v) if n in sizes else v for n, v in joined.items()}, at
 
 
-def _ply_binary(data: bytes, at: int, elements: list[_Element], order: str, path: Path) -> dict[str, dict]:
+def _ply_binary(data: bytes, at: int, elements: list[_PlyElement], order: str, path: Path) -> dict[str, dict]:
     tables = {}
     for element in elements:
         rows = _uniform(data, at, element, order)
@@ -276,7 +276,7 @@ def _ply_binary(data: bytes, at: int, elements: list[_Element], order: str, path
     return tables
 
 
-def _uniform(data: bytes, at: int, element: _Element, order: str) -> np.ndarray | None:
+def _uniform(data: bytes, at: int, element: _PlyElement, order: str) -> np.ndarray | None:
     """All rows at once, where every row's lists are as long as the first row's; None otherwise."""
     fields, where = [], at
     for p in element.properties:
@@ -301,7 +301,7 @@ def _uniform(data: bytes, at: int, element: _Element, order: str) -> np.ndarray 
     return rows if same else None
 
 
-def _ragged(data: bytes, at: int, element: _Element, order: str, path: Path) -> tuple[dict, int]:
+def _ragged(data: bytes, at: int, element: _PlyElement, order: str, path: Path) -> tuple[dict, int]:
     """A binary element whose lists differ in length, row by row."""
     kinds = [(p, np.dtype(order + p.kind), np.dtype(order + p.count) if p.count else None) for p in element.properties]
     flat: dict[str, list] = {p.name: [] for p in element.properties}

@@ -21,7 +21,7 @@ from mistyle.core.uvs import Layout, Verdict, arrange, signed_areas
 from mistyle.files.bounds import refuse
 from mistyle.files.lookups import effective, framed, looked_up, plain_lookups
 from mistyle.files.polygons import check_positions
-from mistyle.files.raw import Extent, Raw, RawMap
+from mistyle.files.raw import Extent, Raw, RawMap, RawMaterial
 
 # Faces below this area in the unit sphere have none that anything could be computed from (float32 positions).
 NO_AREA = 1e-13
@@ -121,10 +121,11 @@ def prepare(
         part=part.astype(np.int32),
         parts=names,
     )
-    materials = tuple(
-        _material(raw, mesh, p, material, tile, plans[material].carried, size, notes)
-        for p, (material, tile) in enumerate(owners)
-    )
+    materials = []
+    for p, (material, tile) in enumerate(owners):
+        made, said = _material(raw, mesh, p, raw.materials[material], tile, plans[material].carried, size)
+        materials.append(made)
+        notes.extend(said)
     progress(1.0)
     kept = authored is not None and np.array_equal(corner_uvs, authored)
     how = "new" if any(p.layout is None for p in plans) else "kept" if kept else "shifted"
@@ -138,7 +139,7 @@ def prepare(
         uv=how,
         notes=tuple(dict.fromkeys(notes)),
     )
-    return Asset(name=path.stem, mesh=mesh, materials=materials, source=source)
+    return Asset(name=path.stem, mesh=mesh, materials=tuple(materials), source=source)
 
 
 def _work_matrix(raw: Raw, has_area: np.ndarray, path: Path, up: str) -> Float[np.ndarray, "4 4"]:
@@ -310,12 +311,11 @@ def _with_part(primitive, part: Int[np.ndarray, " f"]):
 
 
 def _material(
-    raw: Raw, mesh: Mesh, part: int, material: int, tile: int, all_carried: bool, size: int, notes: list[str]
-) -> Material:
-    """The part's maps in its working UVs, carried over where the file's lookup differs from them."""
-    source = raw.materials[material]
+    raw: Raw, mesh: Mesh, part: int, source: RawMaterial, tile: int, all_carried: bool, size: int
+) -> tuple[Material, list[str]]:
+    """The maps of a part's `source` in its working UVs, carried over where the file's lookup differs; and notes."""
     maps, said = source.load(tile)
-    notes.extend(said)
+    notes = list(said)
     rows = np.flatnonzero(mesh.part == part)
     plain = {name for name, entry in maps.items() if not all_carried and _is_plain(entry, raw.uvs, rows)}
     done = {
@@ -342,7 +342,7 @@ def _material(
         notes.append(
             f"The {name} map of material '{source.name}' was left out: its faces have no UVs to look it up at."
         )
-    return Material(
+    made = Material(
         name=mesh.parts[part],
         albedo=albedo,
         normal=done.get("normal"),
@@ -356,6 +356,7 @@ def _material(
         specular=done.get("specular"),
         shading=shading,
     )
+    return made, notes
 
 
 def _is_plain(entry: RawMap, uvs: Float[np.ndarray, "f 3 2"] | None, rows: np.ndarray) -> bool:

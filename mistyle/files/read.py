@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.asset import Picture, Pixels
-from mistyle.files.layers import Frame, frame_of
+from mistyle.files.layers import LayeredPicture, frame_of
 from mistyle.files.pictures import picture_of
 from mistyle.files.reader_process import ask
 
 __all__ = [
-    "Frame",
+    "LayeredPicture",
     "Picture",
     "read_colmap",
     "read_colmap_points",
@@ -49,7 +49,7 @@ def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
     return {name: np.asarray(plane, np.float32) for name, plane in ask("exr", Path(path)).items()}
 
 
-def read_frame(path: Path) -> Frame:
+def read_frame(path: Path) -> LayeredPicture:
     """A picture to compare: the layers of an .exr (of all its parts, whatever their windows) by name, or the one layer
     of an .hdr, PNG, JPEG, WebP or TIFF; linear Rec.709, premultiplied, NaN and infinities kept.
 

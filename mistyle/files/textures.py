@@ -26,7 +26,6 @@ class Pictures:
     albedo: bytes
     normal: bytes
     orm: bytes
-    has_alpha: bool = False
 
 
 def part_stems(name: str, parts: Sequence[str]) -> list[str]:
@@ -65,7 +64,6 @@ def encode_pictures(
         albedo=encode_png(albedo, encode=srgb_colours),
         normal=encode_png(maps.normal, encode=normal_colours),
         orm=encode_png(orm_colours(maps, occlusion)),
-        has_alpha=alpha is not None,
     )
 
 

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.core.mesh import Mesh, local_origin
-from mistyle.files.materialx import Look
+from mistyle.files.materialx import TexturedMaterial
 
 NAMES = ("Ar", "Gf", "Kind", "Sdf", "Tf", "Usd", "UsdGeom", "UsdShade", "UsdSkel", "UsdUtils", "UsdValidation", "Vt")
 UTF8 = 1 << 11  # zip's flag for a name in UTF-8, without which readers take code page 437
@@ -44,7 +44,7 @@ def write_usd(
     name: str,
     mesh: Mesh,
     positions: Float[np.ndarray, "v 3"],
-    looks: Sequence[Look],
+    looks: Sequence[TexturedMaterial],
     *,
     metres_per_unit: float = 1.0,
 ) -> None:
@@ -96,7 +96,7 @@ def write_usd(
     stage.GetRootLayer().Save()
 
 
-def define_material(pxr: Any, stage: Any, place: str, look: Look, primvar: str = "st") -> Any:
+def define_material(pxr: Any, stage: Any, place: str, look: TexturedMaterial, primvar: str = "st") -> Any:
     """A preview surface with the four textures of a look, looked up at `primvar`."""
     material = pxr.UsdShade.Material.Define(stage, place)
     _titled(material, look.title)

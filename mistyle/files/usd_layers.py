@@ -17,7 +17,7 @@ COPY = "Copy it into the mesh's folder, or flatten the stage (usdcat --flatten)"
 
 
 @dataclass(frozen=True)
-class Place:
+class PackagedFile:
     """A file, or a file inside a package (`inner`, its path there)."""
 
     file: Path
@@ -27,21 +27,21 @@ class Place:
         return f"{self.file}[{self.inner}]" if self.inner else str(self.file)
 
 
-def place_of(layer: Any) -> Place:
+def place_of(layer: Any) -> PackagedFile:
     """Where an opened layer lies."""
     outer, bracket, inner = str(layer.identifier).partition("[")
-    return _inside(Place(Path(outer).resolve(), inner.removesuffix("]") if bracket else ""))
+    return _inside(PackagedFile(Path(outer).resolve(), inner.removesuffix("]") if bracket else ""))
 
 
-def _inside(place: Place) -> Place:
+def _inside(place: PackagedFile) -> PackagedFile:
     """A package by itself is the first file in it."""
     if place.inner or place.file.suffix.lower() != ".usdz":
         return place
     with zipfile.ZipFile(place.file) as package:
-        return Place(place.file, package.namelist()[0])
+        return PackagedFile(place.file, package.namelist()[0])
 
 
-def locate(root: Path, anchor: Place, reference: str) -> Place:
+def locate(root: Path, anchor: PackagedFile, reference: str) -> PackagedFile:
     """The file that a layer at `anchor` names. Raises InputRefused where it is outside `root` or no plain file name."""
     found = f"a reference to {reference[:120]!r}"
     name = reference.replace("\\", "/")
@@ -53,14 +53,14 @@ def locate(root: Path, anchor: Place, reference: str) -> Place:
         whole = posixpath.normpath(posixpath.join(posixpath.dirname(anchor.inner), outer))
         if whole.startswith(("/", "..")) or bracket:
             raise refuse(anchor.file, found, "a file inside the package", "Package the asset again")
-        return Place(anchor.file, whole)
+        return PackagedFile(anchor.file, whole)
     try:
         target = (anchor.file.parent / outer).resolve()
     except (OSError, RuntimeError) as error:  # a loop of links
         raise refuse(anchor.file, found, "a file name", COPY) from error
     if not target.is_relative_to(root):
         raise refuse(anchor.file, found, "a file inside the mesh's own folder", COPY)
-    return Place(target, inner if bracket else "")
+    return PackagedFile(target, inner if bracket else "")
 
 
 def check_layers(pxr: Any, path: Path) -> list[Path]:
@@ -69,7 +69,7 @@ def check_layers(pxr: Any, path: Path) -> list[Path]:
     Returns the files. Refused: names that lead out of the folder or to a network, layers of other formats, packages
     that are compressed or nested, value clips (which would be opened later), too many or too large files.
     """
-    root, start = path.resolve().parent, Place(path.resolve())
+    root, start = path.resolve().parent, PackagedFile(path.resolve())
     waiting, seen = [start], {str(start)}
     files: dict[Path, int] = {}
     while waiting:
@@ -91,7 +91,7 @@ def check_layers(pxr: Any, path: Path) -> list[Path]:
     return list(files)
 
 
-def _named(pxr: Any, here: Place, path: Path) -> Iterator[str]:
+def _named(pxr: Any, here: PackagedFile, path: Path) -> Iterator[str]:
     """The layers that one layer names, in every variant."""
     try:
         layer = pxr.Sdf.Layer.FindOrOpen(str(here))
@@ -111,7 +111,7 @@ def _has_clips(layer: Any, path: Any) -> bool:
     return prim is not None and (prim.HasInfo("clips") or prim.HasInfo("clipSets"))
 
 
-def _size(here: Place, path: Path) -> int:
+def _size(here: PackagedFile, path: Path) -> int:
     if not here.file.is_file():
         raise refuse(path, f"no file at {here.file}, which it stands on", "all its layers", "Copy the whole asset")
     size = here.file.stat().st_size
@@ -152,7 +152,7 @@ def textures_named(pxr: Any, files: list[Path], root: Path) -> list[Path]:
             continue
         for name in {n for kind in pxr.UsdUtils.ExtractExternalReferences(str(file)) for n in kind}:
             try:
-                there = locate(root, Place(file), name).file
+                there = locate(root, PackagedFile(file), name).file
             except InputRefused:
                 continue
             tiles = there.parent.glob(there.name.replace("<UDIM>", "1???")) if "<UDIM>" in there.name else [there]
@@ -166,7 +166,7 @@ def said(error: Exception) -> str:
     return (words[0] if words else str(error).strip().splitlines()[-1])[:160]
 
 
-def bytes_of(place: Place, limit: int) -> bytes | None:
+def bytes_of(place: PackagedFile, limit: int) -> bytes | None:
     """The content of a texture; None where it is not there."""
     from mistyle.files.bounds import read_bytes
 

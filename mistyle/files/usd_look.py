@@ -11,23 +11,35 @@ any variant's. The variants therefore hold what only they say: the materials in 
 
 import os
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from mistyle.core.asset import Asset, Primitive
+from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
-from mistyle.files.materialx import Look
+from mistyle.files.materialx import TexturedMaterial
 from mistyle.files.usd import define_material, library
-from mistyle.files.usd_read import Polygons, mesh_prims, open_stage, polygons, uv_primvar
+from mistyle.files.usd_mesh import Polygons, polygons, uv_primvar
 from mistyle.files.usd_shapes import is_shape
+from mistyle.files.usd_stage import mesh_prims, open_stage
 
 SET = "look"
 
 
+@dataclass(frozen=True)
+class _SourceMesh:
+    """A mesh prim of the source: its path, its faces in the asset, its polygons, whether its place mirrors it."""
+
+    name: str
+    faces: slice
+    shape: Polygons
+    mirrored: bool
+
+
 def write_look(
-    path: Path, before: str | None, asset: Asset, looks: Sequence[Look], variant: str, *, beside: Path
+    path: Path, before: str | None, asset: Asset, looks: Sequence[TexturedMaterial], variant: str, *, beside: Path
 ) -> None:
     """Write the layer `path` (.usda): `before` with one variant more, or a new one; the new variant is selected.
 
@@ -39,7 +51,7 @@ def write_look(
     path.write_text(before or "#usda 1.0\n", encoding="utf-8")
     stage = _opened(pxr, path, source, os.path.relpath(asset.source.path, beside))
     shapes = _shapes(pxr, source, asset)
-    root = "/" + next(iter(shapes)).strip("/").split("/")[0]
+    root = "/" + shapes[0].name.strip("/").split("/")[0]
     given = source.GetDefaultPrim()
     root = str(given.GetPath()) if given else root
     if not stage.GetRootLayer().HasDefaultPrim():
@@ -48,22 +60,22 @@ def write_look(
     sets = prim.GetVariantSets().AddVariantSet(SET)
     sets.AddVariant(variant)
     sets.SetVariantSelection(variant)
-    used = sorted({int(k) for one, *_ in shapes.values() for k in np.unique(asset.mesh.part[one.start : one.stop])})
+    used = sorted({int(k) for mesh in shapes for k in np.unique(asset.mesh.part[mesh.faces])})
     names = {part: f"{root}/{SET}/{looks[part].name}" for part in used}
-    primvars = {_kept(pxr, source, asset, name, one) for name, (one, *_) in shapes.items()}
+    primvars = {_kept(pxr, source, asset, mesh) for mesh in shapes}
     primvar = primvars.pop() if len(primvars) == 1 else None
     if primvar is None:
         primvar = f"st_{variant}"
-        for name, entry in shapes.items():
-            _author(pxr, stage, asset, name, *entry, primvar)
-    for name in shapes:
-        _editable(stage, name)
+        for mesh in shapes:
+            _author(pxr, stage, asset, mesh, primvar)
+    for mesh in shapes:
+        _editable(stage, mesh.name)
     with sets.GetVariantEditContext():
         pxr.UsdGeom.Scope.Define(stage, f"{root}/{SET}")
         for part, place in names.items():
             define_material(pxr, stage, place, looks[part], primvar)
-    for name, (one, shape, _) in shapes.items():
-        _bind(pxr, stage, name, asset.mesh.part[one.start : one.stop], shape, names, looks)
+    for mesh in shapes:
+        _bind(pxr, stage, mesh, asset.mesh.part[mesh.faces], names, looks)
     stage.GetRootLayer().Save()
 
 
@@ -87,12 +99,11 @@ def _opened(pxr: Any, path: Path, source: Any, relative: str) -> Any:
     return stage
 
 
-def _shapes(pxr: Any, source: Any, asset: Asset) -> dict[str, tuple[Primitive, Polygons, bool]]:
-    """Of every mesh prim: its faces in the asset, its polygons, whether its place mirrors it. InputRefused where the
-    file has other meshes than the asset."""
+def _shapes(pxr: Any, source: Any, asset: Asset) -> list[_SourceMesh]:
+    """Every mesh prim of the asset in the source. InputRefused where the file has other meshes than the asset."""
     path = asset.source.path
     there = {str(prim.GetPath()): (prim, matrix) for prim, _, matrix in mesh_prims(pxr, source, path, [])}
-    result = {}
+    result: dict[str, _SourceMesh] = {}
     for one in asset.source.primitives:
         prim, matrix = there.get(one.name, (None, None))
         if prim is not None and is_shape(prim):
@@ -104,32 +115,31 @@ def _shapes(pxr: Any, source: Any, asset: Asset) -> dict[str, tuple[Primitive, P
         shape = None if prim is None else polygons(pxr, prim, path)
         if shape is None or matrix is None or len(shape.corner) != one.stop - one.start:
             raise InputRefused(f"{path}: {one.name} is no longer the mesh that the run read; run the job again")
-        result[one.name] = (one, shape, bool(np.linalg.det(matrix[:3, :3]) < 0))
-    return result
+        mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0)
+        result[one.name] = _SourceMesh(one.name, slice(one.start, one.stop), shape, mirrored)
+    return list(result.values())
 
 
-def _kept(pxr: Any, source: Any, asset: Asset, name: str, one: Primitive) -> str | None:
+def _kept(pxr: Any, source: Any, asset: Asset, mesh: _SourceMesh) -> str | None:
     """The primvar at which the asset's UVs stand in the file already; None where it has others."""
-    found = uv_primvar(pxr, pxr.UsdGeom.Mesh(source.GetPrimAtPath(name)), [])
+    found = uv_primvar(pxr, pxr.UsdGeom.Mesh(source.GetPrimAtPath(mesh.name)), [])
     if asset.source.old_uvs is None or not found or "2" not in str(found.GetTypeName()):  # readers of two components
         return None
-    step = asset.mesh.corner_uvs[one.start : one.stop] - asset.source.old_uvs[one.start : one.stop]
+    step = asset.mesh.corner_uvs[mesh.faces] - asset.source.old_uvs[mesh.faces]
     # Moved by whole tiles: the texture repeats, the file's own UVs do.
     same = np.abs(step - np.round(step[:, :1])).max(initial=0) < 1e-4
     return str(found.GetPrimvarName()) if same else None
 
 
-def _author(
-    pxr: Any, stage: Any, asset: Asset, name: str, one: Primitive, shape: Polygons, mirrored: bool, primvar: str
-) -> None:
+def _author(pxr: Any, stage: Any, asset: Asset, mesh: _SourceMesh, primvar: str) -> None:
     """Author the UVs that a mesh has in the asset as `primvar`."""
-    prim = _editable(stage, name)
-    new = asset.mesh.corner_uvs[one.start : one.stop]
+    prim, shape, mirrored = _editable(stage, mesh.name), mesh.shape, mesh.mirrored
+    new = asset.mesh.corner_uvs[mesh.faces]
     corner = shape.corner[:, [0, 2, 1]] if mirrored else shape.corner
     values = np.zeros((len(shape.vertices), 2), np.float32)
     values[corner.reshape(-1)] = new.reshape(-1, 2)
     api = pxr.UsdGeom.PrimvarsAPI(prim)
-    if np.abs(values[corner] - new).max() > 1e-6 or _is_cut(stage, name):
+    if np.abs(values[corner] - new).max() > 1e-6 or _is_cut(stage, mesh.name):
         # A chart ends inside a polygon: its triangles become the faces.
         _cut(pxr, stage, prim, shape)
         values = new.reshape(-1, 2) if shape.turned == mirrored else new[:, [0, 2, 1]].reshape(-1, 2)
@@ -178,11 +188,11 @@ def _cut(pxr: Any, stage: Any, prim: Any, shape: Polygons) -> None:
 
 
 def _bind(
-    pxr: Any, stage: Any, name: str, part: np.ndarray, shape: Polygons, names: Any, looks: Sequence[Look]
+    pxr: Any, stage: Any, source: _SourceMesh, part: np.ndarray, names: Any, looks: Sequence[TexturedMaterial]
 ) -> None:
     """Bind a mesh, or a subset per part in the place of the source's own subsets."""
     api = pxr.UsdShade.MaterialBindingAPI
-    prim = stage.GetPrimAtPath(name)
+    prim = stage.GetPrimAtPath(source.name)
     parts = np.unique(part)
     for subset in api(prim).GetMaterialBindSubsets():
         if not subset.GetPrim().GetName().startswith(f"{SET}_"):
@@ -190,7 +200,7 @@ def _bind(
     _bound(pxr, stage, prim, names[parts[0]])
     if len(parts) == 1:
         return
-    face = np.arange(len(part)) if _is_cut(stage, name) else shape.polygon
+    face = np.arange(len(part)) if _is_cut(stage, source.name) else source.shape.polygon
     mesh, taken = pxr.UsdGeom.Mesh(prim), np.zeros(0, np.int64)
     for k in parts:
         rows = np.setdiff1d(np.unique(face[part == k]), taken)

@@ -12,9 +12,9 @@ from jaxtyping import Float
 from mistyle.core.asset import Shading
 from mistyle.core.errors import InputRefused
 from mistyle.core.retexture import Wrap
-from mistyle.files.pictures import MAX_PICTURE_BYTES, Budget, alpha_of, decode
+from mistyle.files.pictures import MAX_PICTURE_BYTES, Budget, alpha_map, decode
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
-from mistyle.files.usd_layers import Place, bytes_of, locate, place_of
+from mistyle.files.usd_layers import PackagedFile, bytes_of, locate, place_of
 
 CHANNELS = {"r": (0,), "g": (1,), "b": (2,), "rgb": (0, 1, 2), "a": ()}
 INPUTS = {"albedo": "diffuseColor", "roughness": "roughness", "metallic": "metallic", "normal": "normal"}
@@ -31,11 +31,11 @@ DEFAULTS = {"albedo": (0.18, 0.18, 0.18), "roughness": 0.5, "metallic": 0.0}
 
 
 @dataclass(frozen=True)
-class Texture:
+class UsdTexture:
     """A UsdUVTexture: its file as named by the layer at `anchor`, value = scale * texel + bias, the channels used."""
 
     file: str
-    anchor: Place
+    anchor: PackagedFile
     space: str
     scale: tuple[float, ...] | None
     bias: tuple[float, ...] | None
@@ -46,21 +46,21 @@ class Texture:
 
 
 @dataclass(frozen=True)
-class Found:
+class UsdMaterial:
     """A material, the primvar that its first texture is looked up at (None: it has none), the primvar that is its
     albedo (None: it is said otherwise), and the textures by map."""
 
     material: RawMaterial
     primvar: str | None
     colour: str | None = None
-    textures: Mapping[str, Texture] = field(default_factory=dict)
+    textures: Mapping[str, UsdTexture] = field(default_factory=dict)
 
     def others(self) -> dict[str, str]:
         """The primvar of every map that is looked up at another than the first."""
         return {kind: t.primvar for kind, t in self.textures.items() if t.primvar != self.primvar}
 
 
-def at_own_coordinates(found: Found, sets: Mapping[str, Float[np.ndarray, "f 3 2"]]) -> RawMaterial:
+def at_own_coordinates(found: UsdMaterial, sets: Mapping[str, Float[np.ndarray, "f 3 2"]]) -> RawMaterial:
     """The material whose maps are looked up at their own primvars; `sets` has the corners' coordinates by primvar."""
     others = {kind: sets[name] for kind, name in found.others().items() if name in sets}
     return replace(found.material, load=partial(_moved, found.material.load, others)) if others else found.material
@@ -76,12 +76,12 @@ def plain(
     albedo: tuple[float, float, float] = (1.0, 1.0, 1.0),
     colour: str | None = None,
     shading: Shading = PLAIN,
-) -> Found:
+) -> UsdMaterial:
     """A material without textures; `colour` is the primvar that is its albedo, `shading` what else it says."""
-    return Found(RawMaterial(name, no_textures, None, albedo, 0.5, 0.0, shading), None, colour)
+    return UsdMaterial(RawMaterial(name, no_textures, None, albedo, 0.5, 0.0, shading), None, colour)
 
 
-def outside(found: Found, uvs: Float[np.ndarray, "n 3 2"] | None) -> list[str]:
+def outside(found: UsdMaterial, uvs: Float[np.ndarray, "n 3 2"] | None) -> list[str]:
     """Notes on textures that are looked up outside the unit square and are black there, as the file says or for want of
     a wrap mode."""
     notes = []
@@ -101,19 +101,19 @@ def outside(found: Found, uvs: Float[np.ndarray, "n 3 2"] | None) -> list[str]:
     return notes
 
 
-def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any, notes: list[str]) -> Found:
+def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any, notes: list[str]) -> UsdMaterial:
     """The preview surface of a UsdShade.Material; a plain material, and a note, where it has none."""
     name = material.GetPrim().GetName()
     surface = material.ComputeSurfaceSource()[0]
     if not surface or surface.GetShaderId() != "UsdPreviewSurface":
         notes.append(f"Material '{name}' has no UsdPreviewSurface and was read as plain.")
         return plain(name)
-    textures: dict[str, Texture] = {}
+    textures: dict[str, UsdTexture] = {}
     constants: dict[str, Any] = dict(DEFAULTS)
     colour = None
     for kind, named in INPUTS.items():
         value = _source(pxr, surface.GetInput(named), time)
-        if isinstance(value, Texture):
+        if isinstance(value, UsdTexture):
             textures[kind] = value
         elif isinstance(value, Primvar):
             if kind == "albedo" and value.kind.startswith("UsdPrimvarReader_") and value.name:
@@ -147,20 +147,20 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
         1.0 if "metallic" in textures else float(np.clip(constants["metallic"], 0, 1)),
         shading,
     )
-    return Found(made, next((t.primvar for t in textures.values()), None), colour, textures)
+    return UsdMaterial(made, next((t.primvar for t in textures.values()), None), colour, textures)
 
 
-def _shading(pxr: Any, surface: Any, textures: dict[str, Texture], time: Any) -> Shading:
+def _shading(pxr: Any, surface: Any, textures: dict[str, UsdTexture], time: Any) -> Shading:
     """What the preview surface says besides the maps that are painted; its textures go into `textures`."""
 
     def constant(name: str, otherwise: Any) -> Any:
         value = _source(pxr, surface.GetInput(name), time)
-        return otherwise if value is None or isinstance(value, Texture | Primvar) else value
+        return otherwise if value is None or isinstance(value, UsdTexture | Primvar) else value
 
     glossy = bool(_source(pxr, surface.GetInput("useSpecularWorkflow"), time))
     for kind, name in SHADING.items():
         value = _source(pxr, surface.GetInput(name), time)
-        if isinstance(value, Texture) and (kind != "specular" or glossy):
+        if isinstance(value, UsdTexture) and (kind != "specular" or glossy):
             textures[kind] = value
     ior, threshold = float(constant("ior", 1.5)), float(constant("opacityThreshold", 0.0))
     f0 = [((1 - ior) / (1 + ior)) ** 2] * 3 if ior > 0 else [1.0] * 3
@@ -183,7 +183,7 @@ def _differs(value: Any, neutral: float) -> bool:
     """Whether an input says anything but its neutral value."""
     if value is None:
         return False
-    return isinstance(value, Texture | Primvar) or bool((np.array(value, float) != neutral).any())
+    return isinstance(value, UsdTexture | Primvar) or bool((np.array(value, float) != neutral).any())
 
 
 @dataclass(frozen=True)
@@ -195,7 +195,7 @@ class Primvar:
 
 
 def _source(pxr: Any, given: Any, time: Any) -> Any:
-    """A constant, a Texture, another shader as a Primvar, or None where nothing is said."""
+    """A constant, a UsdTexture, another shader as a Primvar, or None where nothing is said."""
     if not given:
         return None
     producing = given.GetValueProducingAttributes()
@@ -212,7 +212,7 @@ def _source(pxr: Any, given: Any, time: Any) -> Any:
     return _texture(pxr, shader, attribute.GetName().removeprefix("outputs:"), time)
 
 
-def _texture(pxr: Any, shader: Any, channel: str, time: Any) -> Texture | None:
+def _texture(pxr: Any, shader: Any, channel: str, time: Any) -> UsdTexture | None:
     file = _attribute(shader, "file")
     asset = file.Get(time) if file else None
     if asset is None or channel not in CHANNELS:
@@ -221,7 +221,7 @@ def _texture(pxr: Any, shader: Any, channel: str, time: Any) -> Texture | None:
     primvar, transform = _lookup(pxr, shader.GetInput("st"), time)
     space, scale, bias = (_value(shader, name, time) for name in ("sourceColorSpace", "scale", "bias"))
     wrap = [str(_value(shader, name, time) or "useMetadata") for name in ("wrapS", "wrapT")]
-    return Texture(
+    return UsdTexture(
         asset.path, place_of(layer), str(space or "auto"), None if scale is None else tuple(scale),
         None if bias is None else tuple(bias), channel, primvar, transform, (wrap[0], wrap[1]),
     )  # fmt: skip
@@ -260,7 +260,7 @@ def _lookup(pxr: Any, given: Any, time: Any) -> tuple[str, Float[np.ndarray, "3 
     return "st", transform
 
 
-def _load(textures: dict[str, Texture], root: Path, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
+def _load(textures: dict[str, UsdTexture], root: Path, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
     maps: dict[str, RawMap] = {}
     notes: list[str] = []
     for kind, texture in textures.items():
@@ -276,7 +276,7 @@ def _load(textures: dict[str, Texture], root: Path, budget: Budget, tile: int) -
     return maps, tuple(notes)
 
 
-def _texels(kind: str, texture: Texture, place: Place, budget: Budget, notes: list[str]) -> np.ndarray | None:
+def _texels(kind: str, texture: UsdTexture, place: PackagedFile, budget: Budget, notes: list[str]) -> np.ndarray | None:
     """One map as `Material` has it; None with a note where it is not there or cannot be used."""
     chosen = CHANNELS[texture.channel]
     if not chosen:
@@ -294,19 +294,17 @@ def _texels(kind: str, texture: Texture, place: Place, budget: Budget, notes: li
     return _meant(kind, texture, pixels, chosen)
 
 
-def _alpha(texture: Texture, place: Place, notes: list[str]) -> Float[np.ndarray, "h w"] | None:
+def _alpha(texture: UsdTexture, place: PackagedFile, notes: list[str]) -> Float[np.ndarray, "h w"] | None:
     """A map that is a texture's alpha; 1 where it has none."""
     data = bytes_of(place, MAX_PICTURE_BYTES)
     if data is None:
         notes.append(f"Texture {texture.file} is not there and was left out.")
         return None
-    alpha = alpha_of(data, str(place))
-    alpha = np.ones((2, 2), np.float32) if alpha is None else alpha
     scale, bias = ((said or (other,) * 4)[3] for said, other in ((texture.scale, 1.0), (texture.bias, 0.0)))
-    return np.clip(alpha * np.float32(scale) + np.float32(bias), 0, 1)
+    return np.clip(alpha_map(data, str(place)) * np.float32(scale) + np.float32(bias), 0, 1)
 
 
-def _light(place: Place, notes: list[str]) -> np.ndarray | None:
+def _light(place: PackagedFile, notes: list[str]) -> np.ndarray | None:
     """An EXR texture's first three channels; a single one counts for all."""
     from mistyle.files.hdr import read_exr
 
@@ -319,7 +317,7 @@ def _light(place: Place, notes: list[str]) -> np.ndarray | None:
     return np.stack([planes[names[min(k, len(names) - 1)]] for k in range(3)], axis=-1)
 
 
-def _meant(kind: str, texture: Texture, pixels: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
+def _meant(kind: str, texture: UsdTexture, pixels: np.ndarray, chosen: tuple[int, ...]) -> np.ndarray:
     """scale * texel + bias in the channels that are used; normals as unit vectors, 2 c - 1 where nothing is said."""
     said = texture.scale is not None or texture.bias is not None
     scale = np.array((texture.scale or (1, 1, 1, 1))[:3], np.float32)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.measure.colour_difference import delta_e, lab
-from mistyle.measure.flip_bands import Pair, flip_maps
+from mistyle.measure.flip_bands import FlipPair, flip_maps
 
 PPD = 3840 * math.pi / 180  # 0.7 m from a display of 3840 pixels and 0.7 m
 SMALL = 1e-2  # keeps relative errors of black pixels finite
@@ -130,7 +130,7 @@ class Viewing:
 
 
 @dataclass(frozen=True)
-class Measured:
+class MetricValues:
     """Values by metric, error maps (h w) by metric (flip, hdr_flip, de2000), and HDR-FLIP's exposures."""
 
     values: Mapping[str, float]
@@ -156,7 +156,7 @@ def measure_colour(
     names: Sequence[str] = COLOUR,
     viewing: Viewing | None = None,
     progress: Callable[[float], None] = lambda done: None,
-) -> Measured:
+) -> MetricValues:
     """The metrics `names` of two linear pictures that are finite inside the mask. NaN where the mask is empty.
 
     Raises ValueError where a pixel inside the mask is not finite.
@@ -164,18 +164,18 @@ def measure_colour(
     viewing = viewing or Viewing()
     values, maps = dict.fromkeys(names, math.nan), {}
     if not mask.any():
-        return Measured(values, maps, viewing.exposures)
+        return MetricValues(values, maps, viewing.exposures)
     a, b = _inside(reference, test, mask)
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
         raise ValueError("a pixel inside the mask is NaN or infinite")
     exposures = viewing.exposures
-    jobs: dict[str, Pair] = {}
+    jobs: dict[str, FlipPair] = {}
     if "hdr_flip" in names:
         exposures = exposures or flip_exposures(a, mask)
-        jobs["hdr_flip"] = Pair(a, b, exposures)
+        jobs["hdr_flip"] = FlipPair(a, b, exposures)
     looks = (encoded(a), encoded(b)) if set(names) & ENCODED else None
     if "flip" in names and looks is not None:
-        jobs["flip"] = Pair(*looks)
+        jobs["flip"] = FlipPair(*looks)
 
     def others() -> None:
         values.update(_linear(a, b, mask, names, viewing))
@@ -190,7 +190,7 @@ def measure_colour(
     else:
         others()
     progress(1.0)
-    return Measured(values, maps, exposures)
+    return MetricValues(values, maps, exposures)
 
 
 def _linear(a, b, mask, names: Sequence[str], viewing: Viewing) -> dict[str, float]:
@@ -209,7 +209,7 @@ def _encoded(a, b, mask, names: Sequence[str], viewing: Viewing, maps: dict[str,
     if "psnr" in names:
         values["psnr"] = _decibels(_mean_square(a, b, mask), 1.0)
     if "ssim" in names:
-        values["ssim"] = _ssim(a, b, mask)
+        values["ssim"] = ssim(a, b, mask)
     if "de2000" in names or "de2000_p95" in names:
         maps["de2000"] = ciede_map(a, b)
         inside = maps["de2000"][mask]
@@ -225,17 +225,17 @@ def measure_data(
     test: Float[np.ndarray, "h w c"],
     mask: Bool[np.ndarray, "h w"],
     names: Sequence[str] = DATA,
-) -> Measured:
+) -> MetricValues:
     """rmse, mae, max_error and (of three channels) angle of layers that are not colours; finite inside the mask."""
     values = {n: math.nan for n in names if n in DATA and (n != "angle" or reference.shape[2] == 3)}
     if not mask.any():
-        return Measured(values)
+        return MetricValues(values)
     a, b = reference[mask].astype(np.float64), test[mask].astype(np.float64)
     gap = np.abs(a - b)
     found = {"rmse": np.sqrt((gap**2).mean()), "mae": gap.mean(), "max_error": gap.max()}
     if "angle" in values:
         found["angle"] = _angle(a, b)
-    return Measured({n: float(found[n]) for n in values})
+    return MetricValues({n: float(found[n]) for n in values})
 
 
 def _angle(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> float:
@@ -324,12 +324,15 @@ def _relative(a, b, mask) -> dict[str, float]:
     return {"relmse": square / count, "smape": absolute / count}
 
 
-def _ssim(a, b, mask) -> float:
-    """In bands that overlap by the window, so that large pictures need little memory."""
+def ssim(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> float:
+    """SSIM of two sRGB-encoded pictures, mean over the mask; NaN where the window of 11 pixels does not fit.
+
+    Bands overlap by the window, so that large pictures need little memory.
+    """
     from skimage.metrics import structural_similarity
 
     if min(a.shape[:2]) < 11:
-        return math.nan  # the window does not fit
+        return math.nan
     total, reach, band = 0.0, 5, 512
     for start in range(0, len(a), band):
         low, high = max(0, start - reach), min(len(a), start + band + reach)

@@ -31,11 +31,11 @@ def flip_map(
 ) -> Float[np.ndarray, "h w"]:
     """FLIP's error of every pixel, 0..1: of sRGB-encoded pictures (clipped to 0..1), or with `exposures` (first, last,
     number) of linear ones (HDR-FLIP; negative values count as 0)."""
-    return flip_maps({"flip": Pair(reference, test, exposures)}, ppd)["flip"]
+    return flip_maps({"flip": FlipPair(reference, test, exposures)}, ppd)["flip"]
 
 
 @dataclass(frozen=True)
-class Pair:
+class FlipPair:
     """Two pictures for `flip_maps`: sRGB-encoded, or linear with exposures."""
 
     reference: Float[np.ndarray, "h w 3"]
@@ -44,7 +44,7 @@ class Pair:
 
 
 def flip_maps(
-    pairs: Mapping[str, Pair], ppd: float, meanwhile: Callable[[], None] | None = None
+    pairs: Mapping[str, FlipPair], ppd: float, meanwhile: Callable[[], None] | None = None
 ) -> dict[str, Float[np.ndarray, "h w"]]:
     """`flip_map` of several pairs of one size; of large ones the lower rows in a second process, beside which
     `meanwhile` runs first and then the upper rows."""
@@ -74,7 +74,7 @@ def flip_maps(
         }
 
 
-def _start(folder: Path, pairs: Mapping[str, Pair], ppd: float, cut: int) -> subprocess.Popen:
+def _start(folder: Path, pairs: Mapping[str, FlipPair], ppd: float, cut: int) -> subprocess.Popen:
     """The second process, with the rows from `cut` on."""
     low = max(0, cut - reach(ppd))
     order = []

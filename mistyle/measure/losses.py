@@ -249,11 +249,6 @@ def _pad_edge(values: torch.Tensor) -> torch.Tensor:
     return functional.pad(values, (1, 1, 1, 1), mode="replicate")
 
 
-def total_variation(values: Float[torch.Tensor, "c h w"]) -> torch.Tensor:
-    """Mean of |x(u+1, v) - x(u, v)| plus mean of |x(u, v+1) - x(u, v)| (the paper's sum, as means)."""
-    return (values[:, :, 1:] - values[:, :, :-1]).abs().mean() + (values[:, 1:] - values[:, :-1]).abs().mean()
-
-
 def mean_gradient(picture: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None) -> float:
     """Mean absolute difference of neighbouring pixels (both axes, all channels), of pairs inside the mask."""
     inside = np.ones(picture.shape[:2], bool) if mask is None else mask

@@ -1,25 +1,23 @@
 """Figures for the report, the benchmarks and the fit's own judgement; every definition stands with its function.
 
 Pictures are float arrays (h, w, 3), sRGB-encoded 0..1 unless a name says linear; masks are bool. A figure over no
-pixels is NaN. Higher is better for psnr, ssim, detail_correlation, edge_recall and coverage; lower for the others.
+pixels is NaN. Higher is better for psnr, detail_correlation and coverage; lower for the others.
 """
 
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.image import dilate, erode, gaussian, resize
+from mistyle.core.image import erode, gaussian, resize
 from mistyle.core.view import View
-from mistyle.measure.colour_difference import delta_e, lab
-from mistyle.measure.overlap import DEPTH_TOLERANCE, Overlap, overlap, seen_here, seen_there
+from mistyle.measure.colour_difference import lab
+from mistyle.measure.overlap import Overlap, overlap, seen_here, seen_there
 
 PATCH = 5
 SCALES = (1, 2, 4)
 QUANTILES = 256
-SEAM_JUMP = 8.0  # times the usual uv step between neighbouring pixels
 
 
 def psnr(reference: Float[np.ndarray, "*n"], test: Float[np.ndarray, "*n"], mask: np.ndarray | None = None) -> float:
@@ -27,35 +25,6 @@ def psnr(reference: Float[np.ndarray, "*n"], test: Float[np.ndarray, "*n"], mask
     squares = (np.asarray(reference, np.float64) - test) ** 2
     error = float(squares[mask].mean() if mask is not None else squares.mean())
     return float("inf") if error == 0 else float(-10 * np.log10(error))
-
-
-def ssim(
-    reference: Float[np.ndarray, "h w 3"], test: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None
-) -> float:
-    """Structural similarity (Wang et al. 2004: Gaussian window of 1.5 px, K = 0.01, 0.03), mean over the mask."""
-    from skimage.metrics import structural_similarity
-
-    found: Any = structural_similarity(
-        reference, test, data_range=1.0, channel_axis=-1, gaussian_weights=True, use_sample_covariance=False, full=True
-    )
-    full = found[1]
-    return float(full[mask].mean() if mask is not None else full.mean())
-
-
-def flip(reference: Float[np.ndarray, "h w 3"], test: Float[np.ndarray, "h w 3"]) -> float:
-    """Mean LDR-FLIP error (Andersson et al. 2020) at 67 pixels per degree, 0..1."""
-    import flip_evaluator
-
-    a, b = (np.ascontiguousarray(np.clip(picture, 0, 1), np.float32) for picture in (reference, test))
-    return float(flip_evaluator.evaluate(a, b, "LDR", inputsRGB=True, applyMagma=False)[1])
-
-
-def ciede2000(
-    reference: Float[np.ndarray, "*n 3"], test: Float[np.ndarray, "*n 3"], mask: np.ndarray | None = None
-) -> float:
-    """Mean CIE Delta E 2000 (ISO/CIE 11664-6, all factors 1) over the mask, from CIELAB with the D65 white."""
-    difference = delta_e(lab(reference), lab(test))
-    return float(difference[mask].mean() if mask is not None else difference.mean())
 
 
 def patch_distance(
@@ -236,28 +205,6 @@ def band_correlation(
     return float((a * b).sum() / scale) if scale > 0 else float("nan")
 
 
-def edge_recall(
-    picture: Float[np.ndarray, "h w 3"],
-    reference: Float[np.ndarray, "h w 3"],
-    mask: Bool[np.ndarray, "h w"],
-    thresholds: tuple[float, float] = (20, 60),
-) -> float:
-    """Share of the reference's Canny edges (8-bit lightness, 2 px blur) with an edge of the picture within one pixel,
-    minus the share that edges thrown at random would meet. Without the second, noise would score best."""
-    inner = erode(mask, 3)
-    mine, theirs = (_edges(p, mask, thresholds) & inner for p in (picture, reference))
-    if not theirs.any():
-        return float("nan")
-    near = dilate(mine, 1)
-    return float(near[theirs].mean() - near[inner].mean())
-
-
-def _edges(picture, mask, thresholds) -> Bool[np.ndarray, "h w"]:
-    light, weight = lab(picture)[..., 0], mask.astype(np.float32)
-    smooth = gaussian(light * weight, 2) / np.maximum(gaussian(weight, 2), 1e-3)
-    return cv2.Canny(np.clip(smooth * 2.55, 0, 255).astype(np.uint8), *thresholds) > 0
-
-
 def warp_error(
     view: View, other: View, picture: Float[np.ndarray, "h w 3"], other_picture: Float[np.ndarray, "h w 3"]
 ) -> float:
@@ -276,31 +223,6 @@ def shared_error(
     if not shared.both.any():
         return float("nan")
     return float(np.abs(lab(seen_here(shared, picture)) - lab(seen_there(shared, other_picture))).sum(axis=1).mean())
-
-
-def seam_ratio(view: View, picture: Float[np.ndarray, "h w 3"]) -> float:
-    """How much more neighbouring pixels differ across UV seams than beside them: 1 where seams cannot be seen.
-
-    A pair of neighbours is a seam where both lie on the surface, their depths continue each other, and their uv jump
-    is over SEAM_JUMP times the view's median step, or their texture sets differ. Compared with the pairs within eight
-    pixels of a seam. NaN where the view shows no seam.
-    """
-    differences, steps, pairs = [], [], []
-    depth = np.where(view.mask, view.depth, 0)
-    for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-        joined = view.mask[a] & view.mask[b] & (np.abs(depth[a] - depth[b]) < DEPTH_TOLERANCE)
-        jump = np.linalg.norm(view.uv[a] - view.uv[b], axis=-1)
-        steps.append(jump[joined])
-        pairs.append((joined, jump, view.part[a] != view.part[b]))
-        differences.append(np.abs(picture[a] - picture[b]).sum(axis=-1))
-    if not sum(map(len, steps)):
-        return float("nan")
-    usual = float(np.median(np.concatenate(steps)))
-    seams = [joined & ((jump > SEAM_JUMP * usual) | parts) for joined, jump, parts in pairs]
-    on = np.concatenate([d[s] for d, s in zip(differences, seams, strict=True)])
-    beside = [dilate(s, 8) & ~s & joined for s, (joined, _, _) in zip(seams, pairs, strict=True)]
-    off = np.concatenate([d[s] for d, s in zip(differences, beside, strict=True)])
-    return float(on.mean() / max(float(off.mean()), 1e-9)) if len(on) and len(off) else float("nan")
 
 
 def coverage(known: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> float:

@@ -169,21 +169,6 @@ def ball_mean(picture: Float[np.ndarray, "h w 4"], name: str, scale: float = 1.0
     return picture[inside][:, :3].mean(axis=0)
 
 
-def patch_means(picture: Float[np.ndarray, "h w 4"], scale: float = 1.0) -> Float[np.ndarray, "24 3"]:
-    """The mean linear colours of the chart's patches, in the order of `colour_checker`."""
-    columns, rows = PATCHES
-    found = np.zeros((rows, columns, 3), np.float32)
-    for row in range(rows):
-        for column in range(columns):
-            x = CHART_CENTRE[0] + CHART_SIZE[0] * ((column + 0.5) / columns - 0.5)
-            y = CHART_CENTRE[1] - CHART_SIZE[1] * ((row + 0.5) / rows - 0.5)
-            px, py = pixel_of(x, y, scale)
-            reach = 0.25 * CHART_SIZE[0] / columns * UNIT * column_camera(scale).focal / 40.0
-            block = picture[int(py - reach) : int(py + reach) + 1, int(px - reach) : int(px + reach) + 1, :3]
-            found[row, column] = block.mean(axis=(0, 1))
-    return np.rot90(found, 1).reshape(24, 3)
-
-
 def exposed(rig: Rig, seed: int = 0) -> Rig:
     """The rig scaled so that the grey ball's visible half has a mean luminance of 0.18."""
     seen = float(luminance(ball_mean(references(rig.light, 64, seed, 0.5), "grey", 0.5)[None])[0])

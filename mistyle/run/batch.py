@@ -22,7 +22,7 @@ from mistyle.files.output import keep_folder, write_file
 from mistyle.files.store import clean_leftovers
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs
-from mistyle.run.batch_plan import PLAN, Plan, read_plan, write_plan
+from mistyle.run.batch_plan import PLAN, BatchPlan, read_plan, write_plan
 from mistyle.run.progress import grouped
 from mistyle.run.shard import SHARDS, claim_batch, finished, job_of, marker, outcome
 
@@ -42,7 +42,7 @@ class Choices:
     watch: bool = False
 
 
-def planned(jobs: Path, out: Path | None, choices: Choices) -> Plan:
+def planned(jobs: Path, out: Path | None, choices: Choices) -> BatchPlan:
     """The plan of a jobs file, a folder of meshes and pictures, or a plan (or its folder) that is there already."""
     is_plan = jobs.name == PLAN or (jobs.is_dir() and (jobs / PLAN).is_file())
     if is_plan:
@@ -54,7 +54,7 @@ def planned(jobs: Path, out: Path | None, choices: Choices) -> Plan:
         return plan
     if out is None:
         raise UsageError(f"{jobs}: a new batch needs -o OUT, the folder for everything it makes")
-    return Plan(out.absolute(), read_jobs(jobs, threads_each(choices)))
+    return BatchPlan(out.absolute(), read_jobs(jobs, threads_each(choices)))
 
 
 def workers_of(choices: Choices) -> int:
@@ -67,7 +67,7 @@ def threads_each(choices: Choices) -> int:
     return choices.threads or max(1, cores() // workers_of(choices))
 
 
-def run_batch(plan: Plan, choices: Choices) -> dict[str, Any]:
+def run_batch(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
     """Run every job of the plan that is not done yet; returns the summary. One failing job never stops the others."""
     known = {job.name for job in plan.jobs}
     unknown = [name for name in choices.only if name not in known]
@@ -93,21 +93,19 @@ def run_batch(plan: Plan, choices: Choices) -> dict[str, Any]:
     return summary
 
 
-def _run(plan: Plan, todo: Sequence[int], choices: Choices, reused: int) -> list[engines.Ended]:
+def _run(plan: BatchPlan, todo: Sequence[int], choices: Choices, reused: int) -> list[engines.Ended]:
     from mistyle.run.batch_watch import watching
 
     with watching(plan, todo, reused, live=choices.watch) as watch:
         if not todo:
             return []
         if choices.engine == "ray":
-            return engines.ray(
-                plan, todo, threads_each(choices), watch, address=choices.address, gpus=choices.gpus,
-                wait=choices.wait, timeout=choices.timeout,
-            )  # fmt: skip
+            cluster = engines.RayCluster(choices.address, threads_each(choices), choices.gpus, choices.wait)
+            return engines.ray(plan, todo, cluster, watch, choices.timeout)
         return engines.local(plan, todo, min(workers_of(choices), len(todo)), watch, choices.timeout)
 
 
-def summarise(plan: Plan, ended: dict[int, engines.Ended], seconds: float, reused: int) -> dict[str, Any]:
+def summarise(plan: BatchPlan, ended: dict[int, engines.Ended], seconds: float, reused: int) -> dict[str, Any]:
     """How every job of the plan stands, and the command that retries what failed."""
     rows = [_row(plan, k, job, ended.get(k)) for k, job in enumerate(plan.jobs)]
     failed = [row["name"] for row in rows if row["state"] == "failed"]
@@ -125,7 +123,7 @@ def summarise(plan: Plan, ended: dict[int, engines.Ended], seconds: float, reuse
     }
 
 
-def _row(plan: Plan, index: int, job: Record, ended: engines.Ended | None) -> dict[str, Any]:
+def _row(plan: BatchPlan, index: int, job: Record, ended: engines.Ended | None) -> dict[str, Any]:
     found = outcome(plan, job)
     state, told = found.state, found.told
     if ended is not None and ended.code != 0:
@@ -161,7 +159,7 @@ def describe(summary: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def dry_run(plan: Plan, choices: Choices) -> dict[str, Any]:
+def dry_run(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
     """What the batch would do: estimated seconds, disk and memory of every job that is not done yet."""
     from mistyle.run.material_plan import plan_material
     from mistyle.run.stylize_plan import plan as plan_style

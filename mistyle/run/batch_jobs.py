@@ -38,7 +38,7 @@ MOST_JOBS = 100_000
 MOST_TOLD = 20
 
 
-class Job(BaseModel):
+class BatchJob(BaseModel):
     """One job as a jobs file says it: a mesh with a style picture, or with references to fit its material to."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -72,7 +72,7 @@ class JobsFile(BaseModel):
 
     preset: str = "standard"
     settings: dict[str, Any] = {}
-    job: list[Job] = []
+    job: list[BatchJob] = []
     grid: list[Grid] = []
 
 
@@ -159,7 +159,7 @@ def _of_folder(folder: Path) -> JobsFile:
     return JobsFile(grid=[Grid(meshes=meshes, styles=styles)])
 
 
-def _spread(grid: Grid, base: Path, origin: str) -> list[Job]:
+def _spread(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
     """The jobs of a grid, meshes first."""
     meshes, styles = _globbed(grid.meshes, base, origin), _globbed(grid.styles, base, origin)
     result = []
@@ -169,7 +169,7 @@ def _spread(grid: Grid, base: Path, origin: str) -> list[Job]:
                 parts = [mesh.stem, style.stem]
                 parts += [preset] if preset is not None and len(grid.presets) > 1 else []
                 parts += [f"v{k}"] if len(grid.variants) > 1 else []
-                result.append(Job(mesh=mesh, style=style, preset=preset, settings=variant, name="_".join(parts)))
+                result.append(BatchJob(mesh=mesh, style=style, preset=preset, settings=variant, name="_".join(parts)))
     return result
 
 
@@ -193,17 +193,17 @@ def _globbed(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
     return list(dict.fromkeys(found))
 
 
-def _names(jobs: Sequence[Job]) -> list[str]:
+def _names(jobs: Sequence[BatchJob]) -> list[str]:
     """A name for each job that no other has and that is safe as the name of a folder; equal ones get -2, -3, …"""
 
-    def base(job: Job) -> str:
+    def base(job: BatchJob) -> str:
         second = job.style.stem if job.style is not None else "fit"
         return safe_name(job.name or f"{job.mesh.stem}_{second}", filler="-")
 
     return distinct([base(job) for job in jobs], limit=ASSET, joint="-")
 
 
-def _record(job: Job, name: str, file: JobsFile, base: Path, threads: int) -> Record:
+def _record(job: BatchJob, name: str, file: JobsFile, base: Path, threads: int) -> Record:
     if (job.style is None) == (job.references is None):
         raise UsageError("expected either a style (stylize) or references (fit), found " + _said(job))
     if job.style is not None and (job.lights or job.masks or job.exposure):
@@ -237,7 +237,7 @@ def _record(job: Job, name: str, file: JobsFile, base: Path, threads: int) -> Re
     )
 
 
-def _said(job: Job) -> str:
+def _said(job: BatchJob) -> str:
     return "both" if job.style is not None else "neither"
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.files.output import write_file
-from mistyle.run.batch_plan import Plan
+from mistyle.run.batch_plan import BatchPlan
 
 THUMBNAIL = 288  # pixels
 COLUMNS = ("seconds", "peak_gb")
@@ -42,7 +42,7 @@ for (const button of document.querySelectorAll('th button')) button.addEventList
 """
 
 
-def write_page(plan: Plan, summary: dict[str, Any]) -> Path:
+def write_page(plan: BatchPlan, summary: dict[str, Any]) -> Path:
     """Write OUT/batch.html from a batch's summary; names and messages are escaped, and no connection is allowed."""
     from jinja2 import Environment, FileSystemLoader
 
@@ -63,7 +63,7 @@ def write_page(plan: Plan, summary: dict[str, Any]) -> Path:
     return plan.out / "batch.html"
 
 
-def _row(plan: Plan, row: dict[str, Any]) -> dict[str, Any]:
+def _row(plan: BatchPlan, row: dict[str, Any]) -> dict[str, Any]:
     folder = plan.out / row["name"] / "report"
     report = folder / "index.html"
     values = {name: row.get(name) for name in COLUMNS} | row.get("figures", {})

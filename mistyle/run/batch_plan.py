@@ -23,7 +23,7 @@ MAX_PLAN_BYTES = 1 << 30  # some hundred thousand jobs
 
 
 @dataclass(frozen=True)
-class Plan:
+class BatchPlan:
     """The jobs of a batch, and the folder that their run folders lie in.
 
     `overwrite` is how this call was asked to treat files there that are not mistyle's; plan.json does not hold it.
@@ -34,7 +34,7 @@ class Plan:
     overwrite: bool = False
 
 
-def write_plan(plan: Plan) -> Path:
+def write_plan(plan: BatchPlan) -> Path:
     """OUT/plan.json; the same jobs give the same bytes. An edited one is set aside; UsageError for a user's file."""
     values = {
         "version": VERSION,
@@ -46,7 +46,7 @@ def write_plan(plan: Plan) -> Path:
     return plan.out / PLAN
 
 
-def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> Plan:
+def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> BatchPlan:
     """A plan (the file or its folder), with its paths as this machine sees them. Raises InputRefused or UsageError."""
     path = path / PLAN if path.is_dir() else path
     try:
@@ -58,7 +58,7 @@ def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> Plan:
     if not isinstance(values, dict) or values.get("version") != VERSION or not isinstance(values.get("jobs"), list):
         raise InputRefused(f"{path}: found no plan of version {VERSION}; write it anew with `mistyle batch`")
     jobs = tuple(mapped(validate(job, str(path), Record), maps) for job in values["jobs"])
-    return Plan(Path(replaced(str(values["out"]), maps)), jobs)
+    return BatchPlan(Path(replaced(str(values["out"]), maps)), jobs)
 
 
 def mapped(job: Record, maps: Sequence[tuple[str, str]]) -> Record:
@@ -119,7 +119,7 @@ def indices(text: str, count: int) -> tuple[int, ...]:
     return tuple(dict.fromkeys(found))
 
 
-def with_delivery(plan: Plan, said: Mapping[str, Any]) -> Plan:
+def with_delivery(plan: BatchPlan, said: Mapping[str, Any]) -> BatchPlan:
     """A batch's plan in which every job delivers what the command line says. UsageError where a job cannot."""
     from mistyle.run import deliver
     from mistyle.run.material_settings import MaterialSettings

@@ -7,14 +7,14 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from mistyle.run.batch_plan import Plan
+from mistyle.run.batch_plan import BatchPlan
 from mistyle.run.engines import Ended, Watch, last_lines
 
 ROWS = 30  # of the live table
 
 
 @contextmanager
-def watching(plan: Plan, todo: Sequence[int], reused: int, live: bool) -> Iterator[Watch]:
+def watching(plan: BatchPlan, todo: Sequence[int], reused: int, live: bool) -> Iterator[Watch]:
     """The function that engines tell about each shard; with `live`, a table of all of them that keeps itself new."""
     state: dict[int, tuple[float, Ended | None]] = {}
     lock = threading.Lock()
@@ -35,18 +35,18 @@ def watching(plan: Plan, todo: Sequence[int], reused: int, live: bool) -> Iterat
     from rich.console import Console
     from rich.live import Live
 
-    class Table:
+    class ProgressTable:
         """Made anew each time the screen asks for it."""
 
         def __rich__(self) -> Any:
             with lock:
                 return _table(plan, todo, dict(state), reused)
 
-    with Live(Table(), console=Console(stderr=True), refresh_per_second=2):
+    with Live(ProgressTable(), console=Console(stderr=True), refresh_per_second=2):
         yield told
 
 
-def _table(plan: Plan, todo: Sequence[int], state: dict[int, tuple[float, Ended | None]], reused: int) -> Any:
+def _table(plan: BatchPlan, todo: Sequence[int], state: dict[int, tuple[float, Ended | None]], reused: int) -> Any:
     from rich.markup import escape
     from rich.table import Table
 

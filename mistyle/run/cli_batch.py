@@ -230,22 +230,20 @@ def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
 def _farm(options: argparse.Namespace) -> int:
     from mistyle.run.batch import Choices, planned, say, threads_each
     from mistyle.run.batch_plan import path_maps, with_delivery
-    from mistyle.run.farm import export
+    from mistyle.run.farm import ShardNeeds, export
 
     choices = Choices(workers=options.workers, threads=options.threads)
     given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
     plan = with_delivery(given, said_settings(options, DELIVERY_OPTIONS))
-    files = export(
-        plan,
-        options.bundle or plan.out / "farm",
-        options.form,
-        threads=threads_each(choices),
-        memory_gb=options.memory,
-        gpus=options.gpus,
-        chunk=options.chunk,
-        program=options.program,
-        maps=path_maps(options.path_map),
+    needs = ShardNeeds(
+        threads_each(choices),
+        options.memory,
+        options.gpus,
+        options.chunk,
+        options.program,
+        path_maps(options.path_map),
     )
+    files = export(plan, options.bundle or plan.out / "farm", options.form, needs)
     if options.json:
         print(json.dumps({"files": [str(p) for p in files], "shards": len(plan.jobs)}))
     else:

@@ -48,7 +48,7 @@ def add_export(verbs: Any) -> None:
 def _export(options: argparse.Namespace) -> int:
     import os
 
-    from mistyle.run.deliver import export
+    from mistyle.run.deliver import DeliveryRequest, export
     from mistyle.run.deliver_settings import TEXTURES, ColourSettings, listed
     from mistyle.run.progress import Progress
 
@@ -58,13 +58,15 @@ def _export(options: argparse.Namespace) -> int:
         files += export(
             options.asset,
             options.out / target if len(targets) > 1 else options.out,
-            formats=listed(options.formats),
-            target=target,
-            name=options.name,
-            names=options.texture_name or TEXTURES,
-            metres_per_unit=options.metres_per_unit,
-            colour=colour,
-            source=options.source,
+            DeliveryRequest(
+                formats=listed(options.formats),
+                target=target,
+                name=options.name,
+                names=options.texture_name or TEXTURES,
+                metres_per_unit=options.metres_per_unit,
+                colour=colour,
+                source=options.source,
+            ),
             overwrite=options.overwrite,
             note=progress.note,
         )

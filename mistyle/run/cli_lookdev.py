@@ -74,7 +74,6 @@ def _lookdev(options: argparse.Namespace) -> int:
         progress,
         hdri=options.hdri,
         date=options.date,
-        mp4=options.mp4,
         overwrite=options.overwrite,
     )
     told = files | {"notes": progress.notes}

@@ -18,16 +18,16 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.layers import BEAUTY, Frame
+from mistyle.files.layers import BEAUTY, LayeredPicture
 from mistyle.files.output import claim, replace_files
 from mistyle.files.store import atomic_write
 from mistyle.measure import compare_metrics as metrics
 from mistyle.measure import compare_protocols as protocols
-from mistyle.measure.compare_metrics import METRICS, Measured
+from mistyle.measure.compare_metrics import METRICS, MetricValues
 from mistyle.run.compare_inputs import Match, Planes, alpha_mask, chosen_layers, matches, planes, read_mask, reduced
 from mistyle.run.compare_limits import broken, without_effect
-from mistyle.run.compare_pictures import Written, thumbnail, worst_regions, write_pictures
-from mistyle.run.compare_records import CompareJob, Row, columns, csv_text, junit_text, number, row_record
+from mistyle.run.compare_pictures import PairPictures, thumbnail, worst_regions, write_pictures
+from mistyle.run.compare_records import CompareJob, ComparisonRow, columns, csv_text, junit_text, number, row_record
 from mistyle.run.progress import Progress, grouped
 from mistyle.run.versions import peak_gb, versions
 
@@ -45,13 +45,27 @@ RANK = ("flip", "hdr_flip", "relmse", "psnr", "psnr_h", "rms_error", "rmse")
 
 
 @dataclass
-class Found:
+class ComparisonState:
     """What has been compared so far (state: rows arrive one by one, and only the worst keep their pictures)."""
 
-    rows: list[Row] = field(default_factory=list)
-    written: dict[str, Written] = field(default_factory=dict)
+    rows: list[ComparisonRow] = field(default_factory=list)
+    written: dict[str, PairPictures] = field(default_factory=dict)
     heap: list[tuple[float, int, str]] = field(default_factory=list)
     exposures: dict[tuple[str, str], tuple[float, float, int]] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _LayerPair:
+    """One layer of two pictures over the same window, and the files that it comes from."""
+
+    match: Match
+    frames: tuple[LayeredPicture, LayeredPicture]
+    planes: Planes
+
+    @property
+    def high(self) -> bool:
+        """Whether the values of either picture may exceed 1."""
+        return self.frames[0].high or self.frames[1].high
 
 
 def compare(
@@ -67,7 +81,7 @@ def compare(
     for them.
     """
     pairs = matches(job.reference, job.tests)
-    start, found = time.perf_counter(), Found()
+    start, found = time.perf_counter(), ComparisonState()
     result: dict[str, Any] = {}
 
     def write(folder: Path) -> None:
@@ -91,13 +105,13 @@ def compare(
     return result
 
 
-def _one(job: CompareJob, match: Match, folder: Path, found: Found, report: Callable, alone: bool) -> None:
+def _one(job: CompareJob, match: Match, folder: Path, found: ComparisonState, report: Callable, alone: bool) -> None:
     """Compare one picture; what is missing or refused becomes a failed row, except where it is all there is."""
     if match.reference is None or match.test is None:
         who = "the reference" if match.reference is None else "the test"
         missing = f"{who} has no picture of this name"
         failures = () if job.allow_missing else (missing,)
-        found.rows.append(Row(match.name, match.test_name, "", failures=failures, notes=(missing,)))
+        found.rows.append(ComparisonRow(match.name, match.test_name, "", failures=failures, notes=(missing,)))
         return
     from mistyle.files.read import read_frame
 
@@ -108,18 +122,16 @@ def _one(job: CompareJob, match: Match, folder: Path, found: Found, report: Call
         names, notes = chosen_layers(reference, test, job.layers)
         mask = _mask(job, reference)
         for k, name in enumerate(names):
-            both = planes(reference, test, name, job.window, mask)
-            _layer(
-                job, match, (reference, test), both, notes, folder, found, lambda d, k=k: report((k + d) / len(names))
-            )
+            pair = _LayerPair(match, (reference, test), planes(reference, test, name, job.window, mask))
+            _layer(job, pair, notes, folder, found, lambda d, k=k: report((k + d) / len(names)))
             notes = []
     except InputRefused as error:
         if alone:
             raise
-        found.rows.append(Row(match.name, match.test_name, "", failures=(f"refused: {error}",)))
+        found.rows.append(ComparisonRow(match.name, match.test_name, "", failures=(f"refused: {error}",)))
 
 
-def _mask(job: CompareJob, reference: Frame) -> np.ndarray | None:
+def _mask(job: CompareJob, reference: LayeredPicture) -> np.ndarray | None:
     if job.mask is None:
         return None
     return alpha_mask(reference) if job.mask == "alpha" else read_mask(Path(job.mask), reference)
@@ -127,16 +139,15 @@ def _mask(job: CompareJob, reference: Frame) -> np.ndarray | None:
 
 def _layer(
     job: CompareJob,
-    match: Match,
-    frames: tuple[Frame, Frame],
-    both: Planes,
+    pair: _LayerPair,
     notes: Sequence[str],
     folder: Path,
-    found: Found,
+    found: ComparisonState,
     report: Callable[[float], None],
 ) -> None:
-    high = frames[0].high or frames[1].high
-    measured = _measure(job, match, frames, both, high, found, report)
+    """Compare one layer: its row in `found`, and its pictures in `folder`."""
+    match, frames, both, high = pair.match, pair.frames, pair.planes, pair.high
+    measured = _measure(job, pair, found, report)
     odd = int(both.odd.sum())
     failures = [] if job.allow_nonfinite or not odd else [_nonfinite(both)]
     if not both.mask.any():
@@ -144,7 +155,7 @@ def _layer(
     failures += broken(job.limits, match.name, both.layer, measured.values)
     error = next((measured.maps[n] for n in ("flip", "hdr_flip") if n in measured.maps), None)
     ranked = error if error is not None else _plain_error(both)
-    row = Row(
+    row = ComparisonRow(
         image=match.name,
         test=match.test_name,
         layer=both.layer,
@@ -167,17 +178,20 @@ def _layer(
     found.rows.append(row)
 
 
-def _measure(job, match, frames, both: Planes, high: bool, found: Found, report) -> Measured:
+def _measure(
+    job: CompareJob, pair: _LayerPair, found: ComparisonState, report: Callable[[float], None]
+) -> MetricValues:
+    both = pair.planes
     if job.protocol is not None:
-        return Measured(_protocol(job, frames, both) if both.kind == "colour" else {})
+        return MetricValues(_protocol(job, pair.frames, both) if both.kind == "colour" else {})
     if both.kind == "data":
         return metrics.measure_data(both.reference, both.test, both.mask, job.metrics)
-    names = [n for n in job.metrics if METRICS[n].kind == "colour" and (high or n != "hdr_flip")]
+    names = [n for n in job.metrics if METRICS[n].kind == "colour" and (pair.high or n != "hdr_flip")]
     if job.viewing.lpips is None:
         names = [n for n in names if n != "lpips"]
     viewing = job.viewing
     if "hdr_flip" in names and viewing.exposures is None:
-        key = (match.name, both.layer)
+        key = (pair.match.name, both.layer)
         if key not in found.exposures:
             usable = (both.mask | both.odd) & np.isfinite(both.reference).all(axis=-1)
             found.exposures[key] = metrics.flip_exposures(both.reference, usable)
@@ -185,7 +199,7 @@ def _measure(job, match, frames, both: Planes, high: bool, found: Found, report)
     return metrics.measure_colour(both.reference, both.test, both.mask, names, viewing, report)
 
 
-def _protocol(job: CompareJob, frames: tuple[Frame, Frame], both: Planes) -> dict[str, float]:
+def _protocol(job: CompareJob, frames: tuple[LayeredPicture, LayeredPicture], both: Planes) -> dict[str, float]:
     a, b = both.reference, both.test
     if job.protocol == "idiff":
         return protocols.idiff(*(_stored(f, both.layer, v) for f, v in zip(frames, (a, b), strict=True)))
@@ -196,7 +210,7 @@ def _protocol(job: CompareJob, frames: tuple[Frame, Frame], both: Planes) -> dic
     return protocols.stanford_orb(a, b, np.asarray(shown, np.float32))
 
 
-def _straight(frame: Frame, layer: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+def _straight(frame: LayeredPicture, layer: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
     """sRGB-encoded colours that are not premultiplied, and alpha of the finished picture."""
     alpha = frame.layer("alpha") if layer == BEAUTY else None
     if alpha is None:
@@ -205,7 +219,7 @@ def _straight(frame: Frame, layer: str, values: np.ndarray) -> tuple[np.ndarray,
     return metrics.encoded(np.where(a > 0, values / np.maximum(a, 1e-6), 0).astype(np.float32)), a
 
 
-def _stored(frame: Frame, layer: str, values: np.ndarray) -> np.ndarray:
+def _stored(frame: LayeredPicture, layer: str, values: np.ndarray) -> np.ndarray:
     """What idiff sees: an EXR's values, another picture's encoded ones times alpha; alpha is a channel."""
     if frame.high:
         alpha = frame.layer("alpha") if layer == BEAUTY else None
@@ -219,7 +233,7 @@ def _stored(frame: Frame, layer: str, values: np.ndarray) -> np.ndarray:
     return np.concatenate([product, alpha], axis=2)
 
 
-def _over_white(frame: Frame, layer: str, values: np.ndarray) -> np.ndarray:
+def _over_white(frame: LayeredPicture, layer: str, values: np.ndarray) -> np.ndarray:
     straight, alpha = _straight(frame, layer, values)
     return straight if alpha is None else straight * alpha + (1 - alpha)
 
@@ -237,7 +251,7 @@ def _plain_error(both: Planes) -> np.ndarray:
     return result
 
 
-def badness(row: Row) -> float:
+def badness(row: ComparisonRow) -> float:
     """What rows are ordered by: larger is worse; failures and pixels that are not finite first."""
     for name in RANK:
         if name in row.values:
@@ -250,7 +264,7 @@ def badness(row: Row) -> float:
     return 1e9
 
 
-def _worth_showing(job: CompareJob, row: Row, place: str, folder: Path, found: Found) -> bool:
+def _worth_showing(job: CompareJob, row: ComparisonRow, place: str, folder: Path, found: ComparisonState) -> bool:
     """Whether the row is among the worst so far; the least bad of those loses its pictures where there are too many."""
     if job.pictures <= 0:
         return False
@@ -267,7 +281,9 @@ def _worth_showing(job: CompareJob, row: Row, place: str, folder: Path, found: F
     return True
 
 
-def _record(job: CompareJob, found: Found, overall: Sequence[str], seconds: float, context: Mapping) -> dict[str, Any]:
+def _record(
+    job: CompareJob, found: ComparisonState, overall: Sequence[str], seconds: float, context: Mapping
+) -> dict[str, Any]:
     rows = found.rows
     failed = [r for r in rows if r.failures]
     names = columns(rows)
@@ -296,7 +312,7 @@ def _record(job: CompareJob, found: Found, overall: Sequence[str], seconds: floa
     }
 
 
-def _called(row: Row) -> str:
+def _called(row: ComparisonRow) -> str:
     return f"{row.test}: {row.image}" + (f" [{row.layer}]" if row.layer else "")
 
 
@@ -306,7 +322,7 @@ def _mask_text(job: CompareJob) -> str:
     return "the reference's alpha above 0.5" if job.mask == "alpha" else f"{Path(job.mask).name} above one half"
 
 
-def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
+def summary(rows: Sequence[ComparisonRow]) -> list[dict[str, Any]]:
     """Per test and layer: how many rows, how many failed, and the mean and worst of every metric."""
     result = []
     for test, layer in dict.fromkeys((r.test, r.layer) for r in rows):
@@ -324,7 +340,7 @@ def summary(rows: Sequence[Row]) -> list[dict[str, Any]]:
     return result
 
 
-def _write_files(folder: Path, record: dict[str, Any], found: Found, overall: Sequence[str]) -> None:
+def _write_files(folder: Path, record: dict[str, Any], found: ComparisonState, overall: Sequence[str]) -> None:
     from mistyle.run.compare_page import page
 
     text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False) + "\n"

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import resize
-from mistyle.files.layers import BEAUTY, Frame, Layer, Window
+from mistyle.files.layers import BEAUTY, Layer, LayeredPicture, Window
 
 ENDINGS = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
@@ -109,7 +109,9 @@ def _number(name: str) -> str | None:
     return digits[-1].lstrip("0") or "0" if digits else None
 
 
-def chosen_layers(reference: Frame, test: Frame, wanted: Sequence[str]) -> tuple[list[str], list[str]]:
+def chosen_layers(
+    reference: LayeredPicture, test: LayeredPicture, wanted: Sequence[str]
+) -> tuple[list[str], list[str]]:
     """The names of the layers to compare, and sentences about those that only one picture has.
 
     `wanted` names them (InputRefused where a picture lacks one); empty: all that both have.
@@ -134,7 +136,11 @@ def chosen_layers(reference: Frame, test: Frame, wanted: Sequence[str]) -> tuple
 
 
 def planes(
-    reference: Frame, test: Frame, name: str, window: Literal["display", "overlap"], mask: np.ndarray | None
+    reference: LayeredPicture,
+    test: LayeredPicture,
+    name: str,
+    window: Literal["display", "overlap"],
+    mask: np.ndarray | None,
 ) -> Planes:
     """One layer of both frames over the same window. InputRefused where sizes, channels or colour spaces differ.
 
@@ -160,14 +166,14 @@ def planes(
     return _sorted_out(name, a.kind, left, right, counted)
 
 
-def _layer(frame: Frame, name: str) -> Layer:
+def _layer(frame: LayeredPicture, name: str) -> Layer:
     layer = frame.layer(name)
     if layer is None:
         raise InputRefused(f"{frame.path}: found no layer {name!r}; expected it, as the other picture has it.")
     return layer
 
 
-def _window(a: Layer, b: Layer, reference: Frame, test: Frame, how: str) -> Window:
+def _window(a: Layer, b: Layer, reference: LayeredPicture, test: LayeredPicture, how: str) -> Window:
     if how == "display":
         if a.display == b.display:
             return a.display
@@ -206,7 +212,7 @@ def _sorted_out(name: str, kind, left: np.ndarray, right: np.ndarray, counted: n
     return Planes(name, kind, left, right, counted & ~broken, odd, bad)
 
 
-def read_mask(path: Path, frame: Frame) -> Bool[np.ndarray, "h w"]:
+def read_mask(path: Path, frame: LayeredPicture) -> Bool[np.ndarray, "h w"]:
     """A mask file: its luminance above one half, or its alpha where it has one that is not everywhere 1."""
     from mistyle.files.read import read_frame
 
@@ -216,7 +222,7 @@ def read_mask(path: Path, frame: Frame) -> Bool[np.ndarray, "h w"]:
     return np.asarray(values.mean(axis=-1) > 0.5 if layer.kind == "data" else values.mean(axis=-1) > 0.2140)
 
 
-def alpha_mask(frame: Frame) -> Bool[np.ndarray, "h w"]:
+def alpha_mask(frame: LayeredPicture) -> Bool[np.ndarray, "h w"]:
     """Where a picture's own alpha is above one half."""
     alpha = frame.layer("alpha")
     if alpha is None:
@@ -224,7 +230,7 @@ def alpha_mask(frame: Frame) -> Bool[np.ndarray, "h w"]:
     return np.asarray(alpha.values()[..., 0] > 0.5)
 
 
-def reduced(frame: Frame, test: Frame, factor: int) -> Frame:
+def reduced(frame: LayeredPicture, test: LayeredPicture, factor: int) -> LayeredPicture:
     """The frame at the test's size by means over `factor` x `factor` pixels, where it is exactly so much larger."""
     wide, high = test.layers[0].display[2:]
     if any(x.display != (0, 0, wide * factor, high * factor) for x in frame.layers):

@@ -13,10 +13,10 @@ from typing import Any
 
 from mistyle.measure.compare_metrics import METRICS
 from mistyle.measure.compare_protocols import PROTOCOL_BETTER
-from mistyle.run.compare_pictures import GREY, STOPS, WIDE, Written
+from mistyle.run.compare_pictures import GREY, STOPS, WIDE, PairPictures
 
 
-def page(record: Mapping[str, Any], written: Mapping[str, Written]) -> str:
+def page(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -> str:
     """The page as text; `record` is compare.json's content, `written` says what pictures each folder has."""
     import jinja2
     from markupsafe import Markup
@@ -45,14 +45,14 @@ def page(record: Mapping[str, Any], written: Mapping[str, Written]) -> str:
     )
 
 
-def data_block(record: Mapping[str, Any], written: Mapping[str, Written]) -> str:
+def data_block(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -> str:
     """JSON that cannot end the script element it stands in."""
     rows = [{**row, **_pictures(written.get(row["folder"]))} for row in record["rows"]]
     text = json.dumps({"rows": rows, "wide": WIDE, "stops": STOPS, "grey": GREY}, ensure_ascii=True, allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _pictures(found: Written | None) -> dict[str, Any]:
+def _pictures(found: PairPictures | None) -> dict[str, Any]:
     return {} if found is None else {"wide": found.wide, "span": found.span, "maps": list(found.maps)}
 
 

@@ -43,7 +43,7 @@ DIVERGING = (
 
 
 @dataclass(frozen=True)
-class Written:
+class PairPictures:
     """What the page must know of a pair's pictures: M of the wide curve (0: there is none), the range of the signed
     difference, whether there is an error map, and the names of the maps."""
 
@@ -52,7 +52,7 @@ class Written:
     maps: tuple[str, ...]
 
 
-def write_pictures(folder: Path, planes: Planes, maps: Mapping[str, np.ndarray], high: bool) -> Written:
+def write_pictures(folder: Path, planes: Planes, maps: Mapping[str, np.ndarray], high: bool) -> PairPictures:
     """Fill `folder` with a pair's pictures; `maps` are error maps (h w) by metric."""
     folder.mkdir(parents=True, exist_ok=True)
     odd = _broken(planes)
@@ -73,7 +73,7 @@ def write_pictures(folder: Path, planes: Planes, maps: Mapping[str, np.ndarray],
     for name, values in maps.items():
         save(folder / f"{name}.webp", heat(values, 20.0 if name == "de2000" else 1.0), odd)
     (folder / "histogram.svg").write_text(histogram(planes), encoding="utf-8")
-    return Written(wide, span, tuple(maps))
+    return PairPictures(wide, span, tuple(maps))
 
 
 def thumbnail(path: Path, planes: Planes, error: np.ndarray | None) -> None:

@@ -49,7 +49,7 @@ class CompareJob:
 
 
 @dataclass(frozen=True)
-class Row:
+class ComparisonRow:
     """One layer of one picture of one test.
 
     values     metric -> number; a metric that this layer does not have is not there
@@ -81,7 +81,7 @@ def number(value: float) -> float | str | None:
     return value if math.isfinite(value) else ("inf" if value > 0 else "-inf")
 
 
-def row_record(row: Row) -> dict[str, Any]:
+def row_record(row: ComparisonRow) -> dict[str, Any]:
     """A row as compare.json and the page have it."""
     return {
         "image": row.image,
@@ -101,12 +101,12 @@ def row_record(row: Row) -> dict[str, Any]:
     }
 
 
-def columns(rows: Sequence[Row]) -> list[str]:
+def columns(rows: Sequence[ComparisonRow]) -> list[str]:
     """The metrics that any row has, in the order of their first appearance."""
     return list(dict.fromkeys(name for row in rows for name in row.values))
 
 
-def csv_text(rows: Sequence[Row]) -> str:
+def csv_text(rows: Sequence[ComparisonRow]) -> str:
     """One line a row; cells that a spreadsheet would take for a formula begin with an apostrophe."""
     names = columns(rows)
     text = io.StringIO()
@@ -126,7 +126,7 @@ def _cell(text: str) -> str:
     return f"'{text}" if text[:1] in ("=", "+", "-", "@", "\t", "\r") else text
 
 
-def junit_text(rows: Sequence[Row], overall: Sequence[str] = ()) -> str:
+def junit_text(rows: Sequence[ComparisonRow], overall: Sequence[str] = ()) -> str:
     """JUnit XML: a suite per test, a case per image and layer; `overall` failures stand in a case of their own."""
     root = ElementTree.Element("testsuites", name="mistyle compare")
     for test in dict.fromkeys(row.test for row in rows):

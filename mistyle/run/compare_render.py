@@ -22,7 +22,7 @@ from mistyle.run.compare import FILES, compare
 from mistyle.run.compare_pictures import DIVERGING, mapped, webp
 from mistyle.run.compare_records import CompareJob
 from mistyle.run.progress import Progress
-from mistyle.run.render_files import Shot
+from mistyle.run.render_files import RenderView
 from mistyle.run.renderers import Rendered, Renderer, left_out, renderer, shots, subject
 
 LEVEL = 0.01
@@ -104,7 +104,7 @@ def _save(path: Path, found: Rendered) -> None:
     write_exr(path, dict(zip("RGBA", np.moveaxis(mean, -1, 0), strict=False)))
 
 
-def _tests(every: Sequence[Shot], folders: Sequence[Path], drawn: dict) -> list[tuple[str, Tested]]:
+def _tests(every: Sequence[RenderView], folders: Sequence[Path], drawn: dict) -> list[tuple[str, Tested]]:
     result = []
     for shot in every:
         first = np.stack(drawn[folders[0].name, shot.name].pictures)[..., :3]

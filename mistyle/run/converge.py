@@ -24,7 +24,7 @@ from mistyle.measure.compare_metrics import definitions, measure_colour
 from mistyle.measure.compare_stats import interval, slope
 from mistyle.run.charts import Chart
 from mistyle.run.progress import Progress
-from mistyle.run.render_files import Shot, Subject
+from mistyle.run.render_files import RenderView, Subject
 from mistyle.run.renderers import Renderer, left_out, renderer, shots, subject
 from mistyle.run.versions import versions
 
@@ -134,7 +134,7 @@ def _defined(scene: Path, defines: Mapping[str, str], work: Path) -> Path:
     return path
 
 
-def _reference(job: ConvergeJob, what: Subject, shot: Shot, first: Renderer, progress: Progress):
+def _reference(job: ConvergeJob, what: Subject, shot: RenderView, first: Renderer, progress: Progress):
     """The picture that errors are measured against, and a sentence about it."""
     if job.reference is not None:
         from mistyle.files.read import read_frame
@@ -154,7 +154,7 @@ def _reference(job: ConvergeJob, what: Subject, shot: Shot, first: Renderer, pro
 
 def measure(
     what: Subject,
-    shot: Shot,
+    shot: RenderView,
     chosen: Sequence[Renderer],
     counts: Sequence[int],
     seeds: int,

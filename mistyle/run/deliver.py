@@ -11,6 +11,7 @@ Deliveries of other names lie in the same folder untouched; the same name again 
 import json
 import re
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,46 +25,52 @@ from mistyle.files.store import atomic_write, digest, sha256_file
 from mistyle.run.colour import key_of, light_space, picture_space
 from mistyle.run.deliver_files import Delivery, fields_for, write_delivery
 from mistyle.run.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
-from mistyle.run.finished import Finished, read_finished, read_listing
+from mistyle.run.finished import FinishedAsset, read_finished, read_listing
 from mistyle.run.stages import program
+
+
+@dataclass(frozen=True)
+class DeliveryRequest:
+    """What is to be delivered.
+
+    name             pattern of the delivered name: {asset} {mesh} {style} {target}, and {v}, one more than the highest
+                     version there; the latest version stays where asset, settings and program are the same
+    names            pattern of texture files: {asset} (the delivered name), {map}, {ext}, and {udim} for tiles
+    metres_per_unit  what USD says of the mesh's units
+    source           where the mesh file of a USD look lies now, if it was moved
+    """
+
+    formats: Sequence[str]
+    target: str = "blender"
+    name: str = "{asset}"
+    names: str = TEXTURES
+    metres_per_unit: float = 1.0
+    colour: ColourSettings = ColourSettings()
+    source: Path | None = None
 
 
 def export(
     place: Path,
     out: Path,
+    wanted: DeliveryRequest,
     *,
-    formats: Sequence[str],
-    target: str = "blender",
-    name: str = "{asset}",
-    names: str = TEXTURES,
-    metres_per_unit: float = 1.0,
-    colour: ColourSettings | None = None,
-    source: Path | None = None,
     overwrite: bool = False,
     note: Callable[..., None] = lambda *sentences: None,
 ) -> list[Path]:
     """Deliver the asset found at `place` into the folder `out`; returns the delivery's files.
 
-    `name` is the pattern of the delivered name: {asset} {mesh} {style} {target}, and {v}, one more than the highest
-    version there; where the latest version is of the same asset, settings and program it is kept and returned. `names`
-    is the pattern of texture files: {asset} (the delivered name), {map}, {ext}, and {udim} where the asset has tiles.
-    `source` is where the mesh file of a USD look lies now, if it was moved. `note` gets sentences about the files.
+    `note` gets sentences about the files. UsageError for a request that cannot be met.
     """
-    wrong = [f for f in formats if f not in FORMATS]
-    if wrong or target not in TARGETS:
-        offered = f"formats {', '.join(FORMATS)}; targets {', '.join(TARGETS)}"
-        raise UsageError(f"'{wrong[0] if wrong else target}' cannot be written; expected {offered}")
-    try:
-        checked_name(name)
-        checked_textures(names)
-    except ValueError as error:
-        raise UsageError(str(error)) from None
-    colour = colour or ColourSettings()
+    _check_request(wanted)
+    formats, target, source = tuple(wanted.formats), wanted.target, wanted.source
     folder, manifest = read_listing(place)
     files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != "done.json"]
-    of = digest([program(), files, list(formats), target, names, metres_per_unit, key_of(colour), source])
-    called, version = _called(out, name, fields_for(manifest, target), of)
-    chosen = Delivery(tuple(formats), target, called, version, names, metres_per_unit, light_space(colour), source)
+    of = digest(
+        [program(), files, list(formats), target, wanted.names, wanted.metres_per_unit, key_of(wanted.colour), source]
+    )
+    called, version = _called(out, wanted.name, fields_for(manifest, target), of)
+    space = light_space(wanted.colour)
+    chosen = Delivery(formats, target, called, version, wanted.names, wanted.metres_per_unit, space, source)
     if not _whole(out, called, of):
         inputs = [place, folder, *([source] if source else [])]
         claim(out, named_files(chosen), inputs=inputs, overwrite=overwrite)
@@ -75,6 +82,18 @@ def export(
     record = read_own(out / f"{called}.export.json")
     note(*record.get("notes", ()))
     return sorted([out / f"{called}.export.json", *(out / str(e["file"]) for e in record["files"])])
+
+
+def _check_request(wanted: DeliveryRequest) -> None:
+    wrong = [f for f in wanted.formats if f not in FORMATS]
+    if wrong or wanted.target not in TARGETS:
+        offered = f"formats {', '.join(FORMATS)}; targets {', '.join(TARGETS)}"
+        raise UsageError(f"'{wrong[0] if wrong else wanted.target}' cannot be written; expected {offered}")
+    try:
+        checked_name(wanted.name)
+        checked_textures(wanted.names)
+    except ValueError as error:
+        raise UsageError(str(error)) from None
 
 
 def _called(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tuple[str, int | None]:
@@ -115,7 +134,7 @@ def _whole(out: Path, name: str, of: str) -> bool:
         return False
 
 
-def _deliver(new: Path, out: Path, finished: Finished, chosen: Delivery, of: str) -> None:
+def _deliver(new: Path, out: Path, finished: FinishedAsset, chosen: Delivery, of: str) -> None:
     """Fill the folder. UsageError where this delivery would replace a file of another one."""
     record: dict[str, Any] = write_delivery(new, out, finished, chosen) | {"of": of}
     path = new / f"{chosen.name}.export.json"
@@ -160,13 +179,15 @@ def deliver(job: Any, progress: Any) -> dict[str, dict[str, list[str]]]:
             files = export(
                 job.out,
                 job.out / "delivered" / target,
-                formats=chosen.chosen_formats,
-                target=target,
-                name=chosen.name,
-                names=chosen.textures,
-                metres_per_unit=chosen.metres_per_unit,
-                colour=job.settings.colour,
-                source=job.mesh if job.mesh.suffix.lower() in USD else None,
+                DeliveryRequest(
+                    formats=chosen.chosen_formats,
+                    target=target,
+                    name=chosen.name,
+                    names=chosen.textures,
+                    metres_per_unit=chosen.metres_per_unit,
+                    colour=job.settings.colour,
+                    source=job.mesh if job.mesh.suffix.lower() in USD else None,
+                ),
                 overwrite=job.overwrite,
                 note=progress.note,
             )

@@ -20,12 +20,12 @@ from mistyle.core.names import (
     uses,
 )
 from mistyle.files.bounds import USD
-from mistyle.files.materialx import Look, write_materialx
+from mistyle.files.materialx import TexturedMaterial, write_materialx
 from mistyle.files.obj_write import write_obj
 from mistyle.files.ocio import ColourSpace, exr_tags
 from mistyle.files.packing import TARGETS, Target, TextureSet, write_slot
 from mistyle.files.store import sha256_file
-from mistyle.run.finished import Finished
+from mistyle.run.finished import FinishedAsset
 
 # What materials in files refer to: every map by itself, whatever the target packs.
 SINGLE = ("albedo", "normal", "roughness", "metallic")
@@ -55,7 +55,7 @@ def fields_for(manifest: Mapping[str, Any], target: str) -> dict[str, str]:
     return {"asset": str(manifest["name"]), "mesh": mesh, "style": style or "look", "target": target}
 
 
-def write_delivery(folder: Path, out: Path, finished: Finished, chosen: Delivery) -> dict[str, Any]:
+def write_delivery(folder: Path, out: Path, finished: FinishedAsset, chosen: Delivery) -> dict[str, Any]:
     """Write one delivery; returns its record."""
     target = TARGETS[chosen.target]
     referring = any(f in chosen.formats for f in ("usd", "mtlx", "obj"))
@@ -100,7 +100,7 @@ def _slots(formats: Sequence[str], target: Target, referring: bool) -> list[Any]
     return slots
 
 
-def notes(finished: Finished, chosen: Delivery) -> tuple[str, ...]:
+def notes(finished: FinishedAsset, chosen: Delivery) -> tuple[str, ...]:
     """What is to be said of the delivered files."""
     turned = [text for text in finished.manifest.get("notes", ()) if TURNED in text]
     if not turned or "obj" not in chosen.formats:
@@ -120,7 +120,7 @@ def _tiled(pattern: str, sets: Sequence[TextureSet]) -> str:
     return pattern
 
 
-def set_labels(pattern: str, name: str, finished: Finished) -> list[str]:
+def set_labels(pattern: str, name: str, finished: FinishedAsset) -> list[str]:
     """The {asset} of every texture set: the delivered name, with the material's where several have textures.
 
     Tiles of one material share it; all others differ even without case, and leave room for the rest of the pattern.
@@ -164,8 +164,8 @@ def _texture_files(
 
 
 def _looks(
-    finished: Finished, chosen: Delivery, pattern: str, labels: Sequence[str], slots: Sequence[Any]
-) -> list[Look]:
+    finished: FinishedAsset, chosen: Delivery, pattern: str, labels: Sequence[str], slots: Sequence[Any]
+) -> list[TexturedMaterial]:
     """The material of every part, by the files of its single maps."""
     exr = any((s.map, s.ext) == ("albedo", "exr") for s in slots)
     parts = finished.asset.mesh.parts
@@ -174,11 +174,13 @@ def _looks(
     looks = []
     for name, title, label, textures in zip(names, titles, labels, finished.sets, strict=True):
         files = [f"textures/{texture_name(pattern, label, textures.tile, m, 'exr' if exr else 'png')}" for m in SINGLE]
-        looks.append(Look(name, *files, srgb=not exr, space=chosen.space, title=title))
+        looks.append(TexturedMaterial(name, *files, srgb=not exr, space=chosen.space, title=title))
     return looks
 
 
-def _materials(folder: Path, out: Path, finished: Finished, chosen: Delivery, looks: Sequence[Look]) -> list[str]:
+def _materials(
+    folder: Path, out: Path, finished: FinishedAsset, chosen: Delivery, looks: Sequence[TexturedMaterial]
+) -> list[str]:
     """USD, MaterialX and OBJ, which all refer to the single maps; returns the files that deliveries share."""
     tiles = [textures.tile for textures in finished.sets]
     mesh, positions = finished.asset.mesh, finished.asset.source.user_positions
@@ -197,7 +199,9 @@ def _materials(folder: Path, out: Path, finished: Finished, chosen: Delivery, lo
     return []
 
 
-def _look_layer(folder: Path, out: Path, finished: Finished, chosen: Delivery, looks: Sequence[Look]) -> list[str]:
+def _look_layer(
+    folder: Path, out: Path, finished: FinishedAsset, chosen: Delivery, looks: Sequence[TexturedMaterial]
+) -> list[str]:
     """A USD mesh gets its look as a layer over the file it came from, one variant per style."""
     from mistyle.files.records import load_record
     from mistyle.files.usd_look import write_look

@@ -7,7 +7,6 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 FORMATS = ("glb", "usd", "mtlx", "obj", "maps")
-PROGRAMS = ("blender", "unreal", "unity-urp", "unity-hdrp", "houdini", "arnold")
 TEXTURES = "{asset}_{map}.{ext}"
 NAME_FIELDS = frozenset({"asset", "mesh", "style", "target", "v"})
 TEXTURE_FIELDS = frozenset({"asset", "map", "ext", "udim"})

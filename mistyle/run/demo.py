@@ -12,7 +12,7 @@ ROW = 480  # pixels of a row of the sheet
 
 
 @dataclass(frozen=True)
-class Painting:
+class DemoPainting:
     """A painting of `scenes/`: its file, the mesh that it is shown on by default, and a few words."""
 
     file: str
@@ -22,10 +22,10 @@ class Painting:
 
 MESHES = {"elephant": "demo.obj", "robot": "robot.obj"}
 PAINTINGS = {
-    "oil": Painting("demo_style.png", "elephant", "an evening over the sea"),
-    "mosaic": Painting("demo_mosaic.jpg", "elephant", "fish in stone and glass"),
-    "hatched": Painting("demo_hatched.png", "robot", "a still life in ink"),
-    "pixel": Painting("demo_pixel.png", "robot", "a castle, cell by cell"),
+    "oil": DemoPainting("demo_style.png", "elephant", "an evening over the sea"),
+    "mosaic": DemoPainting("demo_mosaic.jpg", "elephant", "fish in stone and glass"),
+    "hatched": DemoPainting("demo_hatched.png", "robot", "a still life in ink"),
+    "pixel": DemoPainting("demo_pixel.png", "robot", "a castle, cell by cell"),
 }
 DEFAULT = "mosaic"
 

@@ -21,7 +21,7 @@ from typing import Any
 
 from mistyle.core.children import PARENT
 from mistyle.core.errors import EnvironmentMissing, MistyleError
-from mistyle.run.batch_plan import PLAN, Plan
+from mistyle.run.batch_plan import PLAN, BatchPlan
 from mistyle.run.shard import SHARDS
 
 # Exit codes that a program gives itself; a shell reports a signal as 128 + its number.
@@ -47,14 +47,14 @@ class Ended:
 Watch = Callable[[int, Ended | None], None]
 
 
-def command(plan: Plan, index: int, maps: Sequence[tuple[str, str]] = ()) -> list[str]:
+def command(plan: BatchPlan, index: int, maps: Sequence[tuple[str, str]] = ()) -> list[str]:
     """The process of one shard."""
     options = [part for source, target in maps for part in ("--path-map", f"{source}={target}")]
     options += ["--overwrite"] * plan.overwrite
     return [sys.executable, "-m", "mistyle", "shard", str(plan.out / PLAN), "--index", str(index), *options]
 
 
-def log_of(plan: Plan, index: int) -> Path:
+def log_of(plan: BatchPlan, index: int) -> Path:
     """Where a shard's words go."""
     return plan.out / SHARDS / f"{plan.jobs[index].name}.log"
 
@@ -64,7 +64,9 @@ def crashed(code: int) -> bool:
     return code in CRASHES or (code < 0 and -code not in (signal.SIGTERM, signal.SIGINT))
 
 
-def local(plan: Plan, todo: Sequence[int], workers: int, watch: Watch, timeout: float | None = None) -> list[Ended]:
+def local(
+    plan: BatchPlan, todo: Sequence[int], workers: int, watch: Watch, timeout: float | None = None
+) -> list[Ended]:
     """Run shards as processes of this machine, `workers` at a time; their threads are a setting of each job.
 
     On Ctrl-C or a request to stop, every shard is asked to stop and given time for its checkpoint.
@@ -135,7 +137,7 @@ class _Children:
     stopping: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
 
-    def run(self, plan: Plan, index: int, plain: bool, timeout: float | None) -> int:
+    def run(self, plan: BatchPlan, index: int, plain: bool, timeout: float | None) -> int:
         with _surroundings(plain) as environment:
             with self.lock:
                 if self.stopping:
@@ -213,7 +215,7 @@ def _waited(child: subprocess.Popen, timeout: float | None) -> int:
         return stopped(child)
 
 
-def last_lines(plan: Plan, index: int, count: int = 5) -> str:
+def last_lines(plan: BatchPlan, index: int, count: int = 5) -> str:
     """The end of a shard's log, for a person; where it crashed, Python's innermost calls. The last try's."""
     try:
         text = log_of(plan, index).read_text(encoding="utf-8", errors="replace")
@@ -224,24 +226,32 @@ def last_lines(plan: Plan, index: int, count: int = 5) -> str:
     return "\n".join(lines[-count:] if crash is None else lines[max(crash - 2, 0) : crash + count])
 
 
-def ray(
-    plan: Plan,
-    todo: Sequence[int],
-    threads: int,
-    watch: Watch,
-    *,
-    address: str | None = None,
-    gpus: float = 0.0,
-    wait: float = 300.0,
-    timeout: float | None = None,
-) -> list[Ended]:
-    """Run shards on a Ray cluster: `address` of a running one ("auto"), or None for one of this machine's own.
+@dataclass(frozen=True)
+class RayCluster:
+    """A Ray cluster and the share of it that each shard takes.
 
-    Each takes `threads` cores and `gpus` (a share is allowed). A lost worker's shard is started again, three times at
-    most. Where nothing has begun after `wait` seconds the cluster cannot serve what is asked for: MistyleError, instead
-    of waiting for ever. A cluster of our own listens on the loopback address only and asks for a token. All machines
+    address  of a running cluster ("auto"); None starts one on this machine
+    threads  cores of a shard
+    gpus     GPUs of a shard; fractions are allowed
+    wait     seconds after which a cluster that has begun no shard counts as unable to serve
+    """
+
+    address: str | None = None
+    threads: int = 1
+    gpus: float = 0.0
+    wait: float = 300.0
+
+
+def ray(
+    plan: BatchPlan, todo: Sequence[int], cluster: RayCluster, watch: Watch, timeout: float | None = None
+) -> list[Ended]:
+    """Run shards on a Ray cluster.
+
+    A lost worker's shard is started again, three times at most. MistyleError where no shard has begun after
+    `cluster.wait` seconds. A cluster of our own listens on the loopback address only and asks for a token. All machines
     must see the plan's folder at the same place.
     """
+    address = cluster.address
     if address is None:
         # Read when Ray is imported; without it Ray takes 127.0.0.1 for the machine's own address and listens on all.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
@@ -262,12 +272,16 @@ def ray(
     else:
         library.init(address=address, log_to_driver=False)
     try:
-        return _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout)
+        return _on_ray(library, plan, todo, cluster, watch, timeout)
     finally:
         library.shutdown()
 
 
-def _on_ray(library, plan, todo, threads, gpus, watch, wait, timeout) -> list[Ended]:
+def _on_ray(
+    library: Any, plan: BatchPlan, todo: Sequence[int], cluster: RayCluster, watch: Watch, timeout: float | None
+) -> list[Ended]:
+    """`ray` on the cluster that `library` is connected to."""
+    threads, gpus, wait = cluster.threads, cluster.gpus, cluster.wait
     offered = library.cluster_resources()
     for name, asked in (("CPU", threads), ("GPU", gpus)):
         if asked > offered.get(name, 0):
@@ -316,5 +330,5 @@ def _ray_shard(index: int, line: list[str], log: str, begun: str, timeout: float
     return _tried(index, run, timeout)
 
 
-def _begun(plan: Plan, index: int) -> Path:
+def _begun(plan: BatchPlan, index: int) -> Path:
     return plan.out / SHARDS / f".{plan.jobs[index].name}.begun"

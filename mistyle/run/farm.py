@@ -6,12 +6,13 @@ Every form runs the same shards (`mistyle shard`), which skip what is done, so a
 import json
 import shlex
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from mistyle.files.output import claim, keep_folder, replace_files
 from mistyle.files.store import atomic_write
-from mistyle.run.batch_plan import PLAN, Plan, write_plan
+from mistyle.run.batch_plan import PLAN, BatchPlan, write_plan
 from mistyle.run.shard import SHARDS, claim_batch
 
 Form = Literal["openjd", "sbatch", "commands"]
@@ -19,34 +20,37 @@ BUNDLE = ("template.yaml", "parameter_values.yaml", "asset_references.yaml")
 SHARD_GRACE = 60  # seconds between the request to stop and the end
 
 
-def export(
-    plan: Plan,
-    folder: Path,
-    form: Form,
-    *,
-    threads: int,
-    memory_gb: float = 8.0,
-    gpus: int = 0,
-    chunk: int = 1,
-    program: str = "mistyle",
-    maps: Sequence[tuple[str, str]] = (),
-) -> list[Path]:
-    """Write the plan and what a queue needs into `folder`; returns the files.
+@dataclass(frozen=True)
+class ShardNeeds:
+    """Each shard's share of a worker, and how the worker calls mistyle.
 
-    `program` is how a worker calls mistyle; `maps` how workers see this machine's folders; `chunk` how many shards a
-    task has at first.
+    threads, memory_gb, gpus  of one shard
+    chunk                     shards of a task at first (Open Job Description)
+    program                   the command by which a worker calls mistyle
+    maps                      this machine's folders, and where workers see them
     """
+
+    threads: int
+    memory_gb: float = 8.0
+    gpus: int = 0
+    chunk: int = 1
+    program: str = "mistyle"
+    maps: Sequence[tuple[str, str]] = ()
+
+
+def export(plan: BatchPlan, folder: Path, form: Form, needs: ShardNeeds) -> list[Path]:
+    """Write the plan and the files that a queue needs into `folder`; returns the files."""
     names = {"openjd": BUNDLE, "sbatch": ("mistyle.sbatch",), "commands": ("commands.txt",)}[form]
     claim_batch(plan)
     claim(folder, names, overwrite=plan.overwrite)
     keep_folder(plan.out, SHARDS)
     write_plan(plan)
     if form == "openjd":
-        files = _openjd(plan, threads, memory_gb, gpus, chunk, program, maps)
+        files = _openjd(plan, needs)
     elif form == "sbatch":
-        files = {"mistyle.sbatch": _sbatch(plan, threads, memory_gb, gpus, program, maps)}
+        files = {"mistyle.sbatch": _sbatch(plan, needs)}
     else:
-        lines = [_line(plan, program, str(k), maps) for k in range(len(plan.jobs))]
+        lines = [_line(plan, needs, str(k)) for k in range(len(plan.jobs))]
         files = {"commands.txt": "\n".join(lines) + "\n"}
 
     def fill(new: Path) -> None:
@@ -57,26 +61,31 @@ def export(
     return [folder / name for name in files]
 
 
-def _line(plan: Plan, program: str, index: str, maps: Sequence[tuple[str, str]]) -> str:
+def _options(plan: BatchPlan, needs: ShardNeeds) -> list[str]:
+    """The options of `mistyle shard` that every shard of the plan gets."""
+    maps = [part for source, target in needs.maps for part in ("--path-map", f"{source}={target}")]
+    return [*maps, *["--overwrite"] * plan.overwrite]
+
+
+def _line(plan: BatchPlan, needs: ShardNeeds, index: str) -> str:
     """One shard as a line for a shell; `index` may be a variable of that shell."""
     from mistyle.run.batch_plan import replaced
 
-    options = [part for source, target in maps for part in ("--path-map", f"{source}={target}")]
-    options += ["--overwrite"] * plan.overwrite
-    place = replaced(str(plan.out / PLAN), maps)
-    return f"{program} shard {shlex.quote(place)} --index {index} {shlex.join(options)}".rstrip()
+    place, options = replaced(str(plan.out / PLAN), needs.maps), shlex.join(_options(plan, needs))
+    return f"{needs.program} shard {shlex.quote(place)} --index {index} {options}".rstrip()
 
 
-def _sbatch(plan: Plan, threads: int, memory_gb: float, gpus: int, program: str, maps) -> str:
+def _sbatch(plan: BatchPlan, needs: ShardNeeds) -> str:
+    """A batch script of Slurm: an array of shards."""
     from mistyle.run.batch_plan import replaced
 
-    logs = replaced(str(plan.out / "shards"), maps)
+    logs = replaced(str(plan.out / "shards"), needs.maps)
     options = [
         f"--job-name=mistyle-{plan.out.name}",
         f"--array=0-{len(plan.jobs) - 1}",
-        f"--cpus-per-task={threads}",
-        f"--mem={round(memory_gb * 1024)}M",
-        *([f"--gres=gpu:{gpus}"] if gpus else []),
+        f"--cpus-per-task={needs.threads}",
+        f"--mem={round(needs.memory_gb * 1024)}M",
+        *([f"--gres=gpu:{needs.gpus}"] if needs.gpus else []),
         # Asked to stop early enough to write a checkpoint; the array task then counts as failed and may be resubmitted.
         f"--signal=B:TERM@{SHARD_GRACE}",
         "--requeue",
@@ -87,75 +96,14 @@ def _sbatch(plan: Plan, threads: int, memory_gb: float, gpus: int, program: str,
             "#!/bin/bash",
             *(f"#SBATCH {option}" for option in options),
             # `exec`: the signal reaches the shard itself.
-            f"exec {_line(plan, program, '${SLURM_ARRAY_TASK_ID}', maps)}",
+            f"exec {_line(plan, needs, '${SLURM_ARRAY_TASK_ID}')}",
             "",
         ]
     )
 
 
-def _openjd(plan: Plan, threads: int, memory_gb: float, gpus: int, chunk: int, program: str, maps) -> dict[str, str]:
+def _openjd(plan: BatchPlan, needs: ShardNeeds) -> dict[str, str]:
     """template.yaml (as JSON, which is YAML), parameter_values.yaml and asset_references.yaml of a job bundle."""
-    amounts: list[dict[str, Any]] = [
-        {"name": "amount.worker.vcpu", "min": threads},
-        {"name": "amount.worker.memory", "min": round(memory_gb * 1024)},
-    ]
-    if gpus:
-        amounts.append({"name": "amount.worker.gpu", "min": gpus})
-    options = [part for source, target in maps for part in ("--path-map", f"{source}={target}")]
-    options += ["--overwrite"] * plan.overwrite
-    words = shlex.split(program)
-    arguments = [
-        *words[1:],
-        "shard",
-        "{{Param.Plan}}",
-        "--index",
-        "{{Task.Param.Index}}",
-        "--progress",
-        "openjd",
-        *options,
-    ]
-    template = {
-        "specificationVersion": "jobtemplate-2023-09",
-        "extensions": ["TASK_CHUNKING"],
-        "name": f"mistyle {plan.out.name}"[:128],
-        "parameterDefinitions": [
-            {
-                "name": "Plan",
-                "type": "PATH",
-                "objectType": "FILE",
-                "dataFlow": "IN",
-                "description": "plan.json of the batch; its folder receives the results",
-            }
-        ],
-        "steps": [
-            {
-                "name": "Shards",
-                "parameterSpace": {
-                    "taskParameterDefinitions": [
-                        {
-                            "name": "Index",
-                            "type": "CHUNK[INT]",
-                            "range": f"0-{len(plan.jobs) - 1}",
-                            "chunks": {"defaultTaskCount": chunk, "rangeConstraint": "CONTIGUOUS"},
-                        }
-                    ]
-                },
-                "hostRequirements": {"amounts": amounts},
-                "script": {
-                    "actions": {
-                        "onRun": {
-                            "command": words[0],
-                            "args": arguments,
-                            "cancelation": {
-                                "mode": "NOTIFY_THEN_TERMINATE",
-                                "notifyPeriodInSeconds": SHARD_GRACE,
-                            },
-                        }
-                    }
-                },
-            }
-        ],
-    }
     inputs = sorted({str(p) for job in plan.jobs for p in (job.mesh, job.style, job.references) if p is not None})
     folders = [p for p in inputs if Path(p).is_dir()]
     values = {"parameterValues": [{"name": "Plan", "value": str(plan.out / PLAN)}]}
@@ -166,8 +114,53 @@ def _openjd(plan: Plan, threads: int, memory_gb: float, gpus: int, chunk: int, p
             "referencedPaths": [],
         }
     }
-    return {
-        "template.yaml": json.dumps(template, indent=1) + "\n",
-        "parameter_values.yaml": json.dumps(values, indent=1) + "\n",
-        "asset_references.yaml": json.dumps(references, indent=1) + "\n",
+    bundle = zip(BUNDLE, (_job_template(plan, needs), values, references), strict=True)
+    return {name: json.dumps(tree, indent=1) + "\n" for name, tree in bundle}
+
+
+def _job_template(plan: BatchPlan, needs: ShardNeeds) -> dict[str, Any]:
+    """The job template (Open Job Description 2023-09): one step, whose tasks are chunks of shards."""
+    plan_file = {
+        "name": "Plan",
+        "type": "PATH",
+        "objectType": "FILE",
+        "dataFlow": "IN",
+        "description": "plan.json of the batch; its folder receives the results",
     }
+    index = {
+        "name": "Index",
+        "type": "CHUNK[INT]",
+        "range": f"0-{len(plan.jobs) - 1}",
+        "chunks": {"defaultTaskCount": needs.chunk, "rangeConstraint": "CONTIGUOUS"},
+    }
+    words = shlex.split(needs.program)
+    shard = ["shard", "{{Param.Plan}}", "--index", "{{Task.Param.Index}}", "--progress", "openjd"]
+    run = {
+        "command": words[0],
+        "args": [*words[1:], *shard, *_options(plan, needs)],
+        "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": SHARD_GRACE},
+    }
+    step = {
+        "name": "Shards",
+        "parameterSpace": {"taskParameterDefinitions": [index]},
+        "hostRequirements": {"amounts": _amounts(needs)},
+        "script": {"actions": {"onRun": run}},
+    }
+    return {
+        "specificationVersion": "jobtemplate-2023-09",
+        "extensions": ["TASK_CHUNKING"],
+        "name": f"mistyle {plan.out.name}"[:128],
+        "parameterDefinitions": [plan_file],
+        "steps": [step],
+    }
+
+
+def _amounts(needs: ShardNeeds) -> list[dict[str, Any]]:
+    """What Open Job Description asks a worker for: cores, MiB of memory, GPUs."""
+    amounts: list[dict[str, Any]] = [
+        {"name": "amount.worker.vcpu", "min": needs.threads},
+        {"name": "amount.worker.memory", "min": round(needs.memory_gb * 1024)},
+    ]
+    if needs.gpus:
+        amounts.append({"name": "amount.worker.gpu", "min": needs.gpus})
+    return amounts

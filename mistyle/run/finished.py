@@ -15,7 +15,7 @@ from mistyle.files.packing import TextureSet
 
 
 @dataclass(frozen=True)
-class Finished:
+class FinishedAsset:
     """An asset folder of ours, read back: the mesh, its texture sets, and what its list says."""
 
     asset: Asset
@@ -24,7 +24,7 @@ class Finished:
     folder: Path
 
 
-def read_finished(place: Path) -> Finished:
+def read_finished(place: Path) -> FinishedAsset:
     """The asset of a run folder, an asset folder or a <name>.json. Raises InputRefused."""
     from mistyle.files.read_mesh import read_mesh
 
@@ -40,7 +40,7 @@ def read_finished(place: Path) -> Finished:
             f"{glb}: found {len(asset.mesh.parts)} texture sets, {name}.json lists {len(stems)}; run the job again"
         )
     sets = [_texture_set(folder / "textures", part, stem) for part, stem in stems]
-    return Finished(asset, tuple(sets), manifest, folder)
+    return FinishedAsset(asset, tuple(sets), manifest, folder)
 
 
 def read_listing(place: Path) -> tuple[Path, dict[str, Any]]:

@@ -11,7 +11,7 @@ from mistyle.core.errors import UsageError
 from mistyle.core.maps import Maps
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
-from mistyle.run.report import Pair, Shot
+from mistyle.run.report import BeforeAfter, ReportPicture
 from mistyle.run.stages import Run
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.coat import Coats
@@ -100,7 +100,7 @@ def laid(baked: Baked, made: Finished) -> Baked:
     return replace(baked, maps=maps, begin=begin)
 
 
-def finish_pair(asset: Asset, finishing: FinishRecord, camera: Camera) -> Pair:
+def finish_pair(asset: Asset, finishing: FinishRecord, camera: Camera) -> BeforeAfter:
     """The painting before and after, without light, for the report."""
     from mistyle.render.unlit import unlit
     from mistyle.run.report_draw import shown
@@ -108,5 +108,5 @@ def finish_pair(asset: Asset, finishing: FinishRecord, camera: Camera) -> Pair:
     shots = []
     for maps, caption in ((finishing.before, "as painted"), (finishing.after, "finished")):
         rgb, share = unlit(asset.mesh, maps, [camera])[0]
-        shots.append(Shot(shown(np.concatenate([rgb, share[..., None]], axis=2)), caption))
-    return Pair(shots[0], shots[1], "The albedo alone, without light")
+        shots.append(ReportPicture(shown(np.concatenate([rgb, share[..., None]], axis=2)), caption))
+    return BeforeAfter(shots[0], shots[1], "The albedo alone, without light")

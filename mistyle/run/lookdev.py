@@ -24,7 +24,7 @@ from mistyle.files.output import claim, replace_files
 from mistyle.files.store import atomic_write, sha256_file
 from mistyle.run.progress import Progress
 from mistyle.run.report_overlays import MAGENTA, viridis
-from mistyle.run.sheet_canvas import PANEL, Panel, Row, Sheet, beside, compose, measures, panel_widths
+from mistyle.run.sheet_canvas import PANEL, Panel, PanelRow, Sheet, beside, compose, measures, panel_widths
 
 VIEW_TRANSFORM = "sRGB (Rec.709), no tone curve"
 USUAL = 560  # pixels of a hero picture for which the sheet's type is made
@@ -43,12 +43,13 @@ class LookSettings(BaseModel):
     turntable: int = Field(default=0, ge=0, le=720, description="frames of a turntable; 0: none")
     hdri_turn: int = Field(default=0, ge=0, le=720, description="frames of the light's turn; 0: none")
     frame: int = Field(default=512, ge=32, le=4096, description="pixels of a turntable's frame")
+    mp4: bool = Field(default=False, description="the turntables as mp4 too (needs mistyle[video])")
     threads: int = Field(default=0, ge=0, le=1024, description="threads; 0 takes all cores")
     variant: str = Field(default="auto", description="the Mitsuba variant")
 
 
 @dataclass(frozen=True)
-class Subject:
+class SheetSubject:
     """What the sheet shows: the asset, its file, and pictures per texture set of what is known of its texels."""
 
     asset: Asset
@@ -64,7 +65,6 @@ def lookdev(
     *,
     hdri: Path | None = None,
     date: str | None = None,
-    mp4: bool = False,
     overwrite: bool = False,
 ) -> dict[str, Any]:
     """Draw the sheet of a mesh file or run folder into `out`; returns the paths of what was written.
@@ -72,16 +72,15 @@ def lookdev(
     `hdri` is an .hdr or .exr environment map for the third light; `date` stands in the burn-in (else the day on which
     the asset's file was last changed, UTC). The same asset, settings and thread count give the same pictures.
     """
-    from mistyle.files.images import write_exr, write_png
     from mistyle.files.read import read_radiance
     from mistyle.render import sheet as drawing
     from mistyle.run.start import start_engines
-    from mistyle.run.turntable import encoder, write_turn
+    from mistyle.run.turntable import encoder
 
-    if mp4:
+    if settings.mp4:
         encoder()
     inputs = [place, *([hdri] if hdri is not None else [])]
-    claim(out, files_of_sheet(settings, mp4), inputs=inputs, overwrite=overwrite)
+    claim(out, files_of_sheet(settings), inputs=inputs, overwrite=overwrite)
     start_engines(settings)
     with progress.stage("read", "read the asset"):
         subject = read_subject(place)
@@ -94,44 +93,62 @@ def lookdev(
     with progress.stage("sheet", "draw the sheet") as report:
         day = date or datetime.datetime.fromtimestamp(subject.path.stat().st_mtime, datetime.UTC).date().isoformat()
         picture = compose(*sheet(subject, stage, lights, settings, day, report))
-    written = {"sheet": str(out / "lookdev.png"), "exr": str(out / "lookdev.exr")}
-    turns = {
-        "turntable": (settings.turntable, stage.turn, lights[0]),
-        "light_turn": (settings.hdri_turn, stage.light_turn, lights[2]),
-    }
+    written = {"sheet": "lookdev.png", "exr": "lookdev.exr"}
     record = {"asset": subject.path.name, "sha256": sha256_file(subject.path), "date": day, "mistyle": __version__}
     record |= {
-        "settings": settings.model_dump(mode="json"),
+        "settings": settings.model_dump(mode="json", exclude={"mp4"}),
         "view": VIEW_TRANSFORM,
         "hdri": hdri.name if hdri else None,
     }
     record["exposure_stops"] = {rig.name: round(rig.stops, 3) for rig in lights}
 
     def fill(folder: Path) -> None:
-        write_png(folder / "lookdev.png", srgb_from_linear(np.clip(picture, 0, 1)))
-        write_exr(folder / "lookdev.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)), half=True)
-        for name, (frames, draw, rig) in turns.items():
-            if frames:
-                with progress.stage(name, TURNS[name]) as report:
-                    drawn = draw(frames, rig.light, settings.frame, max(settings.spp // 2, 1), settings.seed, report)
-                    paths = write_turn(folder / name, [shown(p) for p in drawn], mp4)
-                    written[name] = str(out / paths[-1].relative_to(folder))
+        write_sheet(folder, picture)
+        written.update(write_turns(folder, stage, lights, settings, progress))
         atomic_write(folder / "lookdev.json", (json.dumps(record, indent=1) + "\n").encode())
 
     replace_files(out, "lookdev", fill, inputs=inputs, overwrite=overwrite)
-    return written
+    return {name: str(out / file) for name, file in written.items()}
 
 
-def files_of_sheet(settings: LookSettings, mp4: bool) -> list[str]:
+def write_sheet(folder: Path, picture: np.ndarray) -> None:
+    """Write the linear sheet (h w 3) as lookdev.png (sRGB, clipped) and lookdev.exr (half floats)."""
+    from mistyle.files.images import write_exr, write_png
+
+    write_png(folder / "lookdev.png", srgb_from_linear(np.clip(picture, 0, 1)))
+    write_exr(folder / "lookdev.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)), half=True)
+
+
+def write_turns(
+    folder: Path, stage: Any, lights: Sequence[Any], settings: LookSettings, progress: Progress
+) -> dict[str, str]:
+    """Draw and write the turntables that the settings ask for; returns the film of each, relative to the folder."""
+    from mistyle.run.turntable import write_turn
+
+    turns = {
+        "turntable": (settings.turntable, stage.turn, lights[0]),
+        "light_turn": (settings.hdri_turn, stage.light_turn, lights[2]),
+    }
+    films = {}
+    for name, (frames, draw, rig) in turns.items():
+        if frames:
+            with progress.stage(name, TURNS[name]) as report:
+                drawn = draw(frames, rig.light, settings.frame, max(settings.spp // 2, 1), settings.seed, report)
+                paths = write_turn(folder / name, [shown(p) for p in drawn], settings.mp4)
+                films[name] = str(paths[-1].relative_to(folder))
+    return films
+
+
+def files_of_sheet(settings: LookSettings) -> list[str]:
     """What a sheet with these settings consists of."""
     names = ["lookdev.png", "lookdev.exr", "lookdev.json"]
     for name, frames in (("turntable", settings.turntable), ("light_turn", settings.hdri_turn)):
         if frames:
-            names += [*(f"{name}/{k:03}.png" for k in range(frames)), f"{name}.webp", *([f"{name}.mp4"] * mp4)]
+            names += [*(f"{name}/{k:03}.png" for k in range(frames)), f"{name}.webp", *([f"{name}.mp4"] * settings.mp4)]
     return names
 
 
-def read_subject(place: Path) -> Subject:
+def read_subject(place: Path) -> SheetSubject:
     """A mesh file, or the asset of a run folder with what the run knows of its texels. Raises InputRefused."""
     from mistyle.files.read_mesh import read_mesh
     from mistyle.run.renderers import finished_asset
@@ -139,7 +156,7 @@ def read_subject(place: Path) -> Subject:
     path = finished_asset(place) if place.is_dir() else place
     asset = read_mesh(path)
     known = texel_knowledge(place, len(asset.mesh.parts)) if place.is_dir() else {}
-    return Subject(asset, path, known)
+    return SheetSubject(asset, path, known)
 
 
 def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
@@ -170,7 +187,7 @@ def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
 
 
 def sheet(
-    subject: Subject, stage: Any, lights: Sequence[Any], settings: LookSettings, day: str, report: Callable
+    subject: SheetSubject, stage: Any, lights: Sequence[Any], settings: LookSettings, day: str, report: Callable
 ) -> tuple[Sheet, int, float]:
     """What `compose` wants: the sheet with all its pictures drawn, the width of its rows, and the scale of its type."""
     from mistyle.render import sheet as drawing
@@ -209,10 +226,10 @@ def sheet(
         light = type(lights[2].light)(**{**vars(lights[2].light), "turn": lights[2].light.turn + angle})
         turned.append(Panel(shot(*drawing.CAMERAS["3/4"], light, step), f"{angle:.0f}°"))
     rows = (
-        Row("Three lights, each exposed so that the grey ball is 18 %", tuple(heroes)),
-        Row("Soft studio from five sides: the asset turns, the light stands still", tuple(cameras)),
-        Row("What lies behind", tuple(strip)),
-        Row(f"{lights[2].name}, turned about the asset", tuple(turned)),
+        PanelRow("Three lights, each exposed so that the grey ball is 18 %", tuple(heroes)),
+        PanelRow("Soft studio from five sides: the asset turns, the light stands still", tuple(cameras)),
+        PanelRow("What lies behind", tuple(strip)),
+        PanelRow(f"{lights[2].name}, turned about the asset", tuple(turned)),
     )
     return Sheet(subject.path.stem, facts(subject), rows, burn_in(subject, settings, day)), width, scale
 
@@ -230,7 +247,7 @@ def shown(picture: np.ndarray) -> np.ndarray:
     return np.concatenate([colour, alpha], axis=-1).astype(np.float32)
 
 
-def facts(subject: Subject) -> tuple[str, ...]:
+def facts(subject: SheetSubject) -> tuple[str, ...]:
     """What the asset is, in a line, and what reading it had to change."""
     mesh, sizes = subject.asset.mesh, []
     for material in subject.asset.materials:
@@ -242,7 +259,7 @@ def facts(subject: Subject) -> tuple[str, ...]:
     return (line, *subject.asset.source.notes[:2])
 
 
-def burn_in(subject: Subject, settings: LookSettings, day: str) -> str:
+def burn_in(subject: SheetSubject, settings: LookSettings, day: str) -> str:
     """The line at the foot of the sheet."""
     digest = sha256_file(subject.path)[:16]
     parts = (subject.path.name, f"sha256 {digest}", day, f"mistyle {__version__}")

@@ -13,7 +13,7 @@ from mistyle.run.material_job import MATERIAL_STAGES
 from mistyle.run.pages import file_list, heat, map_shots, setting_groups, side_by_side
 from mistyle.run.progress import Progress
 from mistyle.run.record import earlier, merged_peaks, merged_seconds, report_files, write_record
-from mistyle.run.report import Figure, MapSet, Note, Pair, Report, Shot, Step, Timing, write_report
+from mistyle.run.report import BeforeAfter, Figure, MapSet, Note, Report, ReportPicture, Step, Timing, write_report
 from mistyle.run.report_draw import draw
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
@@ -60,7 +60,9 @@ def material_report(folder: Path, made: Any, progress: Progress, report: Callabl
         mesh=made.job.mesh.name,
         style=f"{len(made.captures)} pictures of {made.job.references.name}",
         relation="fitted to",
-        painting=Shot(encoded(reference, reference), f"A reference: {made.measured.names[made.measured.worst[0][0]]}"),
+        painting=ReportPicture(
+            encoded(reference, reference), f"A reference: {made.measured.names[made.measured.worst[0][0]]}"
+        ),
         turntable=tuple(drawn.turns[0]),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
@@ -99,15 +101,17 @@ def facts(made: Any) -> tuple[tuple[str, str], ...]:
 def steps(made: Any) -> tuple[Step, ...]:
     measured = made.measured
     pairs = tuple(
-        Pair(
-            Shot(encoded(reference, reference), "reference"),
-            Shot(encoded(predicted, reference), "predicted"),
+        BeforeAfter(
+            ReportPicture(encoded(reference, reference), "reference"),
+            ReportPicture(encoded(predicted, reference), "predicted"),
             f"{measured.names[k]}: {measured.psnr[k]:.1f} dB{', held out' if measured.held[k] else ''}",
         )
         for k, reference, predicted in measured.worst
     )
     differences = tuple(
-        Shot(difference(reference, predicted), f"{measured.names[k]}: error", "white: 0.1 of the picture's white")
+        ReportPicture(
+            difference(reference, predicted), f"{measured.names[k]}: error", "white: 0.1 of the picture's white"
+        )
         for k, reference, predicted in measured.worst
     )
     compare = Step(
@@ -134,7 +138,7 @@ def steps(made: Any) -> tuple[Step, ...]:
         "How well the references determine each texel's material: dark blue not at all, yellow well; and by how many "
         "pictures it is seen.",
         shots=tuple(
-            Shot(picture, f"{name}: {what}", sharp=True)
+            ReportPicture(picture, f"{name}: {what}", sharp=True)
             for k, (name, t) in enumerate(parts)
             for what, picture in (
                 ("confidence", heat(made.recovered.confidence[k], 1, t, longest)),

@@ -15,7 +15,19 @@ from mistyle.files.own import read_own
 from mistyle.run import report_overlays
 from mistyle.run.finishing import finish_pair
 from mistyle.run.progress import Progress
-from mistyle.run.report import Figure, File, MapSet, Note, Pair, Report, Setting, Shot, Step, Timing, write_report
+from mistyle.run.report import (
+    BeforeAfter,
+    Figure,
+    File,
+    MapSet,
+    Note,
+    Report,
+    ReportPicture,
+    Setting,
+    Step,
+    Timing,
+    write_report,
+)
 from mistyle.run.report_draw import close_up, draw, shown
 from mistyle.run.report_model import page_model
 from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
@@ -54,13 +66,19 @@ def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[fl
         title=made.job.name,
         mesh=made.job.mesh.name,
         style=made.job.style.name,
-        painting=Shot(made.style.rgb, f"The style: {made.job.style.name}"),
+        painting=ReportPicture(made.style.rgb, f"The style: {made.job.style.name}"),
         turntable=tuple(drawn.turns[0]),
         plain=tuple(drawn.turns[1]),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
         facts=facts(made),
         notes=tuple(Note(text) for text in progress.notes),
-        steps=steps(made, [Pair(Shot(b, "as baked"), Shot(after, "after fit and repair"), SAME) for b in before]),
+        steps=steps(
+            made,
+            [
+                BeforeAfter(ReportPicture(b, "as baked"), ReportPicture(after, "after fit and repair"), SAME)
+                for b in before
+            ],
+        ),
         maps=map_sets(made),
         model=page_model(made.folder / f"{made.job.name}.glb"),
         timings=tuple(Timing(named[k], v, k in progress.reused) for k, v in progress.seconds.items()),
@@ -111,13 +129,13 @@ def facts(made: Any) -> tuple[tuple[str, str], ...]:
     )
 
 
-def steps(made: Any, refined: Sequence[Pair]) -> tuple[Step, ...]:
+def steps(made: Any, refined: Sequence[BeforeAfter]) -> tuple[Step, ...]:
     """The stages in the order of the paper; `refined` are pictures before and after fit and repair."""
     views = Step(
         "Views of the mesh",
         "Every camera of the rig, with the mesh's own material.",
         "4.1.1",
-        shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.views),
+        shots=tuple(ReportPicture(view_picture(v), angle(v.camera)) for v in made.views),
         columns=8,
     )
     stylized = Step(
@@ -129,7 +147,7 @@ def steps(made: Any, refined: Sequence[Pair]) -> tuple[Step, ...]:
         )
         + " Paint one over in stylized/, run the same command again, and it goes into the texture.",
         "4.1.3",
-        shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.stylized),
+        shots=tuple(ReportPicture(view_picture(v), angle(v.camera)) for v in made.stylized),
         facts=look_facts(made.looks),
         columns=8,
     )
@@ -139,7 +157,7 @@ def steps(made: Any, refined: Sequence[Pair]) -> tuple[Step, ...]:
         "How many views see each texel: dark blue none, yellow many.",
         "4.1.4",
         shots=tuple(
-            Shot(heat(made.baked.seen[k], len(made.views), t, longest), f"{name}: seen by views", sharp=True)
+            ReportPicture(heat(made.baked.seen[k], len(made.views), t, longest), f"{name}: seen by views", sharp=True)
             for k, (name, t) in enumerate(parts)
         ),
         columns=3,
@@ -148,7 +166,7 @@ def steps(made: Any, refined: Sequence[Pair]) -> tuple[Step, ...]:
     return (views, stylized, baked, *finish, *refining(made, refined, longest))
 
 
-def refining(made: Any, pairs: Sequence[Pair], longest: int) -> tuple[Step, ...]:
+def refining(made: Any, pairs: Sequence[BeforeAfter], longest: int) -> tuple[Step, ...]:
     """Fit and repair, or why there was none."""
     if made.job.settings.keeps_painting:
         return (Step("Normal and roughness", UNFITTED, "4.2"),)
@@ -167,7 +185,9 @@ def refining(made: Any, pairs: Sequence[Pair], longest: int) -> tuple[Step, ...]
         "masks/: paint one over, run the same command again, and it decides.",
         "4.3",
         shots=tuple(
-            Shot(mask_over(made.repaired.mask[k], made.repaired.maps[k], t, longest), f"{name}: repaired texels")
+            ReportPicture(
+                mask_over(made.repaired.mask[k], made.repaired.maps[k], t, longest), f"{name}: repaired texels"
+            )
             for k, (name, t) in enumerate(parts)
         ),
         columns=3,
@@ -240,17 +260,17 @@ def _kept(fit: Any, phase: str) -> str:
     return f"kept; worse within the tolerance: {', '.join(slipped)}" if slipped else "kept; no figure got worse"
 
 
-def map_shots(maps: Maps, longest: int) -> tuple[Shot, ...]:
+def map_shots(maps: Maps, longest: int) -> tuple[ReportPicture, ...]:
     """The maps of a texture set, as written beside the asset, at most `longest` pixels wide and high."""
 
     def small(make: Callable[[slice], np.ndarray]) -> np.ndarray:
         return in_bands(maps.roughness.shape[:2], make, longest)
 
     return (
-        Shot(small(lambda at: srgb_from_linear(maps.albedo[at])), "albedo", "sRGB"),
-        Shot(small(lambda at: maps.normal[at] * 0.5 + 0.5), "normal", "tangent space, +Y, MikkTSpace"),
-        Shot(small(lambda at: maps.roughness[at]), "roughness", "linear"),
-        Shot(small(lambda at: maps.metallic[at]), "metallic", "linear"),
+        ReportPicture(small(lambda at: srgb_from_linear(maps.albedo[at])), "albedo", "sRGB"),
+        ReportPicture(small(lambda at: maps.normal[at] * 0.5 + 0.5), "normal", "tangent space, +Y, MikkTSpace"),
+        ReportPicture(small(lambda at: maps.roughness[at]), "roughness", "linear"),
+        ReportPicture(small(lambda at: maps.metallic[at]), "metallic", "linear"),
     )
 
 

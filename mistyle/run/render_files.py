@@ -20,7 +20,7 @@ TIMEOUT = 6 * 3600.0
 
 
 @dataclass(frozen=True)
-class Shot:
+class RenderView:
     """One picture to render: a camera and a light of a mesh, or a sensor of a scene file."""
 
     name: str
@@ -40,7 +40,7 @@ class Subject:
     threads: int = 0
 
 
-def exported(found: Subject, shot: Shot) -> Path:
+def exported(found: Subject, shot: RenderView) -> Path:
     """The shot as a Mitsuba scene file that any Mitsuba renders, with Mitsuba's own material."""
     from mistyle.render.lookdev import material_maps
     from mistyle.stages.scene_file import write_scene
@@ -98,7 +98,7 @@ def user_camera(asset: Any, camera: Camera) -> tuple[np.ndarray, float]:
     return matrix, scale
 
 
-def scene_for(found: Subject, shot: Shot, spp: int, seed: int) -> Path:
+def scene_for(found: Subject, shot: RenderView, spp: int, seed: int) -> Path:
     """What a command gets as {scene}: the scene file, or for a mesh a JSON that names mesh, camera, lights and an
     equal Mitsuba scene file."""
     if found.asset is None or shot.camera is None:

@@ -23,7 +23,7 @@ import numpy as np
 from mistyle.core.camera import orbit
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
 from mistyle.run.blender import BLENDER, blender_command
-from mistyle.run.render_files import Shot, Subject, as_glb, exported, finished, run_job, scene_for, user_camera
+from mistyle.run.render_files import RenderView, Subject, as_glb, exported, finished, run_job, scene_for, user_camera
 
 MITSUBA_VARIANTS = ("cuda_ad_rgb", "metal_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 
@@ -37,7 +37,7 @@ class Rendered:
     version: str = ""
 
 
-Draw = Callable[[Subject, Shot, int, Sequence[int]], Rendered]
+Draw = Callable[[Subject, RenderView, int, Sequence[int]], Rendered]
 
 
 @dataclass(frozen=True)
@@ -129,14 +129,14 @@ def left_out(found: Subject) -> list[str]:
     return sorted(names)
 
 
-def shots(found: Subject, lights: Sequence[str], views: int, size: int) -> list[Shot]:
+def shots(found: Subject, lights: Sequence[str], views: int, size: int) -> list[RenderView]:
     """Cameras all round a mesh under every light, or the sensors of a scene file."""
     if found.asset is None:
         from mistyle.render.lookdev import file_scene
 
         names = [s.id() for s in file_scene(found.path).sensors()]
         usable = [n if n and not n.startswith(("__", "object_")) else f"sensor{k}" for k, n in enumerate(names)]
-        return [Shot(name, sensor=k) for k, name in enumerate(usable)]
+        return [RenderView(name, sensor=k) for k, name in enumerate(usable)]
     from mistyle.files.read import read_radiance
     from mistyle.render.lookdev import light_rig
 
@@ -145,11 +145,11 @@ def shots(found: Subject, lights: Sequence[str], views: int, size: int) -> list[
     for name in lights:
         rig = light_rig(name, read_radiance)
         called = Path(name).stem
-        result += [Shot(f"{called}_{k}" if views > 1 else called, c, rig) for k, c in enumerate(cameras)]
+        result += [RenderView(f"{called}_{k}" if views > 1 else called, c, rig) for k, c in enumerate(cameras)]
     return result
 
 
-def _mitsuba(integrator: str, found: Subject, shot: Shot, spp: int, seeds: Sequence[int]) -> Rendered:
+def _mitsuba(integrator: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from importlib.metadata import version
 
     from mistyle.render import lookdev
@@ -192,7 +192,7 @@ def _shapes(found: Subject) -> Any:
     return _KEPT[0][1]
 
 
-def _worker(python: str, integrator: str, found: Subject, shot: Shot, spp: int, seeds: Sequence[int]) -> Rendered:
+def _worker(python: str, integrator: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from mistyle.files.read import read_npy
     from mistyle.render import lookdev
     from mistyle.render.scene import passes
@@ -214,7 +214,7 @@ def _worker(python: str, integrator: str, found: Subject, shot: Shot, spp: int, 
     return Rendered(pictures, tuple(done["seconds"]), f"mitsuba {done['mitsuba']} ({done['variant']})")
 
 
-def _cycles(python: str, found: Subject, shot: Shot, spp: int, seeds: Sequence[int]) -> Rendered:
+def _cycles(python: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from mistyle.files.images import write_exr
     from mistyle.files.read import read_frame
     from mistyle.render import lookdev
@@ -244,7 +244,7 @@ def _cycles(python: str, found: Subject, shot: Shot, spp: int, seeds: Sequence[i
     return Rendered(pictures, tuple(done["seconds"]), f"blender {done['blender']}")
 
 
-def _command(name: str, template: str, found: Subject, shot: Shot, spp: int, seeds: Sequence[int]) -> Rendered:
+def _command(name: str, template: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from mistyle.files.read import read_frame
 
     pictures, seconds = [], []

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, UInt8
 
 from mistyle.files.store import atomic_write
 from mistyle.run.charts import Chart, svg
-from mistyle.run.report_model import Model, TooLarge, packed, viewer_script
+from mistyle.run.report_model import PageModel, TooLarge, packed, viewer_script
 from mistyle.run.report_pictures import Encoder, Sizes, accents, kind_in_step, kind_of_maps, palette
 
 Pixels: TypeAlias = (
@@ -37,7 +37,7 @@ SCALES = (1.0, 0.75, 0.55, 0.4, 0.25)
 
 
 @dataclass(frozen=True)
-class Shot:
+class ReportPicture:
     """One picture with what is said below it; `sharp` keeps its pixels as they are (masks, charts)."""
 
     picture: Pixels
@@ -47,11 +47,11 @@ class Shot:
 
 
 @dataclass(frozen=True)
-class Pair:
+class BeforeAfter:
     """Two pictures of the same size in one frame with a handle between them."""
 
-    before: Shot
-    after: Shot
+    before: ReportPicture
+    after: ReportPicture
     caption: str = ""
 
 
@@ -65,8 +65,8 @@ class Step:
     title: str
     text: str = ""
     section: str = ""
-    pairs: tuple[Pair, ...] = ()
-    shots: tuple[Shot, ...] = ()
+    pairs: tuple[BeforeAfter, ...] = ()
+    shots: tuple[ReportPicture, ...] = ()
     facts: tuple[tuple[str, str], ...] = ()
     charts: tuple[Chart, ...] = ()
     columns: int = 4
@@ -86,7 +86,7 @@ class MapSet:
     """The maps of one texture set, and what can be laid over each of them."""
 
     name: str
-    shots: tuple[Shot, ...]
+    shots: tuple[ReportPicture, ...]
     overlays: tuple[Overlay, ...] = ()
 
 
@@ -149,7 +149,7 @@ class Report:
     title: str
     mesh: str
     style: str
-    painting: Shot
+    painting: ReportPicture
     turntable: tuple[Pixels, ...]
     plain: tuple[Pixels, ...] = ()
     made: str = ""
@@ -163,7 +163,7 @@ class Report:
     versions: tuple[tuple[str, str], ...] = ()
     files: tuple[File, ...] = ()
     relation: str = "in the style of"
-    model: Model | TooLarge | None = None
+    model: PageModel | TooLarge | None = None
 
 
 def write_report(path: Path, report: Report) -> None:
@@ -196,7 +196,7 @@ def render(report: Report, scale: float = 1.0, encoder: Encoder | None = None) -
 
     here = Path(__file__).parent
     script = (here / "report.js").read_text(encoding="utf-8")
-    viewer = viewer_script() if isinstance(report.model, Model) else ""
+    viewer = viewer_script() if isinstance(report.model, PageModel) else ""
     swatches, sizes = palette(report.painting.picture), Sizes(scale)
     return _template().render(
         report=report,
@@ -212,7 +212,7 @@ def render(report: Report, scale: float = 1.0, encoder: Encoder | None = None) -
         style=Markup((here / "report.css").read_text(encoding="utf-8")),
         script=Markup(script),
         # base64 needs no escaping.
-        asset=Markup(packed(report.model, sizes.of("texture"))) if isinstance(report.model, Model) else "",
+        asset=Markup(packed(report.model, sizes.of("texture"))) if isinstance(report.model, PageModel) else "",
         viewer=Markup(viewer),
         policy=Markup(policy([script, viewer] if viewer else [script])),
     )

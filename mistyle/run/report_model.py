@@ -19,7 +19,7 @@ MOST_GEOMETRY = 4_500_000
 
 
 @dataclass(frozen=True)
-class Model:
+class PageModel:
     """A glTF asset as `load_gltf` reads it, and the name of its file."""
 
     name: str
@@ -34,12 +34,12 @@ class TooLarge:
     sentence: str
 
 
-def page_model(glb: Path) -> Model | TooLarge:
+def page_model(glb: Path) -> PageModel | TooLarge:
     """The asset for a page, unless its vertices and faces alone would take more than MOST_GEOMETRY bytes there."""
     from mistyle.files.read_mesh import load_gltf
 
     tree, buffers = load_gltf(glb)
-    model = Model(glb.name, tree, buffers)
+    model = PageModel(glb.name, tree, buffers)
     pictures = {image.get("bufferView") for image in tree.get("images", [])}
     geometry = sum(v["byteLength"] for k, v in enumerate(tree.get("bufferViews", [])) if k not in pictures)
     # Packing takes off a third to a half: what is four times too large need not be packed to know.
@@ -52,7 +52,7 @@ def page_model(glb: Path) -> Model | TooLarge:
     )
 
 
-def packed(model: Model, longest: int) -> str:
+def packed(model: PageModel, longest: int) -> str:
     """The asset as base64 of gzip of a GLB whose textures are at most `longest` pixels wide and high.
 
     Textures become JPEG, those with transparency PNG. The same asset gives the same text.

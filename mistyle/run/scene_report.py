@@ -8,7 +8,7 @@ import numpy as np
 
 from mistyle.run.charts import Chart
 from mistyle.run.material_report import difference, encoded
-from mistyle.run.report import Figure, Note, Pair, Report, Shot, Step, write_report
+from mistyle.run.report import BeforeAfter, Figure, Note, Report, ReportPicture, Step, write_report
 from mistyle.run.versions import versions
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
@@ -75,10 +75,14 @@ def write_page(
     pairs, errors = [], []
     for (name, rgb, picture), residual in zip(pictures, fitted.residuals, strict=True):
         said = f"{name}: {residual.psnr[0]:.1f} dB → {residual.psnr[1]:.1f} dB"
-        pairs.append(Pair(Shot(encoded(rgb, rgb), "reference"), Shot(encoded(picture, rgb), "fitted"), said))
-        errors.append(Shot(difference(rgb, picture), f"{name}: error", "ten times as bright"))
+        pairs.append(
+            BeforeAfter(
+                ReportPicture(encoded(rgb, rgb), "reference"), ReportPicture(encoded(picture, rgb), "fitted"), said
+            )
+        )
+        errors.append(ReportPicture(difference(rgb, picture), f"{name}: error", "ten times as bright"))
     textures = tuple(
-        Shot(np.clip(values if values.ndim == 3 else values[..., None], 0, 1), p.name)
+        ReportPicture(np.clip(values if values.ndim == 3 else values[..., None], 0, 1), p.name)
         for p in fitted.parameters
         if (values := fitted.values[p.key]).ndim == 3 and values.shape[2] in (1, 3)
     )
@@ -90,7 +94,7 @@ def write_page(
         mesh=scene,
         style=f"{len(pictures)} pictures of {folder}",
         relation="fitted to",
-        painting=Shot(first, f"A reference: {name}"),
+        painting=ReportPicture(first, f"A reference: {name}"),
         turntable=(encoded(drawn, reference),),
         made=f"mistyle {versions()['mistyle']}, seed {summary['settings']['seed']}",
         facts=(("parameters", str(len(fitted.parameters))), ("sensors", str(len(pictures)))),

@@ -21,7 +21,7 @@ from mistyle.files.output import claim, keep_folder
 from mistyle.files.own import read_own
 from mistyle.files.store import LOCK, atomic_write, digest, sha256_file
 from mistyle.run.batch_jobs import Record
-from mistyle.run.batch_plan import Plan
+from mistyle.run.batch_plan import BatchPlan
 from mistyle.run.inputs import input_files
 from mistyle.run.material_job import MATERIAL_STAGES
 from mistyle.run.progress import Progress
@@ -46,12 +46,12 @@ def key_of(job: Record) -> str:
     return digest([program(), job.kind, job.name, files, lights, job.settings])
 
 
-def marker(plan: Plan, job: Record, failed: bool = False) -> Path:
+def marker(plan: BatchPlan, job: Record, failed: bool = False) -> Path:
     """Where it is written that a job is done, or why it is not."""
     return plan.out / SHARDS / f"{job.name}{'.failed' if failed else ''}.json"
 
 
-def outcome(plan: Plan, job: Record) -> Outcome:
+def outcome(plan: BatchPlan, job: Record) -> Outcome:
     """How a job stands by its markers alone, which is quick; `finished` looks at the files."""
     for state, failed in (("done", False), ("failed", True)):
         told = _read(marker(plan, job, failed))
@@ -60,7 +60,7 @@ def outcome(plan: Plan, job: Record) -> Outcome:
     return Outcome("open", {})
 
 
-def finished(plan: Plan, job: Record, key: str | None = None) -> dict[str, Any] | None:
+def finished(plan: BatchPlan, job: Record, key: str | None = None) -> dict[str, Any] | None:
     """The marker of a job that is done under its present key, with every file as it was written; else None."""
     told = _read(marker(plan, job))
     if told is None or told.get("key") != (key or key_of(job)):
@@ -70,7 +70,7 @@ def finished(plan: Plan, job: Record, key: str | None = None) -> dict[str, Any] 
     return told if whole and files else None
 
 
-def claim_batch(plan: Plan) -> None:
+def claim_batch(plan: BatchPlan) -> None:
     """UsageError where the batch would cover an input or a file that mistyle did not write, in any job's folder."""
     every = [given for job in plan.jobs for given in (job.mesh, job.style, job.references) if given is not None]
     claim(plan.out, ("plan.json", "batch.json", "batch.html"), [SHARDS], every, aside=True, overwrite=plan.overwrite)
@@ -79,7 +79,7 @@ def claim_batch(plan: Plan) -> None:
         claim_run(job_of(plan, job), stages, every)
 
 
-def run_shard(plan: Plan, index: int, progress: Progress) -> dict[str, Any]:
+def run_shard(plan: BatchPlan, index: int, progress: Progress) -> dict[str, Any]:
     """Run job `index` unless it is done; returns its marker's content. Raises what the job raises."""
     job = plan.jobs[index]
     claim(plan.out, folders=[SHARDS], overwrite=plan.overwrite)
@@ -132,7 +132,7 @@ def _wait_for_folder(folder: Path, progress: Progress, seconds: float = 30.0) ->
         time.sleep(0.2)
 
 
-def job_of(plan: Plan, record: Record) -> Any:
+def job_of(plan: BatchPlan, record: Record) -> Any:
     """The `Job` or `MaterialJob` that a record of the plan says."""
     out = plan.out / record.name
     if record.kind == "fit":
@@ -152,7 +152,7 @@ def job_of(plan: Plan, record: Record) -> Any:
     return Job(record.mesh, record.style, out, settings, record.name, overwrite=plan.overwrite)
 
 
-def _run(plan: Plan, record: Record, progress: Progress) -> dict[str, Any]:
+def _run(plan: BatchPlan, record: Record, progress: Progress) -> dict[str, Any]:
     if record.kind == "fit":
         from mistyle.run.material import fit_material
 

@@ -24,7 +24,7 @@ class Panel:
 
 
 @dataclass(frozen=True)
-class Row:
+class PanelRow:
     """Panels of one height side by side under a heading."""
 
     heading: str
@@ -37,7 +37,7 @@ class Sheet:
 
     title: str
     lines: tuple[str, ...]
-    rows: tuple[Row, ...] = field(default_factory=tuple)
+    rows: tuple[PanelRow, ...] = field(default_factory=tuple)
     foot: str = ""
 
 

@@ -96,13 +96,3 @@ def follow(view: View, mask: Bool[np.ndarray, "h w"]) -> View:
         mask=mask,
         coverage=mask.astype(np.float32),
     )
-
-
-def outline_error(a: Bool[np.ndarray, "h w"], b: Bool[np.ndarray, "h w"]) -> float:
-    """Mean distance between two outlines in pixels: that of each outline pixel to the other outline, both ways."""
-    total, count = 0.0, 0
-    for one, other in ((a, b), (b, a)):
-        rim = one & (distance_to(~one) < 1.5)
-        total += float(np.maximum(np.abs(signed(other)[rim]) - 0.5, 0).sum())
-        count += int(rim.sum())
-    return total / count if count else 0.0

@@ -1,7 +1,7 @@
 """The painted surface: any point of it answers with a colour of the painting, at the painting's own resolution."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
 
@@ -292,21 +292,3 @@ def paint(
 
     _, total = dr.while_loop((dj.UInt(0), dj.Array4f(0)), lambda k, *rest: k < reach, body)
     return np.array(dr.ravel(total)).reshape(count, 4)
-
-
-def to_arrays(solution: Solution) -> dict[str, np.ndarray]:
-    """The record as plain arrays, for saving without pickle."""
-    return {field.name: np.asarray(getattr(solution, field.name)) for field in fields(solution)}
-
-
-def from_arrays(arrays: dict[str, np.ndarray]) -> Solution:
-    """The inverse of `to_arrays`, bit for bit."""
-    x, y = arrays["scale"]
-    names = ("positions", "normals", "tangent", "turn", "centre", "painting", "glaze", "piece")
-    return Solution(
-        **{n: arrays[n] for n in names},
-        spacing=float(arrays["spacing"]),
-        scale=(float(x), float(y)),
-        crisp=float(arrays["crisp"]),
-        whole_pixels=bool(arrays["whole_pixels"]),
-    )

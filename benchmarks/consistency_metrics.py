@@ -7,6 +7,7 @@ readability.
 from collections.abc import Iterator, Sequence
 from itertools import combinations
 
+import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
@@ -14,17 +15,14 @@ from mistyle.core.image import dilate, erode, gaussian
 from mistyle.core.view import View
 from mistyle.measure.colour_difference import lab
 from mistyle.measure.lpips import Lpips
-from mistyle.measure.overlap import Overlap, overlap, seen_here, seen_there
+from mistyle.measure.overlap import DEPTH_TOLERANCE, Overlap, overlap, seen_here, seen_there
 
-SHORT, LONG = (
-    (0.0, 46.0),
-    (46.0, 95.0),
-)  # degrees between the cameras of a pair: neighbours, and a part of the way round
+# Degrees between the cameras of a pair: neighbours, and a part of the way round.
+SHORT, LONG = (0.0, 46.0), (46.0, 95.0)
 LEAST_SHARED = 0.05  # share of a view's pixels that a pair must have in common to count
-BAND = (
-    1.5 / 512,
-    10 / 512,
-)  # of the width of the view: what lies between these blurs is the detail that guides ask for
+# Shares of the view's width: the detail that guides ask for lies between these blurs.
+BAND = (1.5 / 512, 10 / 512)
+SEAM_JUMP = 8.0  # times the usual uv step between neighbouring pixels
 Pair = tuple[int, int]
 
 
@@ -139,3 +137,50 @@ def border_ratio(
         off.append(difference[dilate(border, 8) & joined & ~border])
     across, beside = np.concatenate(on), np.concatenate(off)
     return float(across.mean() / max(float(beside.mean()), 1e-9)) if len(across) and len(beside) else float("nan")
+
+
+def edge_recall(
+    picture: Float[np.ndarray, "h w 3"],
+    reference: Float[np.ndarray, "h w 3"],
+    mask: Bool[np.ndarray, "h w"],
+    thresholds: tuple[float, float] = (20, 60),
+) -> float:
+    """Share of the reference's Canny edges (8-bit lightness, 2 px blur) with an edge of the picture within one pixel,
+    minus the share that edges thrown at random would meet. Without the second, noise would score best."""
+    inner = erode(mask, 3)
+    mine, theirs = (_edges(p, mask, thresholds) & inner for p in (picture, reference))
+    if not theirs.any():
+        return float("nan")
+    near = dilate(mine, 1)
+    return float(near[theirs].mean() - near[inner].mean())
+
+
+def _edges(picture, mask, thresholds) -> Bool[np.ndarray, "h w"]:
+    light, weight = lab(picture)[..., 0], mask.astype(np.float32)
+    smooth = gaussian(light * weight, 2) / np.maximum(gaussian(weight, 2), 1e-3)
+    return cv2.Canny(np.clip(smooth * 2.55, 0, 255).astype(np.uint8), *thresholds) > 0
+
+
+def seam_ratio(view: View, picture: Float[np.ndarray, "h w 3"]) -> float:
+    """How much more neighbouring pixels differ across UV seams than beside them: 1 where seams cannot be seen.
+
+    A pair of neighbours is a seam where both lie on the surface, their depths continue each other, and their uv jump
+    is over SEAM_JUMP times the view's median step, or their texture sets differ. Compared with the pairs within eight
+    pixels of a seam. NaN where the view shows no seam.
+    """
+    differences, steps, pairs = [], [], []
+    depth = np.where(view.mask, view.depth, 0)
+    for a, b in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+        joined = view.mask[a] & view.mask[b] & (np.abs(depth[a] - depth[b]) < DEPTH_TOLERANCE)
+        jump = np.linalg.norm(view.uv[a] - view.uv[b], axis=-1)
+        steps.append(jump[joined])
+        pairs.append((joined, jump, view.part[a] != view.part[b]))
+        differences.append(np.abs(picture[a] - picture[b]).sum(axis=-1))
+    if not sum(map(len, steps)):
+        return float("nan")
+    usual = float(np.median(np.concatenate(steps)))
+    seams = [joined & ((jump > SEAM_JUMP * usual) | parts) for joined, jump, parts in pairs]
+    on = np.concatenate([d[s] for d, s in zip(differences, seams, strict=True)])
+    beside = [dilate(s, 8) & ~s & joined for s, (joined, _, _) in zip(seams, pairs, strict=True)]
+    off = np.concatenate([d[s] for d, s in zip(differences, beside, strict=True)])
+    return float(on.mean() / max(float(off.mean()), 1e-9)) if len(on) and len(off) else float("nan")

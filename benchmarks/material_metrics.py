@@ -14,7 +14,9 @@ from jaxtyping import Bool, Float
 from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
-from mistyle.measure import metrics
+from mistyle.measure.compare_metrics import PPD, ssim
+from mistyle.measure.flip_bands import flip_map
+from mistyle.measure.metrics import psnr
 
 HDR_CLIP = 4.0
 
@@ -195,7 +197,7 @@ def psnr_ldr(
 
 def _masked_psnr(a: np.ndarray, b: np.ndarray, mask: np.ndarray, whole: bool) -> float:
     inside = mask[..., None]
-    return metrics.psnr(a * inside, b * inside) if whole else metrics.psnr(a, b, mask)
+    return psnr(a * inside, b * inside) if whole else psnr(a, b, mask)
 
 
 def align_channels(
@@ -220,10 +222,8 @@ def relight_errors(
     a, b = (srgb_from_linear(p) * mask[..., None] for p in (reference, test))
     if not mask.any():
         return RelightErrors(*[float("nan")] * 4)
-    error = metrics.flip(a, b) * mask.size / int(mask.sum())
-    return RelightErrors(
-        psnr_hdr(reference, test, mask), psnr_ldr(reference, test, mask), metrics.ssim(a, b, mask), error
-    )
+    error = float(flip_map(a, b, PPD).sum(dtype=np.float64)) / int(mask.sum())
+    return RelightErrors(psnr_hdr(reference, test, mask), psnr_ldr(reference, test, mask), ssim(a, b, mask), error)
 
 
 def mean_errors(errors: Sequence[RelightErrors]) -> RelightErrors:

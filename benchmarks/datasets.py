@@ -39,8 +39,8 @@ from mistyle.core.distortion import Lens
 from mistyle.core.image import bilinear, linear_from_srgb
 from mistyle.core.light import Environment, Lights
 from mistyle.files.bounds import inside, refuse
-from mistyle.files.cameras import MAX_SIDE, Frame, check_rotation, read_frames
-from mistyle.files.captures import Shot, load_shot
+from mistyle.files.cameras import MAX_SIDE, CameraFrame, check_rotation, read_frames
+from mistyle.files.captures import CapturedPicture, load_shot
 from mistyle.files.read import read_json, read_npy, read_picture, read_radiance, read_size
 
 # Axes of an environment map (up +Y, middle +Z, right -X) in TensoIR's world.
@@ -134,7 +134,7 @@ def read_tensoir(
     return Dataset(_captures(shots, [rig] * len(shots)), lambda k: _tensoir_truth(shots[k]), None)
 
 
-def _captures(shots: list[Shot], rigs: list[Lights]) -> Captures:
+def _captures(shots: list[CapturedPicture], rigs: list[Lights]) -> Captures:
     for shot in shots:
         for picture in (shot.picture, shot.mask):
             if picture is not None and (size := read_size(picture, shot.pixels)) != shot.lens.size:
@@ -158,11 +158,11 @@ def _novel_scenes(file: Path) -> list[str]:
     return scenes
 
 
-def _orb_shot(frame: Frame, home: Path, ending: str) -> Shot:
+def _orb_shot(frame: CameraFrame, home: Path, ending: str) -> CapturedPicture:
     picture = _inside(home, frame.picture + ending)
     mask = _inside(home, f"{Path(frame.picture).parent.as_posix()}_mask/{Path(frame.picture).name}.png")
     camera = Camera(frame.world_from_cam, frame.lens.focal[0], frame.lens.centre, frame.lens.size, frame.name)
-    return Shot(camera, frame.lens, picture, frame.pixels, mask)
+    return CapturedPicture(camera, frame.lens, picture, frame.pixels, mask)
 
 
 def _orb_light(camera: Camera, truth: Path, name: str) -> Lights:
@@ -186,7 +186,7 @@ def _orb_common_light(root: Path, kind: str, scene: str, number: int, ending: st
     return _orb_light(shot.camera, root / "ground_truth" / scene, shot.picture.stem)
 
 
-def _orb_truth(shot: Shot, truth: Path) -> Truth:
+def _orb_truth(shot: CapturedPicture, truth: Path) -> Truth:
     name, size = shot.picture.stem, shot.lens.size
     mask = read_picture(shot.mask).rgb.mean(axis=-1) > 0.5 if shot.mask is not None else np.ones(size, bool)
     normal, depth, albedo = (
@@ -228,7 +228,7 @@ class _Metadata(BaseModel):
     cam_transform_mat: Annotated[str, Field(max_length=2000)]
 
 
-def _tensoir_shot(place: Path, light: str) -> Shot:
+def _tensoir_shot(place: Path, light: str) -> CapturedPicture:
     file = place / "metadata.json"
     try:
         known = _Metadata.model_validate(read_json(file))
@@ -243,7 +243,7 @@ def _tensoir_shot(place: Path, light: str) -> Shot:
     size = (known.imh, known.imw)
     lens = Lens((float(focal), float(focal)), (known.imw / 2, known.imh / 2), size)
     camera = Camera(pose, lens.focal[0], lens.centre, size, place.name)
-    return Shot(camera, lens, _inside(place, f"rgba_{light}.png"), "stored")
+    return CapturedPicture(camera, lens, _inside(place, f"rgba_{light}.png"), "stored")
 
 
 def _tensoir_light(maps: Path, light: str) -> Environment:
@@ -262,7 +262,7 @@ def _to_poles(radiance: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"
     return bilinear(radiance, px.reshape(-1, 2)).reshape(radiance.shape)
 
 
-def _tensoir_truth(shot: Shot) -> Truth:
+def _tensoir_truth(shot: CapturedPicture) -> Truth:
     place = shot.picture.parent
     shown = read_picture(shot.picture)
     alpha = shown.alpha if shown.alpha is not None else np.ones(shot.lens.size, np.float32)
