@@ -1,4 +1,4 @@
-"""The settings of `mistyle fit`: one record per stage, as run/settings.py has them for `stylize`."""
+"""The settings of `mistyle fit`: one record per stage, resolved by the functions of run/settings.py."""
 
 from typing import Any, Literal
 
