@@ -22,7 +22,7 @@ from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
-from mistyle.run import painting, start
+from mistyle.run import painting, start, stylize_start
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages import fit
 
@@ -69,7 +69,7 @@ def main() -> None:
     plain = Settings.model_validate(base)
     start.start_engines(plain)
     asset = read_mesh(SCENES / "demo.obj")
-    atlas = start.lay_out(asset, plain, silent)
+    atlas = stylize_start.lay_out(asset, plain, silent)
     coats = painting.coat(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
     flat = painting.painted(asset, coats, atlas, plain)
     begun = painting.raised(asset, coats, atlas, plain, flat)

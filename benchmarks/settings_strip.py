@@ -20,7 +20,7 @@ from mistyle.files.images import write_png
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
 from mistyle.render.unlit import unlit
-from mistyle.run import painting, start
+from mistyle.run import painting, start, stylize_start
 from mistyle.run.stylize_settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -92,7 +92,7 @@ def main() -> None:
 
 def tile(asset, picture, settings, cameras, report) -> np.ndarray:
     """The painted surface from every camera, without light, side by side, on white, encoded sRGB."""
-    atlas = start.lay_out(asset, settings, lambda done: None)
+    atlas = stylize_start.lay_out(asset, settings, lambda done: None)
     coats = painting.coat(asset, picture, atlas, settings, report)
     drawn = unlit(asset.mesh, painting.painted(asset, coats, atlas, settings), cameras)
     return np.concatenate([srgb_from_linear(rgb + 1 - share[..., None]) for rgb, share in drawn], axis=1)

@@ -61,7 +61,7 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
     from mistyle.core.image import linear_from_srgb
     from mistyle.files.read import read_picture
     from mistyle.render.draw import gbuffer, tracer
-    from mistyle.run import painting, start
+    from mistyle.run import painting, start, stylize_start
 
     def silent(done: float) -> None:
         pass
@@ -69,7 +69,7 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
     settings = resolve(preset, None, changes)
     start.start_engines(settings)
     asset = start.read(DATA / mesh, settings.read, settings.atlas.size, silent)
-    atlas = start.lay_out(asset, settings, silent)
+    atlas = stylize_start.lay_out(asset, settings, silent)
     solution = painting.paint(asset, read_picture(DATA / style), settings, silent)
     maps = []
     for part, (texels, own) in enumerate(zip(atlas.texels, atlas.start, strict=True)):

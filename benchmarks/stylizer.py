@@ -31,7 +31,7 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     from mistyle.core.view import View
     from mistyle.files.read import read_picture
     from mistyle.files.records import load_record
-    from mistyle.run import painting, start
+    from mistyle.run import painting, start, stylize_start
     from mistyle.run.stylize_settings import resolve
 
     settings = resolve(
@@ -48,7 +48,7 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
 
     solution = timed(parts, "surface", lambda: solve_surface(asset.mesh, style, settings.surface, 0))
     parts["surface_gb"] = peak_gb()
-    laid = timed(parts, "rasterise", lambda: start.lay_out(asset, settings, nothing))
+    laid = timed(parts, "rasterise", lambda: stylize_start.lay_out(asset, settings, nothing))
     maps = timed(parts, "bake", lambda: painting.painted(asset, solution, laid, settings))
     blank = []
     for camera in rig(RigSettings(resolution=resolution))[:views]:

@@ -34,7 +34,7 @@ from mistyle.core.light import Directional, Lights, has_soft, lights
 from mistyle.core.maps import Maps
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
-from mistyle.run import start
+from mistyle.run import start, stylize_start
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.fit import two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
@@ -102,7 +102,7 @@ def sized(quick: bool) -> Settings:
 def prepare(mesh: Path, style: Path, settings: Settings, slope: float, spp: int, cache: Path | None) -> Bench:
     """The object painted, and which of its texels count."""
     asset = read_mesh(mesh, size=settings.atlas.size)
-    atlas = start.lay_out(asset, settings, silent)
+    atlas = stylize_start.lay_out(asset, settings, silent)
     scene = known.painted(asset, read_picture(style), atlas, settings, slope, seed=0)
     cameras = known.cameras_of(settings.rig.resolution, 16)
     count = seen(Truth("", asset.mesh, atlas.texels, scene.truth, scene.areas), cameras)

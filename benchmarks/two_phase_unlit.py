@@ -89,15 +89,15 @@ def paint(mesh: str, style: str, preset: str) -> Painted:
     from mistyle.files.read import read_picture
     from mistyle.files.read_mesh import read_mesh
     from mistyle.render.draw import gbuffer, tracer
-    from mistyle.run import painting, start
+    from mistyle.run import painting, stylize_start
 
     chosen = settings_of(preset, {})
     asset = read_mesh(DATA / "meshes/plain" / MESHES[mesh], size=chosen.atlas.size)
-    atlas = start.lay_out(asset, chosen, silent)
+    atlas = stylize_start.lay_out(asset, chosen, silent)
     picture = read_picture(next((DATA / "styles").glob(f"{style}.*")))
     coats = painting.coat(asset, picture, atlas, chosen, silent)
     traced, views = tracer(asset.mesh), []
-    for camera in start.cameras_of(chosen, asset.mesh, print):
+    for camera in stylize_start.cameras_of(chosen, asset.mesh, print):
         hits = gbuffer(traced, camera)
         cover = hits.mask.astype(np.float32)
         views.append(View(camera, hits.position, hits.depth, hits.normal, hits.uv, hits.part, hits.mask, cover))

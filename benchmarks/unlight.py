@@ -20,7 +20,7 @@ from mistyle.core.image import luminance
 from mistyle.core.view import View
 from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
-from mistyle.run import painting, start, sweep
+from mistyle.run import painting, start, stylize_start, sweep
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.mvst import Painted
 
@@ -39,7 +39,7 @@ def measured(asset: Any, style: Picture, settings: Settings, shown: str) -> tupl
     """`light` before and after, and the share taken, of views that are `lit` or show none."""
     from mistyle.render.draw import draw_views
 
-    atlas = start.lay_out(asset, settings, silent)
+    atlas = stylize_start.lay_out(asset, settings, silent)
     truth = painting.painted(asset, painting.coat(asset, style, atlas, settings, silent), atlas, settings)
     views = views_of(asset, truth, settings.rig.resolution)
     if shown == "lit":

@@ -95,7 +95,7 @@ def style_job(made: Stages, settings: Any) -> None:
     from mistyle.files.read import read_picture
     from mistyle.files.views import read_views, write_views
     from mistyle.render.draw import draw_views
-    from mistyle.run import painting, start
+    from mistyle.run import painting, start, stylize_start
     from mistyle.stages.fit import two_phase
 
     mesh_file, style_file = inputs(made.out)
@@ -103,8 +103,8 @@ def style_job(made: Stages, settings: Any) -> None:
     # The path of the file is where this run happens to work.
     made.bytes["read and unwrap"] = digest([asset.mesh, asset.source.notes])
     style = read_picture(style_file)
-    atlas = made.note("texels", start.lay_out(asset, settings, nothing))
-    cameras = start.cameras_of(settings, asset.mesh, lambda text: None)[:5]
+    atlas = made.note("texels", stylize_start.lay_out(asset, settings, nothing))
+    cameras = stylize_start.cameras_of(settings, asset.mesh, lambda text: None)[:5]
     views = draw_views(asset.mesh, atlas.start, cameras, "paper_views", settings.draw.spp, settings.seed)
     write_views(made.out / "views", views, lights("paper_views"), paper_files=True)
     made.note("views", made.out / "views")

@@ -110,11 +110,11 @@ def test_each_map_is_as_fine_as_pictures_show_it():
 @pytest.fixture
 def alive(monkeypatch):
     """How many texture sets were in memory when the next was laid out."""
-    from mistyle.run import start
+    from mistyle.run import stylize_start
 
     living: list[weakref.ref] = []
     counts: list[int] = []
-    lay_out = start.lay_out_one
+    lay_out = stylize_start.lay_out_one
 
     def watched(*given):
         import gc
@@ -125,7 +125,7 @@ def alive(monkeypatch):
         living.extend(map(weakref.ref, (texels, maps)))
         return texels, maps
 
-    for module in (start, verbs):
+    for module in (stylize_start, verbs):
         monkeypatch.setattr(module, "lay_out_one", watched)
     return counts
 

@@ -24,9 +24,10 @@ from mistyle.run.charts import Chart, svg
 from mistyle.run.cli import main
 from mistyle.run.material import hold_out, lights_in_order, place, references_of
 from mistyle.run.material_job import MATERIAL_STAGES, MaterialJob
-from mistyle.run.material_outlines import tell_placed, tell_views
+from mistyle.run.material_outlines import tell_placed
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 from mistyle.run.progress import Progress
+from mistyle.run.verbs import tell_views
 from mistyle.stages import unknown_light
 from mistyle.stages.align import Alignment
 

@@ -292,7 +292,7 @@ def test_the_maps_of_a_large_atlas_are_never_whole_as_numbers():
 
     from mistyle.core.maps import Texels, flat_maps
     from mistyle.run import report_overlays
-    from mistyle.run.pages import heat, map_shots, mask_over
+    from mistyle.run.report_parts import heat, map_shots, mask_over
 
     size = 2048
     maps, covered = flat_maps(size), np.ones((size, size), bool)

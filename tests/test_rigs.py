@@ -13,8 +13,8 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
 from mistyle.render.draw import tracer
 from mistyle.render.visible import face_on
-from mistyle.run.start import cameras_of
 from mistyle.run.stylize_settings import resolve
+from mistyle.run.stylize_start import cameras_of
 from mistyle.stages.rigs import next_best_views, sample_surface
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from mistyle.core import stopping
 from mistyle.core.errors import InputRefused, Stopped, UsageError
-from mistyle.render import device, scene_fit, scene_grad, scene_keys, scene_text, scene_xml
+from mistyle.render import device, scene_fit, scene_grad, scene_keys, scene_source, scene_xml
 from mistyle.run import cli
 from mistyle.run.scene_references import choose_channels
 
@@ -272,7 +272,7 @@ def test_the_text_with_its_parameters_loads_as_the_file_with_them(house, tmp_pat
     device.use()
     out = tmp_path / "copy" / "house.xml"
     out.parent.mkdir()
-    out.write_bytes(scene_text.resolved(house / "house.xml", {"light": "0.25", "size": "8"}, out))
+    out.write_bytes(scene_source.resolved(house / "house.xml", {"light": "0.25", "size": "8"}, out))
     ours = np.array(mi.render(mi.load_file(str(out)), spp=4, seed=1))
     assert np.allclose(
         ours, np.array(mi.render(mi.load_file(str(house / "house.xml"), light="0.25", size="8"), spp=4, seed=1))
@@ -280,7 +280,7 @@ def test_the_text_with_its_parameters_loads_as_the_file_with_them(house, tmp_pat
     assert ours.shape[:2] == (8, 8)
     (house / "broken.xml").write_text("<scene")
     with pytest.raises(InputRefused, match="not XML"):
-        scene_text.resolved(house / "broken.xml", {}, out)
+        scene_source.resolved(house / "broken.xml", {}, out)
 
 
 def test_converge_takes_the_scenes_parameters(house, tmp_path):

@@ -1,5 +1,7 @@
 """Layers of settings: the later one wins, and the guilty one is named."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -105,3 +107,13 @@ def test_views_take_the_samples_that_their_use_needs():
 def test_what_is_fitted_follows_what_painted_the_views(preset, change, refined, kept):
     settings = resolve(preset, None, change, {})
     assert (settings.refined, settings.keeps_painting) == (refined, kept)
+
+
+@pytest.mark.parametrize("verb", ["stylize", "material", "scene", "train"])
+def test_settings_are_read_without_the_stages_and_their_libraries(verb):
+    code = f"import sys, mistyle.run.{verb}_settings; print(*sys.modules)"
+    loaded = set(
+        subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    )
+    assert not loaded & {"numpy", "cv2", "scipy", "torch", "mitsuba", "drjit"}
+    assert not any(name.startswith("mistyle.render") for name in loaded)

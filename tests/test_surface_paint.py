@@ -22,7 +22,7 @@ from mistyle.core.tangents import corner_tangents
 from mistyle.files.images import write_png
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.render.unlit import unlit
-from mistyle.run import options, painting, preview, start, variations
+from mistyle.run import options, painting, preview, stylize_start, variations
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages import coat
 from mistyle.stages.texels import rasterise
@@ -321,7 +321,7 @@ def test_a_coat_of_two_pictures_with_a_protected_part(painted_sheet, tmp_path):
     settings = Settings.model_validate(
         {"surface": {"samples": 700}, "atlas": {"size": 32}, "coat": chosen | {"height": 0.2, "gloss": 1.0}}
     )
-    atlas = start.lay_out(asset, settings, lambda done: None)
+    atlas = stylize_start.lay_out(asset, settings, lambda done: None)
     coats = painting.coat(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)
     flat = painting.painted(asset, coats, atlas, settings)
     assert (flat[0].normal[..., 2] == 1).all()

@@ -1,20 +1,15 @@
 """The text of a Mitsuba scene file: where a parameter's element stands, and what replaces it."""
 
-import os
 import re
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
-from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from mistyle.core.errors import InputRefused
 from mistyle.render.scene_keys import Parameter
-
-Edit = tuple[int, int, str]  # first byte, byte after the last, what comes in their place
+from mistyle.render.scene_source import Edit, Element, elements_of
 
 
 def children(node: Any) -> list[tuple[str, int]]:
@@ -63,44 +58,6 @@ def _child(state: Any, node: Any, name: str) -> int | None:
     return fitting[place] if place < len(fitting) else None
 
 
-@dataclass(frozen=True)
-class _Element:
-    """One element of the text: bytes `begin`..`end`, its start tag ends at `body`."""
-
-    tag: str
-    attributes: dict[str, str]
-    begin: int
-    body: int
-    end: int
-    parent: int | None
-
-
-def _elements(source: bytes) -> list[_Element]:
-    parser = expat.ParserCreate()
-    found: list[dict[str, Any]] = []
-    above: list[int] = []
-
-    def opened(tag: str, attributes: dict[str, str]) -> None:
-        begin = parser.CurrentByteIndex
-        body = begin + len(re.match(rb"<(?:[^<>\"']|\"[^\"]*\"|'[^']*')*>", source[begin:])[0])  # pyright: ignore
-        parent = above[-1] if above else None
-        above.append(len(found))
-        found.append({"tag": tag, "attributes": attributes, "begin": begin, "body": body, "parent": parent})
-
-    def closed(tag: str) -> None:
-        element = found[above.pop()]
-        end = parser.CurrentByteIndex
-        alone = source[: element["body"]].endswith(b"/>")
-        element["end"] = element["body"] if alone else end + source[end:].index(b">") + 1
-
-    parser.StartElementHandler, parser.EndElementHandler = opened, closed
-    try:
-        parser.Parse(source, True)
-    except expat.ExpatError as error:
-        raise InputRefused(f"found a scene file that is not XML ({error}); check the file.") from error
-    return [_Element(**element) for element in found]
-
-
 def edits_of(
     state: Any, sources: Sequence[bytes], p: Parameter, values: np.ndarray, file: Path | None
 ) -> tuple[int, list[Edit]] | str:
@@ -119,7 +76,7 @@ def edits_of(
 def _edits(
     node: Any, literal: str | None, source: bytes, p: Parameter, values: np.ndarray, file: Path | None
 ) -> list[Edit] | str:
-    elements = _elements(source)
+    elements = elements_of(source)
     at = next((k for k, e in enumerate(elements) if e.begin == node.offset - 1), None)
     if at is None:
         return "its element could not be found in the text."
@@ -149,7 +106,7 @@ def _edits(
     return [(element.end - 2, element.end, f">{text}</{element.tag}>")]
 
 
-def _mesh_edits(elements: Sequence[_Element], at: int, file: Path | None) -> list[Edit] | str:
+def _mesh_edits(elements: Sequence[Element], at: int, file: Path | None) -> list[Edit] | str:
     """A PLY mesh gives way to the written one, whose vertices stand in the world already."""
     inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
     if file is None or elements[at].attributes.get("type") != "ply" or "filename" not in inner:
@@ -159,60 +116,3 @@ def _mesh_edits(elements: Sequence[_Element], at: int, file: Path | None) -> lis
     old = inner["filename"]
     moved = [(inner["to_world"].begin, inner["to_world"].end, "")] if "to_world" in inner else []
     return [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>'), *moved]
-
-
-def include_edit(source: bytes, included: Path, defines: Mapping[str, str], new: str) -> list[Edit]:
-    """What makes `source` include the file `new` instead of `included`; nothing where it does not include that."""
-    elements = _elements(source)
-    given = {e.attributes.get("name", ""): e.attributes.get("value", "") for e in elements if e.tag == "default"}
-    given |= defines
-    for e in elements:
-        name = e.attributes.get("filename", "")
-        for key in sorted(given, key=len, reverse=True):
-            name = name.replace(f"${key}", given[key])
-        if e.tag == "include" and name and included.as_posix().endswith(Path(name).as_posix().lstrip("./")):
-            return [(e.begin, e.end, f"<include filename={quoteattr(new)}/>")]
-    return []
-
-
-def surroundings(source: bytes, path: Path, defines: Mapping[str, str], out: Path) -> list[Edit]:
-    """Defaults as they were given, those that the file does not have too, and the way back to the original's folder."""
-    edits: list[Edit] = []
-    elements = _elements(source)
-    there = {e.attributes.get("name", "") for e in elements if e.tag == "default"}
-    new = [f"\n<default name={quoteattr(k)} value={quoteattr(v)}/>" for k, v in defines.items() if k not in there]
-    for e in elements:
-        name = e.attributes.get("name", "")
-        if e.tag == "default" and name in defines:
-            text = f"<default name={quoteattr(name)} value={quoteattr(defines[name])}/>"
-            edits.append((e.begin, e.end, text))
-    if out.parent.resolve() == path.parent.resolve():
-        return edits + [(elements[0].body, elements[0].body, "".join(new))] if new else edits
-    for e in elements:
-        if e.tag == "path" and not Path(e.attributes.get("value", "/")).is_absolute():
-            there = _from(out, path.parent / e.attributes["value"])
-            edits.append((e.begin, e.end, f"<path value={quoteattr(there)}/>"))
-    body = elements[0].body
-    edits.append((body, body, f"\n<path value={quoteattr(_from(out, path.parent))}/>" + "".join(new)))
-    return edits
-
-
-def resolved(path: Path, defines: Mapping[str, str], out: Path) -> bytes:
-    """A scene file's text for another folder, with its parameters as given: it loads as `path` does with `defines`."""
-    source = path.read_bytes()
-    return spliced(source, surroundings(source, path, defines, out))
-
-
-def _from(out: Path, folder: Path) -> str:
-    try:
-        return Path(os.path.relpath(folder.resolve(), out.parent.resolve())).as_posix()
-    except ValueError:  # another drive
-        return folder.resolve().as_posix()
-
-
-def spliced(source: bytes, edits: Sequence[Edit]) -> bytes:
-    result, at = [], 0
-    for begin, end, text in sorted(edits):
-        result += [source[at:begin], text.encode()]
-        at = end
-    return b"".join([*result, source[at:]])

@@ -15,7 +15,7 @@ import numpy as np
 from mistyle.core import stopping
 from mistyle.core.errors import InputRefused
 from mistyle.core.names import WRITTEN, distinct, safe_name
-from mistyle.render import device, scene_text
+from mistyle.render import device, scene_source, scene_text
 from mistyle.render.scene_keys import Parameter
 
 
@@ -162,7 +162,7 @@ def write_scene(
     if not isinstance(scene, SceneFile):
         return Written(None, textures, ("The scene does not come from a file: only its textures were written.",))
     sources = [Path(str(file)).read_bytes() for file in scene.state.files]
-    edits: dict[int, list[scene_text.Edit]] = {0: []}
+    edits: dict[int, list[scene_source.Edit]] = {0: []}
     notes = []
     for p in fitted.parameters:
         found = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
@@ -173,8 +173,8 @@ def write_scene(
     if not any(edits.values()):
         return Written(None, textures, tuple(notes))
     notes += _rewrite_includes(scene, sources, edits, out, write_file)
-    edits[0] += scene_text.surroundings(sources[0], scene.path, scene.defines, out)
-    write_file(out, scene_text.spliced(sources[0], edits[0]))
+    edits[0] += scene_source.surroundings(sources[0], scene.path, scene.defines, out)
+    write_file(out, scene_source.spliced(sources[0], edits[0]))
     wrong = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
     if wrong:
         out.unlink()
@@ -187,7 +187,7 @@ def write_scene(
 def _rewrite_includes(
     scene: SceneFile,
     sources: Sequence[bytes],
-    edits: dict[int, list[scene_text.Edit]],
+    edits: dict[int, list[scene_source.Edit]],
     out: Path,
     write_file: Callable[[Path, bytes], Any],
 ) -> list[str]:
@@ -199,10 +199,10 @@ def _rewrite_includes(
         included = Path(str(scene.state.files[k]))
         new = out.with_name(f"{out.stem}_{k}_{included.name}")
         for parent in range(len(sources)):
-            change = scene_text.include_edit(sources[parent], included, scene.defines, new.name)
+            change = scene_source.include_edit(sources[parent], included, scene.defines, new.name)
             if change and parent != k:
                 edits.setdefault(parent, []).extend(change)
-                write_file(new, scene_text.spliced(sources[k], edits[k]))
+                write_file(new, scene_source.spliced(sources[k], edits[k]))
                 notes.append(f"{out.name} includes {new.name}, a copy of {included.name} with the fitted values.")
                 break
     return notes

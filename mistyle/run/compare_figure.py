@@ -12,8 +12,9 @@ from mistyle.core.errors import UsageError
 from mistyle.files.store import atomic_write
 from mistyle.measure.flip_bands import flip_map
 from mistyle.run.compare_inputs import Match, Planes, chosen_layers, planes
-from mistyle.run.compare_pictures import heat, shown
+from mistyle.run.compare_pictures import shown
 from mistyle.run.compare_records import CompareJob
+from mistyle.run.false_colour import heat
 
 CROP = 360  # pixels of a crop's longer side in the figure
 GAP, TEXT = 10, 46

@@ -18,6 +18,7 @@ from mistyle.core.image import luminance
 from mistyle.measure.compare_metrics import encoded
 from mistyle.run.charts import Chart, svg
 from mistyle.run.compare_inputs import Planes
+from mistyle.run.false_colour import DIVERGING, RAINBOW, heat, mapped
 
 WIDE = 4.4
 LOSSLESS = 2_200_000  # pixels; larger pictures are stored with losses that are not seen
@@ -26,20 +27,6 @@ THUMB = 200
 NOT_A_NUMBER = (255, 0, 255)
 STOPS = (-8.0, 6.0)  # of false colours, about middle grey
 GREY = 0.18
-# Ten stops of a map from dark violet to yellow (magma's look, in a few linear pieces), as 8-bit red, green, blue.
-HEAT = ((0, 0, 4), (28, 16, 68), (79, 18, 123), (129, 37, 129), (181, 54, 122), (229, 80, 100), (251, 135, 97))
-HEAT += ((254, 194, 135), (252, 253, 191))
-RAINBOW = ((48, 18, 59), (65, 69, 171), (70, 117, 237), (57, 162, 252), (27, 207, 212), (36, 236, 166), (97, 252, 108))
-RAINBOW += ((164, 252, 59), (209, 232, 52), (243, 198, 58), (254, 155, 45), (243, 99, 21), (217, 56, 6), (122, 4, 3))
-DIVERGING = (
-    (5, 48, 97),
-    (67, 147, 195),
-    (209, 229, 240),
-    (247, 247, 247),
-    (253, 219, 199),
-    (214, 96, 77),
-    (103, 0, 31),
-)
 
 
 @dataclass(frozen=True)
@@ -145,11 +132,6 @@ def false_colours(linear: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 
     return mapped((np.log2(bright / GREY) - STOPS[0]) / (STOPS[1] - STOPS[0]), RAINBOW)
 
 
-def heat(error: Float[np.ndarray, "h w"], most: float = 1.0) -> UInt8[np.ndarray, "h w 3"]:
-    """An error of 0..`most` from black to yellow."""
-    return mapped(error / np.float32(most), HEAT)
-
-
 def signed(planes: Planes) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
     """Test minus reference (of colours: luminance), blue below and red above, and the range it is spread over."""
     a, b = (np.nan_to_num(v, posinf=0.0, neginf=0.0) for v in (planes.reference, planes.test))
@@ -158,15 +140,6 @@ def signed(planes: Planes) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
     span = float(np.percentile(inside, 99.5)) if len(inside) else 1.0
     span = span if span > 0 else float(inside.max()) if len(inside) and inside.max() > 0 else 1.0
     return mapped(gap / (2 * span) + 0.5, DIVERGING), span
-
-
-def mapped(values: np.ndarray, colours: tuple[tuple[int, int, int], ...]) -> UInt8[np.ndarray, "h w 3"]:
-    """Values of 0..1 as colours between those of a list."""
-    table = np.array(colours, np.float64)
-    steps = np.linspace(0, len(table) - 1, 256)
-    lookup = np.stack([np.interp(steps, np.arange(len(table)), table[:, c]) for c in range(3)], axis=1)
-    index = np.clip(np.nan_to_num(values) * 255 + 0.5, 0, 255).astype(np.uint8)
-    return np.round(lookup).astype(np.uint8)[index]
 
 
 def _eight(picture: np.ndarray, odd: np.ndarray | None) -> UInt8[np.ndarray, "h w 3"]:

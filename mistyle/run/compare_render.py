@@ -19,8 +19,9 @@ from mistyle.files.output import claim
 from mistyle.files.store import atomic_write
 from mistyle.measure.compare_stats import Tested, same_picture
 from mistyle.run.compare import FILES, compare
-from mistyle.run.compare_pictures import DIVERGING, mapped, webp
+from mistyle.run.compare_pictures import webp
 from mistyle.run.compare_records import CompareJob
+from mistyle.run.false_colour import DIVERGING, mapped
 from mistyle.run.progress import Progress
 from mistyle.run.render_files import RenderView
 from mistyle.run.renderers import Rendered, Renderer, left_out, renderer, shots, subject

@@ -121,7 +121,7 @@ def _defined(scene: Path, defines: Mapping[str, str], work: Path) -> Path:
     """The scene file with its parameters as given, for every renderer; itself without any."""
     if not defines:
         return scene
-    from mistyle.render.scene_text import resolved
+    from mistyle.render.scene_source import resolved
 
     if scene.suffix.lower() != ".xml":
         name, value = next(iter(defines.items()))

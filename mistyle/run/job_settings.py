@@ -4,6 +4,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+LEAST_OVERLAP = 0.8  # of the mesh's outline with alpha or masks, below which a camera does not fit
+
 
 class ReadSettings(BaseModel):
     """How the mesh is read."""

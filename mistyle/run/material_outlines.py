@@ -1,13 +1,10 @@
-"""Whether the cameras of `mistyle fit` and `mistyle bake` fit the mesh, as the user hears of it."""
+"""Whether the cameras of `mistyle fit` fit the mesh, as the user hears of it."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from mistyle.core.mesh import Mesh
-from mistyle.core.view import View
-from mistyle.run.material_settings import LEAST_OVERLAP, ReferenceSettings
+from mistyle.run.material_settings import ReferenceSettings
 from mistyle.run.progress import Progress
 
 
@@ -31,15 +28,3 @@ def tell_placed(placed: Any, progress: Progress) -> None:
         if text.startswith("Warning:"):
             progress.say(text)
     progress.note(*placed.notes)
-
-
-def tell_views(mesh: Mesh, views: Sequence[View], progress: Progress) -> None:
-    """The same for the pictures of `mistyle bake`, whose alpha is their coverage."""
-    from mistyle.stages.outline_check import check_outlines, overlap_line, overlap_notes
-
-    names = [view.camera.name for view in views]
-    found = check_outlines(mesh, [view.camera for view in views], (view.coverage > 0.5 for view in views))
-    if np.isfinite(found.overlap).any():
-        progress.say(overlap_line(names, found.overlap))
-    fix = "Check the cameras' axes, and that they are in working units (camera.json of `mistyle render`)."
-    progress.note(*overlap_notes(names, found, LEAST_OVERLAP, fix, trusted=True))

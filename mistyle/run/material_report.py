@@ -10,12 +10,12 @@ from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.run import report_overlays
 from mistyle.run.charts import Chart
 from mistyle.run.material_job import MATERIAL_STAGES
-from mistyle.run.pages import file_list, heat, map_shots, setting_groups, side_by_side
 from mistyle.run.progress import Progress
 from mistyle.run.record import earlier, merged_peaks, merged_seconds, report_files, write_record
 from mistyle.run.report import BeforeAfter, Figure, MapSet, Note, Report, ReportPicture, Step, Timing, write_report
 from mistyle.run.report_draw import draw
 from mistyle.run.report_model import page_model
+from mistyle.run.report_parts import file_list, heat, map_shots, setting_groups, side_by_side
 from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
 from mistyle.run.stages import Run
 from mistyle.run.turntable import write_turn

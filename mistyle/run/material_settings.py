@@ -1,15 +1,13 @@
-"""The settings of `mistyle fit`: one record per stage, as run/settings.py has them for `stylize`."""
+"""The settings of `mistyle fit`: one record per stage, resolved by the functions of run/settings.py."""
 
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
-from mistyle.run.job_settings import ReadSettings, ReportSettings
+from mistyle.run.job_settings import LEAST_OVERLAP, ReadSettings, ReportSettings
 from mistyle.stages.atlas_settings import AtlasSettings
 from mistyle.stages.recover_settings import RecoverSettings
-
-LEAST_OVERLAP = 0.8  # of the mesh's outline with alpha or masks
 
 
 class ReferenceSettings(BaseModel):

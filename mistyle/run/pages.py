@@ -5,32 +5,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel
 
 from mistyle.core.camera import Camera
-from mistyle.core.image import srgb_from_linear
-from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
-from mistyle.files.own import read_own
 from mistyle.run import report_overlays
 from mistyle.run.finishing import finish_pair
 from mistyle.run.progress import Progress
-from mistyle.run.report import (
-    BeforeAfter,
-    Figure,
-    File,
-    MapSet,
-    Note,
-    Report,
-    ReportPicture,
-    Setting,
-    Step,
-    Timing,
-    write_report,
-)
+from mistyle.run.report import BeforeAfter, Figure, MapSet, Note, Report, ReportPicture, Step, Timing, write_report
 from mistyle.run.report_draw import close_up, draw, shown
 from mistyle.run.report_model import page_model
-from mistyle.run.report_pictures import Sizes, in_bands, kind_in_step, kind_of_maps
+from mistyle.run.report_parts import file_list, heat, map_shots, mask_over, setting_groups, side_by_side
+from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
 from mistyle.run.style_look import look_facts
 from mistyle.run.stylize_job import FINISH, FIRST, RETOUCH, STAGES
 from mistyle.run.summary import MEANINGS, figures
@@ -102,19 +87,6 @@ def map_sets(made: Any) -> tuple[MapSet, ...]:
         )
         sets.append(MapSet(name, map_shots(made.repaired.maps[k], longest), over))
     return tuple(sets)
-
-
-def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:
-    """Pictures in a row at the height of the first, with a white gap between them."""
-    from mistyle.core.image import resize
-
-    height = pictures[0].shape[0]
-    gap = np.ones((height, height // 32, 3), np.float32)
-    row: list[np.ndarray] = []
-    for picture in pictures:
-        width = round(picture.shape[1] * height / picture.shape[0])
-        row += [resize(picture, (height, width)), gap]
-    return np.clip(np.concatenate(row[:-1], axis=1), 0, 1)
 
 
 def facts(made: Any) -> tuple[tuple[str, str], ...]:
@@ -217,29 +189,6 @@ def view_picture(view: View) -> np.ndarray:
     return shown(np.concatenate([view.rgb, view.coverage[..., None]], axis=-1))
 
 
-def heat(values: np.ndarray, most: float, texels: Texels, longest: int) -> np.ndarray:
-    """Values of 0..most of every covered texel as colour (viridis), white elsewhere; at most `longest` pixels."""
-    import cv2
-
-    def rows(at: slice) -> np.ndarray:
-        levels = np.clip(np.sqrt(values[at] / max(most, 1)) * 255, 0, 255).astype(np.uint8)
-        colours = cv2.applyColorMap(levels, cv2.COLORMAP_VIRIDIS)[..., ::-1]
-        return np.where(texels.covered[at, :, None], colours, np.uint8(255)).astype(np.uint8)
-
-    return in_bands(values.shape[:2], rows, longest, sharp=True)
-
-
-def mask_over(mask: np.ndarray, maps: Maps, texels: Texels, longest: int) -> np.ndarray:
-    """The albedo with the masked texels in magenta, white outside the islands; at most `longest` pixels."""
-
-    def rows(at: slice) -> np.ndarray:
-        albedo = srgb_from_linear(maps.albedo[at])
-        tinted = np.where(mask[at, :, None], 0.35 * albedo + 0.65 * np.array([1.0, 0.0, 0.8], np.float32), albedo)
-        return np.where(texels.covered[at, :, None], tinted, 1.0).astype(np.float32)
-
-    return in_bands(mask.shape[:2], rows, longest)
-
-
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
     """Each phase: kept (and what got worse all the same) or undone, and the figures that decided."""
     kept = [
@@ -258,55 +207,3 @@ def _kept(fit: Any, phase: str) -> str:
         return "kept, not judged"
     slipped = worse(*({name: pair[k] for name, pair in pairs.items()} for k in (0, 1)), times=0.0)
     return f"kept; worse within the tolerance: {', '.join(slipped)}" if slipped else "kept; no figure got worse"
-
-
-def map_shots(maps: Maps, longest: int) -> tuple[ReportPicture, ...]:
-    """The maps of a texture set, as written beside the asset, at most `longest` pixels wide and high."""
-
-    def small(make: Callable[[slice], np.ndarray]) -> np.ndarray:
-        return in_bands(maps.roughness.shape[:2], make, longest)
-
-    return (
-        ReportPicture(small(lambda at: srgb_from_linear(maps.albedo[at])), "albedo", "sRGB"),
-        ReportPicture(small(lambda at: maps.normal[at] * 0.5 + 0.5), "normal", "tangent space, +Y, MikkTSpace"),
-        ReportPicture(small(lambda at: maps.roughness[at]), "roughness", "linear"),
-        ReportPicture(small(lambda at: maps.metallic[at]), "metallic", "linear"),
-    )
-
-
-def setting_groups(settings: BaseModel) -> dict[str, tuple[Setting, ...]]:
-    """Every setting with its meaning, by stage."""
-    groups: dict[str, tuple[Setting, ...]] = {}
-    alone: list[Setting] = []
-    root = type(settings)
-    default = root()
-    for name in root.model_fields:
-        value = getattr(settings, name)
-        if isinstance(value, BaseModel):
-            groups[name] = tuple(
-                Setting(
-                    k,
-                    str(getattr(value, k)),
-                    f.description or "",
-                    getattr(value, k) != getattr(getattr(default, name), k),
-                )
-                for k, f in type(value).model_fields.items()
-            )
-        else:
-            meaning = root.model_fields[name].description or ""
-            alone.append(Setting(name, str(value), meaning, value != getattr(default, name)))
-    return {"job": tuple(alone)} | groups
-
-
-def file_list(folder: Path, name: str) -> tuple[File, ...]:
-    """The files of the asset as its own list names them."""
-    listed = read_own(folder / f"{name}.json")["files"]
-    return tuple(
-        File(
-            f"asset/{entry['file']}",
-            entry["bytes"],
-            entry["sha256"],
-            entry.get("colour_space") or entry.get("what") or "",
-        )
-        for entry in listed
-    )

@@ -28,11 +28,12 @@ from mistyle.run.made import Atlas, Baked, Repaired
 from mistyle.run.painting import bake, check_coat, coat_files, stylized_stage, surface_stage, unlit_views
 from mistyle.run.progress import Progress, Report
 from mistyle.run.stages import Run, claim_run
-from mistyle.run.start import draw, mesh_stage, start_engines, texels_stage
+from mistyle.run.start import mesh_stage, start_engines
 from mistyle.run.style_look import StyleLook, style_looks
 from mistyle.run.stylize_budget import PLAIN, STYLED, TILED, counts
 from mistyle.run.stylize_job import EVERY_STAGE, REFINING, STAGES, Job
 from mistyle.run.stylize_settings import Settings
+from mistyle.run.stylize_start import draw, texels_stage
 from mistyle.stages.light_left import light_left
 
 

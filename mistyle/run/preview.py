@@ -22,10 +22,11 @@ from mistyle.run.made import Atlas
 from mistyle.run.painting import check_coat, coat, painted, raised, surface_stage
 from mistyle.run.progress import Progress, Report
 from mistyle.run.stages import Run, claim_run
-from mistyle.run.start import lay_out, mesh_stage, start_engines, texels_stage
+from mistyle.run.start import mesh_stage, start_engines
 from mistyle.run.stylize_budget import PLAIN, STYLED, TILED, counts
 from mistyle.run.stylize_job import PREVIEW_STAGES, Job
 from mistyle.run.stylize_settings import Settings
+from mistyle.run.stylize_start import lay_out, texels_stage
 
 SAMPLES, ATLAS = 80_000, 1024  # at most: those of the preset draft
 SIDE = 448  # pixels of a view, and of a map where there are few
@@ -104,7 +105,7 @@ def painted_maps(asset: Asset, style: Picture, atlas: Atlas, settings: Settings,
 def write(path: Path, asset: Asset, maps: Sequence[Maps], seed: int) -> None:
     """The sheet: four views in a row, and below them the maps of each texture set."""
     from mistyle.files.images import write_png
-    from mistyle.run.pages import map_shots
+    from mistyle.run.report_parts import map_shots
 
     cameras = [orbit(azimuth, ELEVATION, distance=4, fov=30, size=(SIDE, SIDE)) for azimuth in VIEWS]
     views = lit_views(asset, seed)(maps, cameras)

@@ -1,21 +1,16 @@
-"""What every kind of job begins with: engines, the mesh, its atlas, the cameras and the views."""
+"""What every kind of job begins with: engines and the mesh."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mistyle.core.asset import Asset
-from mistyle.core.camera import Camera, rig
 from mistyle.core.cores import use_threads
-from mistyle.core.maps import Maps, OwnMaps, Texels
-from mistyle.core.mesh import Mesh
 from mistyle.run.job_settings import ReadSettings
-from mistyle.run.made import Atlas
 from mistyle.run.progress import Report
 from mistyle.run.settings import thread_count
-from mistyle.run.stylize_settings import Settings
 
 
 def start_engines(settings: Any) -> str:
@@ -44,78 +39,6 @@ def mesh_stage(run: Any, files: Sequence[Path]) -> Asset:
     return run.record(
         "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)
     )
-
-
-def texels_stage(run: Any, asset: Asset) -> Atlas:
-    """The stage "texels" of a job that paints."""
-    s = run.job.settings
-    return run.record("texels", ["mesh"], [s.atlas, s.fit.metallic], lambda r: lay_out(asset, s, r))
-
-
-def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:
-    """Rasterise every texture set and lay the asset's own material into it."""
-    texels, start = [], []
-    for part in range(len(asset.mesh.parts)):
-        where, maps = lay_out_one(asset, part, settings)
-        texels.append(where)
-        start.append(maps)
-        report((part + 1) / len(asset.mesh.parts))
-    return Atlas(tuple(texels), tuple(start))
-
-
-def lay_out_one(asset: Asset, part: int, settings: Settings) -> tuple[Texels, Maps]:
-    """One texture set of `lay_out`."""
-    from mistyle.stages.texels import rasterise, start_maps
-
-    texels = rasterise(asset.mesh, part, settings.atlas.size)
-    metallic = "zero" if settings.fit.metallic == "zero" else "keep"
-    return texels, start_maps(asset.materials[part], texels, settings.atlas.size, metallic)
-
-
-def own_maps(asset: Asset, settings: Settings) -> list[OwnMaps]:
-    """The asset's own material as its file has it, for pictures that need no atlas: each map at its own resolution."""
-    from mistyle.render.lookdev import material_maps
-
-    metallic = "zero" if settings.fit.metallic == "zero" else "keep"
-    return [material_maps(material, metallic) for material in asset.materials]
-
-
-def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> list[Camera]:
-    """The rig in visiting order, from the settings, from a file, or made for the mesh (then it says what it sees)."""
-    if settings.rig.kind == "nbv":
-        from mistyle.stages.rigs import next_best_views
-
-        planned = next_best_views(mesh, settings.rig)
-        say(planned.sentence())
-        return list(planned.cameras)
-    if settings.rig.kind != "file":
-        return rig(settings.rig)
-    from mistyle.files.cameras import read_cameras
-
-    assert settings.rig.file is not None
-    return read_cameras(settings.rig.file)
-
-
-def draw(
-    folder: Path,
-    asset: Asset,
-    maps: Sequence[Maps],
-    settings: Settings,
-    report: Report,
-    say: Callable[[str], None],
-    read: bool = True,
-) -> None:
-    """Render the views and write them with their cameras and lights; `read` says whether anything reads their
-    colours."""
-    from mistyle.core.light import lights
-    from mistyle.files.views import write_views
-    from mistyle.render.draw import draw_views
-
-    template = settings.draw.scene or "paper_views"
-    cameras = cameras_of(settings, asset.mesh, say)
-    views = draw_views(asset.mesh, maps, cameras, template, settings.draw.samples(read), settings.seed, report)
-    # What lit these very views, so that they can be fitted to.
-    write_views(folder, views, lights(str(template)), paper_files=settings.draw.paper_files)
 
 
 def ambient(asset: Asset, part: int, size: int, seed: int, report: Report) -> np.ndarray:

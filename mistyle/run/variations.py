@@ -52,7 +52,7 @@ def sheet(
     mesh: Path, style: Path, out: Path, settings: Settings, count: int, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
     """Write OUT/variations.png; returns its path and, picture by picture, the options that make it."""
-    from mistyle.run import start
+    from mistyle.run import start, stylize_start
     from mistyle.run.colour import read_style
     from mistyle.run.inputs import input_files
 
@@ -64,7 +64,7 @@ def sheet(
     with progress.stage("mesh", "read the mesh") as report:
         asset = start.read(mesh, settings.read, ATLAS, report)
     progress.note(*asset.source.notes, *picture.notes)
-    tiles, labels, atlas = [], [], start.lay_out(asset, reduced(settings), lambda done: None)
+    tiles, labels, atlas = [], [], stylize_start.lay_out(asset, reduced(settings), lambda done: None)
     drawn = lit_views(asset, settings.seed)
     for variation in variations(settings, count):
         with progress.stage("surface", f"paint with {variation.label}") as report:

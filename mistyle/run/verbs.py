@@ -6,21 +6,25 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.files.output import claim, read_written, replace_files
 from mistyle.run.budget import kept, size_of
 from mistyle.run.inputs import input_files
-from mistyle.run.material_outlines import tell_views
+from mistyle.run.job_settings import LEAST_OVERLAP
 from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
 from mistyle.run.plan import existing
 from mistyle.run.progress import Progress
-from mistyle.run.start import draw, lay_out_one, own_maps, read, start_engines
+from mistyle.run.start import read, start_engines
 from mistyle.run.stylize_budget import BAKE, BAKE_TILED, BAKED, DRAWN, RENDER, RENDER_TILED, bake_counts, render_counts
 from mistyle.run.stylize_job import Job
 from mistyle.run.stylize_settings import Settings
+from mistyle.run.stylize_start import draw, lay_out_one, own_maps
 
 
 def render_views(
@@ -123,3 +127,15 @@ def baked_set(
     baked = backproject(views, texels, settings.bake, mesh=asset.mesh)
     shares.append(float(baked.known.sum() / max(texels.covered.sum(), 1)))
     return texels, replace(start, albedo=fill(baked, texels), known=baked.known)
+
+
+def tell_views(mesh: Mesh, views: Sequence[View], progress: Progress) -> None:
+    """Every picture's overlap with the mesh's outline, and warnings about the cameras; alpha is the coverage."""
+    from mistyle.stages.outline_check import check_outlines, overlap_line, overlap_notes
+
+    names = [view.camera.name for view in views]
+    found = check_outlines(mesh, [view.camera for view in views], (view.coverage > 0.5 for view in views))
+    if np.isfinite(found.overlap).any():
+        progress.say(overlap_line(names, found.overlap))
+    fix = "Check the cameras' axes, and that they are in working units (camera.json of `mistyle render`)."
+    progress.note(*overlap_notes(names, found, LEAST_OVERLAP, fix, trusted=True))
