@@ -83,7 +83,7 @@ def test_tables_on_a_sheet_are_the_turned_grid(degrees):
     tangent = np.tile(np.array([np.cos(angle), np.sin(angle), 0], np.float32), (len(pixel), 1))
     points = as_points(positions, np.broadcast_to(view_samples.TOWARDS, positions.shape), 2.0)
     depth = np.full(len(pixel), 4.0, np.float32)
-    level = view_samples.sheet_level(points, tangent, np.ones(len(pixel), np.float32), cell, size, depth, 100.0)
+    level = view_samples.flat_level(points, tangent, np.ones(len(pixel), np.float32), cell, size, depth, 100.0)
     assert np.abs(np.cross(tangent, view_samples.TOWARDS) - level.across).max() < 1e-6
     assert not level.turned.any()
     inner = (np.abs(positions[:, :2] - 12) < 4).all(axis=1)
@@ -105,7 +105,7 @@ def test_neighbours_never_lie_across_a_depth_step():
     points = as_points(positions, np.broadcast_to(view_samples.TOWARDS, positions.shape), 2.0)
     tangent = np.tile(np.array([1, 0, 0], np.float32), (len(pixel), 1))
     focal = view.camera.focal
-    level = view_samples.sheet_level(points, tangent, np.ones(len(pixel), np.float32), cell, size, depth, focal)
+    level = view_samples.flat_level(points, tangent, np.ones(len(pixel), np.float32), cell, size, depth, focal)
     near = depth < 3.9
     assert 20 < near.sum() < len(near) - 20
     assert np.array_equal(near[level.neighbours], np.broadcast_to(near[:, None], level.neighbours.shape))
@@ -164,9 +164,9 @@ def test_pins_are_means_of_known_pixels():
     known = view.mask & (np.indices((48, 48)).sum(axis=0) % 3 == 0)
     rgb = np.where(known[..., None], linear_from_srgb(np.full((48, 48, 3), 0.25, np.float32)), 0.9)
     pixel, cell, _ = view_samples.representatives(view.mask, 4)
-    pins = view_samples.pinned(cell, 4, view, Prior(rgb.astype(np.float32), known))
+    pins = view_samples.constrain(cell, 4, view, Prior(rgb.astype(np.float32), known))
     assert not pins.known[distance_to(~view.mask).reshape(-1)[pixel] > 6].any(), "a third is too little"
-    everything = view_samples.pinned(cell, 4, view, Prior(rgb.astype(np.float32), view.mask))
+    everything = view_samples.constrain(cell, 4, view, Prior(rgb.astype(np.float32), view.mask))
     assert everything.known.all()
     assert everything.colour[:, 0].min() > pins.colour[pins.colour[:, 0] > 0, 0].max()
 

@@ -27,7 +27,7 @@ from mistyle.stages import finish_style
 from mistyle.stages.finish import Film, Finishing, Painted, finish, own_directions, shape_edges
 from mistyle.stages.finish_settings import FinishSettings
 from mistyle.stages.texels import rasterise
-from mistyle.surface.lookup import Solution, colour
+from mistyle.surface.lookup import PaintedSurface, colour
 
 SIZE = 64
 QUICK = FinishSettings(method="vgg", steps=3, crops=2, crop_size=64, texels_per_pixel=1)
@@ -78,7 +78,7 @@ def painted(painting) -> Painted:
     count = len(normals)
     piece = (normals[:, 1] > 0).astype(np.int32)
     centre = np.stack([rng.uniform(20, 76, count), rng.uniform(16, 56, count)], axis=1).astype(np.float32)
-    solution = Solution(
+    solution = PaintedSurface(
         positions=radius * normals,
         normals=normals,
         tangent=tangent,

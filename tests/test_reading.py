@@ -7,7 +7,7 @@ from helpers import data, fixed_surface
 
 from mistyle.core.errors import UsageError
 from mistyle.run.settings import resolve
-from mistyle.surface import edges, style, synthesis
+from mistyle.surface import edges, field, style, synthesis
 from mistyle.surface.chosen import FROM_PAINTING, flat, graphic, resolved, settled
 from mistyle.surface.reading import read_style
 from mistyle.surface.settings import SurfaceSettings
@@ -189,11 +189,11 @@ def test_the_coarsest_level_sees_the_same_share_of_the_painting_at_every_stroke_
 
 
 def test_a_piece_copied_once_is_no_overuse_where_the_surface_shows_a_part_of_the_picture():
-    book = style.pages(style.prepare(noise((200, 200))), 200, 0.0)
+    book = style.exemplar(style.prepare(noise((200, 200))), 200, 0.0)
     row, column = np.mgrid[50:90, 50:90].reshape(2, -1).astype(np.float32)
     page = np.zeros(len(row), np.int32)
-    once = synthesis.usage(book, synthesis.Choice(page, column, row)).reshape(200, 200)
-    twice = synthesis.usage(book, synthesis.Choice(page, column, 50 + np.floor(row / 2 - 25))).reshape(200, 200)
+    once = field.usage(book, field.NearestNeighbourField(page, column, row)).reshape(200, 200)
+    twice = field.usage(book, field.NearestNeighbourField(page, column, 50 + np.floor(row / 2 - 25))).reshape(200, 200)
     assert once[60:80, 60:80] == pytest.approx(1) and twice[55:65, 60:80] == pytest.approx(2)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import fixed_surface
 from scipy.spatial import KDTree
-from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, spread_on, strokes  # noqa: F401
+from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, solved, spread_on, strokes  # noqa: F401
 
 from mistyle.core.asset import Asset, Material, Picture, Source
 from mistyle.core.camera import RigSettings, resized, rig
@@ -40,7 +40,7 @@ def test_thinning_is_that_of_one_point_after_the_other(dj, rng):  # noqa: F811
     points, radius = on_a_ball(3000, rng), 0.12
     normals = np.where(rng.random((3000, 1)) < 0.5, points, -points)  # two surfaces that face away from each other
     rank = rng.permutation(3000)
-    kept = cells.thin(dj, cells.cells(dj, points, normals, radius, rank), radius)
+    kept = cells.thin(dj, cells.point_grid(dj, points, normals, radius, rank), radius)
     tree, alive, plain = KDTree(points), np.ones(3000, bool), np.zeros(3000, bool)
     for i in np.argsort(-rank):
         if alive[i]:
@@ -91,7 +91,7 @@ def test_glaze_adds_the_missing_light_and_dark(ball):
     settings, levels, tone, cavity = ball
     wanted = guides.detail(levels, tone, cavity)[-1]
     guide = guides.Guide(np.zeros((len(wanted), 3), np.float32), wanted, levels[-1].directed)
-    book = style.pages(style.prepare(strokes()), 64, 0.5)
+    book = style.exemplar(style.prepare(strokes()), 64, 0.5)
     grey = np.full(len(wanted), 0.5, np.float32)
     laid = glaze(levels, guide, grey, book, settings)
     assert np.corrcoef(laid, wanted)[0, 1] > 0.8 and 0.01 < np.abs(laid).max() <= 0.12
@@ -167,7 +167,9 @@ def ramp_solution(turn):
     up, tangent = np.array([[0, 1, 0]], np.float32), np.array([[0.6, 0, 0.8]], np.float32)
     centre, turns = np.full((1, 2), 100, np.float32), np.array([turn], np.int32)
     zero = np.zeros(1, np.float32)
-    return lookup.Solution(0 * up, up, tangent, turns, centre, 0.05, (2.0, 2.0), picture, zero, turns * 0, 8.0, False)
+    return lookup.PaintedSurface(
+        0 * up, up, tangent, turns, centre, 0.05, (2.0, 2.0), picture, zero, turns * 0, 8.0, False
+    )
 
 
 @pytest.mark.parametrize("turn", [0, 1, 2, 3])
@@ -234,7 +236,7 @@ def test_content_of_a_texture_rules_the_tone(painted_sheet, dj):  # noqa: F811
     light = {}
     for keep in (0.0, 1.0):
         chosen = settings.model_copy(update={"keep_content": keep})
-        made = guides.guides(levels, palette, open_sky, chosen, np.random.default_rng(1), found)
+        made = guides.level_guides(levels, palette, open_sky, chosen, np.random.default_rng(1), found)
         dark = np.floor((levels[-1].points.positions[:, 0] / 1.4 + 0.5) * 4) % 2 == 0
         light[keep] = made[-1].colour[~dark, 0].mean() - made[-1].colour[dark, 0].mean()
     assert light[1.0] > 0.3 > abs(light[0.0])
@@ -383,7 +385,7 @@ def many_parts() -> object:
 @pytest.mark.parametrize("shape", [box(1.2, 1.2, 0.001), many_parts(), sheet(2)], ids=["wall", "parts", "two-faces"])
 def test_any_mesh_will_do(shape):
     settings = fixed_surface(samples=700)
-    solution = synthesis.solve(shape, strokes(), settings, 0, open_sky)
+    solution = solved(shape, strokes(), settings, 0)
     corners = shape.positions[shape.faces].mean(axis=1)
     normals = np.cross(*(np.diff(shape.positions[shape.faces], axis=1).transpose(1, 0, 2)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

@@ -20,8 +20,8 @@ from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
 from mistyle.stages.coat import Coats
 from mistyle.surface.guides import Content
-from mistyle.surface.linefield import Course
-from mistyle.surface.lookup import Solution
+from mistyle.surface.linefield import DirectionConstraint
+from mistyle.surface.lookup import PaintedSurface
 from mistyle.surface.settings import CoatSettings
 
 
@@ -52,14 +52,14 @@ def paint(
     settings: Settings,
     report: Report,
     content: Content | None = None,
-    course: Course | None = None,
-) -> Solution:
-    """The surface painted once with one picture; `content` is the lightness of a texture that it has already, `course`
-    where strokes shall run."""
+    direction: DirectionConstraint | None = None,
+) -> PaintedSurface:
+    """The surface painted once with one picture; `content` is the lightness of a texture that it has already,
+    `direction` where strokes shall run."""
     from mistyle.backends.embedded import solve_surface
 
     return solve_surface(
-        asset.mesh, style, settings.surface, settings.seed, progress=report, content=content, course=course
+        asset.mesh, style, settings.surface, settings.seed, progress=report, content=content, direction=direction
     )
 
 
@@ -113,7 +113,7 @@ HEIGHT, GLOSS = 0.15, 1.0  # slope of the painting's relief in the normal map, a
 LOOKED_UP = 2**20  # texels whose colour is looked up at one time
 
 
-def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings) -> list[Maps]:
+def painted(asset: Asset, coats: Coats | PaintedSurface, atlas: Atlas, settings: Settings) -> list[Maps]:
     """The start maps with the painting's colours in place of the albedo, looked up for every covered texel.
 
     A single solution paints everything.
@@ -139,7 +139,9 @@ def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Setti
     return maps
 
 
-def raised(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings, maps: Sequence[Maps]) -> list[Maps]:
+def raised(
+    asset: Asset, coats: Coats | PaintedSurface, atlas: Atlas, settings: Settings, maps: Sequence[Maps]
+) -> list[Maps]:
     """Painted maps with the painting's relief laid upon their normals, and its gloss upon their roughness."""
     from mistyle.backends.embedded import surface_relief
     from mistyle.core.image import nearest_fill_in_place
@@ -174,9 +176,9 @@ def pieces(at: np.ndarray) -> Iterator[slice]:
     return (rows for rows in bands(at.shape[0], at.shape[1], round(LOOKED_UP / share)) if at[rows].any())
 
 
-def whose(coats: Coats | Solution, part: int, texels: Texels) -> list[tuple[Solution, np.ndarray]]:
+def whose(coats: Coats | PaintedSurface, part: int, texels: Texels) -> list[tuple[PaintedSurface, np.ndarray]]:
     """Each solution with the covered texels of a set that it paints."""
-    if isinstance(coats, Solution):
+    if isinstance(coats, PaintedSurface):
         return [(coats, texels.covered)]
     return [(one, texels.covered & (coats.choice[part] == k)) for k, one in enumerate(coats.solutions)]
 

@@ -73,7 +73,7 @@ def stylizer_of(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, 
     make = getattr(import_module(module), name)
     course = painted_course(settings.coat.direction_map, asset.mesh, atlas.texels)
     picture = masked_style(style, settings.coat.style_mask)
-    return make(asset.mesh, picture, surface, settings.seed, report, content=found, course=course)
+    return make(asset.mesh, picture, surface, settings.seed, report, content=found, direction=course)
 
 
 def masker_of(settings: Settings) -> Masker | None:

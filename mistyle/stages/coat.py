@@ -15,8 +15,8 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.core.tangents import corner_tangents
 from mistyle.stages.frames import texel_frames
-from mistyle.surface.linefield import Course
-from mistyle.surface.lookup import Solution
+from mistyle.surface.linefield import DirectionConstraint
+from mistyle.surface.lookup import PaintedSurface
 from mistyle.surface.settings import SurfaceSettings
 
 PICTURE_STROKES = 32  # strokes side by side along a picture's long side, by which `stroke_size` is turned into a scale
@@ -30,7 +30,7 @@ FLOW_FREE, FLOW_SURE = 0.1, 0.5  # distances from mid grey up to which, and from
 class Coats:
     """One solution a picture, and per texture set which of them each texel takes (0: the job's own style)."""
 
-    solutions: tuple[Solution, ...]
+    solutions: tuple[PaintedSurface, ...]
     choice: tuple[np.ndarray, ...]
 
 
@@ -147,7 +147,7 @@ def nearest_texels(
     return near, chosen
 
 
-def painted_course(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> Course | None:
+def painted_course(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> DirectionConstraint | None:
     """Where strokes shall run by a picture in the mesh's UVs (row 0 is v = 1): red and green, less one half, are the
     direction along u and v. The further a colour is from mid grey, and the more opaque, the more it counts; half way is
     fully.

@@ -23,7 +23,7 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.stages import finish_style, fit_table
 from mistyle.stages.finish_settings import JUDGED, FinishSettings
-from mistyle.surface.lookup import Solution
+from mistyle.surface.lookup import PaintedSurface
 
 if TYPE_CHECKING:
     import torch
@@ -55,7 +55,7 @@ class Painted:
     mesh: Mesh
     maps: tuple[Maps, ...]
     texels: tuple[Texels, ...]
-    solution: Solution
+    solution: PaintedSurface
     only: tuple[Bool[np.ndarray, "_ _"], ...] | None = None
 
 

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.image import resize
 from mistyle.measure.features import Features
-from mistyle.surface.lookup import Solution
+from mistyle.surface.lookup import PaintedSurface
 from mistyle.surface.samples import as_points, lifted, workers
 
 TURNED = 35.0  # degrees between a piece of the painting and the page that stands for it, beyond which it does not count
@@ -28,7 +28,7 @@ class Exemplar:
     pages     per page and level of the features, a map (k, rows, columns), torch
     """
 
-    solution: Solution
+    solution: PaintedSurface
     tree: Any
     size: tuple[int, int]
     pages: tuple[tuple[Any, ...], ...]
@@ -45,7 +45,7 @@ class Places:
     sample: Int[np.ndarray, " n"]
 
 
-def exemplar(solution: Solution, pixel: float, features: Features) -> Exemplar:
+def exemplar(solution: PaintedSurface, pixel: float, features: Features) -> Exemplar:
     """The painting at `pixel` working units a pixel, and its features (half precision)."""
     import torch
 
