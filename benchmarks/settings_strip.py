@@ -55,7 +55,7 @@ def changed(base: Settings, change: dict[str, Any], folder: Path) -> Settings:
         return base.model_copy(update={"surface": base.surface.model_copy(update=change)})
     path = folder / "flow.png"
     write_png(path, np.broadcast_to(np.array([*change["flow"], 0.5], np.float32), (8, 8, 3)))
-    return base.model_copy(update={"coat": base.coat.model_copy(update={"direction_map": path})})
+    return base.model_copy(update={"paint": base.paint.model_copy(update={"direction_map": path})})
 
 
 def save(picture: Image.Image, path: Path) -> int:

@@ -26,7 +26,7 @@ from mistyle.run import painting
 from mistyle.run.made import Atlas
 from mistyle.run.settings import Settings
 from mistyle.stages.backproject import BakeSettings, backproject, fill
-from mistyle.stages.coat import lay_relief
+from mistyle.stages.coat import PaintRelief, TexelBand, lay_relief
 from mistyle.stages.texels import pad
 
 WET, DRY = 0.25, 0.7  # roughness of wet and of dry paint
@@ -88,7 +88,8 @@ def true_maps(
     roughness = WET + (DRY - WET) / (1 + np.exp(-4 * _field(points, side, PATCHES, rng)))
     made = replace(flat, normal=flat.normal.copy(), roughness=np.zeros_like(flat.roughness))
     tangents = corner_tangents(asset.mesh)
-    lay_relief(asset, made, texels, slice(0, len(at)), at, gradient, roughness, slope, 1.0, tangents)
+    band, relief = TexelBand(texels, slice(0, len(at)), at), PaintRelief(gradient, roughness)
+    lay_relief(made, band, relief, slope, 1.0, asset.mesh, tangents)
     return replace(made, **{name: nearest_fill(getattr(made, name), at) for name in ("albedo", "normal", "roughness")})
 
 

@@ -32,8 +32,8 @@ DESIGNS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "phase2": ({"fit": {"refine": "albedo"}}, {"fit": {"refine": "off"}}),
     "both": ({"fit": {"refine": "all"}}, {"fit": {"refine": "off"}}),
     # Twice the relief, to begin with and to aim at.
-    "bold": ({"fit": {"refine": "all", "relief": 0.3}, "coat": {"height": 0.3}}, {"fit": {"refine": "off"}}),
-    "bold_unfitted": ({"fit": {"refine": "off"}, "coat": {"height": 0.3}}, {"fit": {"refine": "off"}}),
+    "bold": ({"fit": {"refine": "all", "relief": 0.3}, "paint": {"height": 0.3}}, {"fit": {"refine": "off"}}),
+    "bold_unfitted": ({"fit": {"refine": "off"}, "paint": {"height": 0.3}}, {"fit": {"refine": "off"}}),
 }
 SMALL, LARGE = 252, 378  # pixels of a picture's side, under an environment and under the key light
 SPP = {"path": 32, "direct": 16}  # samples a pixel under either

@@ -218,8 +218,8 @@ def test_the_job_with_this_stylizer_and_its_resumption(inputs, tmp_path, monkeyp
 
 
 def test_what_it_cannot_follow_is_refused(inputs, tmp_path):
-    with pytest.raises(UsageError, match="coat.height"):
-        pipeline.stylize(by_view(inputs, tmp_path, coat={"height": 0.2}), Progress(quiet=True))
+    with pytest.raises(UsageError, match="paint.height"):
+        pipeline.stylize(by_view(inputs, tmp_path, paint={"height": 0.2}), Progress(quiet=True))
     absent = {"segmenter": str(tmp_path / "absent.onnx")}
     with pytest.raises((InputRefused, EnvironmentMissing)):
         pipeline.stylize(by_view(inputs, tmp_path, sweep=absent), Progress(quiet=True))

@@ -284,7 +284,7 @@ def test_the_option_from_end_to_end(inputs, weights, tmp_path):  # noqa: F811
     [
         ({}, "found no weights of VGG-19"),
         ({"stylizer": "embedded-view"}, "expected the embedded stylizer"),
-        ({"coat": {"slots": ["wood=bark.jpg"]}}, "found 2 style pictures; expected one"),
+        ({"paint": {"slots": ["wood=bark.jpg"]}}, "found 2 style pictures; expected one"),
         ({"surface": {"glaze": 0.5}}, "glaze"),
     ],
 )

@@ -173,6 +173,8 @@ def test_the_crop_is_taken_side_by_side():
 def test_the_old_name_is_answered_with_the_new_one():
     with pytest.raises(UsageError, match="now called 'surface.stroke_scale'"):
         resolve(None, None, {"surface": {"style_scale": 2.0}}, {})
+    with pytest.raises(UsageError, match=r"'coat\.height' is now called 'paint\.height'"):
+        resolve(None, None, {"coat": {"height": 0.2}}, {})
     assert (
         resolve(None, None, {"surface": {"stroke_coherence": 0.2, "crop": [0.1, 0, 0, 0]}}, {}).surface.levels is None
     )

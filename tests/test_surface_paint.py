@@ -120,7 +120,7 @@ def test_strokes_go_where_they_are_told(follow, axis):
     assert front.sum() > 50 and (np.abs(tangent[front, axis]) > 0.99).all() and (sure[front] > 0.9).all()
 
 
-def test_a_painted_course_takes_the_place_of_the_form():
+def test_a_painted_direction_takes_the_place_of_the_form():
     points = spread_on(box(0.6, 1.2, 0.6), 1500)
     slanting = np.array([1, 1, 0], np.float32) / np.float32(np.sqrt(2))
 
@@ -144,7 +144,7 @@ def test_red_and_green_of_a_direction_map_are_u_and_v(painted_sheet, tmp_path):
     inside = np.linalg.norm(along_u, axis=1) * np.linalg.norm(along_v, axis=1) > 0
     for colour, expected in (((1, 0.5, 0), along_u), ((0.5, 0, 1), along_v), ((0.9, 0.9, 0.5), along_u + along_v)):
         write_png(tmp_path / "flow.png", np.broadcast_to(np.array(colour, np.float32), (8, 8, 3)))
-        course = coat.painted_course(tmp_path / "flow.png", mesh, [texels])
+        course = coat.painted_direction(tmp_path / "flow.png", mesh, [texels])
         found, counts = course(texels.position[at][inside], texels.normal[at][inside])
         wanted = expected[inside] / np.linalg.norm(expected[inside], axis=1, keepdims=True)
         assert inside.sum() > 100 and (np.abs((found * wanted).sum(axis=1)) > 0.99).mean() > 0.95
@@ -152,12 +152,14 @@ def test_red_and_green_of_a_direction_map_are_u_and_v(painted_sheet, tmp_path):
     half = np.full((8, 8, 3), 0.5, np.float32)
     write_png(tmp_path / "grey.png", half)
     with pytest.raises(InputRefused, match="mid grey or transparent everywhere"):
-        coat.painted_course(tmp_path / "grey.png", mesh, [texels])
+        coat.painted_direction(tmp_path / "grey.png", mesh, [texels])
     half[:, :4] = (1, 0.5, 0)
     write_png(tmp_path / "half.png", half)
-    found, counts = coat.painted_course(tmp_path / "half.png", mesh, [texels])(texels.position[at], texels.normal[at])
+    found, counts = coat.painted_direction(tmp_path / "half.png", mesh, [texels])(
+        texels.position[at], texels.normal[at]
+    )
     assert (counts[at[1] < 12] == 1).all() and (counts[at[1] > 20] == 0).all()
-    assert coat.painted_course(None, mesh, [texels]) is None
+    assert coat.painted_direction(None, mesh, [texels]) is None
 
 
 def ramp_solution(turn):
@@ -254,7 +256,8 @@ def test_existing_normals_are_composed_and_roughness_moved(painted_sheet, rng):
     def laid(slope: np.ndarray, height: float, gloss: float) -> Maps:
         made = replace(start, normal=start.normal.copy(), roughness=start.roughness.copy())
         rows, tangents = slice(0, 32), corner_tangents(mesh)
-        coat.lay_relief(asset, made, texels, rows, texels.covered, slope, dull, height, gloss, tangents)
+        band = coat.TexelBand(texels, rows, texels.covered)
+        coat.lay_relief(made, band, coat.PaintRelief(slope, dull), height, gloss, asset.mesh, tangents)
         return made
 
     same = laid(nothing, 0.15, 1.0)
@@ -320,7 +323,7 @@ def test_a_coat_of_two_pictures_with_a_protected_part(painted_sheet, tmp_path):
         write_png(tmp_path / f"{name}.png", picture)
     chosen = {"slots": [f"{tmp_path / 'half.png'}={tmp_path / 'blue.png'}"], "protect": tmp_path / "strip.png"}
     settings = Settings.model_validate(
-        {"surface": {"samples": 700}, "atlas": {"size": 32}, "coat": chosen | {"height": 0.2, "gloss": 1.0}}
+        {"surface": {"samples": 700}, "atlas": {"size": 32}, "paint": chosen | {"height": 0.2, "gloss": 1.0}}
     )
     atlas = start.lay_out(asset, settings, lambda done: None)
     coats = painting.coat(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)

@@ -25,7 +25,7 @@ from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import fit_settings, inpainter_inputs, lights_of_views, opaque, release, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
-from mistyle.run.painting import bake, check_coat, coat_files, stylized_stage, surface_stage, unlit_views
+from mistyle.run.painting import bake, check_paint, paint_files, stylized_stage, surface_stage, unlit_views
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import REFINING, STAGES, Job, Run, claim_run
@@ -67,7 +67,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     claim_run(job, STAGES, inputs_of(job))
     check(job.settings)
     style = read_style(job.style, job.settings.colour)
-    check_coat(job.settings.coat)
+    check_paint(job.settings.paint)
     check_generative(job.settings, progress.say)
     check_finish(job.settings)
     if job.settings.stylizer != "embedded":
@@ -94,7 +94,7 @@ def report_stage(run: Run, made: Made, progress: Progress) -> None:
 def inputs_of(job: Job) -> list[Path]:
     """Every file and folder of the user's that the job reads."""
     s = job.settings
-    return [*input_files(job.mesh), job.style, *coat_files(s.coat), *filter(None, (s.rig.file, s.draw.scene))]
+    return [*input_files(job.mesh), job.style, *paint_files(s.paint), *filter(None, (s.rig.file, s.draw.scene))]
 
 
 def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> Made:
@@ -201,15 +201,15 @@ def painted_stages(
         swept = swept_stages(run, asset, style, atlas, views)
         write_first(run, asset, atlas, swept[0])
         return *swept, None
-    coats = surface_stage(run, asset, style, atlas)
+    layers = surface_stage(run, asset, style, atlas)
     baked = run.record(
-        "bake", ["views", "surface"], [s.bake, s.refined, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
+        "bake", ["views", "surface"], [s.bake, s.refined, s.paint], lambda r: bake(asset, layers, atlas, views, s, r)
     )
     if not s.keeps_painting or s.finish.method != "off":
         write_first(run, asset, atlas, baked)
     if s.finish.method == "off":
         return baked, stylized_stage(run, asset, baked, views, "bake"), None
-    baked, finishing = finish_stage(run, asset, coats, atlas, baked)
+    baked, finishing = finish_stage(run, asset, layers, atlas, baked)
     return baked, stylized_stage(run, asset, baked, views, "finish"), finishing
 
 
@@ -285,8 +285,8 @@ def repair(
         release(settings)
         # The weight-free inpainter takes the painting again, to which phase 1 has fitted normal and roughness already.
         maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
-    if settings.coat.protect is not None:
-        own = [painted_mask(settings.coat.protect, texels) for texels in atlas.texels]
+    if settings.paint.protect is not None:
+        own = [painted_mask(settings.paint.protect, texels) for texels in atlas.texels]
         maps = [protected(m, start, mask) for m, start, mask in zip(maps, atlas.start, own, strict=True)]
     return Repaired(tuple(maps), tuple(masks))
 

@@ -26,7 +26,7 @@ from mistyle.stages.fit import FitSettings
 from mistyle.stages.inpaint import RepairSettings
 from mistyle.stages.mvst import SweepSettings
 from mistyle.stages.texels import AtlasSettings
-from mistyle.surface.settings import CoatSettings, SurfaceSettings
+from mistyle.surface.settings import PaintSettings, SurfaceSettings
 
 READ_SAMPLES = 8  # per pixel of a view that a stylizer reads
 
@@ -109,7 +109,7 @@ class Settings(BaseModel):
     rig: RigSettings = RigSettings()
     draw: DrawSettings = DrawSettings()
     surface: SurfaceSettings = SurfaceSettings()
-    coat: CoatSettings = CoatSettings()
+    paint: PaintSettings = PaintSettings()
     sweep: SweepSettings = SweepSettings()
     atlas: AtlasSettings = AtlasSettings()
     bake: BakeSettings = BakeSettings()
@@ -195,8 +195,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 PRESETS["demo"] = PRESETS["draft"] | {"surface": {"samples": 150_000}, "atlas": {"size": 2048}}
 
 
-# Settings by their earlier names.
-RENAMED = {"surface.style_scale": "surface.stroke_scale"}
+# Settings, and tables of settings, by their earlier names.
+RENAMED = {"surface.style_scale": "surface.stroke_scale", "coat": "paint"}
 
 Root = TypeVar("Root", bound=BaseModel)
 
@@ -255,7 +255,11 @@ def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
         path = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             if path in RENAMED:
-                raise UsageError(f"{origin}: '{path}' is now called '{RENAMED[path]}'; write that") from None
+                inner = first["input"]
+                below = f".{next(iter(inner))}" if isinstance(inner, Mapping) and inner else ""
+                raise UsageError(
+                    f"{origin}: '{path}{below}' is now called '{RENAMED[path]}{below}'; write that"
+                ) from None
             near = difflib.get_close_matches(path, known_keys(root), n=1, cutoff=0.5)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UsageError(f"{origin}: there is no setting '{path}'{hint} (--print-config lists all)") from None
