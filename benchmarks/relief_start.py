@@ -78,7 +78,9 @@ def main() -> None:
         results[name] = timed(
             figures,
             f"{name}.seconds",
-            lambda begin=begin: fit.two_phase(asset.mesh, flat, targets, atlas.texels, plain.fit, 0, begin=begin),
+            lambda begin=begin: fit.two_phase(
+                asset.mesh, fit.FitStart(flat, begin=begin), fit.FitTargets(targets), atlas.texels, plain.fit, 0
+            ),
         )
     losses = {name: loss(found.trace, steps) for name, found in results.items()}
     for name, course in losses.items():

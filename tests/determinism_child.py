@@ -96,7 +96,7 @@ def style_job(made: Stages, settings: Any) -> None:
     from mistyle.files.views import read_views, write_views
     from mistyle.render.draw import draw_views
     from mistyle.run import painting, start
-    from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit import FitStart, FitTargets, two_phase
 
     mesh_file, style_file = inputs(made.out)
     asset = made.note("read and unwrap", start.read(mesh_file, settings.read, settings.atlas.size, nothing))
@@ -117,7 +117,14 @@ def style_job(made: Stages, settings: Any) -> None:
     fitted = None
     for name, change in phases.items():
         chosen = settings.fit.model_copy(update=change)
-        fitted = two_phase(asset.mesh, baked.maps, stylized, atlas.texels, chosen, settings.seed, begin=baked.begin)
+        fitted = two_phase(
+            asset.mesh,
+            FitStart(baked.maps, begin=baked.begin),
+            FitTargets(stylized),
+            atlas.texels,
+            chosen,
+            settings.seed,
+        )
         maps = [getattr(m, key).ravel() for m in fitted.maps for key in ("albedo", "normal", "roughness")]
         made.numbers(name, maps=np.concatenate(maps), trace=np.concatenate([*fitted.trace.values()]))
     repaired = repair(made, asset, atlas, baked, fitted, settings)

@@ -238,7 +238,7 @@ def fit(
     report: Report,
 ) -> Any:
     """Section 4.2: normal and roughness, then albedo; of views that show known light, solved for under it."""
-    from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit import FitStart, FitTargets, two_phase
     from mistyle.stages.fit_lit import lit_phases
     from mistyle.stages.unlight import unlit
 
@@ -250,7 +250,13 @@ def fit(
         return lit_phases(asset.mesh, baked.maps, stylized, where, lit, chosen, seed, report, style=look)
     plain = unlit(stylized, baked.gains) if baked.gains else None
     fitted = two_phase(
-        asset.mesh, baked.maps, stylized, where, chosen, seed, report, begin=baked.begin, style=look, unlit=plain
+        asset.mesh,
+        FitStart(baked.maps, begin=baked.begin),
+        FitTargets(stylized, style=look, unlit=plain),
+        where,
+        chosen,
+        seed,
+        report,
     )
     unknown = f"{settings.draw.scene}: the fit does not know this scene's light, so the lit views are not solved for."
     return replace(fitted, notes=(*fitted.notes, unknown)) if solving else fitted
@@ -308,7 +314,7 @@ def settle_relief(
 
     Texels outside the masks keep their bits.
     """
-    from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit import FitStart, FitTargets, two_phase
 
     steps = round(settings.fit.iterations1 * SETTLING)
     if settings.refined == "off" or steps == 0 or not any(mask.any() for mask in masks):
@@ -318,7 +324,13 @@ def settle_relief(
     )
     targets = unlit_views(asset, maps, views, lambda done: None)
     settled = two_phase(
-        asset.mesh, maps, targets, atlas.texels, short, seed=settings.seed + 1, progress=report, only=masks
+        asset.mesh,
+        FitStart(maps, only=masks),
+        FitTargets(targets),
+        atlas.texels,
+        short,
+        seed=settings.seed + 1,
+        progress=report,
     )
     return list(settled.maps)
 
