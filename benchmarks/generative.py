@@ -220,7 +220,7 @@ def painted_views(job: Any, views: list[Any], kept: Path, resumed: bool) -> list
     """The sweep over the views; resumed: stopped in the last one and begun again with networks loaded anew."""
     from mistyle.backends import diffusion
     from mistyle.core.errors import Stopped
-    from mistyle.stages.mvst import SweepSettings, sweep
+    from mistyle.stages.mvst import SweepSettings, ViewPainter, ViewStore, sweep
 
     key = diffusion.key(job, views)
 
@@ -232,9 +232,9 @@ def painted_views(job: Any, views: list[Any], kept: Path, resumed: bool) -> list
     paint = diffusion.stylizer(job, views)
     if resumed:
         with suppress(Stopped):
-            sweep(views, stops, SweepSettings(), 0, kept=kept, key=key)
+            sweep(views, ViewPainter(stops), SweepSettings(), 0, store=ViewStore(kept, key))
         paint = diffusion.stylizer(job, views)
-    return [one.rgb for one in sweep(views, paint, SweepSettings(), 0, kept=kept, key=key).painted]
+    return [one.rgb for one in sweep(views, ViewPainter(paint), SweepSettings(), 0, store=ViewStore(kept, key)).painted]
 
 
 def painted(made: Any, stylizer: str, resumed: bool, work: Path) -> bool:

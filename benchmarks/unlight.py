@@ -21,7 +21,7 @@ from mistyle.core.view import View
 from mistyle.files.read import read_mesh, read_picture
 from mistyle.run import painting, start, sweep
 from mistyle.run.settings import Settings
-from mistyle.stages.mvst import Painted
+from mistyle.stages.mvst import PaintedView
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
@@ -51,8 +51,8 @@ def measured(asset: Any, style: Picture, settings: Settings, shown: str) -> tupl
     return before, after, found[1].taken or 0.0
 
 
-def as_painted(view: View) -> Painted:
-    return Painted(view.rgb, view.mask & (view.coverage > 0.99), view.mask, 0.0, 1.0)
+def as_painted(view: View) -> PaintedView:
+    return PaintedView(view.rgb, view.mask & (view.coverage > 0.99), view.mask, 0.0, 1.0)
 
 
 def main() -> None:

@@ -176,14 +176,14 @@ def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any
     from mistyle.run.sweep import stylizer_of
     from mistyle.stages.backproject import bake
     from mistyle.stages.lift import WarpSettings, lift
-    from mistyle.stages.mvst import sweep
+    from mistyle.stages.mvst import ViewPainter, sweep
     from mistyle.stages.warp import composite
 
     chosen = settings.model_copy(update={"stylizer": "embedded-view"})
     made.note("warp", composite([lift(view, WarpSettings()) for view in views[:2]], views[2], WarpSettings()))
     paint = stylizer_of(asset, style, atlas, chosen, nothing)
     made.note("one view", paint(views[0], None, np.random.default_rng(0)))
-    swept = made.note("sweep", sweep(views[:3], paint, chosen.sweep, 0, keeps_outlines=True))
+    swept = made.note("sweep", sweep(views[:3], ViewPainter(paint, keeps_outlines=True), chosen.sweep, 0))
     made.note("bake from views", bake(swept.views, atlas.texels[0], chosen.bake, 4, mesh=asset.mesh))
 
 

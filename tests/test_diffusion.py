@@ -14,7 +14,7 @@ from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings
 from mistyle.core.camera import orbit
 from mistyle.core.errors import EnvironmentMissing, InputRefused, Stopped, UsageError
 from mistyle.core.view import Prior, View
-from mistyle.stages.mvst import SweepSettings, sweep
+from mistyle.stages.mvst import SweepSettings, ViewPainter, ViewStore, sweep
 
 torch.set_num_threads(1)
 SIDE = 32
@@ -276,7 +276,7 @@ def test_the_denoiser_agrees_with_diffusers_own_pipeline(pipeline):
 
 def walks_as_diffusers(pipeline) -> None:
     """The plain twin: diffusers' pipeline with the same latents, conditions and prompts walks the same path."""
-    from mistyle.stages.repaint import sample
+    from mistyle.stages.repaint import Resampling, sample
 
     seen = view()
     asked = diffusion._asked(pipeline, QUICK, seen, (SIDE, SIDE), ())
@@ -287,9 +287,9 @@ def walks_as_diffusers(pipeline) -> None:
         None,
         None,
         levels,
+        Resampling(refine=0),
         rng=torch.Generator().manual_seed(0),
         like=torch.zeros_like(noise),
-        refine=0,
     )
     theirs = pipeline(
         diffusion.prompt_of(QUICK),
@@ -304,7 +304,7 @@ def walks_as_diffusers(pipeline) -> None:
 
 
 def test_pinned_latents_end_as_the_prior_and_the_rest_does_not(pipeline):
-    from mistyle.stages.repaint import sample
+    from mistyle.stages.repaint import Resampling, sample
 
     known, mask = diffusion_denoise.prior_latent(pipeline.vae, half_prior(), (SIDE, SIDE), 2)
     asked = diffusion._asked(pipeline, QUICK, view(), (SIDE, SIDE), ())
@@ -312,7 +312,7 @@ def test_pinned_latents_end_as_the_prior_and_the_rest_does_not(pipeline):
     levels = diffusion_denoise.noise_levels(pipeline.scheduler, 4)
 
     def run():
-        return sample(denoise, known, mask, levels, 2, 3, rng=torch.Generator().manual_seed(5), refine=0)
+        return sample(denoise, known, mask, levels, Resampling(2, 3, refine=0), rng=torch.Generator().manual_seed(5))
 
     end, again = run(), run()
     pinned = mask.bool().expand_as(end)
@@ -364,7 +364,7 @@ def test_a_killed_sweep_goes_on_in_the_view_it_was_in(tmp_path, views, loras):
     views, wanted = views[:3], job(tmp_path / "loras", style_lora=loras["style1"])
     settings, key = SweepSettings(), diffusion.key(wanted, views)
     painter = diffusion.stylizer(wanted, views)
-    whole = sweep(views, painter, settings, 0)
+    whole = sweep(views, ViewPainter(painter), settings, 0)
     seen: list[str] = []
 
     def stopping(v, prior, rng):
@@ -374,16 +374,10 @@ def test_a_killed_sweep_goes_on_in_the_view_it_was_in(tmp_path, views, loras):
         return painter(v, prior, rng)
 
     with pytest.raises(Stopped):
-        sweep(views, stopping, settings, 0, kept=tmp_path / "kept", key=key)
+        sweep(views, ViewPainter(stopping), settings, 0, store=ViewStore(tmp_path / "kept", key))
     again: list[str] = []
-    resumed = sweep(
-        views,
-        lambda v, p, r: again.append(v.camera.name) or painter(v, p, r),
-        settings,
-        0,
-        kept=tmp_path / "kept",
-        key=key,
-    )
+    rest = ViewPainter(lambda v, p, r: again.append(v.camera.name) or painter(v, p, r))
+    resumed = sweep(views, rest, settings, 0, store=ViewStore(tmp_path / "kept", key))
     assert len(again) == 1 and again[0] == seen[-1]
     for a, b in zip(resumed.views, whole.views, strict=True):
         np.testing.assert_array_equal(a.rgb, b.rgb)

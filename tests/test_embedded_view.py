@@ -11,7 +11,6 @@ from test_mvst import disagreement
 from test_pipeline import TINY, hashes, inputs, job
 from test_warp import at, see
 
-from mistyle.backends import STYLIZERS
 from mistyle.core.asset import Picture
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
 from mistyle.core.image import distance_to, linear_from_srgb, srgb_from_linear
@@ -21,7 +20,7 @@ from mistyle.run import pipeline
 from mistyle.run.progress import Progress
 from mistyle.run.settings import resolve
 from mistyle.run.stages import Job
-from mistyle.stages.mvst import SweepSettings, sweep
+from mistyle.stages.mvst import SweepSettings, ViewPainter, sweep
 from mistyle.surface import view_samples
 from mistyle.surface.samples import GRID
 
@@ -173,8 +172,8 @@ def test_pins_are_means_of_known_pixels():
 
 def test_a_sweep_agrees_where_single_views_do_not(paint):
     views = [ball(30, 64), ball(60, 64)]
-    alone = sweep(views, lambda v, p, rng: paint(v, None, rng), SweepSettings(), 0, keeps_outlines=True)
-    together = sweep(views, paint, SweepSettings(), 0, keeps_outlines=True)
+    alone = sweep(views, ViewPainter(lambda v, p, rng: paint(v, None, rng), keeps_outlines=True), SweepSettings(), 0)
+    together = sweep(views, ViewPainter(paint, keeps_outlines=True), SweepSettings(), 0)
     assert disagreement(list(together.views)) < 0.6 * disagreement(list(alone.views))
 
 
@@ -224,11 +223,3 @@ def test_what_it_cannot_follow_is_refused(inputs, tmp_path):
     with pytest.raises((InputRefused, EnvironmentMissing)):
         pipeline.stylize(by_view(inputs, tmp_path, sweep=absent), Progress(quiet=True))
     assert not list(tmp_path.iterdir())
-
-
-def test_every_named_stylizer_is_there():
-    from importlib import import_module
-
-    for entry in STYLIZERS.values():
-        module, _, name = entry.partition(":")
-        assert callable(getattr(import_module(module), name))

@@ -1,6 +1,5 @@
 """The weight-free stylizer: samples, frames, guides, search, look-up and the whole of it on small shapes."""
 
-import importlib
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -10,7 +9,6 @@ import pytest
 from helpers import data, fixed_surface
 from scipy.spatial import KDTree
 
-from mistyle.backends import STYLIZERS
 from mistyle.core.asset import Picture
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas
@@ -625,12 +623,6 @@ def test_occlusion_has_its_closed_forms():
     assert ambient_occlusion(open_box, p, n, rays=64, distance=0.3)[0] == 1.0  # nothing within reach
     again = ambient_occlusion(open_box, p, n, seed=7)
     assert (again == ambient_occlusion(open_box, p, n, seed=7)).all()
-
-
-def test_registered_stylizers_exist():
-    for entry in STYLIZERS.values():
-        module, _, name = entry.partition(":")
-        assert callable(getattr(importlib.import_module(module), name))
 
 
 def test_a_real_pair_shows_palette_strokes_and_form():

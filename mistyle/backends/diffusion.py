@@ -224,7 +224,7 @@ def paint_view(
     import torch
 
     from mistyle.backends import diffusion_denoise as d
-    from mistyle.stages.repaint import sample
+    from mistyle.stages.repaint import Resampling, sample
 
     size = d.fitting_size(view.camera.size, d.grain(pipeline))
     device, factor = pipeline._execution_device, pipeline.vae_scale_factor
@@ -236,13 +236,13 @@ def paint_view(
     if prior is None or not prior.known.any():
         shape = (1, pipeline.unet.config.in_channels, size[0] // factor, size[1] // factor)
         # Nothing to harmonise with: the refinement is for the border between known and new.
-        latent = sample(denoise, None, None, levels, rng=generator, like=torch.zeros(shape, device=device), refine=0.0)
+        like = torch.zeros(shape, device=device)
+        latent = sample(denoise, None, None, levels, Resampling(refine=0.0), rng=generator, like=like)
     else:
         known, mask = d.prior_latent(pipeline.vae, prior, size, factor)
         known, mask = known.to(device), mask.to(device)
-        latent = sample(
-            denoise, known, mask, levels, chosen.block, chosen.repeats, rng=generator, refine=chosen.refinement
-        )
+        resampling = Resampling(chosen.block, chosen.repeats, chosen.refinement)
+        latent = sample(denoise, known, mask, levels, resampling, rng=generator)
     painted = d.decode(pipeline.vae, latent)
     return linear_from_srgb(resize(painted, view.camera.size))
 

@@ -13,7 +13,7 @@ from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
-from mistyle.stages.mvst import Masker, Painted, Stylizer, Swept, finished, sweep
+from mistyle.stages.mvst import Masker, PaintedView, Stylizer, Swept, ViewPainter, ViewStore, finished, sweep
 
 KEPT = "sweep"  # the folder in work/ that holds the views of an unfinished sweep
 
@@ -61,19 +61,15 @@ def refuse_what_is_not_kept(settings: Settings) -> None:
 
 
 def stylizer_of(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Stylizer:
-    """The stylizer that the settings name, ready to paint."""
-    from importlib import import_module
-
-    from mistyle.backends import STYLIZERS
+    """The weight-free stylizer of views, ready to paint."""
+    from mistyle.backends.embedded_view import stylizer
     from mistyle.stages.coat import content, masked_style, painted_direction, scaled
 
     surface = scaled(settings.surface, asset, settings.paint.stroke_size)
-    found = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
-    module, _, name = STYLIZERS[settings.stylizer].partition(":")
-    make = getattr(import_module(module), name)
+    lightness = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
     direction = painted_direction(settings.paint.direction_map, asset.mesh, atlas.texels)
     picture = masked_style(style, settings.paint.style_mask)
-    return make(asset.mesh, picture, surface, settings.seed, report, content=found, direction=direction)
+    return stylizer(asset.mesh, picture, surface, settings.seed, report, content=lightness, direction=direction)
 
 
 def masker_of(settings: Settings) -> Masker | None:
@@ -87,7 +83,7 @@ def masker_of(settings: Settings) -> Masker | None:
 
 def swept(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View], report: Report
-) -> tuple[Painted, ...]:
+) -> tuple[PaintedView, ...]:
     """Paint the views one after another; what is finished is kept in work/ until all are."""
     s = run.job.settings
     network = s.stylizer == "diffusion"
@@ -97,20 +93,11 @@ def swept(
         paint = view_stylizer(run, style, views, lambda done: report(0.1 * done))
     else:
         paint = stylizer_of(asset, style, atlas, s, lambda done: report(0.1 * done))
-    kept, key = run.hidden.root / KEPT, run.keys["surface"]
-    result = sweep(
-        views,
-        paint,
-        s.sweep,
-        s.seed,
-        lambda done: report(0.1 + 0.9 * done),
-        masker=masker_of(s),
-        keeps_outlines=not network,
-        kept=kept,
-        key=key,
-    )
+    painter = ViewPainter(paint, masker_of(s), keeps_outlines=not network)
+    store = ViewStore(run.hidden.root / KEPT, run.keys["surface"])
+    result = sweep(views, painter, s.sweep, s.seed, lambda done: report(0.1 + 0.9 * done), store)
     run.progress.say(sentence(result))
-    del paint
+    del paint, painter
     if network:
         release(s)
     return result.painted
@@ -128,7 +115,7 @@ def sentence(result: Swept) -> str:
 def bake(
     asset: Asset,
     stylized: Sequence[View],
-    painted: Sequence[Painted],
+    painted: Sequence[PaintedView],
     atlas: Atlas,
     settings: Settings,
     report: Report,
