@@ -41,9 +41,13 @@ def picture(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((24, 20, 3)).astype(np.float32)
 
 
-def job(tmp_path: Path, chosen: DiffusionSettings = QUICK, style: np.ndarray | None = None, **more) -> diffusion.Job:
+def job(
+    tmp_path: Path, chosen: DiffusionSettings = QUICK, style: np.ndarray | None = None, **more
+) -> diffusion.DiffusionJob:
     settings = ModelSettings(**({"folder": tiny_models.folder(), "device": "cpu"} | more))
-    return diffusion.Job(settings, TRAINING, chosen, picture() if style is None else style, "wave", tmp_path, 0)
+    return diffusion.DiffusionJob(
+        settings, TRAINING, chosen, picture() if style is None else style, "wave", tmp_path, 0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -203,8 +207,8 @@ def test_the_ip_recipe_needs_no_words_that_nothing_taught():
 def test_guidance_takes_four_more_looks_a_pair_and_changes_the_picture(pipeline, loras, which):
     for half in consislora.BLOCKS:
         consislora.load_half(pipeline, loras[f"{half}1"], half, half)
-    ours = consislora_make.Halves(loras["content1"], loras["style1"])
-    theirs = consislora_make.Halves(loras["content2"], loras["style2"])
+    ours = consislora_make.LoraPair(loras["content1"], loras["style1"])
+    theirs = consislora_make.LoraPair(loras["content2"], loras["style2"])
     plain = paint(pipeline)
     terms = diffusion._guidance(pipeline, QUICK.model_copy(update={which: 2.0}), theirs, ours)
     calls = counted(pipeline)
@@ -351,10 +355,10 @@ def test_content_loras_cost_what_is_said(tmp_path, views, content, steps):
     chosen = QUICK.model_copy(update={"content": content})
     wanted = job(tmp_path, chosen)
     said, watched = [], []
-    assert diffusion.training_left(wanted, views) == steps
     diffusion.stylizer(wanted, views, said.append, lambda *a: watched.append(a))
     assert f"{steps} training steps" in said[0] and [w[:2] for w in watched] == [(k + 1, steps) for k in range(steps)]
-    assert diffusion.training_left(wanted, views) == 0
+    diffusion.stylizer(wanted, views, said.append)
+    assert "nothing is trained" in said[-1]
     halves = {"none": 1, "shared": 2, "per-view": 5}[content]
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 * halves
 

@@ -86,10 +86,10 @@ def _check(settings: Settings, say: Callable[[str], None]) -> None:
 
 def diffusion_job(settings: Settings, style: Picture, name: str, out: Path) -> Any:
     """The stylizer's own job: the style picture without its transparent parts' colours."""
-    from mistyle.backends.diffusion import Job
+    from mistyle.backends.diffusion import DiffusionJob
 
     loras = settings.models.loras or out / "work" / LORAS
-    return Job(settings.models, settings.train, settings.diffusion, opaque(style), name, loras, settings.seed)
+    return DiffusionJob(settings.models, settings.train, settings.diffusion, opaque(style), name, loras, settings.seed)
 
 
 def opaque(style: Picture) -> np.ndarray:
