@@ -259,7 +259,7 @@ def test_pictures_by_path_and_shapes_that_share_a_material_are_noted(tmp_path):
 def test_a_named_loss_of_a_texture_is_that_of_the_noisy_path():
     job, notes = scene_job.prepare(
         flat(cameras=CAMERAS[:1]), [COLOUR], None, [np.full((24, 24, 3), 0.3)], None, None, None, (), None,
-        scene_job.Plan(1, 1, None, 0.02, True, 1, 0), False,
+        scene_job.FitPlan(1, 1, None, 0.02, True, 1, 0), False,
     )  # fmt: skip
     assert job.loss == "relative" and not job.newton and TRUE_COLOUR.shape == job.chosen[0].shape
     assert not any("log_srgb_l1" in note for note in notes)

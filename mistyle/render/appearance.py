@@ -302,7 +302,7 @@ def _path_class(mi: Any) -> type:
 def _surface_class(mi: Any) -> type:
     import drjit as dr
 
-    class Surface(mi.BSDF):
+    class LayeredSurface(mi.BSDF):
         def __init__(self, textures, edge, coat, coat_roughness):
             super().__init__(mi.Properties())
             self.textures, self.edge, self.coat, self.coat_roughness = textures, edge, coat, coat_roughness
@@ -383,4 +383,4 @@ def _surface_class(mi: Any) -> type:
             lobes /= 4 * dr.select(above, dr.dot(wo, half), 1)
             return dr.select(above, dr.fma(1 - shiny - coated, wo.z / dr.pi, lobes), 0)
 
-    return Surface
+    return LayeredSurface

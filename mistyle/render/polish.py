@@ -160,7 +160,7 @@ class _Job:
         wide = self.mi.TensorXb(aligned(np.broadcast_to(counts[..., None], clean.shape), bool))
         share = max(float(counts.mean()), 1e-9)
         # The weights are the relative loss's, which a polish does not take.
-        return shown, scene_grad.Sight(sensor, self.mi.TensorXf(aligned(clean)), wide, None, share)
+        return shown, scene_grad.ReferenceView(sensor, self.mi.TensorXf(aligned(clean)), wide, None, share)
 
     def gradient(self, values, k: int, spp: tuple[int, int], seeds: tuple[int, int]):
         """Loss of picture k and its gradient by key."""

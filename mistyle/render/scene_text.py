@@ -64,7 +64,7 @@ def _child(state: Any, node: Any, name: str) -> int | None:
 
 
 @dataclass(frozen=True)
-class _Element:
+class _SceneElement:
     """One element of the text: bytes `begin`..`end`, its start tag ends at `body`."""
 
     tag: str
@@ -75,7 +75,7 @@ class _Element:
     parent: int | None
 
 
-def _elements(source: bytes) -> list[_Element]:
+def _elements(source: bytes) -> list[_SceneElement]:
     parser = expat.ParserCreate()
     found: list[dict[str, Any]] = []
     above: list[int] = []
@@ -98,7 +98,7 @@ def _elements(source: bytes) -> list[_Element]:
         parser.Parse(source, True)
     except expat.ExpatError as error:
         raise InputRefused(f"found a scene file that is not XML ({error}); check the file.") from error
-    return [_Element(**element) for element in found]
+    return [_SceneElement(**element) for element in found]
 
 
 def edits_of(
@@ -149,7 +149,7 @@ def _edits(
     return [(element.end - 2, element.end, f">{text}</{element.tag}>")]
 
 
-def _mesh_edits(elements: Sequence[_Element], at: int, file: Path | None) -> list[Edit] | str:
+def _mesh_edits(elements: Sequence[_SceneElement], at: int, file: Path | None) -> list[Edit] | str:
     """A PLY mesh gives way to the written one, whose vertices stand in the world already."""
     inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
     if file is None or elements[at].attributes.get("type") != "ply" or "filename" not in inner:

@@ -41,7 +41,7 @@ SPECULAR = 0.04  # F0 of a dielectric of index 1.5
 
 
 @dataclass(frozen=True)
-class Sky:
+class StudioSky:
     """Open sky over each texture set, on grids of `size`² texels: the mean open direction (world, unit) and the share
     of the hemisphere that is open, cosine-weighted, 0..1; row 0 is v = 1."""
 
@@ -125,7 +125,7 @@ def packed(maps: Maps) -> UInt32[np.ndarray, "n 2"]:
 class Studio:
     """An asset ready to be drawn; a class because mesh, light and materials are uploaded once for all pictures."""
 
-    def __init__(self, traced: Tracer, light: np.ndarray, sky: Sky, looks: Sequence[Sequence[Maps]]) -> None:
+    def __init__(self, traced: Tracer, light: np.ndarray, sky: StudioSky, looks: Sequence[Sequence[Maps]]) -> None:
         """`light` is `prefiltered`; `looks` are one `Maps` per texture set each; sets of a look may differ in size."""
         import mitsuba
 

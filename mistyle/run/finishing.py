@@ -15,7 +15,7 @@ from mistyle.run.report import Pair, Shot
 from mistyle.run.settings import Settings
 from mistyle.run.stages import Run
 from mistyle.stages.coat import StyleLayers
-from mistyle.stages.finish import Finished
+from mistyle.stages.finish import StyleFinish
 
 LEVELS = 3  # of VGG-19: relu1_1 to relu3_1
 WEIGHTS = "for example --vgg vgg19-normalised (see mistyle models), or --vgg vgg19.pth as torchvision has it"
@@ -81,20 +81,20 @@ def finish_stage(run: Run, asset: Asset, layers: StyleLayers, atlas: Atlas, bake
 
 def finished(
     asset: Asset, layers: StyleLayers, atlas: Atlas, baked: Baked, settings: Settings, report: Report
-) -> Finished:
+) -> StyleFinish:
     """The painted maps, finished; protected texels stay."""
     from mistyle.measure.features import load_features
     from mistyle.stages.coat import painted_mask
-    from mistyle.stages.finish import Painted, finish
+    from mistyle.stages.finish import PaintedAsset, finish
 
     protect = settings.paint.protect
     only = None if protect is None else tuple(~painted_mask(protect, t) for t in atlas.texels)
-    painted = Painted(asset.mesh, baked.maps, atlas.texels, layers.solutions[0], only)
+    painted = PaintedAsset(asset.mesh, baked.maps, atlas.texels, layers.solutions[0], only)
     features = load_features(weights_file(settings), LEVELS)
     return finish(painted, features, settings.finish, settings.seed, report, bridge=settings.fit.bridge)
 
 
-def laid(baked: Baked, made: Finished) -> Baked:
+def laid(baked: Baked, made: StyleFinish) -> Baked:
     """The painting with its finished albedo; what begins the fit has the same one."""
     pairs = zip(baked.begin, made.albedo, strict=True) if baked.begin else ()
     begin = tuple(replace(maps, albedo=albedo) for maps, albedo in pairs)

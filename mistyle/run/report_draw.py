@@ -101,7 +101,7 @@ def studio_light() -> Float[np.ndarray, "h w 3"]:
 def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
     """Open sky over every texture set; it has no finer detail than the mesh."""
     from mistyle.render.occlusion import open_sky
-    from mistyle.render.studio import Sky
+    from mistyle.render.studio import StudioSky
     from mistyle.stages.texels import rasterise
 
     pages = np.zeros((len(mesh.parts), SKY_TEXELS, SKY_TEXELS, 4), np.float32)
@@ -111,7 +111,7 @@ def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
         if at.any():
             page[at] = open_sky(traced, texels.position[at], texels.normal[at], rays=SKY_RAYS, seed=seed)
             page[...] = nearest_fill(page, at)
-    return Sky(SKY_TEXELS, pages)
+    return StudioSky(SKY_TEXELS, pages)
 
 
 def path_trace(

@@ -13,7 +13,7 @@ from mistyle.core.light import Directional, Lights, direction_in_world
 from mistyle.core.maps import place_of
 from mistyle.stages import fit_table
 from mistyle.stages.fit_settings import FitSettings
-from mistyle.stages.fit_table import Table
+from mistyle.stages.fit_table import FitTable
 
 if TYPE_CHECKING:
     import torch
@@ -80,7 +80,7 @@ class PhaseRunner:
     """A phase under way: its trace, and what the last steps say about where the albedo struggles."""
 
     def __init__(
-        self, scene: SceneContext, table: Table, phase: Phase, settings: FitSettings, rng: np.random.Generator
+        self, scene: SceneContext, table: FitTable, phase: Phase, settings: FitSettings, rng: np.random.Generator
     ) -> None:
         self.scene, self.table, self.phase, self.settings, self.rng = scene, table, phase, settings, rng
         self.shader = shader(settings, phase.gloss)
