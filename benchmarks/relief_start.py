@@ -47,10 +47,11 @@ def views_of(asset: Any, maps: Any, resolution: int) -> list[View]:
 def lit(asset: Any, maps: Any, resolution: int) -> np.ndarray:
     """The object in the studio from two sides, as it is and as clay."""
     from mistyle.render.draw import pictures
+    from mistyle.render.scene import Staging
 
     cameras = rig(RigSettings(resolution=resolution))[:2]
     clay = [replace(m, albedo=np.full_like(m.albedo, 0.5)) for m in maps]
-    shown = [p for each in (maps, clay) for p in pictures(asset.mesh, each, cameras, spp=32)]
+    shown = [p for each in (maps, clay) for p in pictures(asset.mesh, each, cameras, Staging(spp=32))]
     return np.concatenate([srgb_from_linear(p[..., :3]) for p in shown], axis=1)
 
 

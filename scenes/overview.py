@@ -63,12 +63,13 @@ def drawn(asset: Any, maps: list[Any], azimuth: float, lamp: float | None) -> np
     from mistyle.core.camera import orbit
     from mistyle.core.image import srgb_from_linear
     from mistyle.render.draw import picture
+    from mistyle.render.scene import Staging
 
     camera = orbit(azimuth, ELEVATION, distance=DISTANCE, fov=30, size=(SIDE, SIDE))
     if lamp is None:
-        shot = picture(asset.mesh, maps, camera, "studio", SAMPLES)
+        shot = picture(asset.mesh, maps, camera, Staging("studio", SAMPLES))
         return srgb_from_linear(shot[..., :3])
-    shot = picture(asset.mesh, maps, camera, "hdri", SAMPLES, hdri=lamp_map(azimuth + lamp))
+    shot = picture(asset.mesh, maps, camera, Staging("hdri", SAMPLES, hdri=lamp_map(azimuth + lamp)))
     ground = np.linspace(0.035, 0.012, SIDE)[:, None, None]  # a dark wall behind
     return srgb_from_linear(shot[..., :3] + (1 - shot[..., 3:]) * ground)
 

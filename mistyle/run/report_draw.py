@@ -120,10 +120,12 @@ def path_trace(
     """The asset on its backdrop, linear, with as many samples as its noise needs, and the backdrop alone."""
     from mistyle.render.device import give_back
     from mistyle.render.draw import passes
+    from mistyle.render.scene import Staging
     from mistyle.render.settle import settled
 
     most = max(2, settings.report.spp * MOST // PASS)
-    found, behind, _ = settled(passes(asset.mesh, maps, camera, "studio", PASS, settings.seed), guide, GOOD, most)
+    drawn = passes(asset.mesh, maps, camera, Staging("studio", PASS, settings.seed))
+    found, behind, _ = settled(drawn, guide, GOOD, most)
     give_back()
     return found, behind
 
