@@ -140,7 +140,12 @@ def test_gradients_are_those_of_the_scene(references, bump):
         loss, ours = fast.gradients(values, k)
         rounds = [
             scene_grad.gradients(
-                scene, table, chosen, values, engine, views[k], scene_grad.l2, (256, 256), (2 * j + 1, 2 * j + 2)
+                scene_grad.LiveScene(scene, table, chosen, engine),
+                values,
+                views[k],
+                scene_grad.l2,
+                (256, 256),
+                (2 * j + 1, 2 * j + 2),
             )
             for j in range(2)
         ]
@@ -183,7 +188,8 @@ def test_other_materials_are_left_out_of_the_pictures(references):
 def test_where_it_does_not_hold_the_reason_is_told(references, changed, words):
     scene = start(**changed)
     plan = scene_job.FitPlan(1, 1, 1, 0.01, True, 1, 0)
-    job, notes = scene_job.prepare(scene, KEYS[:1], None, references, None, None, "l2", (), None, plan)
+    evidence, objective = scene_job.Evidence(references), scene_job.Objective("l2")
+    job, notes = scene_job.prepare(scene, scene_job.Unknowns(KEYS[:1]), evidence, objective, plan)
     assert job.fast is None
     assert any(words in note for note in notes)
 

@@ -63,9 +63,10 @@ def fit_scene(
     """
     device.use()
     plan = scene_job.FitPlan(iterations, spp, spp_grad, rate, pyramid, sensors_per_step, seed, solver)
-    given = (scene, keys, sensors, references, masks, only, loss, regularizers, integrator)
+    unknowns, objective = scene_job.Unknowns(keys, only), scene_job.Objective(loss, regularizers)
+    evidence = scene_job.Evidence(references, sensors, masks)
     with device.plain_errors(DOING):
-        job, notes = scene_job.prepare(*given, plan, fast)
+        job, notes = scene_job.prepare(scene, unknowns, evidence, objective, plan, integrator, fast)
     state = scene_job.begun(job) if resume is None else scene_job.restored(resume, job)
     edge = len(job.views) / (2 * len(job.views) + iterations * sensors_per_step)
     with device.plain_errors(DOING):
@@ -194,9 +195,8 @@ def _gradients(job: scene_job.SceneProblem, state: scene_job.FitState, k: int, s
     if job.fast is not None:
         return *job.fast.gradients(state.values, k), 0
     samples = (job.plan.spp, job.plan.spp_grad or 1)
-    return scene_grad.gradients(
-        job.scene, job.table, job.chosen, state.values, job.engine, job.views[k], job.losses[k], samples, seeds
-    )
+    live = scene_grad.LiveScene(job.scene, job.table, job.chosen, job.engine)
+    return scene_grad.gradients(live, state.values, job.views[k], job.losses[k], samples, seeds)
 
 
 def _add(total: dict, found: dict, state: scene_job.FitState, weight: float, sensor: int | None) -> None:

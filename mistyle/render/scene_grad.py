@@ -251,12 +251,19 @@ def compare(shown: Any, view: ReferenceView, loss: Loss) -> tuple[float, Any, in
     return float(np.asarray(value).ravel()[0]) / view.share, gradient, broken
 
 
+@dataclass(frozen=True)
+class LiveScene:
+    """A scene whose chosen parameters change, what `mi.traverse` gave of it, and the integrator that draws it."""
+
+    scene: Any
+    table: Any
+    chosen: Sequence[Parameter]
+    integrator: Any
+
+
 def gradients(
-    scene: Any,
-    table: Any,
-    chosen: Sequence[Parameter],
+    live: LiveScene,
     values: Mapping[str, np.ndarray],
-    integrator: Any,
     view: ReferenceView,
     loss: Loss,
     spp: tuple[int, int],
@@ -264,12 +271,12 @@ def gradients(
 ) -> tuple[float, dict[str, np.ndarray], int]:
     """Loss of one camera, dL/dvalue of every chosen parameter by key, and the picture's values that are no numbers.
 
-    `table` is what `mi.traverse` gave; `values` are put into the scene first. `spp` and `seeds`: of the picture, of
-    the gradient.
+    The values are put into the scene first. `spp` and `seeds`: of the picture, of the gradient.
     """
     import drjit as dr
     import mitsuba as mi
 
+    scene, table, chosen, integrator = live.scene, live.table, live.chosen, live.integrator
     # Fresh variables each time: a backward pass takes the graph of the one before with it.
     moving = put(table, chosen, values, grad=True)
     shown = picture(scene, integrator, view.sensor, spp[0], seeds[0])
@@ -284,12 +291,9 @@ def gradients(
 
 
 def derivative(
-    scene: Any,
-    table: Any,
-    chosen: Sequence[Parameter],
+    live: LiveScene,
     values: Mapping[str, np.ndarray],
     direction: Mapping[str, np.ndarray],
-    integrator: Any,
     sensor: Any,
     spp: int,
     seed: int,
@@ -301,15 +305,16 @@ def derivative(
     import drjit as dr
     import mitsuba as mi
 
+    table = live.table
     along = mi.Float(0)
     dr.enable_grad(along)
-    for p in chosen:
+    for p in live.chosen:
         kind = type(table[p.key])
         # All directions are arrays, so that every column runs the same kernel.
         table[p.key] = typed(kind, values[p.key]) + typed(kind, direction[p.key]) * along
     table.update()
     dr.forward(along, dr.ADFlag.ClearEdges)
-    image = integrator.render_forward(scene, table, sensor, seed=dr.opaque(mi.UInt32, seed), spp=spp)
+    image = live.integrator.render_forward(live.scene, table, sensor, seed=dr.opaque(mi.UInt32, seed), spp=spp)
     result = np.array(image, dtype=np.float32)[..., :3]
     return np.where(np.isfinite(result), result, np.float32(0))
 

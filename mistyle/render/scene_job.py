@@ -88,10 +88,44 @@ class FitState:
     broken: dict[int, int] = field(default_factory=dict)
 
 
-def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, integrator, plan: FitPlan, fast=True):
-    """Check everything and put it together; returns the job and notes."""
+@dataclass(frozen=True)
+class Unknowns:
+    """The parameters to fit, by name, and masks of the numbers that may change (`only`, by name)."""
+
+    keys: str | Sequence[str]
+    only: Mapping[str, np.ndarray] | None = None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The pictures to fit to, with their sensors and masks; None: the scene's sensors, every pixel."""
+
+    references: Any
+    sensors: Any = None
+    masks: Any = None
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The loss (None: chosen by the way of drawing) and the regularizers that are added to it."""
+
+    loss: str | scene_grad.Loss | None = None
+    regularizers: Sequence[Regularizer] = ()
+
+
+def prepare(
+    scene: Any,
+    unknowns: Unknowns,
+    evidence: Evidence,
+    objective: Objective,
+    plan: FitPlan,
+    integrator: Any = None,
+    fast: bool = True,
+) -> tuple[SceneProblem, list[str]]:
+    """Check everything and put it together; returns the problem and notes."""
     import mitsuba as mi
 
+    keys, loss, regularizers = unknowns.keys, objective.loss, objective.regularizers
     counts = [plan.iterations, plan.spp, plan.sensors_per_step, 1 if plan.spp_grad is None else plan.spp_grad]
     if min(counts) < 1 or not plan.rate > 0:
         raise UsageError("iterations, spp, spp_grad and sensors_per_step must be 1 or more, and rate above 0.")
@@ -101,7 +135,7 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
         raise UsageError(f"the solver '{plan.solver}' is not known; expected {', '.join(SOLVERS)}.")
     engine, notes = scene_grad.ad_integrator(scene, integrator)
     chosen = scene_keys.match(scene, [keys] if isinstance(keys, str) else keys, engine)
-    views = _views(scene, sensors, references, masks)
+    views = _views(scene, evidence.sensors, evidence.references, evidence.masks)
     notes = [*notes, *(f"{p.name}: {note}" for p in chosen for note in p.notes)]
     if len(views) < FEWEST_VIEWS:
         notes.append(
@@ -110,7 +144,7 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
         )
     table = mi.traverse(scene)
     table.properties = {p.key: table.properties[p.key] for p in chosen}
-    free = _free(chosen, only or {})
+    free = _free(chosen, unknowns.only or {})
     scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
     quick, why = _fast(scene, chosen, views, loss or "log_srgb_l1", engine) if fast else (None, "it was not asked for.")
     if loss is None:
