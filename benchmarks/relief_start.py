@@ -69,9 +69,9 @@ def main() -> None:
     start.start_engines(plain)
     asset = read_mesh(SCENES / "demo.obj")
     atlas = start.lay_out(asset, plain, silent)
-    coats = painting.coat(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
-    flat = painting.painted(asset, coats, atlas, plain)
-    begun = painting.raised(asset, coats, atlas, plain, flat)
+    layers = painting.paint_layers(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
+    flat = painting.painted(asset, layers, atlas, plain)
+    begun = painting.raised(asset, layers, atlas, plain, flat)
     targets = views_of(asset, flat, resolution)
     figures: dict[str, float] = {}
     results: dict[str, Any] = {}

@@ -91,8 +91,8 @@ def main() -> None:
 def tile(asset, picture, settings, cameras, report) -> np.ndarray:
     """The painted surface from every camera, without light, side by side, on white, encoded sRGB."""
     atlas = start.lay_out(asset, settings, lambda done: None)
-    coats = painting.coat(asset, picture, atlas, settings, report)
-    drawn = unlit(asset.mesh, painting.painted(asset, coats, atlas, settings), cameras)
+    layers = painting.paint_layers(asset, picture, atlas, settings, report)
+    drawn = unlit(asset.mesh, painting.painted(asset, layers, atlas, settings), cameras)
     return np.concatenate([srgb_from_linear(rgb + 1 - share[..., None]) for rgb, share in drawn], axis=1)
 
 

@@ -56,14 +56,14 @@ def painted(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, slop
     """The object painted with `style`; `slope` is the true relief's root mean square slope."""
     from mistyle.backends.embedded import surface_relief
 
-    coats = painting.coat(asset, style, atlas, settings, silent)
-    flat = painting.painted(asset, coats, atlas, settings)
-    painter = painting.raised(asset, coats, atlas, settings, flat)
+    layers = painting.paint_layers(asset, style, atlas, settings, silent)
+    flat = painting.painted(asset, layers, atlas, settings)
+    painter = painting.raised(asset, layers, atlas, settings, flat)
     truth = []
     for part, (texels, maps) in enumerate(zip(atlas.texels, flat, strict=True)):
         side = painting.texel_side(asset, part, texels)
         place = texels.position[texels.covered], texels.normal[texels.covered]
-        guessed = surface_relief(coats.solutions[0], *place, footprint=side)[0]
+        guessed = surface_relief(layers.solutions[0], *place, footprint=side)[0]
         truth.append(true_maps(asset, texels, maps, guessed, side, slope, np.random.default_rng([seed, part])))
     areas = tuple(texel_areas(asset.mesh, texels) for texels in atlas.texels)
     return Painted(asset, atlas, tuple(truth), tuple(flat), tuple(painter), areas)

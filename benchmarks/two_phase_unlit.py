@@ -56,7 +56,7 @@ class Painted:
     settings: Any
     asset: Any
     atlas: Any
-    coats: Any
+    layers: Any
     views: Any
     picture: Any
 
@@ -93,13 +93,13 @@ def paint(mesh: str, style: str, preset: str) -> Painted:
     asset = read_mesh(DATA / "meshes/plain" / MESHES[mesh], size=chosen.atlas.size)
     atlas = start.lay_out(asset, chosen, silent)
     picture = read_picture(next((DATA / "styles").glob(f"{style}.*")))
-    coats = painting.coat(asset, picture, atlas, chosen, silent)
+    layers = painting.paint_layers(asset, picture, atlas, chosen, silent)
     traced, views = tracer(asset.mesh), []
     for camera in start.cameras_of(chosen, asset.mesh, print):
         hits = gbuffer(traced, camera)
         cover = hits.mask.astype(np.float32)
         views.append(View(camera, hits.position, hits.depth, hits.normal, hits.uv, hits.part, hits.mask, cover))
-    return Painted(mesh, style, chosen, asset, atlas, coats, views, picture)
+    return Painted(mesh, style, chosen, asset, atlas, layers, views, picture)
 
 
 def finish(painted: Painted, preset: str, change: Mapping[str, Any]) -> Finished:
@@ -108,7 +108,7 @@ def finish(painted: Painted, preset: str, change: Mapping[str, Any]) -> Finished
     from mistyle.stages.inpaint import struggle_mask
 
     s = settings_of(preset, change)
-    baked = painting.bake(painted.asset, painted.coats, painted.atlas, painted.views, s, silent)
+    baked = painting.bake(painted.asset, painted.layers, painted.atlas, painted.views, s, silent)
     stylized = painting.unlit_views(painted.asset, baked.maps, painted.views, silent)
     took: dict[str, float] = {}
     fitted = common.timed(

@@ -39,7 +39,7 @@ def measured(asset: Any, style: Picture, settings: Settings, shown: str) -> tupl
     from mistyle.render.draw import draw_views
 
     atlas = start.lay_out(asset, settings, silent)
-    truth = painting.painted(asset, painting.coat(asset, style, atlas, settings, silent), atlas, settings)
+    truth = painting.painted(asset, painting.paint_layers(asset, style, atlas, settings, silent), atlas, settings)
     views = views_of(asset, truth, settings.rig.resolution)
     if shown == "lit":
         matt = [replace(m, roughness=np.ones_like(m.roughness)) for m in truth]

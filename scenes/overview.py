@@ -44,9 +44,9 @@ def painted(mesh: Path, style: Path) -> tuple[Any, list[Any]]:
     start.start_engines(settings)
     asset = read_mesh(mesh)
     atlas = start.lay_out(asset, settings, lambda done: None)
-    coats = painting.coat(asset, read_picture(style), atlas, settings, lambda done: None)
-    flat = painting.painted(asset, coats, atlas, settings)
-    return asset, painting.raised(asset, coats, atlas, settings, flat)
+    layers = painting.paint_layers(asset, read_picture(style), atlas, settings, lambda done: None)
+    flat = painting.painted(asset, layers, atlas, settings)
+    return asset, painting.raised(asset, layers, atlas, settings, flat)
 
 
 def cropped(path: Path, width: int, height: int) -> np.ndarray:

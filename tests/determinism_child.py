@@ -109,9 +109,9 @@ def style_job(made: Stages, settings: Any) -> None:
     write_views(made.out / "views", views, lights("paper_views"), paper_files=True)
     made.note("views", made.out / "views")
     views = read_views(made.out / "views")
-    coats = painting.coat(asset, style, atlas, settings, nothing)
-    made.note("surface", coats)
-    baked = made.note("bake", painting.bake(asset, coats, atlas, views, settings, nothing))
+    layers = painting.paint_layers(asset, style, atlas, settings, nothing)
+    made.note("surface", layers)
+    baked = made.note("bake", painting.bake(asset, layers, atlas, views, settings, nothing))
     stylized = made.note("stylized", painting.unlit_views(asset, baked.maps, views, nothing))
     phases = {"fit phase 1": {"refine": "normal-roughness"}, "fit phase 2": {"iterations1": 0, "refine": "all"}}
     fitted = None

@@ -326,11 +326,11 @@ def test_a_coat_of_two_pictures_with_a_protected_part(painted_sheet, tmp_path):
         {"surface": {"samples": 700}, "atlas": {"size": 32}, "paint": chosen | {"height": 0.2, "gloss": 1.0}}
     )
     atlas = start.lay_out(asset, settings, lambda done: None)
-    coats = painting.coat(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)
-    flat = painting.painted(asset, coats, atlas, settings)
+    layers = painting.paint_layers(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)
+    flat = painting.painted(asset, layers, atlas, settings)
     assert (flat[0].normal[..., 2] == 1).all()
-    maps = painting.raised(asset, coats, atlas, settings, flat)[0]
-    assert len(coats.solutions) == 2
+    maps = painting.raised(asset, layers, atlas, settings, flat)[0]
+    assert len(layers.solutions) == 2
     np.testing.assert_allclose(maps.albedo[:5], atlas.start[0].albedo[:5])
     # The darker stripes are 0.21; beside lighter ones the sharpened look-ups undershoot them.
     assert (maps.albedo[8:, :15, 2] > 0.05).all() and (maps.albedo[8:, :15, 0] < 0.02).all()

@@ -63,7 +63,7 @@ def paint(
     )
 
 
-def coat(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> StyleLayers:
+def paint_layers(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> StyleLayers:
     """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
     from mistyle.run.colour import read_style
     from mistyle.stages.coat import content, masked_style, painted_direction, scaled, slot_masks
@@ -190,7 +190,7 @@ def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> Style
     """The stage "surface": the painting, before it is laid into a texture."""
     s, seed = run.job.settings, run.job.settings.seed
     inputs = [style.rgb, style.alpha, s.surface, s.paint, paint_files(s.paint), seed]
-    return run.record("surface", ["texels"], inputs, lambda r: coat(asset, style, atlas, s, r))
+    return run.record("surface", ["texels"], inputs, lambda r: paint_layers(asset, style, atlas, s, r))
 
 
 def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View], after: str) -> list[View]:

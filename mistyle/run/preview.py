@@ -19,7 +19,7 @@ from mistyle.core.maps import Maps
 from mistyle.run.budget import kept, size_of
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas
-from mistyle.run.painting import check_paint, coat, painted, raised, surface_stage
+from mistyle.run.painting import check_paint, paint_layers, painted, raised, surface_stage
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import Settings
 from mistyle.run.stages import PREVIEW_STAGES, Job, Run, claim_run
@@ -92,7 +92,7 @@ def sentence(full: Settings, small: Settings) -> str:
 
 def painted_maps(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> list[Maps]:
     """The painting with its relief, laid into the texture; nothing of it is kept."""
-    layers = coat(asset, style, atlas, settings, report)
+    layers = paint_layers(asset, style, atlas, settings, report)
     return raised(asset, layers, atlas, settings, painted(asset, layers, atlas, settings))
 
 
