@@ -57,7 +57,7 @@ def ebsynth(program: Path) -> Callable[[Scene], Row]:
 
 
 def source_guides(painting: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Large-area colours (encoded) and the lightness band (Lab / 100) of the painting, as `surface.style.pages`."""
+    """Large-area colours (encoded) and the lightness band (Lab / 100) of the painting, as `surface.style.exemplar`."""
     lab = styles.lab_from_srgb(painting)
     sigma = max(0.6, max(painting.shape[:2]) * styles.BROAD)
     broad = styles.blurred(lab, sigma)

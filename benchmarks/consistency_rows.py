@@ -86,11 +86,13 @@ def per_view(scene: Scene) -> Row:
 
 def swept(scene: Scene) -> Row:
     """The same, each view from what the earlier ones show of its surface (paper 4.1.3)."""
-    from mistyle.stages.mvst import sweep
+    from mistyle.stages.mvst import ViewPainter, sweep
     from mistyle.stages.sweep_settings import SweepSettings
 
     start = time.perf_counter()
-    done = sweep(scene.views, view_stylizer(scene), SweepSettings(), scene.settings.seed, keeps_outlines=True)
+    done = sweep(
+        scene.views, ViewPainter(view_stylizer(scene), keeps_outlines=True), SweepSettings(), scene.settings.seed
+    )
     seconds = time.perf_counter() - start
     found = zip(done.painted, scene.views, strict=True)
     return Row([srgb_from_linear(p.rgb) * v.mask[..., None] for p, v in found], seconds)

@@ -102,25 +102,25 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
 def guided(asset: Asset, picture: Picture, settings: Settings, views: Sequence[View]):
     """Colour and detail guide of every view's pixels, and the painting at the size at which views show it."""
     from mistyle.backends.embedded import array_module, open_sky
-    from mistyle.surface.synthesis import finest_size
-    from mistyle.surface.view_samples import ground
+    from mistyle.surface.kernels import module
+    from mistyle.surface.synthesis import SurfaceFields, finest_size, mesh_guides
 
-    module, occlusion = array_module(), open_sky(asset.mesh, settings.seed)
+    dj, fields = module(array_module()), SurfaceFields(open_sky(asset.mesh, settings.seed))
     chosen = settings.surface
-    base = ground(asset.mesh, picture.rgb, chosen, settings.seed, occlusion, alpha=picture.alpha, device=module)
-    points, wanted, painting = base.levels[-1].points, base.wanted[-1], base.painting
+    base = mesh_guides(asset.mesh, picture, fields, chosen, settings.seed, dj)
+    points, guide, painting = base.levels[-1].points, base.guides[-1], base.picture
     colour, detail = [], []
     for view in views:
         index, weight = nearest_samples(points, view)
-        lab = np.einsum("nk,nkc->nc", weight, wanted.colour[index])
+        lab = np.einsum("nk,nkc->nc", weight, guide.colour[index])
         colour.append(on_mesh(view, cv2.cvtColor((100 * lab)[None].astype(np.float32), cv2.COLOR_Lab2RGB)[0]))
-        detail.append(on_mesh(view, (weight * wanted.detail[index]).sum(axis=1)))
+        detail.append(on_mesh(view, (weight * guide.detail[index]).sum(axis=1)))
     long = max(painting.rgb.shape[:2])
     camera = views[0].camera
     # Pixels of the view per pixel of the painting: a sample spacing shows one pixel of the painting at `finest_size`.
     factor = points.spacing / (long / finest_size(chosen)) * camera.focal / settings.rig.distance
     size = styles.long_side(painting.rgb.shape, long * factor)
-    shown = styles.Painting(resize(painting.rgb, size), resize(painting.opaque.astype(np.float32), size) > 0.99)
+    shown = styles.StyleImage(resize(painting.rgb, size), resize(painting.opaque.astype(np.float32), size) > 0.99)
     return colour, detail, shown
 
 

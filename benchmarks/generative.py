@@ -111,7 +111,7 @@ def sdxl(shape: dict[str, Any], device: str, dtype: torch.dtype) -> Any:
 def train_step(pipeline: Any, shape: dict[str, Any], device: str, dtype: torch.dtype) -> Callable[[], object]:
     """One step of a content picture, optimiser included."""
     from mistyle.backends import consislora
-    from mistyle.backends.consislora_train import Lesson, joint_phase, run_phase
+    from mistyle.backends.consislora_train import TrainingExample, joint_phase, run_phase
     from mistyle.backends.diffusion_settings import TrainSettings
 
     settings = TrainSettings(rank=shape["rank"], steps=1)
@@ -120,7 +120,7 @@ def train_step(pipeline: Any, shape: dict[str, Any], device: str, dtype: torch.d
             consislora.add_half(pipeline.unet, half, shape["rank"], 0)
     side, width = shape["side"], shape["xl"]["cross_attention_dim"]
     latent = side // 2 ** (len(shape["vae"]) - 1)
-    shown = Lesson(
+    shown = TrainingExample(
         torch.randn(1, 4, latent, latent, device=device),
         torch.randn(1, 77, width, device=device, dtype=dtype),
         torch.randn(1, shape["pooled"], device=device, dtype=dtype),
@@ -131,11 +131,11 @@ def train_step(pipeline: Any, shape: dict[str, Any], device: str, dtype: torch.d
 
 def denoise_step(pipeline: Any, shape: dict[str, Any], device: str, dtype: torch.dtype) -> Callable[[], object]:
     """One noise level: two ControlNets and the UNet with its LoRAs, for the empty and the real prompt."""
-    from mistyle.backends.diffusion_denoise import Asked, denoiser
+    from mistyle.backends.diffusion_denoise import Conditioning, denoiser
 
     side, width = shape["side"], shape["xl"]["cross_attention_dim"]
     latent = side // 2 ** (len(shape["vae"]) - 1)
-    asked = Asked(
+    asked = Conditioning(
         torch.randn(2, 77, width, device=device, dtype=dtype),
         torch.randn(2, shape["pooled"], device=device, dtype=dtype),
         torch.tensor([[side, side, 0, 0, side, side]] * 2, device=device, dtype=dtype),
@@ -220,7 +220,7 @@ def painted_views(job: Any, views: list[Any], kept: Path, resumed: bool) -> list
     """The sweep over the views; resumed: stopped in the last one and begun again with networks loaded anew."""
     from mistyle.backends import diffusion
     from mistyle.core.errors import Stopped
-    from mistyle.stages.mvst import sweep
+    from mistyle.stages.mvst import ViewPainter, ViewStore, sweep
     from mistyle.stages.sweep_settings import SweepSettings
 
     key = diffusion.key(job, views)
@@ -233,19 +233,19 @@ def painted_views(job: Any, views: list[Any], kept: Path, resumed: bool) -> list
     paint = diffusion.stylizer(job, views)
     if resumed:
         with suppress(Stopped):
-            sweep(views, stops, SweepSettings(), 0, kept=kept, key=key)
+            sweep(views, ViewPainter(stops), SweepSettings(), 0, store=ViewStore(kept, key))
         paint = diffusion.stylizer(job, views)
-    return [one.rgb for one in sweep(views, paint, SweepSettings(), 0, kept=kept, key=key).painted]
+    return [one.rgb for one in sweep(views, ViewPainter(paint), SweepSettings(), 0, store=ViewStore(kept, key)).painted]
 
 
 def painted(made: Any, stylizer: str, resumed: bool, work: Path) -> bool:
     """Two views, from models on disk: LoRAs trained where the stylizer takes some; whether all colours are finite."""
-    from mistyle.backends.diffusion import Job
+    from mistyle.backends.diffusion import DiffusionJob
     from mistyle.backends.diffusion_settings import DiffusionSettings, TrainSettings
 
     sampling = DiffusionSettings(adapter=cast(Any, stylizer), steps=2, block=1, repeats=2, refinement=0.5)
     training = TrainSettings(rank=4, steps=2, style_steps=1, switch=1, resolution=16)
-    job = Job(made, training, sampling, noise(), "style", work / "loras", 0)
+    job = DiffusionJob(made, training, sampling, noise(), "style", work / "loras", 0)
     with tempfile.TemporaryDirectory() as kept:
         views = painted_views(job, [ball(0.0), ball(30.0)], Path(kept), resumed)
     return all(bool(np.isfinite(one).all()) for one in views)

@@ -24,9 +24,9 @@ def sky(name: str) -> Any:
     """An environment, exposed so that a grey ball in it has a mean luminance of 0.18."""
     from mistyle.files.read import read_radiance
     from mistyle.render.lookdev import light_rig
-    from mistyle.render.sheet import Rig, exposed
+    from mistyle.render.sheet import LightRig, exposed
 
-    return exposed(Rig(name, light_rig(str(DATA / "hdri" / name), read_radiance)[0])).light
+    return exposed(LightRig(name, light_rig(str(DATA / "hdri" / name), read_radiance)[0])).light
 
 
 def lit(glb: Path, size: int = SIZE, spp: int = SPP) -> list[np.ndarray]:

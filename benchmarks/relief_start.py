@@ -49,10 +49,11 @@ def views_of(asset: Any, maps: Any, resolution: int) -> list[View]:
 def lit(asset: Any, maps: Any, resolution: int) -> np.ndarray:
     """The object in the studio from two sides, as it is and as clay."""
     from mistyle.render.draw import pictures
+    from mistyle.render.scene import Staging
 
     cameras = rig(RigSettings(resolution=resolution))[:2]
     clay = [replace(m, albedo=np.full_like(m.albedo, 0.5)) for m in maps]
-    shown = [p for each in (maps, clay) for p in pictures(asset.mesh, each, cameras, spp=32)]
+    shown = [p for each in (maps, clay) for p in pictures(asset.mesh, each, cameras, Staging(spp=32))]
     return np.concatenate([srgb_from_linear(p[..., :3]) for p in shown], axis=1)
 
 
@@ -70,9 +71,9 @@ def main() -> None:
     start.start_engines(plain)
     asset = read_mesh(SCENES / "demo.obj")
     atlas = stylize_start.lay_out(asset, plain, silent)
-    coats = painting.coat(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
-    flat = painting.painted(asset, coats, atlas, plain)
-    begun = painting.raised(asset, coats, atlas, plain, flat)
+    layers = painting.paint_layers(asset, read_picture(SCENES / "demo_style.png"), atlas, plain, silent)
+    flat = painting.painted(asset, layers, atlas, plain)
+    begun = painting.raised(asset, layers, atlas, plain, flat)
     targets = views_of(asset, flat, resolution)
     figures: dict[str, float] = {}
     results: dict[str, Any] = {}
@@ -80,7 +81,9 @@ def main() -> None:
         results[name] = timed(
             figures,
             f"{name}.seconds",
-            lambda begin=begin: fit.two_phase(asset.mesh, flat, targets, atlas.texels, plain.fit, 0, begin=begin),
+            lambda begin=begin: fit.two_phase(
+                asset.mesh, fit.FitStart(flat, begin=begin), fit.FitTargets(targets), atlas.texels, plain.fit, 0
+            ),
         )
     losses = {name: loss(found.trace, steps) for name, found in results.items()}
     for name, course in losses.items():

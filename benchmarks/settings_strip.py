@@ -57,7 +57,7 @@ def changed(base: Settings, change: dict[str, Any], folder: Path) -> Settings:
         return base.model_copy(update={"surface": base.surface.model_copy(update=change)})
     path = folder / "flow.png"
     write_png(path, np.broadcast_to(np.array([*change["flow"], 0.5], np.float32), (8, 8, 3)))
-    return base.model_copy(update={"coat": base.coat.model_copy(update={"direction_map": path})})
+    return base.model_copy(update={"paint": base.paint.model_copy(update={"direction_map": path})})
 
 
 def save(picture: Image.Image, path: Path) -> int:
@@ -93,8 +93,8 @@ def main() -> None:
 def tile(asset, picture, settings, cameras, report) -> np.ndarray:
     """The painted surface from every camera, without light, side by side, on white, encoded sRGB."""
     atlas = stylize_start.lay_out(asset, settings, lambda done: None)
-    coats = painting.coat(asset, picture, atlas, settings, report)
-    drawn = unlit(asset.mesh, painting.painted(asset, coats, atlas, settings), cameras)
+    layers = painting.paint_layers(asset, picture, atlas, settings, report)
+    drawn = unlit(asset.mesh, painting.painted(asset, layers, atlas, settings), cameras)
     return np.concatenate([srgb_from_linear(rgb + 1 - share[..., None]) for rgb, share in drawn], axis=1)
 
 

@@ -88,15 +88,20 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
 
 def whole(where: Problem, figures: dict[str, float]) -> None:
     """The fit as a job runs it; then a few steps of each phase, part by part."""
-    from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit import FitStart, FitTargets, two_phase
 
     marks: list[float] = []
 
     def fit() -> Any:
         return two_phase(
-            where.mesh, where.maps, where.views, where.texels, where.settings.fit, 0,
+            where.mesh,
+            FitStart(where.maps),
+            FitTargets(where.views),
+            where.texels,
+            where.settings.fit,
+            0,
             lambda done: marks.append(time.perf_counter()),
-        )  # fmt: skip
+        )
 
     timed(figures, "standard.seconds", fit)
     figures["standard.cpu"] = figures.pop("standard.seconds.cpu")
@@ -120,14 +125,13 @@ def whole(where: Problem, figures: dict[str, float]) -> None:
 
 def steppers(where: Problem, settings: Any) -> Iterator[tuple[str, Any]]:
     """Both phases, ready to step, one after the other on one table."""
-    from mistyle.core.light import lights
     from mistyle.stages import fit, fit_run, fit_table
 
-    world = fit._world(where.mesh, where.views, settings)
+    scene = fit._scene(where.mesh, where.views, settings)
     shrink = fit.shrinkage(where.mesh, where.texels, where.views, settings.texels_per_pixel)
     table = fit_table.build(where.maps, where.texels, shrink)
-    for phase in fit._phases(settings, lights("phase1"), where.views):
-        yield phase.name, fit_run.Run(world, table, phase, settings, np.random.default_rng(0))
+    for phase in fit._phases(settings, fit.FitTargets(where.views)):
+        yield phase.name, fit_run.PhaseRunner(scene, table, phase, settings, np.random.default_rng(0))
 
 
 @contextmanager
@@ -152,11 +156,11 @@ def watched(run: Any, spent: dict[str, float]) -> Iterator[None]:
     places += [("picture", seam, "fetch"), ("picture", run, "shader"), ("backward", torch.Tensor, "backward")]
     places += [("pull", split.Split, "pull")]
     places += [("texels", fit_table, name) for name in ("pairs", "variation", "step")]
-    features = clocked("features", run.world.features)
+    features = clocked("features", run.scene.features)
     with ExitStack() as stack:
         for name, owner, attribute in places:
             stack.enter_context(patch.object(owner, attribute, clocked(name, getattr(owner, attribute))))
-        stack.enter_context(patch.object(run, "world", replace(run.world, features=features)))
+        stack.enter_context(patch.object(run, "scene", replace(run.scene, features=features)))
         yield
 
 
@@ -192,9 +196,9 @@ def _shading(run: Any) -> float:
     from mistyle.render import deferred, seam
     from mistyle.stages import fit_run
 
-    world, size = run.world, run.settings.crop_size
-    cameras = [zoom(world.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in run._crops()]
-    surface = deferred.trace(world.traced, cameras, world.tangents)
+    scene, size = run.scene, run.settings.crop_size
+    cameras = [zoom(scene.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in run._crops()]
+    surface = deferred.trace(scene.traced, cameras, scene.tangents)
     lit, _ = run._light(surface)
     where = seam.taps(surface, run.table.sizes)
     leaves = {n: torch.from_numpy(v[where.texels]) for n, v in run.table.values.items()}
@@ -225,9 +229,9 @@ def with_vgg(where: Problem, figures: dict[str, float], count: int, size: int) -
 
 def _style(run: Any, sets: Sequence[Any]) -> float:
     """The style loss of some sets of crops, lit as the first steps light them; nothing moves."""
-    from mistyle.stages.fit_run import Run
+    from mistyle.stages.fit_run import PhaseRunner
 
-    probe = Run(run.world, replace(run.table), run.phase, run.settings, np.random.default_rng(0))
+    probe = PhaseRunner(run.scene, replace(run.table), run.phase, run.settings, np.random.default_rng(0))
     for crops in sets:
         probe._gradients(crops)
     return float(np.mean(probe.trace["style"]))
@@ -239,16 +243,16 @@ def lights(where: Problem, figures: dict[str, float]) -> None:
     from mistyle.core.tangents import corner_tangents
     from mistyle.render.draw import tracer
     from mistyle.stages import fit_judge
-    from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit import FitStart, FitTargets, two_phase
 
-    judge = fit_judge.bench(tracer(where.mesh), corner_tangents(where.mesh), where.views)
+    judge = fit_judge.build_evaluation(tracer(where.mesh), corner_tangents(where.mesh), where.views)
     for choice in ("together", "one-per-view"):
         update = {"refine": "normal-roughness", "lights": choice, "judge": False}
         settings = where.settings.fit.model_copy(update=update)
-        fit = two_phase(where.mesh, where.maps, where.views, where.texels, settings, 0)
+        fit = two_phase(where.mesh, FitStart(where.maps), FitTargets(where.views), where.texels, settings, 0)
         name = choice.replace("-", "_")
         figures[f"lights.{name}.slope_correlation"] = slope_correlation(where, fit.maps)
-        for figure, value in fit_judge.figures(judge, fit.maps, scene_lights("phase1")).items():
+        for figure, value in fit_judge.evaluate(judge, fit.maps, scene_lights("phase1")).items():
             figures[f"lights.{name}.{figure}"] = value
 
 

@@ -36,7 +36,7 @@ from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
 from mistyle.run import start, stylize_start
 from mistyle.run.stylize_settings import Settings
-from mistyle.stages.fit import two_phase, view_mask
+from mistyle.stages.fit import FitStart, FitTargets, two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings
@@ -124,7 +124,11 @@ def lit_rows(bench: Bench, lit: Lights) -> tuple[dict[str, Sequence[Maps]], dict
     flat = known.baked(scene, views)
     chosen = bench.settings.fit.model_copy(update={"painted": "with-light"})
     paper = chosen.model_copy(update={"judge": False})
-    old = timed(figures, "paper.seconds", lambda: two_phase(mesh, flat, views, scene.atlas.texels, paper, 0))
+    old = timed(
+        figures,
+        "paper.seconds",
+        lambda: two_phase(mesh, FitStart(flat), FitTargets(views), scene.atlas.texels, paper, 0),
+    )
     new = timed(figures, "phase2.seconds", lambda: lit_phases(mesh, flat, views, scene.atlas.texels, lit, chosen, 0))
     first = [_with(b, m, "normal", "roughness") for b, m in zip(flat, new.maps, strict=True)]
     captures = in_memory(bench.cameras, [lit] * len(views), [v.rgb for v in views], [view_mask(v) for v in views])
@@ -149,7 +153,7 @@ def unlit_rows(bench: Bench) -> tuple[dict[str, Sequence[Maps]], dict[str, float
     rows: dict[str, Sequence[Maps]] = {"flat": scene.flat, "painter": scene.painter}
     for row, refine in (("phase1", "normal-roughness"), ("phase2", "all")):
         each = chosen.model_copy(update={"refine": refine})
-        rows[row] = two_phase(mesh, scene.flat, views, texels, each, 0, begin=scene.painter).maps
+        rows[row] = two_phase(mesh, FitStart(scene.flat, begin=scene.painter), FitTargets(views), texels, each, 0).maps
     return rows, figures | errors(bench, rows)
 
 
@@ -164,7 +168,14 @@ def struggling(bench: Bench) -> dict[str, float]:
         for iterations, crops in ((steps, 2), (4 * steps, 4)):
             more = {"iterations1": 0, "iterations2": iterations, "crops": crops, "judge": False}
             chosen = bench.settings.fit.model_copy(update=more)
-            fits.append((planted, two_phase(scene.asset.mesh, begin, planted.views, scene.atlas.texels, chosen, 0)))
+            fits.append(
+                (
+                    planted,
+                    two_phase(
+                        scene.asset.mesh, FitStart(begin), FitTargets(planted.views), scene.atlas.texels, chosen, 0
+                    ),
+                )
+            )
     figures: dict[str, float] = {}
     choices = {
         f".outlier_{outlier:g}.agreement_{agreement:g}": RepairSettings(outlier=outlier, agreement=agreement)

@@ -28,7 +28,7 @@ from mistyle.run.made import Atlas
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.backproject import backproject, fill
 from mistyle.stages.bake_settings import BakeSettings
-from mistyle.stages.coat import lay_relief
+from mistyle.stages.coat import PaintRelief, TexelBand, lay_relief
 from mistyle.stages.texels import pad
 
 WET, DRY = 0.25, 0.7  # roughness of wet and of dry paint
@@ -58,14 +58,14 @@ def painted(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, slop
     """The object painted with `style`; `slope` is the true relief's root mean square slope."""
     from mistyle.backends.embedded import surface_relief
 
-    coats = painting.coat(asset, style, atlas, settings, silent)
-    flat = painting.painted(asset, coats, atlas, settings)
-    painter = painting.raised(asset, coats, atlas, settings, flat)
+    layers = painting.paint_layers(asset, style, atlas, settings, silent)
+    flat = painting.painted(asset, layers, atlas, settings)
+    painter = painting.raised(asset, layers, atlas, settings, flat)
     truth = []
     for part, (texels, maps) in enumerate(zip(atlas.texels, flat, strict=True)):
         side = painting.texel_side(asset, part, texels)
         place = texels.position[texels.covered], texels.normal[texels.covered]
-        guessed = surface_relief(coats.solutions[0], *place, footprint=side)[0]
+        guessed = surface_relief(layers.solutions[0], *place, footprint=side)[0]
         truth.append(true_maps(asset, texels, maps, guessed, side, slope, np.random.default_rng([seed, part])))
     areas = tuple(texel_areas(asset.mesh, texels) for texels in atlas.texels)
     return Painted(asset, atlas, tuple(truth), tuple(flat), tuple(painter), areas)
@@ -90,7 +90,8 @@ def true_maps(
     roughness = WET + (DRY - WET) / (1 + np.exp(-4 * _field(points, side, PATCHES, rng)))
     made = replace(flat, normal=flat.normal.copy(), roughness=np.zeros_like(flat.roughness))
     tangents = corner_tangents(asset.mesh)
-    lay_relief(asset, made, texels, slice(0, len(at)), at, gradient, roughness, slope, 1.0, tangents)
+    band, relief = TexelBand(texels, slice(0, len(at)), at), PaintRelief(gradient, roughness)
+    lay_relief(made, band, relief, slope, 1.0, asset.mesh, tangents)
     return replace(made, **{name: nearest_fill(getattr(made, name), at) for name in ("albedo", "normal", "roughness")})
 
 

@@ -32,8 +32,8 @@ DESIGNS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "phase2": ({"fit": {"refine": "albedo"}}, {"fit": {"refine": "off"}}),
     "both": ({"fit": {"refine": "all"}}, {"fit": {"refine": "off"}}),
     # Twice the relief, to begin with and to aim at.
-    "bold": ({"fit": {"refine": "all", "relief": 0.3}, "coat": {"height": 0.3}}, {"fit": {"refine": "off"}}),
-    "bold_unfitted": ({"fit": {"refine": "off"}, "coat": {"height": 0.3}}, {"fit": {"refine": "off"}}),
+    "bold": ({"fit": {"refine": "all", "relief": 0.3}, "paint": {"height": 0.3}}, {"fit": {"refine": "off"}}),
+    "bold_unfitted": ({"fit": {"refine": "off"}, "paint": {"height": 0.3}}, {"fit": {"refine": "off"}}),
 }
 SMALL, LARGE = 252, 378  # pixels of a picture's side, under an environment and under the key light
 SPP = {"path": 32, "direct": 16}  # samples a pixel under either
@@ -56,7 +56,7 @@ class Painted:
     settings: Any
     asset: Any
     atlas: Any
-    coats: Any
+    layers: Any
     views: Any
     picture: Any
 
@@ -95,13 +95,13 @@ def paint(mesh: str, style: str, preset: str) -> Painted:
     asset = read_mesh(DATA / "meshes/plain" / MESHES[mesh], size=chosen.atlas.size)
     atlas = stylize_start.lay_out(asset, chosen, silent)
     picture = read_picture(next((DATA / "styles").glob(f"{style}.*")))
-    coats = painting.coat(asset, picture, atlas, chosen, silent)
+    layers = painting.paint_layers(asset, picture, atlas, chosen, silent)
     traced, views = tracer(asset.mesh), []
     for camera in stylize_start.cameras_of(chosen, asset.mesh, print):
         hits = gbuffer(traced, camera)
         cover = hits.mask.astype(np.float32)
         views.append(View(camera, hits.position, hits.depth, hits.normal, hits.uv, hits.part, hits.mask, cover))
-    return Painted(mesh, style, chosen, asset, atlas, coats, views, picture)
+    return Painted(mesh, style, chosen, asset, atlas, layers, views, picture)
 
 
 def finish(painted: Painted, preset: str, change: Mapping[str, Any]) -> Finished:
@@ -110,7 +110,7 @@ def finish(painted: Painted, preset: str, change: Mapping[str, Any]) -> Finished
     from mistyle.stages.inpaint import struggle_mask
 
     s = settings_of(preset, change)
-    baked = painting.bake(painted.asset, painted.coats, painted.atlas, painted.views, s, silent)
+    baked = painting.bake(painted.asset, painted.layers, painted.atlas, painted.views, s, silent)
     stylized = painting.unlit_views(painted.asset, baked.maps, painted.views, silent)
     took: dict[str, float] = {}
     fitted = common.timed(

@@ -22,7 +22,7 @@ from mistyle.files.read import read_picture
 from mistyle.files.read_mesh import read_mesh
 from mistyle.run import painting, start, stylize_start, sweep
 from mistyle.run.stylize_settings import Settings
-from mistyle.stages.mvst import Painted
+from mistyle.stages.mvst import PaintedView
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"
@@ -40,7 +40,7 @@ def measured(asset: Any, style: Picture, settings: Settings, shown: str) -> tupl
     from mistyle.render.draw import draw_views
 
     atlas = stylize_start.lay_out(asset, settings, silent)
-    truth = painting.painted(asset, painting.coat(asset, style, atlas, settings, silent), atlas, settings)
+    truth = painting.painted(asset, painting.paint_layers(asset, style, atlas, settings, silent), atlas, settings)
     views = views_of(asset, truth, settings.rig.resolution)
     if shown == "lit":
         matt = [replace(m, roughness=np.ones_like(m.roughness)) for m in truth]
@@ -52,8 +52,8 @@ def measured(asset: Any, style: Picture, settings: Settings, shown: str) -> tupl
     return before, after, found[1].taken or 0.0
 
 
-def as_painted(view: View) -> Painted:
-    return Painted(view.rgb, view.mask & (view.coverage > 0.99), view.mask, 0.0, 1.0)
+def as_painted(view: View) -> PaintedView:
+    return PaintedView(view.rgb, view.mask & (view.coverage > 0.99), view.mask, 0.0, 1.0)
 
 
 def main() -> None:

@@ -44,9 +44,9 @@ def painted(mesh: Path, style: Path) -> tuple[Any, list[Any]]:
     start.start_engines(settings)
     asset = read_mesh(mesh)
     atlas = start.lay_out(asset, settings, lambda done: None)
-    coats = painting.coat(asset, read_picture(style), atlas, settings, lambda done: None)
-    flat = painting.painted(asset, coats, atlas, settings)
-    return asset, painting.raised(asset, coats, atlas, settings, flat)
+    layers = painting.paint_layers(asset, read_picture(style), atlas, settings, lambda done: None)
+    flat = painting.painted(asset, layers, atlas, settings)
+    return asset, painting.raised(asset, layers, atlas, settings, flat)
 
 
 def cropped(path: Path, width: int, height: int) -> np.ndarray:
@@ -63,12 +63,13 @@ def drawn(asset: Any, maps: list[Any], azimuth: float, lamp: float | None) -> np
     from mistyle.core.camera import orbit
     from mistyle.core.image import srgb_from_linear
     from mistyle.render.draw import picture
+    from mistyle.render.scene import Staging
 
     camera = orbit(azimuth, ELEVATION, distance=DISTANCE, fov=30, size=(SIDE, SIDE))
     if lamp is None:
-        shot = picture(asset.mesh, maps, camera, "studio", SAMPLES)
+        shot = picture(asset.mesh, maps, camera, Staging("studio", SAMPLES))
         return srgb_from_linear(shot[..., :3])
-    shot = picture(asset.mesh, maps, camera, "hdri", SAMPLES, hdri=lamp_map(azimuth + lamp))
+    shot = picture(asset.mesh, maps, camera, Staging("hdri", SAMPLES, hdri=lamp_map(azimuth + lamp)))
     ground = np.linspace(0.035, 0.012, SIDE)[:, None, None]  # a dark wall behind
     return srgb_from_linear(shot[..., :3] + (1 - shot[..., 3:]) * ground)
 

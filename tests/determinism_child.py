@@ -96,7 +96,7 @@ def style_job(made: Stages, settings: Any) -> None:
     from mistyle.files.views import read_views, write_views
     from mistyle.render.draw import draw_views
     from mistyle.run import painting, start, stylize_start
-    from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit import FitStart, FitTargets, two_phase
 
     mesh_file, style_file = inputs(made.out)
     asset = made.note("read and unwrap", start.read(mesh_file, settings.read, settings.atlas.size, nothing))
@@ -109,15 +109,22 @@ def style_job(made: Stages, settings: Any) -> None:
     write_views(made.out / "views", views, lights("paper_views"), paper_files=True)
     made.note("views", made.out / "views")
     views = read_views(made.out / "views")
-    coats = painting.coat(asset, style, atlas, settings, nothing)
-    made.note("surface", coats)
-    baked = made.note("bake", painting.bake(asset, coats, atlas, views, settings, nothing))
+    layers = painting.paint_layers(asset, style, atlas, settings, nothing)
+    made.note("surface", layers)
+    baked = made.note("bake", painting.bake(asset, layers, atlas, views, settings, nothing))
     stylized = made.note("stylized", painting.unlit_views(asset, baked.maps, views, nothing))
     phases = {"fit phase 1": {"refine": "normal-roughness"}, "fit phase 2": {"iterations1": 0, "refine": "all"}}
     fitted = None
     for name, change in phases.items():
         chosen = settings.fit.model_copy(update=change)
-        fitted = two_phase(asset.mesh, baked.maps, stylized, atlas.texels, chosen, settings.seed, begin=baked.begin)
+        fitted = two_phase(
+            asset.mesh,
+            FitStart(baked.maps, begin=baked.begin),
+            FitTargets(stylized),
+            atlas.texels,
+            chosen,
+            settings.seed,
+        )
         maps = [getattr(m, key).ravel() for m in fitted.maps for key in ("albedo", "normal", "roughness")]
         made.numbers(name, maps=np.concatenate(maps), trace=np.concatenate([*fitted.trace.values()]))
     repaired = repair(made, asset, atlas, baked, fitted, settings)
@@ -171,7 +178,7 @@ def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any
     from mistyle.run.sweep import stylizer_of
     from mistyle.stages.backproject import bake
     from mistyle.stages.lift import lift
-    from mistyle.stages.mvst import sweep
+    from mistyle.stages.mvst import ViewPainter, sweep
     from mistyle.stages.sweep_settings import WarpSettings
     from mistyle.stages.warp import composite
 
@@ -179,7 +186,7 @@ def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any
     made.note("warp", composite([lift(view, WarpSettings()) for view in views[:2]], views[2], WarpSettings()))
     paint = stylizer_of(asset, style, atlas, chosen, nothing)
     made.note("one view", paint(views[0], None, np.random.default_rng(0)))
-    swept = made.note("sweep", sweep(views[:3], paint, chosen.sweep, 0, keeps_outlines=True))
+    swept = made.note("sweep", sweep(views[:3], ViewPainter(paint, keeps_outlines=True), chosen.sweep, 0))
     made.note("bake from views", bake(swept.views, atlas.texels[0], chosen.bake, 4, mesh=asset.mesh))
 
 

@@ -14,7 +14,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.stages import backproject as stage
-from mistyle.stages.backproject import Baked, backproject, bake, fill, pure_colours
+from mistyle.stages.backproject import Backprojection, backproject, bake, fill, pure_colours
 from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.texels import rasterise
 
@@ -346,7 +346,7 @@ def test_holes_take_the_nearest_colour_of_their_own_island(rng):
     albedo = np.where(known[..., None], rng.random((40, 40, 3)), 0).astype(np.float32)
     marks = np.where(known, 0, -1).astype(np.int16), known.astype(np.int16)
     position = np.stack([rows, columns, 0 * rows], axis=-1)
-    filled = fill(Baked(albedo, known, *marks), texels_of(island, position))
+    filled = fill(Backprojection(albedo, known, *marks), texels_of(island, position))
     for row, column in np.argwhere((island >= 0) & ~known)[::7]:
         mine = np.argwhere(known & (island == island[row, column]))
         distance = np.hypot(*(mine - [row, column]).T)
@@ -363,7 +363,7 @@ def test_holes_are_filled_along_rows(rng):
     albedo = np.where(known[..., None], rng.random((24, 40, 3)), 0).astype(np.float32)
     flat = np.stack([*np.indices((24, 40)), np.zeros((24, 40))], axis=-1)
     view, seen = np.where(known, 0, -1).astype(np.int16), known.astype(np.int16)
-    filled = fill(Baked(albedo, known, view, seen), texels_of(island, flat))
+    filled = fill(Backprojection(albedo, known, view, seen), texels_of(island, flat))
     assert np.array_equal(filled[known], albedo[known])
     assert np.array_equal(filled[:, 3:19], np.broadcast_to(albedo[:, 2:3], (24, 16, 3)))
     assert np.array_equal(filled[:, 22:], np.broadcast_to(albedo[:, 21:22], (24, 18, 3)))
@@ -377,9 +377,9 @@ def test_an_island_without_paint_takes_the_nearest_colour_on_the_surface():
     known = np.repeat([[True, False, True]], 4, axis=0).repeat(8, axis=1)
     albedo = np.where(known[..., None], island[..., None] / 4 + 0.25, 0).repeat(3, axis=-1).astype(np.float32)
     view = np.where(known, 0, -1).astype(np.int16)
-    filled = fill(Baked(albedo, known, view, known.astype(np.int16)), texels_of(island, position))
+    filled = fill(Backprojection(albedo, known, view, known.astype(np.int16)), texels_of(island, position))
     assert (filled[:, 8:16] == 0.75).all()
-    nothing = Baked(albedo, np.zeros_like(known), view, view)
+    nothing = Backprojection(albedo, np.zeros_like(known), view, view)
     assert np.array_equal(fill(nothing, texels_of(island, position)), albedo)
 
 

@@ -98,18 +98,18 @@ def test_files_in_settings_are_placed_like_the_others(props, monkeypatch):
     for name in ("mask.png", "weights.pth", "gold.png"):
         (props / name).write_bytes(b"")
     settings = """
-        { "coat.protect" = "mask.png", fit = { features = "/abs/w.pth" }, "rig.file" = "../cameras.json",
-          "coat.slots" = ["wood=gold.png", "mask.png=gold.png"], "colour.config" = "ocio://default" }
+        { "paint.protect" = "mask.png", fit = { features = "/abs/w.pth" }, "rig.file" = "../cameras.json",
+          "paint.slots" = ["wood=gold.png", "mask.png=gold.png"], "colour.config" = "ocio://default" }
     """
     jobs_file(props, LIST + f"settings = {' '.join(settings.split())}\n")
     monkeypatch.chdir(props.parent)
     monkeypatch.setenv("MISTYLE_VGG", "here.pth")
     first, second = (r.settings for r in read_jobs(Path("props/jobs.toml"), 1))
     # The environment speaks of where one stands.
-    assert first["fit"]["features"] == str(props.parent / "here.pth") and first["coat"]["protect"] is None
-    assert second["coat"]["protect"] == str(props / "mask.png") and second["fit"]["features"] == "/abs/w.pth"
+    assert first["fit"]["features"] == str(props.parent / "here.pth") and first["paint"]["protect"] is None
+    assert second["paint"]["protect"] == str(props / "mask.png") and second["fit"]["features"] == "/abs/w.pth"
     assert second["rig"]["file"] == str(props / "../cameras.json")
-    assert second["coat"]["slots"] == [f"wood={props}/gold.png", f"{props}/mask.png={props}/gold.png"]
+    assert second["paint"]["slots"] == [f"wood={props}/gold.png", f"{props}/mask.png={props}/gold.png"]
     assert second["colour"]["config"] == "ocio://default"
 
 

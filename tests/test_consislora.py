@@ -50,7 +50,7 @@ def shout(unet, name: str) -> None:
 @pytest.mark.parametrize("offset", [0.0, 0.03])
 @pytest.mark.parametrize("level", [0, 300, 700, 999])
 def test_the_picture_loss_is_the_noise_loss_times_its_weight(pipeline, offset, level):
-    phase = consislora_train.Phase("p", "x", 1, ("style",), noise_offset=offset)
+    phase = consislora_train.LoraPhase("p", "x", 1, ("style",), noise_offset=offset)
     alpha = pipeline.scheduler.alphas_cumprod[level].double()
     _, noise = consislora_train.step_noise(phase, torch.Size([1, 4, 8, 8]), 0, 0, 1000)
     z0, eps, noise = (t.double() for t in (torch.randn(1, 4, 8, 8), torch.randn(1, 4, 8, 8), noise))
@@ -70,8 +70,8 @@ def test_weights_are_those_of_sdxl(pipeline):
 
 
 def test_the_noise_offset_is_one_number_a_channel():
-    plain = consislora_train.Phase("style", "x", 1, ("style",))
-    shifted = consislora_train.Phase("style", "x", 1, ("style",), noise_offset=0.5)
+    plain = consislora_train.LoraPhase("style", "x", 1, ("style",))
+    shifted = consislora_train.LoraPhase("style", "x", 1, ("style",), noise_offset=0.5)
     shape = torch.Size([1, 4, 6, 5])
     (_, a), (_, b) = (consislora_train.step_noise(p, shape, 3, 7, 1000) for p in (plain, shifted))
     shift = (b - a).reshape(4, -1)
@@ -88,15 +88,17 @@ def test_only_the_two_blocks_are_reached(pipeline, halves):
     assert all(not v.any() for k, v in a.items() if "lora_B" in k)
 
 
-def lesson(pipeline, picture, prompt="A [v]"):
-    return consislora_train.lesson(pipeline, picture, prompt, 32, 0)
+def training_example(pipeline, picture, prompt="A [v]"):
+    return consislora_train.training_example(pipeline, picture, prompt, 32, 0)
 
 
 def loss_of(pipeline, shown, step=0, level=500):
     phase = consislora_train.joint_phase("[v]", SETTINGS)
     _, noise = consislora_train.step_noise(phase, shown.z0.shape, 0, step, 1000)
     alpha = pipeline.scheduler.alphas_cumprod[level]
-    return consislora_train.step_loss(pipeline.unet, shown, phase, "switch", step, level, noise, alpha)
+    return consislora_train.step_loss(
+        pipeline.unet, shown, phase, "switch", consislora_train.NoisyStep(step, level, noise, alpha)
+    )
 
 
 @pytest.mark.parametrize("trained", [("content", "style"), ("style",)])
@@ -104,7 +106,7 @@ def test_gradients_reach_what_learns_and_nothing_else(pipeline, halves, picture,
     for half in consislora.BLOCKS:
         shout(halves, half)
     consislora.activate(halves, {"content": 1.0, "style": 1.0}, trained)
-    loss, _ = loss_of(pipeline, lesson(pipeline, picture))
+    loss, _ = loss_of(pipeline, training_example(pipeline, picture))
     loss.backward()
     got = {n for n, p in halves.named_parameters() if p.grad is not None}
     assert got == {n for half in trained for n in consislora.parameters(halves, half)}
@@ -115,7 +117,7 @@ def test_gradients_reach_what_learns_and_nothing_else(pipeline, halves, picture,
 def test_the_lower_half_of_the_network_keeps_no_graph_and_says_the_same(pipeline, halves, picture):
     shout(halves, "style")
     consislora.activate(halves, {"content": 1.0, "style": 1.0}, ("style",))
-    shown = lesson(pipeline, picture)
+    shown = training_example(pipeline, picture)
     more = {"text_embeds": shown.pooled, "time_ids": shown.sizes}
     inside = []
     hook = halves.mid_block.register_forward_hook(lambda m, i, o: inside.append(torch.is_grad_enabled()), prepend=True)
@@ -127,16 +129,16 @@ def test_the_lower_half_of_the_network_keeps_no_graph_and_says_the_same(pipeline
     assert torch.is_grad_enabled()
 
 
-def test_a_lesson_keeps_the_pictures_shape(pipeline, picture):
-    shown = lesson(pipeline, picture)
+def test_a_training_example_keeps_the_pictures_shape(pipeline, picture):
+    shown = training_example(pipeline, picture)
     assert shown.z0.shape == (1, 4, 16, 20)
     assert shown.sizes.tolist() == [[64, 80, 0, 0, 32, 40]]
     assert shown.text.shape[-1] == 64 and shown.pooled.shape == (1, 32)
 
 
 def test_training_lowers_the_loss(pipeline, halves, picture):
-    shown = lesson(pipeline, picture)
-    phase = consislora_train.Phase("learn", "A [v]", 40, ("content", "style"), switch=100, rate=5e-2)
+    shown = training_example(pipeline, picture)
+    phase = consislora_train.LoraPhase("learn", "A [v]", 40, ("content", "style"), switch=100, rate=5e-2)
 
     def mean_error() -> float:
         return float(np.mean([loss_of(pipeline, shown, step=k, level=100 * k + 50)[1] for k in range(10)]))
@@ -148,14 +150,16 @@ def test_training_lowers_the_loss(pipeline, halves, picture):
 
 @pytest.mark.parametrize("mode", ["switch", "sum"])
 def test_the_switch_replaces_or_adds(pipeline, halves, picture, mode):
-    shown = lesson(pipeline, picture)
+    shown = training_example(pipeline, picture)
     consislora.activate(halves, {"content": 1.0, "style": 1.0}, ("style",))
     phase = consislora_train.joint_phase("[v]", SETTINGS)
     _, noise = consislora_train.step_noise(phase, shown.z0.shape, 0, 0, 1000)
     alpha = pipeline.scheduler.alphas_cumprod[800]
 
     def at(step):
-        return consislora_train.step_loss(pipeline.unet, shown, phase, mode, step, 800, noise, alpha)
+        return consislora_train.step_loss(
+            pipeline.unet, shown, phase, mode, consislora_train.NoisyStep(step, 800, noise, alpha)
+        )
 
     (before, error), (after, _) = at(SETTINGS.switch - 1), at(SETTINGS.switch)
     assert float(before) == error
@@ -164,9 +168,10 @@ def test_the_switch_replaces_or_adds(pipeline, halves, picture, mode):
 
 
 def made(pipeline, picture, folder, name="style", kind="style", settings=SETTINGS, **more):
-    key = consislora_make.lora_key(kind, picture, "[v]", settings, ModelSettings(folder=tiny_models.folder()), 0)
+    image = consislora_make.TrainingImage(kind, name, picture, "[v]")
+    key = consislora_make.lora_key(image, settings, ModelSettings(folder=tiny_models.folder()), 0)
     halves = consislora_make.paths(folder, name, key)
-    errors = consislora_make.make(pipeline, kind, picture, "[v]", halves, key, settings, 0, **more)
+    errors = consislora_make.make(pipeline, image, halves, key, settings, 0, **more)
     return halves, key, errors
 
 
@@ -224,17 +229,18 @@ def test_a_killed_training_goes_on_from_its_last_checkpoint(pipeline, picture, t
 
 
 def test_a_finished_lora_is_taken_over_and_settings_change_its_name(pipeline, picture, tmp_path):
-    wanted = [("style", "wave", picture, "[v]")]
+    image = consislora_make.TrainingImage("style", "wave", picture, "[v]")
+    folder = consislora_make.LoraFolder(tmp_path)
     settings, said = ModelSettings(folder=tiny_models.folder(), device="cpu"), []
-    first = consislora_make.make_all(settings, wanted, tmp_path, SETTINGS, 0, said.append)
+    first = consislora_make.make_all(settings, [image], folder, SETTINGS, 0, said.append)
     times = [p.stat().st_mtime_ns for p in (first[0].content, first[0].style)]
-    again = consislora_make.make_all(settings, wanted, tmp_path, SETTINGS, 0, said.append)
+    again = consislora_make.make_all(settings, [image], folder, SETTINGS, 0, said.append)
     assert again == first and times == [p.stat().st_mtime_ns for p in (first[0].content, first[0].style)]
     assert "10 training steps" in said[0] and "minutes" in said[0] and "nothing is trained" in said[1]
     other = SETTINGS.model_copy(update={"noise_offset": 0.1})
-    key = consislora_make.lora_key("style", picture, "[v]", other, settings, 0)
+    key = consislora_make.lora_key(image, other, settings, 0)
     assert consislora_make.paths(tmp_path, "wave", key) != first[0]
-    assert key != consislora_make.lora_key("style", picture, "[v]", other, settings, 1)
+    assert key != consislora_make.lora_key(image, other, settings, 1)
 
 
 def test_the_papers_training_takes_hours_and_says_so():

@@ -55,7 +55,7 @@ def test_training_walks_the_published_path(pipeline, kind):
     word = "[c]" if kind == "joint" else "[v]"
     make = consislora_train.joint_phase if kind == "joint" else consislora_train.style_phase
     phase, picture = make(word, SETTINGS), np.random.default_rng(0).random((20, 16, 3)).astype(np.float32)
-    shown = consislora_train.lesson(pipeline, picture, phase.prompt, 16, 0)
+    shown = consislora_train.training_example(pipeline, picture, phase.prompt, 16, 0)
     draws = [consislora_train.step_noise(phase, shown.z0.shape, 5, k, 1000) for k in range(phase.steps)]
     ends = []
     for ours in (True, False):
@@ -80,8 +80,8 @@ def test_gradients_are_unlimited_unless_asked(pipeline, monkeypatch):
     limits = []
     monkeypatch.setattr(torch.nn.utils, "clip_grad_norm_", lambda values, limit: limits.append(limit))
     picture = np.random.default_rng(0).random((16, 16, 3)).astype(np.float32)
-    phase = consislora_train.Phase("joint", "A [c]", 1, ("content",))
-    shown = consislora_train.lesson(pipeline, picture, phase.prompt, 16, 0)
+    phase = consislora_train.LoraPhase("joint", "A [c]", 1, ("content",))
+    shown = consislora_train.training_example(pipeline, picture, phase.prompt, 16, 0)
     for clip in (0.0, 1.0):
         consislora.add_half(pipeline.unet, "content", 4, 7)
         consislora_train.run_phase(pipeline, shown, phase, SETTINGS.model_copy(update={"clip": clip}), 5)

@@ -161,8 +161,9 @@ def test_what_decides_nothing_is_in_no_key(tmp_path):
 
     def keys(paint: dict, **more) -> tuple:
         s = resolve("standard", None, {"inpainter": "paint3d", "models": plain | more, "paint3d": paint}, {})
-        job = diffusion.Job(s.models, s.train, s.diffusion, style.rgb, "wave", tmp_path, 0)
-        trained = consislora_make.lora_key("style", style.rgb, "[v]", s.train, s.models, 0)
+        job = diffusion.DiffusionJob(s.models, s.train, s.diffusion, style.rgb, "wave", tmp_path, 0)
+        image = consislora_make.TrainingImage("style", "wave", style.rgb, "[v]")
+        trained = consislora_make.lora_key(image, s.train, s.models, 0)
         return diffusion.key(job, seen), trained, inpainter_inputs(s, style)
 
     base = keys({})

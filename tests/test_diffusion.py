@@ -14,7 +14,7 @@ from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings
 from mistyle.core.camera import orbit
 from mistyle.core.errors import EnvironmentMissing, InputRefused, Stopped, UsageError
 from mistyle.core.view import Prior, View
-from mistyle.stages.mvst import sweep
+from mistyle.stages.mvst import ViewPainter, ViewStore, sweep
 from mistyle.stages.sweep_settings import SweepSettings
 
 torch.set_num_threads(1)
@@ -42,9 +42,13 @@ def picture(seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).random((24, 20, 3)).astype(np.float32)
 
 
-def job(tmp_path: Path, chosen: DiffusionSettings = QUICK, style: np.ndarray | None = None, **more) -> diffusion.Job:
+def job(
+    tmp_path: Path, chosen: DiffusionSettings = QUICK, style: np.ndarray | None = None, **more
+) -> diffusion.DiffusionJob:
     settings = ModelSettings(**({"folder": tiny_models.folder(), "device": "cpu"} | more))
-    return diffusion.Job(settings, TRAINING, chosen, picture() if style is None else style, "wave", tmp_path, 0)
+    return diffusion.DiffusionJob(
+        settings, TRAINING, chosen, picture() if style is None else style, "wave", tmp_path, 0
+    )
 
 
 @pytest.fixture(scope="module")
@@ -204,8 +208,8 @@ def test_the_ip_recipe_needs_no_words_that_nothing_taught():
 def test_guidance_takes_four_more_looks_a_pair_and_changes_the_picture(pipeline, loras, which):
     for half in consislora.BLOCKS:
         consislora.load_half(pipeline, loras[f"{half}1"], half, half)
-    ours = consislora_make.Halves(loras["content1"], loras["style1"])
-    theirs = consislora_make.Halves(loras["content2"], loras["style2"])
+    ours = consislora_make.LoraPair(loras["content1"], loras["style1"])
+    theirs = consislora_make.LoraPair(loras["content2"], loras["style2"])
     plain = paint(pipeline)
     terms = diffusion._guidance(pipeline, QUICK.model_copy(update={which: 2.0}), theirs, ours)
     calls = counted(pipeline)
@@ -277,7 +281,7 @@ def test_the_denoiser_agrees_with_diffusers_own_pipeline(pipeline):
 
 def walks_as_diffusers(pipeline) -> None:
     """The plain twin: diffusers' pipeline with the same latents, conditions and prompts walks the same path."""
-    from mistyle.stages.repaint import sample
+    from mistyle.stages.repaint import Resampling, sample
 
     seen = view()
     asked = diffusion._asked(pipeline, QUICK, seen, (SIDE, SIDE), ())
@@ -288,9 +292,9 @@ def walks_as_diffusers(pipeline) -> None:
         None,
         None,
         levels,
+        Resampling(refine=0),
         rng=torch.Generator().manual_seed(0),
         like=torch.zeros_like(noise),
-        refine=0,
     )
     theirs = pipeline(
         diffusion.prompt_of(QUICK),
@@ -305,7 +309,7 @@ def walks_as_diffusers(pipeline) -> None:
 
 
 def test_pinned_latents_end_as_the_prior_and_the_rest_does_not(pipeline):
-    from mistyle.stages.repaint import sample
+    from mistyle.stages.repaint import Resampling, sample
 
     known, mask = diffusion_denoise.prior_latent(pipeline.vae, half_prior(), (SIDE, SIDE), 2)
     asked = diffusion._asked(pipeline, QUICK, view(), (SIDE, SIDE), ())
@@ -313,7 +317,7 @@ def test_pinned_latents_end_as_the_prior_and_the_rest_does_not(pipeline):
     levels = diffusion_denoise.noise_levels(pipeline.scheduler, 4)
 
     def run():
-        return sample(denoise, known, mask, levels, 2, 3, rng=torch.Generator().manual_seed(5), refine=0)
+        return sample(denoise, known, mask, levels, Resampling(2, 3, refine=0), rng=torch.Generator().manual_seed(5))
 
     end, again = run(), run()
     pinned = mask.bool().expand_as(end)
@@ -354,6 +358,8 @@ def test_content_loras_cost_what_is_said(tmp_path, views, content, steps):
     said, watched = [], []
     diffusion.stylizer(wanted, views, said.append, lambda *a: watched.append(a))
     assert f"{steps} training steps" in said[0] and [w[:2] for w in watched] == [(k + 1, steps) for k in range(steps)]
+    diffusion.stylizer(wanted, views, said.append)
+    assert "nothing is trained" in said[-1]
     halves = {"none": 1, "shared": 2, "per-view": 5}[content]
     assert len(list(tmp_path.glob("*.safetensors"))) == 2 * halves
 
@@ -363,7 +369,7 @@ def test_a_killed_sweep_goes_on_in_the_view_it_was_in(tmp_path, views, loras):
     views, wanted = views[:3], job(tmp_path / "loras", style_lora=loras["style1"])
     settings, key = SweepSettings(), diffusion.key(wanted, views)
     painter = diffusion.stylizer(wanted, views)
-    whole = sweep(views, painter, settings, 0)
+    whole = sweep(views, ViewPainter(painter), settings, 0)
     seen: list[str] = []
 
     def stopping(v, prior, rng):
@@ -373,16 +379,10 @@ def test_a_killed_sweep_goes_on_in_the_view_it_was_in(tmp_path, views, loras):
         return painter(v, prior, rng)
 
     with pytest.raises(Stopped):
-        sweep(views, stopping, settings, 0, kept=tmp_path / "kept", key=key)
+        sweep(views, ViewPainter(stopping), settings, 0, store=ViewStore(tmp_path / "kept", key))
     again: list[str] = []
-    resumed = sweep(
-        views,
-        lambda v, p, r: again.append(v.camera.name) or painter(v, p, r),
-        settings,
-        0,
-        kept=tmp_path / "kept",
-        key=key,
-    )
+    rest = ViewPainter(lambda v, p, r: again.append(v.camera.name) or painter(v, p, r))
+    resumed = sweep(views, rest, settings, 0, store=ViewStore(tmp_path / "kept", key))
     assert len(again) == 1 and again[0] == seen[-1]
     for a, b in zip(resumed.views, whole.views, strict=True):
         np.testing.assert_array_equal(a.rgb, b.rgb)

@@ -11,7 +11,6 @@ from test_mvst import disagreement
 from test_pipeline import TINY, hashes, inputs, job
 from test_warp import at, see
 
-from mistyle.backends import STYLIZERS
 from mistyle.core.asset import Picture
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
 from mistyle.core.image import distance_to, linear_from_srgb, srgb_from_linear
@@ -21,7 +20,7 @@ from mistyle.run import pipeline
 from mistyle.run.progress import Progress
 from mistyle.run.stylize_job import Job
 from mistyle.run.stylize_settings import resolve
-from mistyle.stages.mvst import sweep
+from mistyle.stages.mvst import ViewPainter, sweep
 from mistyle.stages.sweep_settings import SweepSettings
 from mistyle.surface import view_samples
 from mistyle.surface.samples import GRID
@@ -84,7 +83,7 @@ def test_tables_on_a_sheet_are_the_turned_grid(degrees):
     tangent = np.tile(np.array([np.cos(angle), np.sin(angle), 0], np.float32), (len(pixel), 1))
     points = as_points(positions, np.broadcast_to(view_samples.TOWARDS, positions.shape), 2.0)
     depth = np.full(len(pixel), 4.0, np.float32)
-    level = view_samples.sheet_level(points, tangent, np.ones(len(pixel), np.float32), cell, size, depth, 100.0)
+    level = view_samples.flat_level(points, tangent, np.ones(len(pixel), np.float32), cell, size, depth, 100.0)
     assert np.abs(np.cross(tangent, view_samples.TOWARDS) - level.across).max() < 1e-6
     assert not level.turned.any()
     inner = (np.abs(positions[:, :2] - 12) < 4).all(axis=1)
@@ -106,7 +105,7 @@ def test_neighbours_never_lie_across_a_depth_step():
     points = as_points(positions, np.broadcast_to(view_samples.TOWARDS, positions.shape), 2.0)
     tangent = np.tile(np.array([1, 0, 0], np.float32), (len(pixel), 1))
     focal = view.camera.focal
-    level = view_samples.sheet_level(points, tangent, np.ones(len(pixel), np.float32), cell, size, depth, focal)
+    level = view_samples.flat_level(points, tangent, np.ones(len(pixel), np.float32), cell, size, depth, focal)
     near = depth < 3.9
     assert 20 < near.sum() < len(near) - 20
     assert np.array_equal(near[level.neighbours], np.broadcast_to(near[:, None], level.neighbours.shape))
@@ -165,17 +164,17 @@ def test_pins_are_means_of_known_pixels():
     known = view.mask & (np.indices((48, 48)).sum(axis=0) % 3 == 0)
     rgb = np.where(known[..., None], linear_from_srgb(np.full((48, 48, 3), 0.25, np.float32)), 0.9)
     pixel, cell, _ = view_samples.representatives(view.mask, 4)
-    pins = view_samples.pinned(cell, 4, view, Prior(rgb.astype(np.float32), known))
+    pins = view_samples.constrain(cell, 4, view, Prior(rgb.astype(np.float32), known))
     assert not pins.known[distance_to(~view.mask).reshape(-1)[pixel] > 6].any(), "a third is too little"
-    everything = view_samples.pinned(cell, 4, view, Prior(rgb.astype(np.float32), view.mask))
+    everything = view_samples.constrain(cell, 4, view, Prior(rgb.astype(np.float32), view.mask))
     assert everything.known.all()
     assert everything.colour[:, 0].min() > pins.colour[pins.colour[:, 0] > 0, 0].max()
 
 
 def test_a_sweep_agrees_where_single_views_do_not(paint):
     views = [ball(30, 64), ball(60, 64)]
-    alone = sweep(views, lambda v, p, rng: paint(v, None, rng), SweepSettings(), 0, keeps_outlines=True)
-    together = sweep(views, paint, SweepSettings(), 0, keeps_outlines=True)
+    alone = sweep(views, ViewPainter(lambda v, p, rng: paint(v, None, rng), keeps_outlines=True), SweepSettings(), 0)
+    together = sweep(views, ViewPainter(paint, keeps_outlines=True), SweepSettings(), 0)
     assert disagreement(list(together.views)) < 0.6 * disagreement(list(alone.views))
 
 
@@ -219,17 +218,9 @@ def test_the_job_with_this_stylizer_and_its_resumption(inputs, tmp_path, monkeyp
 
 
 def test_what_it_cannot_follow_is_refused(inputs, tmp_path):
-    with pytest.raises(UsageError, match="coat.height"):
-        pipeline.stylize(by_view(inputs, tmp_path, coat={"height": 0.2}), Progress(quiet=True))
+    with pytest.raises(UsageError, match="paint.height"):
+        pipeline.stylize(by_view(inputs, tmp_path, paint={"height": 0.2}), Progress(quiet=True))
     absent = {"segmenter": str(tmp_path / "absent.onnx")}
     with pytest.raises((InputRefused, EnvironmentMissing)):
         pipeline.stylize(by_view(inputs, tmp_path, sweep=absent), Progress(quiet=True))
     assert not list(tmp_path.iterdir())
-
-
-def test_every_named_stylizer_is_there():
-    from importlib import import_module
-
-    for entry in STYLIZERS.values():
-        module, _, name = entry.partition(":")
-        assert callable(getattr(import_module(module), name))

@@ -24,10 +24,10 @@ from mistyle.run.progress import Progress
 from mistyle.run.stylize_job import Job
 from mistyle.run.stylize_settings import resolve
 from mistyle.stages import finish_style
-from mistyle.stages.finish import Film, Finishing, Painted, finish, own_directions, shape_edges
+from mistyle.stages.finish import Film, Finishing, PaintedAsset, finish, own_directions, shape_edges
 from mistyle.stages.finish_settings import FinishSettings
 from mistyle.stages.texels import rasterise
-from mistyle.surface.lookup import Solution, colour
+from mistyle.surface.lookup import PaintedSurface, colour
 
 SIZE = 64
 QUICK = FinishSettings(method="vgg", steps=3, crops=2, crop_size=64, texels_per_pixel=1)
@@ -65,7 +65,7 @@ def painting() -> np.ndarray:
 
 
 @pytest.fixture(scope="module")
-def painted(painting) -> Painted:
+def painted(painting) -> PaintedAsset:
     """A sphere with pieces of the painting, some turned by quarters."""
     device.use()
     mesh, rng = sphere(24, 12), np.random.default_rng(1)
@@ -78,7 +78,7 @@ def painted(painting) -> Painted:
     count = len(normals)
     piece = (normals[:, 1] > 0).astype(np.int32)
     centre = np.stack([rng.uniform(20, 76, count), rng.uniform(16, 56, count)], axis=1).astype(np.float32)
-    solution = Solution(
+    solution = PaintedSurface(
         positions=radius * normals,
         normals=normals,
         tangent=tangent,
@@ -96,7 +96,7 @@ def painted(painting) -> Painted:
     at = texels.covered
     encoded = colour(solution, texels.position[at], texels.normal[at])
     albedo[at] = np.where(encoded <= 0.04045, encoded / 12.92, ((encoded + 0.055) / 1.055) ** 2.4)
-    return Painted(mesh, (replace(flat_maps(SIZE), albedo=albedo),), (texels,), solution)
+    return PaintedAsset(mesh, (replace(flat_maps(SIZE), albedo=albedo),), (texels,), solution)
 
 
 @pytest.mark.parametrize("statistic", ["gram", "mean-std", "swd"])
@@ -138,8 +138,8 @@ def test_the_film_shows_the_albedo_alone(painted, weights, bridge):
     texels = torch.from_numpy(run.table.values["albedo"][crops.taps.texels]).requires_grad_()
     pixels = seam.fetch(texels, crops.taps)
     shown = film(crops.lit, pixels, True)
-    wanted = pixels.detach().reshape(2, 64, 64, 3).permute(0, 3, 1, 2) * crops.on
-    assert torch.allclose(shown * crops.on, wanted, atol=2e-3)
+    target = pixels.detach().reshape(2, 64, 64, 3).permute(0, 3, 1, 2) * crops.on
+    assert torch.allclose(shown * crops.on, target, atol=2e-3)
     (slope,) = torch.autograd.grad((shown * crops.on).sum(), texels)
     plain = torch.from_numpy(crops.taps.matrix.T @ np.repeat(crops.on.numpy().reshape(-1, 1), 3, axis=1))
     assert torch.allclose(slope, plain, rtol=2e-3, atol=2e-3)
@@ -149,15 +149,15 @@ def test_pixels_find_their_own_place_in_the_painting(painted):
     """With the picture itself for features, the places show what the surface shows."""
     run = Finishing(painted, lambda image: [image], QUICK.model_copy(update={"content": 0.0}), 0)
     crops = run.crops(run.rng, run.seen)
-    wanted = finish_style.wanted(run.exemplar, crops.places, 2, 64)[0]
+    target = finish_style.target_features(run.painting, crops.places, 2, 64)[0]
     shown = run.shown(crops, torch.from_numpy(run.table.values["albedo"][crops.taps.texels]))
-    half = (wanted.shape[2] + 63) // wanted.shape[2]
+    half = (target.shape[2] + 63) // target.shape[2]
     assert half == 1 or half == 2
     shown, counts = (maps[:, :, half // 2 :: half, half // 2 :: half] for maps in (shown, crops.counts))
     at = (counts > 0.2).expand_as(shown).numpy()
     assert at.mean() > 0.02
-    match = np.corrcoef(shown.numpy()[at], wanted.numpy()[at])[0, 1]
-    flipped = np.corrcoef(shown.numpy()[at], wanted.flip(3).numpy()[at])[0, 1]
+    match = np.corrcoef(shown.numpy()[at], target.numpy()[at])[0, 1]
+    flipped = np.corrcoef(shown.numpy()[at], target.flip(3).numpy()[at])[0, 1]
     assert match > 0.8 > flipped
 
 
@@ -244,14 +244,14 @@ def test_torchvisions_layers_are_chosen_alike(tmp_path, rng, ending):
             layers.append(nn.MaxPool2d(2) if n in TORCHVISION_POOLS else nn.ReLU())
     picture = torch.from_numpy(rng.random((1, 3, 32, 32)).astype(np.float32))
     mean, std = (torch.tensor(v).view(1, 3, 1, 1) for v in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
-    x, wanted = (picture - mean) / std, []
+    x, target = (picture - mean) / std, []
     for n, layer in enumerate(layers):
         x = layer(x)
         if n in (1, 6, 11):
-            wanted.append(x)
+            target.append(x)
     found = load_features(path, 3)(picture)
     assert len(found) == 3 and len(load_features(path)(picture)) == 5
-    for a, b in zip(found, wanted, strict=True):
+    for a, b in zip(found, target, strict=True):
         assert torch.allclose(a, b, atol=1e-5)
 
 
@@ -284,7 +284,7 @@ def test_the_option_from_end_to_end(inputs, weights, tmp_path):  # noqa: F811
     [
         ({}, "found no weights of VGG-19"),
         ({"stylizer": "embedded-view"}, "expected the embedded stylizer"),
-        ({"coat": {"slots": ["wood=bark.jpg"]}}, "found 2 style pictures; expected one"),
+        ({"paint": {"slots": ["wood=bark.jpg"]}}, "found 2 style pictures; expected one"),
         ({"surface": {"glaze": 0.5}}, "glaze"),
     ],
 )

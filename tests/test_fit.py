@@ -15,7 +15,7 @@ from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.render import deferred, device, draw, seam
 from mistyle.stages import fit_judge, fit_table
-from mistyle.stages.fit import shrinkage, two_phase
+from mistyle.stages.fit import FitStart, FitTargets, shrinkage, two_phase
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.texels import rasterise
 
@@ -55,7 +55,9 @@ def scene():
 def relief(scene):
     """Phase 1 alone, on the painted sphere."""
     mesh, maps, texels, views = scene
-    return two_phase(mesh, [maps], views, [texels], QUICK.model_copy(update={"refine": "normal-roughness"}), 0)
+    return two_phase(
+        mesh, FitStart([maps]), FitTargets(views), [texels], QUICK.model_copy(update={"refine": "normal-roughness"}), 0
+    )
 
 
 def clay(scene, maps: Maps, direction) -> np.ndarray:
@@ -125,7 +127,7 @@ def test_an_aligned_loss_would_cancel_the_light_and_ours_does_not(scene, relief)
     grey = replace(maps, albedo=np.full_like(maps.albedo, 0.25))
     flat = [replace(v, rgb=np.repeat(v.mask[..., None] * np.float32(0.15), 3, axis=-1)) for v in views]
     settings = QUICK.model_copy(update={"refine": "normal-roughness", "painted": "with-light", "tv_normal": 0.0})
-    aligned = two_phase(mesh, [grey], flat, [texels], settings, 0, phase1_lights=key).maps[0]
+    aligned = two_phase(mesh, FitStart([grey]), FitTargets(flat, lights=key), [texels], settings, 0).maps[0]
     where = inner(scene)
 
     def shading(made):
@@ -140,7 +142,7 @@ def test_phase_2_finds_the_colours_of_the_views(scene):
     mesh, maps, texels, views = scene
     grey = replace(maps, albedo=np.full_like(maps.albedo, 0.3))
     settings = QUICK.model_copy(update={"iterations1": 0, "iterations2": 80, "rate_albedo": 0.04})
-    fit = two_phase(mesh, [grey], views, [texels], settings, 0)
+    fit = two_phase(mesh, FitStart([grey]), FitTargets(views), [texels], settings, 0)
     seen = texels.covered & (np.abs(texels.normal[..., 1]) < 0.8)
     before = np.abs(grey.albedo - maps.albedo)[seen].mean()
     after = np.abs(fit.maps[0].albedo - maps.albedo)[seen].mean()
@@ -156,7 +158,7 @@ def test_phase_2_finds_the_colours_of_the_views(scene):
 def test_same_seed_same_bytes(scene):
     mesh, maps, texels, views = scene
     settings = QUICK.model_copy(update={"iterations1": 3, "iterations2": 3})
-    made = [two_phase(mesh, [maps], views, [texels], settings, seed) for seed in (1, 1, 2)]
+    made = [two_phase(mesh, FitStart([maps]), FitTargets(views), [texels], settings, seed) for seed in (1, 1, 2)]
     bytes_of = [b"".join(getattr(fit.maps[0], n).tobytes() for n in fit_table.MAPS) for fit in made]
     assert bytes_of[0] == bytes_of[1] != bytes_of[2]
     assert made[0].trace == made[1].trace
@@ -167,7 +169,7 @@ def test_a_gradient_that_is_no_number_stops_at_the_last_good_state(scene):
     mesh, maps, texels, views = scene
     broken = maps.roughness.copy()
     broken[50, 70] = np.nan
-    fit = two_phase(mesh, [replace(maps, roughness=broken)], views, [texels], QUICK, 0)
+    fit = two_phase(mesh, FitStart([replace(maps, roughness=broken)]), FitTargets(views), [texels], QUICK, 0)
     assert len(fit.notes) == 2 and fit.notes[0].startswith("phase1 stopped before step")
     where = fit.notes[0].partition("texel (row ")[2]
     row, column = int(where.split(",")[0]), int(where.partition("column ")[2].split()[0])
@@ -184,7 +186,7 @@ def test_pixels_of_a_target_that_are_no_number_are_left_out(scene):
     rgb[40:70, 40:70] = np.nan
     poisoned = [*views[:3], replace(views[3], rgb=rgb), *views[4:]]
     settings = QUICK.model_copy(update={"iterations1": 8, "iterations2": 8, "judge": True})
-    fit = two_phase(mesh, [maps], poisoned, [texels], settings, 0)
+    fit = two_phase(mesh, FitStart([maps]), FitTargets(poisoned), [texels], settings, 0)
     assert all(np.isfinite(getattr(fit.maps[0], name)).all() for name in fit_table.MAPS)
     assert all(np.isfinite(fit.figures[name]).all() for name in fit.figures)
 
@@ -192,14 +194,14 @@ def test_pixels_of_a_target_that_are_no_number_are_left_out(scene):
 def test_a_phase_that_makes_things_worse_is_undone(scene):
     mesh, maps, texels, views = scene
     wild = {"iterations1": 0, "iterations2": 4, "rate_albedo": 1.0, "judge": True}
-    fit = two_phase(mesh, [maps], views, [texels], QUICK.model_copy(update=wild), 0)
+    fit = two_phase(mesh, FitStart([maps]), FitTargets(views), [texels], QUICK.model_copy(update=wild), 0)
     assert fit.kept == {"phase2": False}
     assert "phase2 was undone" in fit.notes[0]
     assert np.array_equal(fit.maps[0].albedo, maps.albedo)
     before, after = fit.figures["phase2.detail"]
     assert after < before
     good = QUICK.model_copy(update={"refine": "normal-roughness", "judge": True, "relief": 0.08})
-    fit = two_phase(mesh, [maps], views, [texels], good, 0)
+    fit = two_phase(mesh, FitStart([maps]), FitTargets(views), [texels], good, 0)
     assert fit.kept == {"phase1": True} and not fit.notes
     assert not np.array_equal(fit.maps[0].normal, maps.normal)
 
@@ -213,15 +215,18 @@ def test_phase_1_goes_on_from_a_given_relief_and_leaves_it_where_it_is_undone(sc
     tilt[..., 0], tilt[..., 2] = 0.3, np.sqrt(1 - 0.09)
     raised = replace(maps, normal=tilt, roughness=np.full_like(maps.roughness, 0.4))
     from_flat, from_relief = (
-        two_phase(mesh, [maps], views, [texels], only, 0, begin=begin).maps[0] for begin in ((), [raised])
+        two_phase(mesh, FitStart([maps], begin=begin), FitTargets(views), [texels], only, 0).maps[0]
+        for begin in ((), [raised])
     )
     covered = texels.covered
     assert np.abs(from_flat.normal[covered, 0]).mean() < 0.06
     assert np.abs(from_relief.normal[covered, 0] - 0.3).mean() < 0.06
     assert np.abs(from_relief.roughness[covered] - 0.4).mean() < 0.06
     assert np.array_equal(from_relief.albedo, from_flat.albedo)
-    monkeypatch.setattr(fit_judge, "worse", lambda old, new, times=1.0: ["style"])
-    judged = two_phase(mesh, [maps], views, [texels], only.model_copy(update={"judge": True}), 0, begin=[raised])
+    monkeypatch.setattr(fit_judge, "regressed", lambda old, new, times=1.0: ["style"])
+    judged = two_phase(
+        mesh, FitStart([maps], begin=[raised]), FitTargets(views), [texels], only.model_copy(update={"judge": True}), 0
+    )
     assert not judged.kept["phase1"] and judged.maps[0] is raised
 
 
@@ -234,7 +239,9 @@ def test_detail_of_a_given_relief_that_is_finer_than_the_views_stays(scene):
     striped = replace(maps, normal=stripes)
     only = QUICK.model_copy(update={"refine": "normal-roughness", "iterations1": 1, "texels_per_pixel": 0.3})
     assert shrinkage(mesh, [texels], views, 0.3) > 1
-    fitted = two_phase(mesh, [maps], views, [texels], only, 0, begin=[striped]).maps[0].normal[..., 0]
+    fitted = (
+        two_phase(mesh, FitStart([maps], begin=[striped]), FitTargets(views), [texels], only, 0).maps[0].normal[..., 0]
+    )
     across = (fitted[:, ::2] - fitted[:, 1::2])[texels.covered[:, ::2] & texels.covered[:, 1::2]]
     assert across.mean() == pytest.approx(0.3, abs=0.02)
 
@@ -245,9 +252,9 @@ def test_a_phase_far_beyond_its_tolerance_is_stopped_on_its_way(scene, monkeypat
     mesh, maps, texels, views = scene
     seen = iter([{"detail": value, "style": 1.0, "views": 1.0} for value in (0.9, 0.9, detail, 0.9)])
     monkeypatch.setattr(fit_judge, "FEWEST", 1)
-    monkeypatch.setattr(fit_judge, "figures", lambda *_, **__: next(seen))
+    monkeypatch.setattr(fit_judge, "evaluate", lambda *_, **__: next(seen))
     chosen = QUICK.model_copy(update={"refine": "normal-roughness", "iterations1": 4, "judge": True})
-    fit = two_phase(mesh, [maps], views, [texels], chosen, 0)
+    fit = two_phase(mesh, FitStart([maps]), FitTargets(views), [texels], chosen, 0)
     assert len(fit.trace["phase1.style"]) == steps and fit.kept == {"phase1": steps == 4}
     if steps == 2:
         assert fit.notes == ("phase1 was undone after 2 of 4 steps: detail got worse.",)
@@ -257,9 +264,9 @@ def test_a_phase_far_beyond_its_tolerance_is_stopped_on_its_way(scene, monkeypat
 def test_refine_off_changes_nothing_and_metallic_zero_only_that(scene):
     mesh, maps, texels, views = scene
     metal = replace(maps, metallic=np.full_like(maps.metallic, 0.4))
-    fit = two_phase(mesh, [metal], views, [texels], FitSettings(refine="off"), 0)
+    fit = two_phase(mesh, FitStart([metal]), FitTargets(views), [texels], FitSettings(refine="off"), 0)
     assert fit.maps[0] is metal and fit.struggle[0].max() == 0
-    fit = two_phase(mesh, [metal], views, [texels], FitSettings(refine="off", metallic="zero"), 0)
+    fit = two_phase(mesh, FitStart([metal]), FitTargets(views), [texels], FitSettings(refine="off", metallic="zero"), 0)
     assert fit.maps[0].metallic.max() == 0 and fit.maps[0].albedo is metal.albedo
 
 
@@ -268,7 +275,7 @@ def test_metallic_moves_only_when_asked(scene):
     metal = replace(maps, metallic=np.full_like(maps.metallic, 0.4))
     for choice in ("keep", "fit"):
         settings = QUICK.model_copy(update={"metallic": choice, "refine": "normal-roughness", "iterations1": 3})
-        made = two_phase(mesh, [metal], views, [texels], settings, 0).maps[0]
+        made = two_phase(mesh, FitStart([metal]), FitTargets(views), [texels], settings, 0).maps[0]
         assert np.array_equal(made.metallic, metal.metallic) == (choice == "keep")
 
 
@@ -277,7 +284,7 @@ def test_texels_outside_the_given_masks_keep_their_bytes(scene):
     only = np.zeros((SIZE, SIZE), bool)
     only[40:80, 20:90] = True
     settings = QUICK.model_copy(update={"iterations1": 4, "iterations2": 4})
-    made = two_phase(mesh, [maps], views, [texels], settings, 0, only=[only]).maps[0]
+    made = two_phase(mesh, FitStart([maps], only=[only]), FitTargets(views), [texels], settings, 0).maps[0]
     for name in ("albedo", "normal", "roughness"):
         a, b = getattr(made, name), getattr(maps, name)
         assert a[~only].tobytes() == b[~only].tobytes()
@@ -386,11 +393,11 @@ def test_the_fit_works_at_the_resolution_of_the_views(scene):
 
 def test_the_judge_names_what_got_worse():
     before = {"detail": 0.9, "style": 2.0, "views": 1.0}
-    assert fit_judge.worse(before, before) == []
-    assert fit_judge.worse(before, {"detail": 0.99, "style": 1.0, "views": 0.5}) == []
-    assert fit_judge.worse(before, {"detail": 0.8, "style": 2.0, "views": 1.0}, fit_judge.HOPELESS) == []
+    assert fit_judge.regressed(before, before) == []
+    assert fit_judge.regressed(before, {"detail": 0.99, "style": 1.0, "views": 0.5}) == []
+    assert fit_judge.regressed(before, {"detail": 0.8, "style": 2.0, "views": 1.0}, fit_judge.HOPELESS) == []
     assert fit_judge.checks(40) == (10, 20) and fit_judge.checks(200) == (50, 100) and fit_judge.checks(12) == ()
-    assert fit_judge.worse(before, {"detail": 0.7, "style": 2.5, "views": 1.0}) == ["detail", "style"]
+    assert fit_judge.regressed(before, {"detail": 0.7, "style": 2.5, "views": 1.0}) == ["detail", "style"]
 
 
 def test_settings_refuse_what_cannot_be():

@@ -10,7 +10,7 @@ from test_seam import sphere
 
 from mistyle.core.camera import rig
 from mistyle.core.image import gaussian, srgb_from_linear
-from mistyle.core.light import Directional, lights
+from mistyle.core.light import Directional
 from mistyle.core.maps import flat_maps
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
@@ -18,7 +18,7 @@ from mistyle.render import device, draw
 from mistyle.run.stylize_settings import PRESETS
 from mistyle.stages import fit as fitting
 from mistyle.stages import fit_run, fit_table
-from mistyle.stages.fit import two_phase
+from mistyle.stages.fit import FitStart, FitTargets, two_phase
 from mistyle.stages.texels import rasterise
 
 VGG = "weights/vgg19_normalised_relu3_1.pth"
@@ -42,9 +42,9 @@ def scene():
 def phases(scene, settings):
     """Both phases of a fit, ready to step on one table."""
     mesh, maps, texels, views = scene
-    world, table = fitting._world(mesh, views, settings), fit_table.build([maps], [texels], 1)
-    for phase in fitting._phases(settings, lights("phase1"), views):
-        yield fit_run.Run(world, table, phase, settings, np.random.default_rng(3))
+    scene, table = fitting._scene(mesh, views, settings), fit_table.build([maps], [texels], 1)
+    for phase in fitting._phases(settings, fitting.FitTargets(views)):
+        yield fit_run.PhaseRunner(scene, table, phase, settings, np.random.default_rng(3))
 
 
 @pytest.mark.parametrize("painted", ["without-light", "with-light"])
@@ -82,7 +82,7 @@ def test_frozen_functions_are_recorded_once_per_phase(scene):
 def test_a_relief_is_found_under_either_way_of_lighting(scene, choice):
     mesh, maps, texels, views = scene
     settings = QUICK.model_copy(update={"refine": "normal-roughness", "iterations1": 30, "lights": choice})
-    made = two_phase(mesh, [maps], views, [texels], settings, 0).maps[0]
+    made = two_phase(mesh, FitStart([maps]), FitTargets(views), [texels], settings, 0).maps[0]
     seen = texels.covered & (np.abs(texels.normal[..., 1]) < 0.8)
     down, across = np.gradient(gaussian(srgb_from_linear(maps.albedo).mean(axis=-1), 1.0))
     assert correlation(made.normal[..., 0], -across, seen) > 0.3
@@ -119,7 +119,7 @@ def test_both_phases_run_with_the_real_vgg(scene):
     weights = data(VGG)
     grey = replace(maps, albedo=np.full_like(maps.albedo, 0.3))
     settings = QUICK.model_copy(update={"features": weights, "iterations1": 4, "iterations2": 24, "rate_albedo": 0.05})
-    fit = two_phase(mesh, [grey], views, [texels], settings, 0)
+    fit = two_phase(mesh, FitStart([grey]), FitTargets(views), [texels], settings, 0)
     assert not fit.notes and fit.kept == {"phase1": True, "phase2": True}
     assert all(np.isfinite(values).all() for values in fit.trace.values())
     made, seen = fit.maps[0], texels.covered & (np.abs(texels.normal[..., 1]) < 0.8)

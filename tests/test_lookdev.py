@@ -126,7 +126,7 @@ def test_the_chart_is_held_upright_and_not_mirrored():
 
 @pytest.mark.parametrize("level", [0.03, 7.0])
 def test_a_light_is_exposed_for_the_grey_ball(level):
-    rig = sheet.exposed(sheet.Rig("dim", Environment(bake_environment((Ambient((level, level, 2 * level)),), 8))))
+    rig = sheet.exposed(sheet.LightRig("dim", Environment(bake_environment((Ambient((level, level, 2 * level)),), 8))))
     seen = sheet.ball_mean(sheet.references(rig.light, 16, 1, SMALL), "grey", SMALL)
     assert abs(float(luminance(seen[None])[0]) - 0.18) < 0.002
     assert abs(rig.stops + np.log2(level * (1 + 0.0722))) < 0.02

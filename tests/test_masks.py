@@ -12,7 +12,7 @@ from test_warp import BALL, at, see
 from mistyle.backends import masks
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.core.image import overlap, srgb_from_linear
-from mistyle.stages.mvst import sweep
+from mistyle.stages.mvst import ViewPainter, sweep
 from mistyle.stages.sweep_settings import SweepSettings
 
 
@@ -60,13 +60,12 @@ def test_a_picture_without_foreground_has_an_empty_mask(runtime, tmp_path):
 def test_the_sweep_reports_the_drift(runtime, tmp_path):
     (tmp_path / "net.onnx").write_bytes(b"net")
     views = [see(at(a, size=64), [BALL]) for a in (0, 40)]
-    swept = sweep(
-        views,
-        lambda view, prior, rng: 0.8 * view.mask[..., None] * np.ones(3, np.float32),
-        SweepSettings(),
-        0,
-        masker=masks.segmenter(tmp_path / "net.onnx"),
-    )
+
+    def grey(view, prior, rng):
+        return 0.8 * view.mask[..., None] * np.ones(3, np.float32)
+
+    painter = ViewPainter(grey, masks.segmenter(tmp_path / "net.onnx"))
+    swept = sweep(views, painter, SweepSettings(), 0)
     assert all(0.9 < p.drift <= 1 for p in swept.painted)
 
 

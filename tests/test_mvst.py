@@ -8,8 +8,7 @@ from mistyle.core.camera import angular_order, rig
 from mistyle.core.image import erode, match_histogram, overlap, srgb_from_linear
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import Prior, View
-from mistyle.stages.mvst import Painted as PaintedView
-from mistyle.stages.mvst import sweep, towards, visiting
+from mistyle.stages.mvst import PaintedView, ViewPainter, ViewStore, sweep, towards, visiting
 from mistyle.stages.sweep_settings import SweepSettings
 
 SETTINGS = SweepSettings()
@@ -49,15 +48,15 @@ def disagreement(views: list[View]) -> float:
 
 def test_views_agree_after_a_sweep_and_not_without():
     views = ring()
-    apart = [v for v in sweep(views, lambda v, p, rng: Noise()(v, None, rng), SETTINGS, 0).views]
-    together = list(sweep(views, Noise(), SETTINGS, 0, keeps_outlines=True).views)
+    apart = [v for v in sweep(views, ViewPainter(lambda v, p, rng: Noise()(v, None, rng)), SETTINGS, 0).views]
+    together = list(sweep(views, ViewPainter(Noise(), keeps_outlines=True), SETTINGS, 0).views)
     # Noise of one pixel is the worst case: landing half a pixel off already shows another value.
     assert disagreement(together) < 0.4 * disagreement(apart)
 
 
 def test_the_first_view_has_no_prior_and_the_others_what_was_painted():
     stylizer = Noise()
-    swept = sweep(ring(), stylizer, SETTINGS, 0, keeps_outlines=True)
+    swept = sweep(ring(), ViewPainter(stylizer, keeps_outlines=True), SETTINGS, 0)
     assert stylizer.seen[0][1] is None
     assert swept.painted[swept.order[0]].known == 0
     for k, (_, prior) in zip(swept.order[1:], stylizer.seen[1:], strict=True):
@@ -90,27 +89,27 @@ def test_cameras_without_angles_keep_their_order_in_the_papers():
 
 def test_a_killed_sweep_goes_on_in_the_view_it_was_in(tmp_path):
     views = ring(48)
-    whole = sweep(views, Noise(), SETTINGS, 7)
+    whole = sweep(views, ViewPainter(Noise()), SETTINGS, 7)
     with pytest.raises(RuntimeError):
-        sweep(views, Noise(broken=3), SETTINGS, 7, kept=tmp_path, key="job")
+        sweep(views, ViewPainter(Noise(broken=3)), SETTINGS, 7, store=ViewStore(tmp_path, "job"))
     rest = Noise()
-    resumed = sweep(views, rest, SETTINGS, 7, kept=tmp_path, key="job")
+    resumed = sweep(views, ViewPainter(rest), SETTINGS, 7, store=ViewStore(tmp_path, "job"))
     assert len(rest.seen) == 3
     for a, b in zip(whole.views, resumed.views, strict=True):
         assert np.array_equal(a.rgb, b.rgb)
     # Another key, a damaged file: painted again.
     (tmp_path / "view_000.npz").write_bytes(b"half a fi")
     again = Noise()
-    sweep(views, again, SETTINGS, 7, kept=tmp_path, key="job")
+    sweep(views, ViewPainter(again), SETTINGS, 7, store=ViewStore(tmp_path, "job"))
     assert [name for name, _ in again.seen] == [views[0].camera.name]
     other = Noise()
-    sweep(views, other, SETTINGS, 7, kept=tmp_path, key="another job")
+    sweep(views, ViewPainter(other), SETTINGS, 7, store=ViewStore(tmp_path, "another job"))
     assert len(other.seen) == 6
 
 
 def test_the_seed_decides():
     views = ring(32)
-    a, b, c = (sweep(views, Noise(), SETTINGS, seed).views for seed in (1, 1, 2))
+    a, b, c = (sweep(views, ViewPainter(Noise()), SETTINGS, seed).views for seed in (1, 1, 2))
     assert all(np.array_equal(x.rgb, y.rgb) for x, y in zip(a, b, strict=True))
     assert not np.array_equal(a[0].rgb, c[0].rgb)
 
@@ -125,7 +124,7 @@ def test_later_views_are_drawn_to_the_anchors_colours():
     means = {}
     for strength in (0.0, 0.5, 1.0):
         settings = SWEEP.model_copy(update={"histogram": strength})
-        swept = sweep(views, drifting, settings, 0)
+        swept = sweep(views, ViewPainter(drifting), settings, 0)
         inner = [srgb_from_linear(v.rgb)[p.mask].mean() for v, p in zip(swept.views, swept.painted, strict=True)]
         means[strength] = inner
     assert means[0.0][0] == means[1.0][0]
@@ -156,17 +155,17 @@ def test_masks_and_drift():
         assert view.rgb.any()
         return np.roll(view.mask, 3, axis=1)
 
-    plain = sweep(views, Noise(), SETTINGS, 0)
+    plain = sweep(views, ViewPainter(Noise()), SETTINGS, 0)
     assert all(p.drift == 1 for p in plain.painted)
     for view, painted in zip(views, plain.painted, strict=True):
         assert np.array_equal(painted.mask, erode(view.mask & (view.coverage > 0.995), 1))
-    seen = sweep(views, Noise(), SETTINGS, 0, masker=shifted, keeps_outlines=True)
+    seen = sweep(views, ViewPainter(Noise(), masker=shifted, keeps_outlines=True), SETTINGS, 0)
     for view, painted in zip(views, seen.painted, strict=True):
         assert painted.drift == pytest.approx(overlap(view.mask, shifted(view)))
         assert 0.8 < painted.drift < 0.97
         assert not (painted.mask & ~shifted(view)).any()
     settings = SweepSettings(mask_erosion=4)
-    assert np.array_equal(sweep(views, Noise(), settings, 0).painted[0].mask, erode(views[0].mask, 4))
+    assert np.array_equal(sweep(views, ViewPainter(Noise()), settings, 0).painted[0].mask, erode(views[0].mask, 4))
 
 
 @pytest.mark.parametrize("follows", [False, True])
@@ -187,7 +186,7 @@ def test_depth_follows_the_outline_where_the_stylizer_moves_it(follows, monkeypa
     lift = mvst.lift
     monkeypatch.setattr(mvst, "lift", watched)
     settings = SweepSettings(follow_outline=follows, mask_erosion=0)
-    sweep(views, shifting, settings, 0, masker=lambda view: view.rgb[..., 0] > 0.5)
+    sweep(views, ViewPainter(shifting, masker=lambda view: view.rgb[..., 0] > 0.5), settings, 0)
     for view, (shown, mask) in zip(views, lifted, strict=True):
         drawn = np.roll(view.mask, 4, axis=1)
         assert np.array_equal(shown.mask, drawn if follows else view.mask)
@@ -203,11 +202,11 @@ def test_depth_follows_the_outline_where_the_stylizer_moves_it(follows, monkeypa
 def test_what_a_stylizer_may_not_give():
     views = ring(32)[:1]
     with pytest.raises(ValueError, match="shape"):
-        sweep(views, lambda v, p, r: np.zeros((3, 3, 3), np.float32), SETTINGS, 0)
+        sweep(views, ViewPainter(lambda v, p, r: np.zeros((3, 3, 3), np.float32)), SETTINGS, 0)
     with pytest.raises(ValueError, match="finite"):
-        sweep(views, lambda v, p, r: np.full(v.rgb.shape, np.nan, np.float32), SETTINGS, 0)
+        sweep(views, ViewPainter(lambda v, p, r: np.full(v.rgb.shape, np.nan, np.float32)), SETTINGS, 0)
     with pytest.raises(ValueError, match="no views"):
-        sweep([], Noise(), SETTINGS, 0)
+        sweep([], ViewPainter(Noise()), SETTINGS, 0)
 
 
 def test_histogram_match_gives_the_targets_distribution(rng):

@@ -10,7 +10,7 @@ from mistyle.run import summary
 from mistyle.run.cli import main
 from mistyle.run.pages import fit_facts
 from mistyle.run.progress import Progress, grouped
-from mistyle.stages.fit_judge import TOLERANCE, undone_where, worse
+from mistyle.stages.fit_judge import TOLERANCE, regressed, undone_where
 
 NOTE = "The mesh has no normals"  # of the square: smooth ones are computed
 
@@ -69,8 +69,8 @@ def test_the_sentence_about_undone_phases_states_the_tolerances_that_decide():
     for name, (share, absolute) in TOLERANCE.items():
         change = share * before[name] + absolute
         sign = -1 if name == "detail" else 1
-        assert worse(before, before | {name: before[name] + sign * 0.99 * change}) == []
-        assert worse(before, before | {name: before[name] + sign * 1.01 * change}) == [name]
+        assert regressed(before, before | {name: before[name] + sign * 0.99 * change}) == []
+        assert regressed(before, before | {name: before[name] + sign * 1.01 * change}) == [name]
         part = next(p for p in sentence.replace(" or ", ", ").split(", ") if name in p)
         assert all(f"{value:.0%}" in part for value in [share] if value)
         assert all(f"{value:g}" in part for value in [absolute] if value)

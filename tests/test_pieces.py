@@ -6,7 +6,7 @@ from helpers import fixed_surface
 from test_surface import plain_cost, plane_level, small_search
 
 from mistyle.render import device
-from mistyle.surface import guides, kernels, pieces, style, synthesis
+from mistyle.surface import field, guides, kernels, pieces, style, synthesis
 
 
 @pytest.fixture(scope="module")
@@ -31,46 +31,49 @@ def faces_of_a_picture(size=128) -> np.ndarray:
 @pytest.mark.parametrize("flip", [False, True])
 def test_a_picture_laid_down_whole_is_one_piece(dj, flip):
     level = plane_level(dj, flip=flip)
-    pages = style.pages(style.prepare(faces_of_a_picture()), 64, 0.5)
+    exemplar = style.exemplar(style.prepare(faces_of_a_picture()), 64, 0.5)
     row, column = np.divmod(np.arange(21 * 21), 21)
     page, x, y = np.zeros(21 * 21, np.int32), 10.0 + column, 20.0 + row
     if flip:  # there the tangents point the other way, and the same picture stands on the page turned over
         over = level.tangent[:, 0] < 0
-        height, width = pages.size
+        height, width = exemplar.size
         page, x, y = np.where(over, 2, page), np.where(over, width - 1 - x, x), np.where(over, height - 1 - y, y)
-    label = pieces.labels(level, pages, page, x, y)
+    choice = field.NearestNeighbourField(page, x, y)
+    label = pieces.labels(level, exemplar, choice)
     assert (label == label[0]).all()
-    choice = synthesis.Choice(page, x, y)
-    at = pieces.on_picture(pages, synthesis.pixels(pages, choice))
+    at = pieces.on_picture(exemplar, field.pixels(exemplar, choice))
     np.testing.assert_allclose(at, np.stack([10 + column, 20 + row], 1) / 64, atol=1e-6)
     far = pieces.reach(label, at)
     assert far.max() == pytest.approx(np.hypot(10, 10) / 64, abs=1e-4) and far.min() < 0.2 / 64
     # Where the picture is cut and moved on by three pixels, another piece begins.
     x = np.where(column > 10, x + (-3 if flip else 3), x)
-    assert len(np.unique(pieces.labels(level, pages, page, x, y))) == 2
+    assert len(np.unique(pieces.labels(level, exemplar, field.NearestNeighbourField(page, x, y)))) == 2
 
 
 def test_near_the_end_of_a_piece_the_search_pays_for_staying(dj, rng):
-    level, pages, described, asked, weight, start, book = small_search(dj, rng)
+    level, exemplar, described, asked, weight, start, arrays = small_search(dj, rng)
     table = kernels.tables(dj, level.neighbours, level.turned, level.offsets)
-    use = synthesis.usage(pages, start)
-    wanted = kernels.Wanted(kernels.floats(dj, asked), kernels.floats(dj, weight))
-    prices, place = kernels.floats(dj, np.array([0.005, 0.003, 1 / 2.0])), synthesis.on_device(dj, start)
+    used = field.usage(exemplar, start)
+    use, targets = (
+        kernels.floats(dj, used),
+        kernels.TargetDescriptors(kernels.floats(dj, asked), kernels.floats(dj, weight)),
+    )
+    prices, place = kernels.floats(dj, np.array([0.005, 0.003, 1 / 2.0])), field.on_device(dj, start)
 
     def found(end: np.ndarray):
-        ends = kernels.Ends(kernels.floats(dj, end.astype(np.float32)), kernels.floats(dj, np.array([6.0])))
-        cost, chosen = kernels.search(dj, table, book, place, wanted, kernels.floats(dj, use), prices, None, ends)
-        return cost.numpy(), synthesis.on_host(chosen)
+        limit = kernels.PatchSizeLimit(kernels.floats(dj, end.astype(np.float32)), kernels.floats(dj, np.array([6.0])))
+        cost, chosen = kernels.search(dj, table, arrays, place, targets, kernels.Prices(prices, use, limit))
+        return cost.numpy(), field.on_host(chosen)
 
     none = np.zeros(len(asked), bool)
     cost, chosen = found(none)
-    plain, same = kernels.search(dj, table, book, place, wanted, kernels.floats(dj, use), prices, None)
-    assert np.array_equal(cost, plain.numpy()) and np.array_equal(chosen.x, synthesis.on_host(same).x)
+    plain, same = kernels.search(dj, table, arrays, place, targets, kernels.Prices(prices, use))
+    assert np.array_equal(cost, plain.numpy()) and np.array_equal(chosen.x, field.on_host(same).x)
     cost, chosen = found(~none)
-    expected = plain_cost(level, pages, described, asked, weight, use, start, chosen, 0.0, 0.003)
+    expected = plain_cost(level, exemplar, described, asked, weight, used, start, chosen, 0.0, 0.003)
     for k in kernels.BESIDE:
         j, turned = level.neighbours[:, k], level.turned[:, k]
-        height, width = pages.shapes[start.page[j]].T
+        height, width = exemplar.shapes[start.page[j]].T
         x, y = start.x[j] + level.offsets[:, k, 0], start.y[j] + level.offsets[:, k, 1]
         x, y = np.where(turned, width - 1 - x, x), np.where(turned, height - 1 - y, y)
         page = np.where(turned, (start.page[j] + 2) % 4, start.page[j])
@@ -81,19 +84,20 @@ def test_near_the_end_of_a_piece_the_search_pays_for_staying(dj, rng):
 
 def test_a_picture_laid_down_whole_is_broken_up_where_that_is_wanted(dj):
     level = plane_level(dj, side=41)
-    pages = style.pages(style.prepare(faces_of_a_picture()), 64, 0.5)
+    exemplar = style.exemplar(style.prepare(faces_of_a_picture()), 64, 0.5)
     row, column = np.divmod(np.arange(41 * 41), 41)
-    start = synthesis.Choice(np.zeros(41 * 41, np.int32), 10.0 + column, 10.0 + row)
+    start = field.NearestNeighbourField(np.zeros(41 * 41, np.int32), 10.0 + column, 10.0 + row)
     none = np.zeros(41 * 41, np.float32)
-    there = synthesis.pixels(pages, start)
-    guide = guides.Guide(colour=pages.broad[there], detail=none, directed=none)
+    there = field.pixels(exemplar, start)
+    guide = guides.Guide(colour=exemplar.broad[there], detail=none, directed=none)
 
     def widths(largest: float) -> np.ndarray:
         settings = fixed_surface(largest_piece=largest, stroke_coherence=0.1)
         rng = np.random.default_rng(0)
-        found = synthesis.paint_level(level, guide, pages, start, 6, settings, rng, dj)
-        label = pieces.labels(level, pages, found.page, found.x, found.y)
-        return 2 * pieces.reach(label, pieces.on_picture(pages, synthesis.pixels(pages, found)))
+        task = synthesis.LevelTask(level, guide, exemplar, 6)
+        found = synthesis.paint_level(task, start, settings, rng, dj)
+        label = pieces.labels(level, exemplar, found)
+        return 2 * pieces.reach(label, pieces.on_picture(exemplar, field.pixels(exemplar, found)))
 
     whole, broken = widths(1.0), widths(0.2)
     # The sheet of 41 x 41 samples stays one piece of the 64 pixels: its widest is its diagonal.

@@ -151,7 +151,7 @@ def test_unknown_stages_and_busy_folders_are_refused(inputs, tmp_path):
 
 @pytest.mark.parametrize("name", ["style_mask", "protect", "direction_map"])
 def test_pictures_of_the_coat_that_are_not_there_end_it_at_once(inputs, tmp_path, name):
-    settings = resolve("draft", None, {**TINY, "coat": {name: str(tmp_path / "no.png")}}, {})
+    settings = resolve("draft", None, {**TINY, "paint": {name: str(tmp_path / "no.png")}}, {})
     with pytest.raises(InputRefused, match=r"no\.png: found nothing; expected a picture"):
         pipeline.stylize(Job(inputs[0], inputs[1], tmp_path / "a", settings, "bell"), Progress(quiet=True))
     assert not (tmp_path / "a").exists()

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from helpers import fixed_surface
-from test_surface import dented_ball, mesh_of, open_sky, strokes
+from test_surface import dented_ball, mesh_of, solved, strokes
 
 from mistyle.surface import creases, kernels, places, samples, synthesis
 
@@ -58,7 +58,7 @@ def test_the_painting_of_a_ball_holds_no_light():
     ratio = {}
     for form in (0.0, 1.0):
         chosen = fixed_surface(samples=6000, form=form)
-        made = synthesis.solve(dented_ball(), strokes(), chosen, 0, open_sky)
+        made = solved(dented_ball(), strokes(), chosen, 0)
         light = lookup.colour(made, made.positions, made.normals, footprint=made.spacing).mean(axis=1)
         up, down = made.normals[:, 1] > 0.5, made.normals[:, 1] < -0.5
         ratio[form] = light[up].mean() / light[down].mean()

@@ -14,7 +14,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.render import device
 from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
-from mistyle.render.polish import polish
+from mistyle.render.polish import PolishSettings, polish
 
 SIZE, RESOLUTION = 24, 48
 
@@ -98,7 +98,7 @@ def test_light_between_walls_leaves_the_albedo(room):
     gain = direct_only[1][direct_only[1] > 0.05].mean() / direct_only[0][direct_only[0] > 0.05].mean()
     assert gain > 1.2  # otherwise this scene would show nothing
     start = Maps(np.clip(truth.albedo * np.float32(gain), 0, 1), *(getattr(baked, n) for n in _REST))
-    done = polish(mesh, [start], captures, 40, rate=0.03, spp=16, spp_grad=4)
+    done = polish(mesh, [start], captures, PolishSettings(40, rate=0.03, spp=16, spp_grad=4))
 
     def wrong(maps):
         return float(np.abs(maps.albedo - truth.albedo)[at].mean())
@@ -112,11 +112,11 @@ _REST = ("normal", "roughness", "metallic", "known")
 
 def test_what_is_not_fitted_stays_and_a_worse_result_is_dropped(room):
     mesh, truth, captures = room
-    done = polish(mesh, [truth], captures, 3, rate=0.5, spp=4)
+    done = polish(mesh, [truth], captures, PolishSettings(3, rate=0.5, spp=4))
     assert done.loss[1] > done.loss[0]
     for name in ("albedo", *_REST):
         np.testing.assert_array_equal(getattr(done.maps[0], name), getattr(truth, name))
-    kept = polish(mesh, [plain((0.2, 0.2, 0.2))], captures, 2, rate=0.02, spp=4).maps[0]
+    kept = polish(mesh, [plain((0.2, 0.2, 0.2))], captures, PolishSettings(2, rate=0.02, spp=4)).maps[0]
     np.testing.assert_array_equal(kept.metallic, 0)
     assert not np.array_equal(kept.albedo, plain((0.2, 0.2, 0.2)).albedo)
 

@@ -7,7 +7,7 @@ from helpers import data, fixed_surface
 
 from mistyle.core.errors import UsageError
 from mistyle.run.stylize_settings import resolve
-from mistyle.surface import edges, style, synthesis
+from mistyle.surface import edges, field, style, synthesis
 from mistyle.surface.chosen import FROM_PAINTING, flat, graphic, resolved, settled
 from mistyle.surface.reading import read_style
 from mistyle.surface.settings import SurfaceSettings
@@ -173,6 +173,8 @@ def test_the_crop_is_taken_side_by_side():
 def test_the_old_name_is_answered_with_the_new_one():
     with pytest.raises(UsageError, match="now called 'surface.stroke_scale'"):
         resolve(None, None, {"surface": {"style_scale": 2.0}}, {})
+    with pytest.raises(UsageError, match=r"'coat\.height' is now called 'paint\.height'"):
+        resolve(None, None, {"coat": {"height": 0.2}}, {})
     assert (
         resolve(None, None, {"surface": {"stroke_coherence": 0.2, "crop": [0.1, 0, 0, 0]}}, {}).surface.levels is None
     )
@@ -189,11 +191,11 @@ def test_the_coarsest_level_sees_the_same_share_of_the_painting_at_every_stroke_
 
 
 def test_a_piece_copied_once_is_no_overuse_where_the_surface_shows_a_part_of_the_picture():
-    book = style.pages(style.prepare(noise((200, 200))), 200, 0.0)
+    book = style.exemplar(style.prepare(noise((200, 200))), 200, 0.0)
     row, column = np.mgrid[50:90, 50:90].reshape(2, -1).astype(np.float32)
     page = np.zeros(len(row), np.int32)
-    once = synthesis.usage(book, synthesis.Choice(page, column, row)).reshape(200, 200)
-    twice = synthesis.usage(book, synthesis.Choice(page, column, 50 + np.floor(row / 2 - 25))).reshape(200, 200)
+    once = field.usage(book, field.NearestNeighbourField(page, column, row)).reshape(200, 200)
+    twice = field.usage(book, field.NearestNeighbourField(page, column, 50 + np.floor(row / 2 - 25))).reshape(200, 200)
     assert once[60:80, 60:80] == pytest.approx(1) and twice[55:65, 60:80] == pytest.approx(2)
 
 

@@ -26,6 +26,7 @@ from mistyle.core.light import (
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device, draw, scene
+from mistyle.render.scene import Staging
 
 # Ray tracing in float32 about four units away.
 TRACED = 2e-5
@@ -87,7 +88,7 @@ def lit(folder: Path, direction: str, material: Maps, camera: Camera) -> np.ndar
     """The quad under one light that travels along `direction`, through a scene file as a user would write it."""
     path = folder / "light.xml"
     path.write_text(DIRECTIONAL.format(direction=direction, shape="sphere", name="object"))
-    return draw.picture(quad(), [material], camera, path, spp=4)
+    return draw.picture(quad(), [material], camera, Staging(path, spp=4))
 
 
 @pytest.mark.parametrize(
@@ -172,13 +173,13 @@ def test_texture_row_zero_is_up_and_column_zero_left() -> None:
     colours = np.array([[[0.8, 0.1, 0.1], [0.1, 0.8, 0.1]], [[0.1, 0.1, 0.8], [0.8, 0.8, 0.1]]], np.float32)
     albedo = np.kron(colours, np.ones((8, 8, 1), np.float32))
     painted = replace(flat_maps(16, roughness=1.0), albedo=albedo)
-    image = draw.picture(quad(), [painted], camera_at(0, 0, 32, 2.0), "phase2_ambient", spp=16)[..., :3]
+    image = draw.picture(quad(), [painted], camera_at(0, 0, 32, 2.0), Staging("phase2_ambient", spp=16))[..., :3]
     # The square fills the middle 30 of 32 pixels; sample the middle of each quarter.
     seen = image[8::16, 8::16]
     assert (seen / seen.max(axis=-1, keepdims=True) > 0.5).tolist() == (colours > 0.5).tolist()
     repeated = quad()
     repeated = replace(repeated, corner_uvs=repeated.corner_uvs + np.array([-1, 1], np.float32))
-    again = draw.picture(repeated, [painted], camera_at(0, 0, 32, 2.0), "phase2_ambient", spp=16)[..., :3]
+    again = draw.picture(repeated, [painted], camera_at(0, 0, 32, 2.0), Staging("phase2_ambient", spp=16))[..., :3]
     assert np.abs(again[8::16, 8::16] - seen).max() < 0.02
 
 
@@ -199,9 +200,9 @@ def test_normals_that_face_away_are_black_for_gradients_and_lit_in_pictures() ->
 
     device.use()
     camera, away = camera_at(60, 0, 16), maps(normal=(-1, 0, 0.5))
-    strict = scene.scene_dict(quad(), [away], camera, "phase2_ambient", spp=4)
+    strict = scene.scene_dict(quad(), [away], camera, Staging("phase2_ambient", spp=4))
     assert np.array(mi.render(mi.load_dict(strict), spp=4))[8, 8, :3].max() == 0
-    assert draw.picture(quad(), [away], camera, "phase2_ambient", spp=4)[8, 8, :3].min() > 0.1
+    assert draw.picture(quad(), [away], camera, Staging("phase2_ambient", spp=4))[8, 8, :3].min() > 0.1
 
 
 def test_both_sides_of_a_surface_are_lit_and_irradiance_is_what_it_says(tmp_path: Path) -> None:
@@ -217,37 +218,37 @@ def test_the_slot_of_a_scene_file(tmp_path: Path) -> None:
     path = tmp_path / "scene.xml"
     path.write_text(DIRECTIONAL.format(direction="0, 0, -1", shape="sphere", name="ball"))
     with pytest.raises(InputRefused, match='id="object".*ball'):
-        draw.picture(quad(), None, camera, path)
+        draw.picture(quad(), None, camera, Staging(path))
     path.write_text("<scene version='3.0.0'><shape")
     with pytest.raises(InputRefused, match="cannot load"):
-        draw.picture(quad(), None, camera, path)
+        draw.picture(quad(), None, camera, Staging(path))
     with pytest.raises(InputRefused, match="no scene"):
-        draw.picture(quad(), None, camera, tmp_path / "absent.xml")
+        draw.picture(quad(), None, camera, Staging(tmp_path / "absent.xml"))
     with pytest.raises(InputRefused, match="takes no environment map"):
-        draw.picture(quad(), None, camera, "phase1_directional", hdri=np.ones((4, 8, 3), np.float32))
+        draw.picture(quad(), None, camera, Staging("phase1_directional", hdri=np.ones((4, 8, 3), np.float32)))
 
 
 def test_an_environment_map_colours_the_object() -> None:
     red = np.zeros((8, 16, 3), np.float32)
     red[..., 0] = 1
-    image = draw.picture(quad(), [maps()], camera_at(0, 0, 8, 2.0), "hdri", spp=4, hdri=red)
+    image = draw.picture(quad(), [maps()], camera_at(0, 0, 8, 2.0), Staging("hdri", spp=4, hdri=red))
     assert image[4, 4, 0] > 0.3 and image[4, 4, 1:3].max() < 1e-6 and image[4, 4, 3] == pytest.approx(1)
 
 
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_every_template_draws_the_object(template: str) -> None:
-    image = draw.picture(sphere(16), None, camera_at(30, 15, 32), template, spp=4, backdrop=False)
+    image = draw.picture(sphere(16), None, camera_at(30, 15, 32), Staging(template, spp=4, backdrop=False))
     assert np.isfinite(image).all()
     assert image[16, 16, :3].min() > 0.02 and image[16, 16, 3] == pytest.approx(1)
     assert not image[0, 0].any(), "the environment must not be seen"
-    from_below = draw.picture(sphere(16), None, camera_at(30, -89, 32), template, spp=4)
+    from_below = draw.picture(sphere(16), None, camera_at(30, -89, 32), Staging(template, spp=4))
     assert from_below[16, 16, :3].min() > 0.005
 
 
 def test_the_studio_has_a_floor_for_cameras_above_it() -> None:
-    with_floor = draw.picture(sphere(16), None, camera_at(30, 15, 32), spp=4)
+    with_floor = draw.picture(sphere(16), None, camera_at(30, 15, 32), Staging(spp=4))
     assert with_floor[..., 3].min() > 0.99
-    turned = draw.picture(sphere(16), None, camera_at(210, 15, 32), spp=4)
+    turned = draw.picture(sphere(16), None, camera_at(210, 15, 32), Staging(spp=4))
     # The studio turns with the camera, and a sphere looks the same from everywhere.
     assert np.abs(with_floor - turned).mean() < 0.05
 
@@ -283,7 +284,7 @@ def test_phase_one_lights_are_fixed_to_the_camera() -> None:
     """A sphere looks the same from everywhere under them; the key stands at the upper left."""
     ball = sphere(64)
     first, second = (
-        draw.picture(ball, None, camera_at(a, e, 32), "phase1_directional", spp=64)[..., 0]
+        draw.picture(ball, None, camera_at(a, e, 32), Staging("phase1_directional", spp=64))[..., 0]
         for a, e in ((0, 0), (130, 40))
     )
     inner = draw.gbuffer(ball, camera_at(0, 0, 32)).normal[..., 2] > 0.4
@@ -296,7 +297,7 @@ def test_the_records_of_the_lights_are_those_of_the_scene_file() -> None:
 
     device.use()
     camera = camera_at(77, -33, 16)
-    loaded = mi.load_dict(scene.scene_dict(sphere(8), None, camera, "phase1_directional"), optimize=False)
+    loaded = mi.load_dict(scene.scene_dict(sphere(8), None, camera, Staging("phase1_directional")), optimize=False)
     rig = [light for light in lights("phase1") if isinstance(light, Directional)]
     assert len(rig) == len(loaded.emitters()) == 3
     reference = mi.Interaction3f()
@@ -358,7 +359,8 @@ def test_parameters_name_textures_that_can_be_optimised() -> None:
 
     device.use()
     mesh = sphere(8, parts=2)
-    made = mi.load_dict(scene.scene_dict(mesh, [flat_maps(4), flat_maps(8)], template="phase2_ambient"), optimize=False)
+    maps = [flat_maps(4), flat_maps(8)]
+    made = mi.load_dict(scene.scene_dict(mesh, maps, None, Staging("phase2_ambient")), optimize=False)
     found = mi.traverse(made)
     for part, side in ((0, 4), (1, 8)):
         for name, key in scene.parameters(part).items():
@@ -376,7 +378,7 @@ def test_samples_come_in_passes_that_threads_do_not_share() -> None:
     with pytest.raises(ValueError, match="spp"):
         scene.samples(0)
     ball, camera = sphere(16), camera_at(30, 15, 24)
-    few, many, reference = (draw.picture(ball, None, camera, "paper_views", spp=n) for n in (16, 128, 1024))
+    few, many, reference = (draw.picture(ball, None, camera, Staging("paper_views", spp=n)) for n in (16, 128, 1024))
     error = [float(np.sqrt(((image - reference) ** 2).mean())) for image in (few, many)]
     # Eight times the samples halve the error at the very least, if the passes differ.
     assert error[1] < 0.5 * error[0]
@@ -408,10 +410,10 @@ def test_a_template_that_does_not_follow_the_camera_is_loaded_once_and_gives_the
     loads: list[int] = []
     load = scene.read_template
     monkeypatch.setattr(scene, "read_template", lambda *a, **k: (loads.append(1), load(*a, **k))[1])
-    once = draw.pictures(ball, None, cameras, "paper_views", spp=4)
+    once = draw.pictures(ball, None, cameras, Staging("paper_views", spp=4))
     assert len(loads) == 1
     monkeypatch.setattr(scene, "follows_camera", lambda template: True)
-    each = draw.pictures(ball, None, cameras, "paper_views", spp=4)
+    each = draw.pictures(ball, None, cameras, Staging("paper_views", spp=4))
     assert len(loads) == 4
     for one, other in zip(once, each, strict=True):
         assert np.array_equal(one, other)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mistyle.stages.repaint import normal, refined, sample, step
+from mistyle.stages.repaint import Resampling, normal, refined, sample, step
 
 RHO, GIVEN = 0.9, 1.5  # two unit normals of this correlation; the first one is known
 MEAN, VARIANCE = RHO * GIVEN, 1 - RHO**2
@@ -23,7 +23,9 @@ def ideal(x: np.ndarray, sigma: float) -> np.ndarray:
 def unknown(L: int, r: int, refine: float = 0.0, count: int = 20_000, seed: int = 0) -> np.ndarray:
     prior = np.tile([GIVEN, 0.0], (count, 1))
     mask = np.array([1.0, 0.0])
-    return sample(ideal, prior, mask, karras(50), L, r, rng=np.random.default_rng(seed), refine=refine)[:, 1]
+    return sample(ideal, prior, mask, karras(50), Resampling(L, r, refine=refine), rng=np.random.default_rng(seed))[
+        :, 1
+    ]
 
 
 def test_resampling_brings_the_conditional():
@@ -67,7 +69,7 @@ def test_the_denoiser_is_called_as_often_as_said(steps, L, r, refine):
         return 0.5 * x
 
     prior = np.zeros((3, 2))
-    sample(count, prior, np.ones(2), levels, L, r, rng=np.random.default_rng(0), refine=refine)
+    sample(count, prior, np.ones(2), levels, Resampling(L, r, refine=refine), rng=np.random.default_rng(0))
     extra = int(refine * steps)
     blocks = [levels[k : min(k + L, steps)] * r for k in range(0, steps, L)]
     assert seen == [s for block in blocks for s in block] + levels[steps - extra : steps]
@@ -75,14 +77,16 @@ def test_the_denoiser_is_called_as_often_as_said(steps, L, r, refine):
 
 def test_pinned_pixels_are_the_prior_at_the_end(rng):
     prior, mask = rng.normal(size=(4, 8, 8)), (rng.random((8, 8)) < 0.4).astype(float)
-    found = sample(lambda x, s: x / (1 + s), prior, mask, karras(20), rng=np.random.default_rng(3), refine=0.0)
+    found = sample(
+        lambda x, s: x / (1 + s), prior, mask, karras(20), Resampling(refine=0.0), rng=np.random.default_rng(3)
+    )
     assert np.array_equal(found[:, mask == 1], prior[:, mask == 1])
     assert (found[:, mask == 0] != prior[:, mask == 0]).all()
 
 
 def test_the_first_view_is_plain_sampling(rng):
     levels, like = karras(12), np.zeros((5, 2))
-    found = sample(ideal, None, None, levels, 10, 10, rng=np.random.default_rng(1), like=like, refine=0.0)
+    found = sample(ideal, None, None, levels, Resampling(10, 10, refine=0.0), rng=np.random.default_rng(1), like=like)
     x = levels[0] * normal(np.random.default_rng(1), like)
     for a, b in zip(levels, levels[1:], strict=False):
         x = step(ideal, x, a, b)
@@ -104,7 +108,7 @@ def test_torch_tensors_pass_through():
     matrix = lambda s: torch.tensor(COVARIANCE @ np.linalg.inv(COVARIANCE + s * s * np.eye(2)))  # noqa: E731
     prior, mask = torch.tensor([GIVEN, 0.0], dtype=torch.float64).repeat(4000, 1), torch.tensor([1.0, 0.0])
     generator = torch.Generator().manual_seed(0)
-    found = sample(lambda x, s: x @ matrix(s).T, prior, mask, karras(50), rng=generator, refine=0.0)
+    found = sample(lambda x, s: x @ matrix(s).T, prior, mask, karras(50), Resampling(refine=0.0), rng=generator)
     assert isinstance(found, torch.Tensor) and found.dtype == torch.float64
     assert torch.equal(found[:, 0], prior[:, 0])
     assert float(found[:, 1].mean()) == pytest.approx(unknown(10, 10).mean(), abs=0.03)

@@ -8,7 +8,7 @@ from test_scene_fit import bitmap, smooth
 
 from mistyle.core.lanes import aligned
 from mistyle.render import device, scene_fit, scene_grad, scene_job, scene_keys
-from mistyle.render.scene_fast import Fast, NotFast
+from mistyle.render.scene_fast import DeferredRenderer, Unsupported
 
 KEYS = ["wall.bsdf.base_color.data", "wall.bsdf.roughness.data", "wall.bsdf.normalmap.data", "ball.bsdf.base_color"]
 SIZE = 16
@@ -131,7 +131,7 @@ def test_gradients_are_those_of_the_scene(references, bump):
     chosen = scene_keys.match(scene, KEYS)
     views = sights(scene, references)
     engine = scene_grad.ad_integrator(scene)[0]
-    fast = Fast(scene, chosen, views, "l2", engine, subsamples=64)
+    fast = DeferredRenderer(scene, chosen, views, "l2", engine, subsamples=64)
     import mitsuba as mi
 
     table = mi.traverse(scene)
@@ -140,7 +140,12 @@ def test_gradients_are_those_of_the_scene(references, bump):
         loss, ours = fast.gradients(values, k)
         rounds = [
             scene_grad.gradients(
-                scene, table, chosen, values, engine, views[k], scene_grad.l2, (256, 256), (2 * j + 1, 2 * j + 2)
+                scene_grad.LiveScene(scene, table, chosen, engine),
+                values,
+                views[k],
+                scene_grad.l2,
+                (256, 256),
+                (2 * j + 1, 2 * j + 2),
             )
             for j in range(2)
         ]
@@ -168,7 +173,7 @@ def test_other_materials_are_left_out_of_the_pictures(references):
     """A diffuse shape stands before the wall: its pixels do not count, its shadow does."""
     scene = start(other={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.9, 0.1, 0.1]}})
     chosen = scene_keys.match(scene, KEYS[:1])
-    fast = Fast(scene, chosen, sights(scene, references), "l2", scene_grad.ad_integrator(scene)[0])
+    fast = DeferredRenderer(scene, chosen, sights(scene, references), "l2", scene_grad.ad_integrator(scene)[0])
     counted = [fast.shade.captures.load(k)[1].mean() for k in range(3)]
     assert max(counted) < 0.98 and min(counted) > 0.5
 
@@ -182,8 +187,9 @@ def test_other_materials_are_left_out_of_the_pictures(references):
 )
 def test_where_it_does_not_hold_the_reason_is_told(references, changed, words):
     scene = start(**changed)
-    plan = scene_job.Plan(1, 1, 1, 0.01, True, 1, 0)
-    job, notes = scene_job.prepare(scene, KEYS[:1], None, references, None, None, "l2", (), None, plan)
+    plan = scene_job.FitPlan(1, 1, 1, 0.01, True, 1, 0)
+    evidence, objective = scene_job.Evidence(references), scene_job.Objective("l2")
+    job, notes = scene_job.prepare(scene, scene_job.Unknowns(KEYS[:1]), evidence, objective, plan)
     assert job.fast is None
     assert any(words in note for note in notes)
 
@@ -192,8 +198,8 @@ def test_a_scene_that_is_shaded_otherwise_is_found_out(references):
     """Another lobe, and a material without a back: neither may be fitted by the wrong picture."""
     scene = start(other={"type": "principled", "base_color": {"type": "rgb", "value": [0.3, 0.5, 0.2]}, "sheen": 0.8})
     chosen = scene_keys.match(scene, KEYS[:1])
-    with pytest.raises(NotFast, match="sheen"):
-        Fast(scene, chosen, sights(scene, references), "l2", scene_grad.ad_integrator(scene)[0])
+    with pytest.raises(Unsupported, match="sheen"):
+        DeferredRenderer(scene, chosen, sights(scene, references), "l2", scene_grad.ad_integrator(scene)[0])
     scene = start(other={"type": "principled", "base_color": rgb(0.3, 0.5, 0.2)}, behind=True)
-    with pytest.raises(NotFast, match="differ from the scene's own"):
-        Fast(scene, chosen, sights(scene, references), "l2", scene_grad.ad_integrator(scene)[0])
+    with pytest.raises(Unsupported, match="differ from the scene's own"):
+        DeferredRenderer(scene, chosen, sights(scene, references), "l2", scene_grad.ad_integrator(scene)[0])

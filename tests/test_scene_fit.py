@@ -121,7 +121,9 @@ def test_gradients_equal_finite_differences(name, truth, rng):
     values[COLOUR] += 0.4
     loss, view = scene_grad.LOSSES[name], scene_grad.sight(scene.sensors()[1], truth[1], None, "cam")
     engine = scene.integrator()
-    _, gradient, broken = scene_grad.gradients(scene, table, chosen, values, engine, view, loss, (64, 64), (1, 2))
+    _, gradient, broken = scene_grad.gradients(
+        scene_grad.LiveScene(scene, table, chosen, engine), values, view, loss, (64, 64), (1, 2)
+    )
     assert not broken
     for key in (COLOUR, ROUGH):
         direction = rng.uniform(0.5, 1, values[key].shape).astype(np.float32)

@@ -62,8 +62,8 @@ def slope(scene, view, loss, spp, seeds):
     engine, _ = scene_grad.ad_integrator(scene)
     found = []
     for n in seeds:
-        given = (scene, table, chosen, values, engine, view, loss, (spp, 64), scene_grad.seeds(n))
-        gradient = scene_grad.gradients(*given)[1]
+        live = scene_grad.LiveScene(scene, table, chosen, engine)
+        gradient = scene_grad.gradients(live, values, view, loss, (spp, 64), scene_grad.seeds(n))[1]
         found.append(sum(float((gradient[k] * values[k]).sum()) for k in TRUE))
     return np.array(found)
 
@@ -105,7 +105,7 @@ def test_derivatives_equal_finite_differences(picture):
     values = {k: np.array(v, np.float32) for k, v in TRUE.items()}
     direction = {k: np.full(3, n + 1, np.float32) for n, k in enumerate(TRUE)}
     sensor = scene.sensors()[0]
-    ours = scene_grad.derivative(scene, table, chosen, values, direction, engine, sensor, 64, 5)
+    ours = scene_grad.derivative(scene_grad.LiveScene(scene, table, chosen, engine), values, direction, sensor, 64, 5)
     ends = []
     for step in (0.01, -0.01):
         scene_grad.put(table, chosen, {k: values[k] + np.float32(step) * direction[k] for k in TRUE})
@@ -257,9 +257,9 @@ def test_pictures_by_path_and_shapes_that_share_a_material_are_noted(tmp_path):
 
 
 def test_a_named_loss_of_a_texture_is_that_of_the_noisy_path():
-    job, notes = scene_job.prepare(
-        flat(cameras=CAMERAS[:1]), [COLOUR], None, [np.full((24, 24, 3), 0.3)], None, None, None, (), None,
-        scene_job.Plan(1, 1, None, 0.02, True, 1, 0), False,
-    )  # fmt: skip
+    evidence = scene_job.Evidence([np.full((24, 24, 3), 0.3)])
+    plan = scene_job.FitPlan(1, 1, None, 0.02, True, 1, 0)
+    scene, unknowns = flat(cameras=CAMERAS[:1]), scene_job.Unknowns([COLOUR])
+    job, notes = scene_job.prepare(scene, unknowns, evidence, scene_job.Objective(), plan, fast=False)
     assert job.loss == "relative" and not job.newton and TRUE_COLOUR.shape == job.chosen[0].shape
     assert not any("log_srgb_l1" in note for note in notes)

@@ -89,7 +89,9 @@ def test_what_has_no_true_gradient_is_not_offered(bsdf, name, free):
         ends.append(np.array(scene_grad.picture(scene, engine, sensor, 1024, 3))[..., :3].mean())
     difference = (ends[0] - ends[1]) / 0.04
     try:
-        ours = scene_grad.derivative(scene, table, [p], values, ones, engine, sensor, 256, 4).mean()
+        ours = scene_grad.derivative(
+            scene_grad.LiveScene(scene, table, [p], engine), values, ones, sensor, 256, 4
+        ).mean()
     except RuntimeError:
         ours = 0.0  # Mitsuba says itself that nothing is attached
     wrong = abs(ours - difference)

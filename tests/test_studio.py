@@ -20,14 +20,14 @@ def ball() -> Mesh:
 
 def drawn(mesh, radiance, azimuth=30.0, **maps):
     from mistyle.render.draw import tracer
-    from mistyle.render.studio import Sky, Studio, prefiltered
+    from mistyle.render.studio import Studio, StudioSky, prefiltered
 
     traced, page = tracer(mesh), np.zeros((1, 64, 64, 4), np.float32)
     rows = np.arcsin(np.linspace(1 - 1 / 64, -1 + 1 / 64, 64))[:, None]
     columns = ((np.arange(64) + 0.5) / 64 * 2 * np.pi)[None]
     side, none = np.cos(rows), np.zeros((64, 64))
     page[0] = np.stack([np.sin(columns) * side, np.sin(rows) + none, np.cos(columns) * side, 1 + none], axis=-1)
-    studio = Studio(traced, prefiltered(radiance), Sky(64, page), [[flat_maps(16, **maps)]])
+    studio = Studio(traced, prefiltered(radiance), StudioSky(64, page), [[flat_maps(16, **maps)]])
     return next(studio.pictures([orbit(azimuth, 15, distance=4, fov=30, size=(64, 64))], (0,), 16))[0]
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import fixed_surface
 from scipy.spatial import KDTree
-from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, spread_on, strokes  # noqa: F401
+from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, solved, spread_on, strokes  # noqa: F401
 
 from mistyle.core.asset import Asset, Material, Picture, Source
 from mistyle.core.camera import resized, rig
@@ -41,7 +41,7 @@ def test_thinning_is_that_of_one_point_after_the_other(dj, rng):  # noqa: F811
     points, radius = on_a_ball(3000, rng), 0.12
     normals = np.where(rng.random((3000, 1)) < 0.5, points, -points)  # two surfaces that face away from each other
     rank = rng.permutation(3000)
-    kept = cells.thin(dj, cells.cells(dj, points, normals, radius, rank), radius)
+    kept = cells.thin(dj, cells.point_grid(dj, points, normals, radius, rank), radius)
     tree, alive, plain = KDTree(points), np.ones(3000, bool), np.zeros(3000, bool)
     for i in np.argsort(-rank):
         if alive[i]:
@@ -92,7 +92,7 @@ def test_glaze_adds_the_missing_light_and_dark(ball):
     settings, levels, tone, cavity = ball
     wanted = guides.detail(levels, tone, cavity)[-1]
     guide = guides.Guide(np.zeros((len(wanted), 3), np.float32), wanted, levels[-1].directed)
-    book = style.pages(style.prepare(strokes()), 64, 0.5)
+    book = style.exemplar(style.prepare(strokes()), 64, 0.5)
     grey = np.full(len(wanted), 0.5, np.float32)
     laid = glaze(levels, guide, grey, book, settings)
     assert np.corrcoef(laid, wanted)[0, 1] > 0.8 and 0.01 < np.abs(laid).max() <= 0.12
@@ -121,7 +121,7 @@ def test_strokes_go_where_they_are_told(follow, axis):
     assert front.sum() > 50 and (np.abs(tangent[front, axis]) > 0.99).all() and (sure[front] > 0.9).all()
 
 
-def test_a_painted_course_takes_the_place_of_the_form():
+def test_a_painted_direction_takes_the_place_of_the_form():
     points = spread_on(box(0.6, 1.2, 0.6), 1500)
     slanting = np.array([1, 1, 0], np.float32) / np.float32(np.sqrt(2))
 
@@ -145,7 +145,7 @@ def test_red_and_green_of_a_direction_map_are_u_and_v(painted_sheet, tmp_path):
     inside = np.linalg.norm(along_u, axis=1) * np.linalg.norm(along_v, axis=1) > 0
     for colour, expected in (((1, 0.5, 0), along_u), ((0.5, 0, 1), along_v), ((0.9, 0.9, 0.5), along_u + along_v)):
         write_png(tmp_path / "flow.png", np.broadcast_to(np.array(colour, np.float32), (8, 8, 3)))
-        course = coat.painted_course(tmp_path / "flow.png", mesh, [texels])
+        course = coat.painted_direction(tmp_path / "flow.png", mesh, [texels])
         found, counts = course(texels.position[at][inside], texels.normal[at][inside])
         wanted = expected[inside] / np.linalg.norm(expected[inside], axis=1, keepdims=True)
         assert inside.sum() > 100 and (np.abs((found * wanted).sum(axis=1)) > 0.99).mean() > 0.95
@@ -153,12 +153,14 @@ def test_red_and_green_of_a_direction_map_are_u_and_v(painted_sheet, tmp_path):
     half = np.full((8, 8, 3), 0.5, np.float32)
     write_png(tmp_path / "grey.png", half)
     with pytest.raises(InputRefused, match="mid grey or transparent everywhere"):
-        coat.painted_course(tmp_path / "grey.png", mesh, [texels])
+        coat.painted_direction(tmp_path / "grey.png", mesh, [texels])
     half[:, :4] = (1, 0.5, 0)
     write_png(tmp_path / "half.png", half)
-    found, counts = coat.painted_course(tmp_path / "half.png", mesh, [texels])(texels.position[at], texels.normal[at])
+    found, counts = coat.painted_direction(tmp_path / "half.png", mesh, [texels])(
+        texels.position[at], texels.normal[at]
+    )
     assert (counts[at[1] < 12] == 1).all() and (counts[at[1] > 20] == 0).all()
-    assert coat.painted_course(None, mesh, [texels]) is None
+    assert coat.painted_direction(None, mesh, [texels]) is None
 
 
 def ramp_solution(turn):
@@ -168,7 +170,9 @@ def ramp_solution(turn):
     up, tangent = np.array([[0, 1, 0]], np.float32), np.array([[0.6, 0, 0.8]], np.float32)
     centre, turns = np.full((1, 2), 100, np.float32), np.array([turn], np.int32)
     zero = np.zeros(1, np.float32)
-    return lookup.Solution(0 * up, up, tangent, turns, centre, 0.05, (2.0, 2.0), picture, zero, turns * 0, 8.0, False)
+    return lookup.PaintedSurface(
+        0 * up, up, tangent, turns, centre, 0.05, (2.0, 2.0), picture, zero, turns * 0, 8.0, False
+    )
 
 
 @pytest.mark.parametrize("turn", [0, 1, 2, 3])
@@ -235,7 +239,7 @@ def test_content_of_a_texture_rules_the_tone(painted_sheet, dj):  # noqa: F811
     light = {}
     for keep in (0.0, 1.0):
         chosen = settings.model_copy(update={"keep_content": keep})
-        made = guides.guides(levels, palette, open_sky, chosen, np.random.default_rng(1), found)
+        made = guides.level_guides(levels, palette, open_sky, chosen, np.random.default_rng(1), found)
         dark = np.floor((levels[-1].points.positions[:, 0] / 1.4 + 0.5) * 4) % 2 == 0
         light[keep] = made[-1].colour[~dark, 0].mean() - made[-1].colour[dark, 0].mean()
     assert light[1.0] > 0.3 > abs(light[0.0])
@@ -253,7 +257,8 @@ def test_existing_normals_are_composed_and_roughness_moved(painted_sheet, rng):
     def laid(slope: np.ndarray, height: float, gloss: float) -> Maps:
         made = replace(start, normal=start.normal.copy(), roughness=start.roughness.copy())
         rows, tangents = slice(0, 32), corner_tangents(mesh)
-        coat.lay_relief(asset, made, texels, rows, texels.covered, slope, dull, height, gloss, tangents)
+        band = coat.TexelBand(texels, rows, texels.covered)
+        coat.lay_relief(made, band, coat.PaintRelief(slope, dull), height, gloss, asset.mesh, tangents)
         return made
 
     same = laid(nothing, 0.15, 1.0)
@@ -319,14 +324,14 @@ def test_a_coat_of_two_pictures_with_a_protected_part(painted_sheet, tmp_path):
         write_png(tmp_path / f"{name}.png", picture)
     chosen = {"slots": [f"{tmp_path / 'half.png'}={tmp_path / 'blue.png'}"], "protect": tmp_path / "strip.png"}
     settings = Settings.model_validate(
-        {"surface": {"samples": 700}, "atlas": {"size": 32}, "coat": chosen | {"height": 0.2, "gloss": 1.0}}
+        {"surface": {"samples": 700}, "atlas": {"size": 32}, "paint": chosen | {"height": 0.2, "gloss": 1.0}}
     )
     atlas = stylize_start.lay_out(asset, settings, lambda done: None)
-    coats = painting.coat(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)
-    flat = painting.painted(asset, coats, atlas, settings)
+    layers = painting.paint_layers(asset, Picture(red, None, tmp_path / "red.png"), atlas, settings, lambda done: None)
+    flat = painting.painted(asset, layers, atlas, settings)
     assert (flat[0].normal[..., 2] == 1).all()
-    maps = painting.raised(asset, coats, atlas, settings, flat)[0]
-    assert len(coats.solutions) == 2
+    maps = painting.raised(asset, layers, atlas, settings, flat)[0]
+    assert len(layers.solutions) == 2
     np.testing.assert_allclose(maps.albedo[:5], atlas.start[0].albedo[:5])
     # The darker stripes are 0.21; beside lighter ones the sharpened look-ups undershoot them.
     assert (maps.albedo[8:, :15, 2] > 0.05).all() and (maps.albedo[8:, :15, 0] < 0.02).all()
@@ -384,7 +389,7 @@ def many_parts() -> object:
 @pytest.mark.parametrize("shape", [box(1.2, 1.2, 0.001), many_parts(), sheet(2)], ids=["wall", "parts", "two-faces"])
 def test_any_mesh_will_do(shape):
     settings = fixed_surface(samples=700)
-    solution = synthesis.solve(shape, strokes(), settings, 0, open_sky)
+    solution = solved(shape, strokes(), settings, 0)
     corners = shape.positions[shape.faces].mean(axis=1)
     normals = np.cross(*(np.diff(shape.positions[shape.faces], axis=1).transpose(1, 0, 2)))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)

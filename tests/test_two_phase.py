@@ -25,7 +25,7 @@ from mistyle.run.stylize_settings import Settings, resolve
 from mistyle.run.summary import MEANINGS
 from mistyle.stages import fit as stages_fit
 from mistyle.stages import fit_lit
-from mistyle.stages.fit import Fit, two_phase, view_mask
+from mistyle.stages.fit import Fit, FitStart, FitTargets, two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.repair_settings import RepairSettings
@@ -100,7 +100,7 @@ def test_lit_views_tell_relief_gloss_and_paint(scene, monkeypatch):
     views = views_of(scene, light)
     baked = known.baked(scene, views)
     fit = lit_phases(mesh, baked, views, texels, light, LIT, 0)
-    paper = two_phase(mesh, baked, views, texels, LIT.model_copy(update={"judge": False}), 0)
+    paper = two_phase(mesh, FitStart(baked), FitTargets(views), texels, LIT.model_copy(update={"judge": False}), 0)
     weight = inside(scene)
     before, after, adam = (map_errors(scene.truth, maps, weight) for maps in (baked, fit.maps, paper.maps))
     assert {name.rpartition(".")[2] for name in fit.figures} <= set(MEANINGS)

@@ -1,12 +1,6 @@
-"""What can be swapped, by name: each entry is "module:function", imported when it is first asked for."""
+"""Stylizers, inpainters and maskers: functions of one signature each.
 
-# `embedded` paints a whole surface; the others make a Stylizer of views (see `mistyle.stages.mvst`).
-STYLIZERS = {
-    "embedded": "mistyle.backends.embedded:solve_surface",
-    "embedded-view": "mistyle.backends.embedded_view:stylizer",
-    "diffusion": "mistyle.backends.diffusion:stylizer",
-}
-INPAINTERS = {
-    "fill": "mistyle.backends.fill:inpainter",
-    "paint3d": "mistyle.backends.paint3d:inpainter",
-}
+embedded       paints a whole surface once; embedded_view and diffusion make a Stylizer of views (`stages/mvst.py`)
+fill, paint3d  make an Inpainter of textures (`stages/inpaint.py`)
+masks          makes a Masker of views
+"""

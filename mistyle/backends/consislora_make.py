@@ -19,8 +19,21 @@ NETWORKS = ("unet", "vae", "text_encoder", "text_encoder_2")
 STEPS_A_SECOND = (2.0, 4.0)  # of a 1024² picture on a recent GPU; an estimate, not measured here
 
 
+Kind = Literal["content", "style"]
+
+
 @dataclass(frozen=True)
-class Halves:
+class TrainingImage:
+    """A picture (sRGB) to train LoRAs on, the name of their files, and the word of the prompt that stands for it."""
+
+    kind: Kind
+    name: str
+    rgb: Float[np.ndarray, "h w 3"]
+    word: str
+
+
+@dataclass(frozen=True)
+class LoraPair:
     """The two LoRAs of one picture; the half that is not its own serves ConsisLoRA's guidance only."""
 
     content: Path
@@ -42,32 +55,25 @@ def identity(settings: ModelSettings) -> str:
     return models.fingerprint(file for name in NETWORKS for file in models.weights(place / name))
 
 
-def lora_key(
-    kind: Literal["content", "style"],
-    rgb: Float[np.ndarray, "h w 3"],
-    word: str,
-    training: TrainSettings,
-    settings: ModelSettings,
-    seed: int,
-) -> str:
+def lora_key(image: TrainingImage, training: TrainSettings, settings: ModelSettings, seed: int) -> str:
     """Everything that decides a LoRA's bits, but for the machine."""
     # How often a checkpoint is written decides nothing.
     numbers = training.model_dump(exclude={"save_every"})
     own = settings.model_dump(include={"precision", "prediction"})
-    return digest([kind, np.float32(rgb), word, numbers, identity(settings), own, seed])
+    return digest([image.kind, np.float32(image.rgb), image.word, numbers, identity(settings), own, seed])
 
 
-def paths(folder: Path, name: str, key: str) -> Halves:
+def paths(folder: Path, name: str, key: str) -> LoraPair:
     """Where a picture's LoRAs are kept: readable, and different for different keys."""
     stem = f"{cut(re.sub(r'[^A-Za-z0-9._+-]+', '_', name), ASSET)}-{key[:10]}"
-    return Halves(folder / f"{stem}.content.safetensors", folder / f"{stem}.style.safetensors")
+    return LoraPair(folder / f"{stem}.content.safetensors", folder / f"{stem}.style.safetensors")
 
 
-def refuse_unknown(every: Sequence[Halves]) -> None:
+def refuse_unknown(every: Sequence[LoraPair]) -> None:
     """UsageError for a file at the place of a LoRA that no training of ours wrote."""
     from mistyle.backends.consislora import notes_of
 
-    for path in (p for halves in every for p in (halves.content, halves.style)):
+    for path in (p for pair in every for p in (pair.content, pair.style)):
         if path.exists() and not (path.is_file() and "mistyle_key" in notes_of(path)):
             raise UsageError(
                 f"{path}: mistyle did not train this LoRA, and would replace it. Choose another folder with -o "
@@ -75,9 +81,9 @@ def refuse_unknown(every: Sequence[Halves]) -> None:
             )
 
 
-def steps_left(kind: Literal["content", "style"], halves: Halves, key: str, training: TrainSettings) -> int:
+def steps_left(kind: Kind, pair: LoraPair, key: str, training: TrainSettings) -> int:
     """Training steps that a picture still takes; checkpoints within a phase are not looked at."""
-    content, style = halves.there(key)
+    content, style = pair.there(key)
     if kind == "content":
         return 0 if content and style else training.steps
     return (0 if content else training.steps) + (0 if style and content else training.style_steps)
@@ -125,10 +131,8 @@ def trainer(settings: ModelSettings) -> Any:
 
 def make(
     pipeline: Any,
-    kind: Literal["content", "style"],
-    rgb: Float[np.ndarray, "h w 3"],
-    word: str,
-    halves: Halves,
+    image: TrainingImage,
+    pair: LoraPair,
     key: str,
     training: TrainSettings,
     seed: int,
@@ -136,12 +140,13 @@ def make(
 ) -> list[float]:
     """Train what is missing of a picture's LoRAs and write them; returns the noise errors of the steps run."""
     from mistyle.backends import consislora
-    from mistyle.backends.consislora_train import joint_phase, lesson, run_phase, style_phase
+    from mistyle.backends.consislora_train import Checkpoint, joint_phase, run_phase, style_phase, training_example
 
+    kind, rgb, word = image.kind, image.rgb, image.word
     notes = {"mistyle_key": key, "mistyle_kind": kind, "prompt_word": word, "base_model": "SDXL", "seed": str(seed)}
-    content, style = halves.there(key)
-    unet, left = pipeline.unet, steps_left(kind, halves, key, training)
-    state = halves.content.with_name(f"{halves.content.name.removesuffix('.content.safetensors')}.training.safetensors")
+    content, style = pair.there(key)
+    unet, left = pipeline.unet, steps_left(kind, pair, key, training)
+    state = pair.content.with_name(f"{pair.content.name.removesuffix('.content.safetensors')}.training.safetensors")
     done, errors = 0, []
 
     def note(step: int, steps: int, loss: float) -> None:
@@ -150,23 +155,23 @@ def make(
     try:
         if not content or (kind == "content" and not style):
             phase = joint_phase(word, training)
-            shown = lesson(pipeline, rgb, phase.prompt, training.resolution, seed)
+            shown = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
             for half in phase.trained:
                 consislora.add_half(unet, half, training.rank, seed + (half == "style"))
-            errors += run_phase(pipeline, shown, phase, training, seed, state, key + phase.name, note)
+            errors += run_phase(pipeline, shown, phase, training, seed, Checkpoint(state, key + phase.name), note)
             if kind == "content":
-                consislora.save_half(halves.style, unet, "style", notes)
-            consislora.save_half(halves.content, unet, "content", notes)
+                consislora.save_half(pair.style, unet, "style", notes)
+            consislora.save_half(pair.content, unet, "content", notes)
             unet.delete_adapters(list(phase.trained))
             done += phase.steps
             style = kind == "content"
         if not style:
             phase = style_phase(word, training)
-            shown = lesson(pipeline, rgb, phase.prompt, training.resolution, seed)
-            consislora.put_half(unet, "content", halves.content)
+            shown = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
+            consislora.put_half(unet, "content", pair.content)
             consislora.add_half(unet, "style", training.rank, seed + 2)
-            errors += run_phase(pipeline, shown, phase, training, seed, state, key + phase.name, note)
-            consislora.save_half(halves.style, unet, "style", notes)
+            errors += run_phase(pipeline, shown, phase, training, seed, Checkpoint(state, key + phase.name), note)
+            consislora.save_half(pair.style, unet, "style", notes)
     finally:
         there = [name for name in ("content", "style") if name in getattr(unet, "peft_config", {})]
         if there:
@@ -174,41 +179,47 @@ def make(
     return errors
 
 
+@dataclass(frozen=True)
+class LoraFolder:
+    """Where LoRAs are kept; without `overwrite` a file there that no training of ours wrote is refused."""
+
+    path: Path
+    overwrite: bool = False
+
+
 def make_all(
     settings: ModelSettings,
-    wanted: Sequence[tuple[Literal["content", "style"], str, np.ndarray, str]],
-    folder: Path,
+    images: Sequence[TrainingImage],
+    folder: LoraFolder,
     training: TrainSettings,
     seed: int,
     say: Callable[[str], None],
     watch: Callable[[int, int, float], None] = lambda step, steps, loss: None,
-    *,
-    overwrite: bool = False,
-) -> list[Halves]:
-    """LoRAs of several pictures, each (kind, name, sRGB picture, word): what is missing is trained, in this order.
+) -> list[LoraPair]:
+    """LoRAs of several pictures: what is missing is trained, in this order.
 
     The time that it will take is said before anything is loaded; nothing is loaded when all is there.
     """
-    keys = [lora_key(kind, rgb, word, training, settings, seed) for kind, _, rgb, word in wanted]
-    made = [paths(folder, name, key) for (_, name, _, _), key in zip(wanted, keys, strict=True)]
-    if not overwrite:
-        refuse_unknown(made)
-    left = [steps_left(w[0], h, k, training) for w, h, k in zip(wanted, made, keys, strict=True)]
+    keys = [lora_key(image, training, settings, seed) for image in images]
+    loras = [paths(folder.path, image.name, key) for image, key in zip(images, keys, strict=True)]
+    if not folder.overwrite:
+        refuse_unknown(loras)
+    left = [steps_left(image.kind, pair, key, training) for image, pair, key in zip(images, loras, keys, strict=True)]
     say(f"LoRAs: {forecast(sum(left), training.resolution)}")
     if not any(left):
-        return made
+        return loras
     check(settings, training)
     pipeline = trainer(settings)
     done = 0
-    for (kind, _, rgb, word), halves, key, steps in zip(wanted, made, keys, left, strict=True):
+    for image, pair, key, steps in zip(images, loras, keys, left, strict=True):
         if steps:
 
             def note(step: int, steps: int, loss: float, before: int = done) -> None:
                 watch(before + step, sum(left), loss)
 
-            make(pipeline, kind, rgb, word, halves, key, training, seed, note)
+            make(pipeline, image, pair, key, training, seed, note)
             done += steps
     device = pipeline.device.type
     del pipeline
     models_check.empty(device)
-    return made
+    return loras

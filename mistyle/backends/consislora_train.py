@@ -28,7 +28,7 @@ Watch = Callable[[int, int, float], None]
 
 
 @dataclass(frozen=True)
-class Phase:
+class LoraPhase:
     """One run of the optimiser: which halves learn, which only speak, and under which losses."""
 
     name: str
@@ -43,7 +43,7 @@ class Phase:
 
 
 @dataclass(frozen=True)
-class Lesson:
+class TrainingExample:
     """What the network is shown, computed once: latent, text, pooled text and SDXL's sizes; and what it predicts."""
 
     z0: Float[torch.Tensor, "1 c h w"]
@@ -53,9 +53,9 @@ class Lesson:
     prediction: str = "epsilon"
 
 
-def joint_phase(word: str, settings: TrainSettings) -> Phase:
+def joint_phase(word: str, settings: TrainSettings) -> LoraPhase:
     """A content picture, or stage 1 of a style picture."""
-    return Phase(
+    return LoraPhase(
         "joint",
         f"A {word}",
         settings.steps,
@@ -66,9 +66,9 @@ def joint_phase(word: str, settings: TrainSettings) -> Phase:
     )
 
 
-def style_phase(word: str, settings: TrainSettings) -> Phase:
+def style_phase(word: str, settings: TrainSettings) -> LoraPhase:
     """Stage 2 of a style picture: x0 loss from the first step, noise with an offset."""
-    return Phase(
+    return LoraPhase(
         "style",
         f"An image in the style of {word}",
         settings.style_steps,
@@ -81,7 +81,9 @@ def style_phase(word: str, settings: TrainSettings) -> Phase:
     )
 
 
-def lesson(pipeline: Any, rgb: Float[np.ndarray, "h w 3"], prompt: str, resolution: int, seed: int) -> Lesson:
+def training_example(
+    pipeline: Any, rgb: Float[np.ndarray, "h w 3"], prompt: str, resolution: int, seed: int
+) -> TrainingExample:
     """Encode an sRGB picture and a prompt: the short side becomes `resolution` pixels, nothing is cropped."""
     height, width = rgb.shape[:2]
     grain = pipeline.vae_scale_factor * 2 ** (len(pipeline.unet.config.block_out_channels) - 1)
@@ -96,11 +98,11 @@ def lesson(pipeline: Any, rgb: Float[np.ndarray, "h w 3"], prompt: str, resoluti
         z0 = (posterior.mean + posterior.std * noise) * vae.config.scaling_factor
         text, _, pooled, _ = pipeline.encode_prompt(prompt, do_classifier_free_guidance=False)
     sizes = torch.tensor([[height, width, 0, 0, *size]], dtype=torch.float32)
-    return Lesson(z0.float(), text, pooled, sizes.to(z0.device), pipeline.scheduler.config.prediction_type)
+    return TrainingExample(z0.float(), text, pooled, sizes.to(z0.device), pipeline.scheduler.config.prediction_type)
 
 
 def step_noise(
-    phase: Phase, shape: torch.Size, seed: int, step: int, levels: int
+    phase: LoraPhase, shape: torch.Size, seed: int, step: int, levels: int
 ) -> tuple[int, Float[torch.Tensor, "b c h w"]]:
     """Noise level and noise of one step; the same on every device."""
     name = int.from_bytes(phase.name.encode()[:8], "big")
@@ -113,49 +115,60 @@ def step_noise(
     return level, noise
 
 
+@dataclass(frozen=True)
+class NoisyStep:
+    """One step's noise and its level: the index, and the product of alphas up to it."""
+
+    step: int
+    level: int
+    noise: Float[torch.Tensor, "b c h w"]
+    alpha_bar: Float[torch.Tensor, ""]
+
+
 def step_loss(
-    unet: Any,
-    shown: Lesson,
-    phase: Phase,
-    mode: str,
-    step: int,
-    level: int,
-    noise: Float[torch.Tensor, "b c h w"],
-    alpha_bar: Float[torch.Tensor, ""],
+    unet: Any, shown: TrainingExample, phase: LoraPhase, mode: str, at: NoisyStep
 ) -> tuple[torch.Tensor, float]:
     """The loss of one step, and the error of what the network predicts alone: the loss over its weight, which can be
     compared over steps."""
+    noise, alpha_bar = at.noise, at.alpha_bar
     zt = consislora.noisy(shown.z0, noise, alpha_bar)
     with consislora.below_without_gradients(unet):
-        said = unet(
+        predicted = unet(
             zt.to(unet.dtype),
-            torch.tensor([level], device=zt.device),
+            torch.tensor([at.level], device=zt.device),
             encoder_hidden_states=shown.text,
             added_cond_kwargs={"text_embeds": shown.pooled, "time_ids": shown.sizes.to(shown.text.dtype)},
             return_dict=False,
         )[0]
-    wanted = consislora.velocity(shown.z0, noise, alpha_bar) if shown.prediction == "v_prediction" else noise
-    error = consislora.epsilon_loss(said, wanted)
-    if step < phase.switch:
+    target = consislora.velocity(shown.z0, noise, alpha_bar) if shown.prediction == "v_prediction" else noise
+    error = consislora.epsilon_loss(predicted, target)
+    if at.step < phase.switch:
         return error, float(error.detach())
-    picture = consislora.x0_loss(said, shown.z0, zt, alpha_bar, shown.prediction)
+    picture = consislora.x0_loss(predicted, shown.z0, zt, alpha_bar, shown.prediction)
     return (picture + error if mode == "sum" else picture), float(error.detach())
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """The file of a training under way, and the key of what decides its bits."""
+
+    path: Path
+    key: str
 
 
 def run_phase(
     pipeline: Any,
-    shown: Lesson,
-    phase: Phase,
+    shown: TrainingExample,
+    phase: LoraPhase,
     settings: TrainSettings,
     seed: int,
-    state: Path | None = None,
-    key: str = "",
+    checkpoint: Checkpoint | None = None,
     watch: Watch = lambda step, steps, loss: None,
 ) -> list[float]:
     """Train the phase's halves, which must be there as adapters of these names; returns each step's noise error.
 
-    `state` is the checkpoint: written every `settings.save_every` steps and when the run is asked to stop, taken up
-    when its `key` is this one's, removed at the end.
+    The checkpoint is written every `settings.save_every` steps and when the run is asked to stop, taken up when the
+    file's key is the same, and removed at the end.
     """
     unet = pipeline.unet
     consislora.activate(unet, {half: 1.0 for half in (*phase.frozen, *phase.trained)}, phase.trained)
@@ -165,13 +178,15 @@ def run_phase(
     )
     scaler = torch.amp.GradScaler(shown.z0.device.type, enabled=unet.dtype == torch.float16)
     alphas = pipeline.scheduler.alphas_cumprod.to(shown.z0.device)
-    history = _take_up(state, key, named, optimiser, scaler)
+    history = _take_up(checkpoint, named, optimiser, scaler)
     between = True
     try:
         for step in range(len(history), phase.steps):
             level, noise = step_noise(phase, shown.z0.shape, seed, step, len(alphas))
             noise = noise.to(shown.z0.device)
-            loss, error = step_loss(unet, shown, phase, settings.loss_mode, step, level, noise, alphas[level])
+            loss, error = step_loss(
+                unet, shown, phase, settings.loss_mode, NoisyStep(step, level, noise, alphas[level])
+            )
             between = False
             for group in optimiser.param_groups:
                 group["lr"] = phase.rate if step < phase.switch else phase.later_rate
@@ -189,19 +204,19 @@ def run_phase(
                     f"training diverged at step {step} (the loss is {error}); use --set models.precision=float32, or a "
                     "lower train.rate"
                 )
-            if state and (step + 1) % settings.save_every == 0 and step + 1 < phase.steps:
-                _keep(state, key, named, optimiser, scaler, history)
+            if checkpoint and (step + 1) % settings.save_every == 0 and step + 1 < phase.steps:
+                _keep(checkpoint, named, optimiser, scaler, history)
             watch(step + 1, phase.steps, error)
     except (Stopped, KeyboardInterrupt):
-        if state and between and history:
-            _keep(state, key, named, optimiser, scaler, history)
+        if checkpoint and between and history:
+            _keep(checkpoint, named, optimiser, scaler, history)
         raise
-    if state:
-        state.unlink(missing_ok=True)
+    if checkpoint:
+        checkpoint.path.unlink(missing_ok=True)
     return history
 
 
-def _keep(state: Path, key: str, named: dict, optimiser: Any, scaler: Any, history: list[float]) -> None:
+def _keep(checkpoint: Checkpoint, named: dict, optimiser: Any, scaler: Any, history: list[float]) -> None:
     """Write the checkpoint: weights, Adam's moments, losses so far."""
     from safetensors.torch import save_file
 
@@ -212,20 +227,21 @@ def _keep(state: Path, key: str, named: dict, optimiser: Any, scaler: Any, histo
         tensors[f"weight:{name}"] = parameter.detach().cpu().contiguous()
         for moment, value in optimiser.state[parameter].items():  # none yet while float16 steps are skipped
             tensors[f"{moment}:{name}"] = value.cpu().contiguous()
-    atomic_write(state, lambda path: save_file(tensors, path, {"mistyle": json.dumps({"key": key})}))
+    about = {"mistyle": json.dumps({"key": checkpoint.key})}
+    atomic_write(checkpoint.path, lambda path: save_file(tensors, path, about))
 
 
-def _take_up(state: Path | None, key: str, named: dict, optimiser: Any, scaler: Any) -> list[float]:
+def _take_up(checkpoint: Checkpoint | None, named: dict, optimiser: Any, scaler: Any) -> list[float]:
     """Put the checkpoint's values in place and return the losses of the steps done; empty where there is none."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
-    if state is None or not state.is_file():
+    if checkpoint is None or not checkpoint.path.is_file():
         return []
     try:
-        if consislora.notes_of(state).get("key") != key:
+        if consislora.notes_of(checkpoint.path).get("key") != checkpoint.key:
             return []
-        kept = load_file(state)
+        kept = load_file(checkpoint.path)
     except (InputRefused, SafetensorError):
         return []
     history = kept["history"].tolist()

@@ -13,7 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.backends import models, models_check
-from mistyle.backends.consislora_make import NETWORKS, Halves, forecast, identity, lora_key, make_all
+from mistyle.backends.consislora_make import (
+    NETWORKS,
+    LoraFolder,
+    LoraPair,
+    TrainingImage,
+    forecast,
+    identity,
+    lora_key,
+    make_all,
+)
 from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, TrainSettings
 from mistyle.backends.models_list import ENCODER, LOOSE_NEEDED
 from mistyle.core.errors import UsageError
@@ -23,7 +32,7 @@ from mistyle.files.store import digest
 
 
 @dataclass(frozen=True)
-class Job:
+class DiffusionJob:
     """What the stylizer is asked for: settings, the style picture, where LoRAs are kept."""
 
     models: ModelSettings
@@ -69,14 +78,15 @@ def _places(settings: ModelSettings, chosen: DiffusionSettings) -> tuple[Path, l
     return place, [models.find(name, settings.folder) for name in ("depth", "canny")]
 
 
-def lessons(job: Job, views: Sequence[View]) -> list[tuple[Any, str, np.ndarray, str]]:
+def training_set(job: DiffusionJob, views: Sequence[View]) -> list[TrainingImage]:
     """The pictures that LoRAs are trained on: the style first, then the first view or every one."""
-    wanted: list[tuple[Any, str, np.ndarray, str]] = []
+    images: list[TrainingImage] = []
     if job.diffusion.adapter == "lora" and job.models.style_lora is None:
-        wanted.append(("style", job.style_name, job.style, job.diffusion.look))
+        images.append(TrainingImage("style", job.style_name, job.style, job.diffusion.look))
     for view in views[: content_count(job.diffusion, len(views))]:
-        wanted.append(("content", view.camera.name, srgb_from_linear(view.rgb), job.diffusion.subject))
-    return wanted
+        rgb = srgb_from_linear(view.rgb)
+        images.append(TrainingImage("content", view.camera.name, rgb, job.diffusion.subject))
+    return images
 
 
 def content_of(chosen: DiffusionSettings) -> str:
@@ -100,9 +110,9 @@ def announcement(settings: ModelSettings, training: TrainSettings, chosen: Diffu
     return f"diffusion: {trained}; then {looks:,} denoising steps over {views} views"
 
 
-def key(job: Job, views: Sequence[View]) -> str:
+def key(job: DiffusionJob, views: Sequence[View]) -> str:
     """What a painted view hangs on besides the sweep's settings, the seed and the rig."""
-    loras = [lora_key(k, rgb, word, job.training, job.models, job.seed) for k, _, rgb, word in lessons(job, views)]
+    loras = [lora_key(image, job.training, job.models, job.seed) for image in training_set(job, views)]
     _, controls = _places(job.models, job.diffusion)
     files = [file for place in controls for file in models.weights(place)]
     if job.diffusion.adapter == "ip":
@@ -124,7 +134,7 @@ def prompt_of(chosen: DiffusionSettings) -> str:
 
 
 def stylizer(
-    job: Job,
+    job: DiffusionJob,
     views: Sequence[View],
     say: Callable[[str], None] = lambda text: None,
     watch: Callable[[int, int, float], None] = lambda step, steps, loss: None,
@@ -136,9 +146,9 @@ def stylizer(
     """
     side = max(max(view.camera.size) for view in views)
     check(job.models, job.diffusion, side)
-    wanted = lessons(job, views)
-    made = make_all(job.models, wanted, job.loras, job.training, job.seed, say, watch)
-    trained = {(kind, name): halves for (kind, name, _, _), halves in zip(wanted, made, strict=True)}
+    images = training_set(job, views)
+    loras = make_all(job.models, images, LoraFolder(job.loras), job.training, job.seed, say, watch)
+    trained = {(image.kind, image.name): pair for image, pair in zip(images, loras, strict=True)}
     style = next((h for (kind, _), h in trained.items() if kind == "style"), None)
     contents = {name: h for (kind, name), h in trained.items() if kind == "content"}
     pipeline, picture = _pipeline(job)
@@ -163,7 +173,7 @@ def _load(pipeline: Any, path: Path, half: Any, name: str | None = None) -> None
     load_half(pipeline, path, name or half, half)
 
 
-def _pipeline(job: Job) -> tuple[Any, list[Any]]:
+def _pipeline(job: DiffusionJob) -> tuple[Any, list[Any]]:
     """SDXL with its ControlNets on the device, and what the IP-Adapter says of the style picture, if it is used."""
     from diffusers.pipelines.controlnet.pipeline_controlnet_sd_xl import StableDiffusionXLControlNetPipeline
 
@@ -185,7 +195,7 @@ def _pipeline(job: Job) -> tuple[Any, list[Any]]:
     return settle(pipeline, job.models, device), picture
 
 
-def _guidance(pipeline: Any, chosen: DiffusionSettings, style: Halves | None, content: Halves | None) -> list[Any]:
+def _guidance(pipeline: Any, chosen: DiffusionSettings, style: LoraPair | None, content: LoraPair | None) -> list[Any]:
     """ConsisLoRA's extra terms (its section 4.3), where on: each half against its twin of the other picture."""
     terms: list[Any] = []
     if style is None or content is None or not (chosen.content_guidance or chosen.style_guidance):
@@ -215,25 +225,25 @@ def paint_view(
     import torch
 
     from mistyle.backends import diffusion_denoise as d
-    from mistyle.stages.repaint import sample
+    from mistyle.stages.repaint import Resampling, sample
 
     size = d.fitting_size(view.camera.size, d.grain(pipeline))
     device, factor = pipeline._execution_device, pipeline.vae_scale_factor
-    asked = _asked(pipeline, chosen, view, size, picture)
+    conditioning = _conditioning(pipeline, chosen, view, size, picture)
     prompts = {p: _text(pipeline, p) for _, *sides in terms for _, p in sides}
-    denoise = d.denoiser(pipeline, asked, terms, prompts)
+    denoise = d.denoiser(pipeline, conditioning, terms, prompts)
     levels = d.noise_levels(pipeline.scheduler, chosen.steps)
     generator = torch.Generator("cpu").manual_seed(int(rng.integers(2**63)))
     if prior is None or not prior.known.any():
         shape = (1, pipeline.unet.config.in_channels, size[0] // factor, size[1] // factor)
         # Nothing to harmonise with: the refinement is for the border between known and new.
-        latent = sample(denoise, None, None, levels, rng=generator, like=torch.zeros(shape, device=device), refine=0.0)
+        like = torch.zeros(shape, device=device)
+        latent = sample(denoise, None, None, levels, Resampling(refine=0.0), rng=generator, like=like)
     else:
         known, mask = d.prior_latent(pipeline.vae, prior, size, factor)
         known, mask = known.to(device), mask.to(device)
-        latent = sample(
-            denoise, known, mask, levels, chosen.block, chosen.repeats, rng=generator, refine=chosen.refinement
-        )
+        resampling = Resampling(chosen.block, chosen.repeats, chosen.refinement)
+        latent = sample(denoise, known, mask, levels, resampling, rng=generator)
     painted = d.decode(pipeline.vae, latent)
     return linear_from_srgb(resize(painted, view.camera.size))
 
@@ -246,10 +256,12 @@ def _text(pipeline: Any, prompt: str, negative: bool = False) -> tuple[Any, Any]
     return (torch.cat([empty, text]), torch.cat([pooled_empty, pooled])) if negative else (text, pooled)
 
 
-def _asked(pipeline: Any, chosen: DiffusionSettings, view: View, size: tuple[int, int], picture: Sequence[Any]) -> Any:
+def _conditioning(
+    pipeline: Any, chosen: DiffusionSettings, view: View, size: tuple[int, int], picture: Sequence[Any]
+) -> Any:
     import torch
 
-    from mistyle.backends.diffusion_denoise import Asked, conditions, tensor_of
+    from mistyle.backends.diffusion_denoise import Conditioning, conditions, tensor_of
 
     device, dtype = pipeline._execution_device, pipeline.unet.dtype
     text, pooled = _text(pipeline, prompt_of(chosen), negative=True)
@@ -259,4 +271,4 @@ def _asked(pipeline: Any, chosen: DiffusionSettings, view: View, size: tuple[int
     pictures = [tensor_of(p).repeat(2, 1, 1, 1).to(device, dtype) for p in conditions(view, size)]
     sizes = torch.tensor([[*size, 0, 0, *size]] * 2, device=device, dtype=dtype)
     scales = (chosen.depth, chosen.canny)
-    return Asked(text, pooled, sizes, pictures, scales, picture, adapters, chosen.guidance)
+    return Conditioning(text, pooled, sizes, pictures, scales, picture, adapters, chosen.guidance)

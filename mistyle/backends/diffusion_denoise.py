@@ -21,7 +21,7 @@ Term = tuple[float, tuple[Mapping[str, float], str], tuple[Mapping[str, float], 
 
 
 @dataclass(frozen=True)
-class Asked:
+class Conditioning:
     """What the network is told for a view, besides its noisy latent; first the empty prompt, then the real one.
 
     text, pooled   (2, n, d) and (2, p); `sizes` SDXL's (2, 6)
@@ -110,46 +110,46 @@ def pooled(known: Bool[np.ndarray, "h w"], factor: int) -> Bool[np.ndarray, "h2 
 
 
 def denoiser(
-    pipeline: Any, asked: Asked, terms: Sequence[Term] = (), prompts: Mapping[str, Any] | None = None
+    pipeline: Any, conditioning: Conditioning, terms: Sequence[Term] = (), prompts: Mapping[str, Any] | None = None
 ) -> Callable[[torch.Tensor, float], torch.Tensor]:
     """(latent, sigma) -> the clean latent that the network expects, with classifier-free guidance.
 
     `terms` add ConsisLoRA's guidance, each two more passes; `prompts` holds their texts' embeddings.
     """
     unet, dtype = pipeline.unet, pipeline.unet.dtype
-    activate(pipeline, asked.adapters)
+    activate(pipeline, conditioning.adapters)
 
     def denoise(x: torch.Tensor, sigma: float) -> torch.Tensor:
         scaled = (x / (sigma**2 + 1) ** 0.5).to(dtype)
         time = torch.tensor(time_step(pipeline.scheduler, sigma), device=x.device)
         both = torch.cat([scaled, scaled])
-        more: dict[str, Any] = {"text_embeds": asked.pooled, "time_ids": asked.sizes}
+        more: dict[str, Any] = {"text_embeds": conditioning.pooled, "time_ids": conditioning.sizes}
         with torch.no_grad():
             down, middle = pipeline.controlnet(
                 both,
                 time,
-                encoder_hidden_states=asked.text,
-                controlnet_cond=list(asked.conditions),
-                conditioning_scale=list(asked.scales),
+                encoder_hidden_states=conditioning.text,
+                controlnet_cond=list(conditioning.conditions),
+                conditioning_scale=list(conditioning.scales),
                 added_cond_kwargs=more,
                 return_dict=False,
             )
-            if asked.picture:
-                more = more | {"image_embeds": list(asked.picture)}
+            if conditioning.picture:
+                more = more | {"image_embeds": list(conditioning.picture)}
             said = unet(
                 both,
                 time,
-                encoder_hidden_states=asked.text,
+                encoder_hidden_states=conditioning.text,
                 added_cond_kwargs=more,
                 down_block_additional_residuals=down,
                 mid_block_additional_residual=middle,
                 return_dict=False,
             )[0].float()
             nothing, something = said.chunk(2)
-            guided = nothing + asked.guidance * (something - nothing)
+            guided = nothing + conditioning.guidance * (something - nothing)
             if terms:
                 residuals = [d[1:] for d in down], middle[1:]
-                guided = guided + _terms(pipeline, terms, prompts or {}, scaled, time, asked, residuals)
+                guided = guided + _terms(pipeline, terms, prompts or {}, scaled, time, conditioning, residuals)
         return clean(pipeline.scheduler.config.prediction_type, guided, x, sigma)
 
     return denoise
@@ -177,7 +177,7 @@ def _terms(
     prompts: Mapping[str, tuple[torch.Tensor, torch.Tensor]],
     scaled: torch.Tensor,
     time: torch.Tensor,
-    asked: Asked,
+    conditioning: Conditioning,
     residuals: tuple[list[torch.Tensor], torch.Tensor],
 ) -> torch.Tensor:
     """The sum of weight x (what one LoRA says - what its opposite says), under the same ControlNets."""
@@ -190,11 +190,11 @@ def _terms(
                 scaled,
                 time,
                 encoder_hidden_states=text,
-                added_cond_kwargs={"text_embeds": pooled_text, "time_ids": asked.sizes[:1]},
+                added_cond_kwargs={"text_embeds": pooled_text, "time_ids": conditioning.sizes[:1]},
                 down_block_additional_residuals=residuals[0],
                 mid_block_additional_residual=residuals[1],
                 return_dict=False,
             )[0].float()
             total += sign * weight * eps
-    activate(pipeline, asked.adapters)
+    activate(pipeline, conditioning.adapters)
     return total

@@ -8,8 +8,8 @@ from jaxtyping import Float
 from mistyle.core.asset import Picture
 from mistyle.core.mesh import Mesh
 from mistyle.surface.guides import Content, Occlusion
-from mistyle.surface.linefield import Course
-from mistyle.surface.lookup import Solution
+from mistyle.surface.linefield import DirectionConstraint
+from mistyle.surface.lookup import PaintedSurface
 from mistyle.surface.settings import ResolvedSettings, SurfaceSettings
 
 
@@ -37,44 +37,39 @@ def solve_surface(
     progress: Callable[[float], None] = lambda done: None,
     *,
     content: Content | None = None,
-    course: Course | None = None,
-) -> Solution:
+    direction: DirectionConstraint | None = None,
+) -> PaintedSurface:
     """Paint `mesh` in the style of a picture; see `mistyle.surface.synthesis.solve` for what it can and cannot do.
 
-    `content(positions, normals)` is the lightness (0..1) of a texture that the mesh has already, `course` where strokes
-    shall run.
+    `content(positions, normals)` is the lightness (0..1) of a texture that the mesh has already, `direction` where
+    strokes shall run.
     """
-    from mistyle.surface.synthesis import solve
+    from mistyle.surface.synthesis import SurfaceFields, solve
 
     module, occlusion = array_module(), open_sky(mesh, seed)
-    return solve(
-        mesh,
-        style.rgb,
-        settings,
-        seed,
-        occlusion,
-        progress,
-        alpha=style.alpha,
-        content=content,
-        course=course,
-        device=module,
-    )
+    return solve(mesh, style, SurfaceFields(occlusion, content, direction), settings, seed, progress, module)
 
 
 def surface_colour(
-    solution: Solution, positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], footprint: float = 0.0
+    surface: PaintedSurface,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    footprint: float = 0.0,
 ) -> Float[np.ndarray, "n 3"]:
     """Encoded sRGB of surface points; `footprint` is the distance of neighbours, over which colour is averaged."""
     from mistyle.surface.lookup import colour
 
-    return colour(solution, positions, normals, footprint=footprint, device=array_module())
+    return colour(surface, positions, normals, footprint=footprint, device=array_module())
 
 
 def surface_relief(
-    solution: Solution, positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], footprint: float = 0.0
+    surface: PaintedSurface,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    footprint: float = 0.0,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Gradient of the painted height along the surface (root mean square about 1) and what the paint adds to the
     roughness; `footprint` as in `surface_colour`."""
     from mistyle.surface.lookup import relief
 
-    return relief(solution, positions, normals, footprint=footprint, device=array_module())
+    return relief(surface, positions, normals, footprint=footprint, device=array_module())

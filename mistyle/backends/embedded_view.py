@@ -10,7 +10,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
 from mistyle.stages.mvst import Stylizer
 from mistyle.surface.guides import Content
-from mistyle.surface.linefield import Course
+from mistyle.surface.linefield import DirectionConstraint
 from mistyle.surface.settings import ResolvedSettings, SurfaceSettings
 
 
@@ -22,7 +22,7 @@ def stylizer(
     progress: Callable[[float], None] = lambda done: None,
     *,
     content: Content | None = None,
-    course: Course | None = None,
+    direction: DirectionConstraint | None = None,
 ) -> Stylizer:
     """A Stylizer of views of `mesh` in the style of a picture; it keeps outlines.
 
@@ -30,21 +30,13 @@ def stylizer(
     `mistyle.surface.view_samples.paint_view`.
     """
     from mistyle.backends.embedded import array_module, open_sky
-    from mistyle.surface.view_samples import ground, paint_view
+    from mistyle.surface import kernels
+    from mistyle.surface.synthesis import SurfaceFields, mesh_guides
+    from mistyle.surface.view_samples import paint_view
 
-    module, occlusion = array_module(), open_sky(mesh, seed)
-    base = ground(
-        mesh,
-        style.rgb,
-        settings,
-        seed,
-        occlusion,
-        progress,
-        alpha=style.alpha,
-        content=content,
-        course=course,
-        device=module,
-    )
+    module = array_module()
+    fields = SurfaceFields(open_sky(mesh, seed), content, direction)
+    base = mesh_guides(mesh, style, fields, settings, seed, kernels.module(module), progress)
 
     def paint(view: View, prior: Prior | None, rng: np.random.Generator) -> np.ndarray:
         rgb = linear_from_srgb(paint_view(view, prior, base, int(rng.integers(2**31)), module))

@@ -13,7 +13,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-from mistyle.backends.models_list import MODELS, Model
+from mistyle.backends.models_list import MODELS, PublishedModel
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
 from mistyle.core.weights import header as weights_header
 from mistyle.files.store import sha256_file
@@ -34,7 +34,7 @@ def need_extra() -> None:
         )
 
 
-def get(name: str) -> Model:
+def get(name: str) -> PublishedModel:
     """The model of this name."""
     if name not in MODELS:
         raise UsageError(f"there is no model '{name}'; choose one of {', '.join(MODELS)}")
@@ -47,7 +47,7 @@ def cache() -> Path:
     return Path(os.environ.get("HF_HUB_CACHE") or os.path.join(home, "hub")).expanduser()
 
 
-def places(model: Model, folder: Path | None) -> list[Path]:
+def places(model: PublishedModel, folder: Path | None) -> list[Path]:
     """Where a model is looked for: the models' folder, then the cache (the pinned revision, then `main`)."""
     found = [folder / model.name] if folder else []
     if model.url:
@@ -97,7 +97,7 @@ def file(name: str, folder: Path | None) -> Path:
     return find(name, folder, loose) / loose[0]
 
 
-def how_to_get(model: Model, folder: Path | None) -> str:
+def how_to_get(model: PublishedModel, folder: Path | None) -> str:
     """The sentence that fixes a missing model."""
     into = folder or Path("models")
     if model.url:
@@ -109,7 +109,7 @@ def _relative(paths: Iterable[Path], place: Path) -> str:
     return ", ".join(p.relative_to(place).as_posix() for p in paths)
 
 
-def lacking(model: Model, place: Path, loose: Iterable[str], weightless: Iterable[str] = ()) -> list[Path]:
+def lacking(model: PublishedModel, place: Path, loose: Iterable[str], weightless: Iterable[str] = ()) -> list[Path]:
     """The files that a model's folder lacks, by the names they should have."""
     lost = [place / name for name in loose if not (place / name).is_file()]
     for part in model.folders:
@@ -191,7 +191,7 @@ def verify(name: str, place: Path, folder: Path | None) -> None:
     """Compare a model's files with the hashes of their fetching or adopting, else with those that its publisher's are
     known by. A file in the models' folder is read once and noted in the lock; in the cache, once a process.
 
-    Files that nobody has named a hash for (see `Model.sha256`) are taken as they are.
+    Files that nobody has named a hash for (see `PublishedModel.sha256`) are taken as they are.
     """
     model = MODELS[name]
     ours = folder is not None and place == folder / name

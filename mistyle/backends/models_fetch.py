@@ -95,7 +95,7 @@ def _files(place: Path) -> list[str]:
     return [p.as_posix() for p in every if p.parts[0] != PARTIAL]
 
 
-def _commit(model: models.Model, noted: str) -> str:
+def _commit(model: models.PublishedModel, noted: str) -> str:
     """The commit to fetch. Where nobody is known to have published one, that of the first fetching stays: what the hub
     calls `main` may change meanwhile."""
     from huggingface_hub import HfApi
@@ -105,7 +105,9 @@ def _commit(model: models.Model, noted: str) -> str:
     return noted if re.fullmatch("[0-9a-f]{40}", noted) else str(HfApi().model_info(model.repo).sha)
 
 
-def _download(model: models.Model, revision: str, place: Path, known: Mapping[str, Any] | None) -> dict[str, str]:
+def _download(
+    model: models.PublishedModel, revision: str, place: Path, known: Mapping[str, Any] | None
+) -> dict[str, str]:
     """Fetch what is not there; returns the sha256 that the hub states for its large files.
 
     A file of another size is replaced if it is `known`, noted in the folder's lock (None: all are). UsageError else.

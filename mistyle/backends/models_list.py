@@ -12,7 +12,7 @@ BASE = ("tokenizer", "text_encoder", "unet", "vae", "scheduler")  # folders of a
 
 
 @dataclass(frozen=True)
-class Model:
+class PublishedModel:
     """One model that mistyle can use. `folders` hold networks or tokenizers ('' is the model's own folder), `loose`
     are single weight files; `patterns` are fetched. `sha256` may hold the first digits only, where no more is known.
     What has a `url` is one file outside the hub, to be put in its place by hand."""
@@ -40,7 +40,7 @@ ENCODER = "models/image_encoder"
 MODELS = {
     model.name: model
     for model in (
-        Model(
+        PublishedModel(
             "sdxl",
             "stabilityai/stable-diffusion-xl-base-1.0",
             "462165984030d82259a11f4367a4eed129e94a7b",
@@ -65,7 +65,7 @@ MODELS = {
                 ),
             },
         ),
-        Model(
+        PublishedModel(
             "depth",
             "diffusers/controlnet-depth-sdxl-1.0",
             "17bb97973f29801224cd66f192c5ffacf82648b4",
@@ -81,7 +81,7 @@ MODELS = {
                 )
             },
         ),
-        Model(
+        PublishedModel(
             "canny",
             "diffusers/controlnet-canny-sdxl-1.0",
             "eb115a19a10d14909256db740ed109532ab1483c",
@@ -97,7 +97,7 @@ MODELS = {
                 )
             },
         ),
-        Model(
+        PublishedModel(
             "ip-adapter",
             "h94/IP-Adapter",
             "018e402774aeeddd60609b4ecdb7e298259dc729",
@@ -122,7 +122,7 @@ MODELS = {
                 f"{ENCODER}/model.safetensors": "6ca9667da1ca9e0b0f75e46bb030f7e011f44f86cbfb8d5a36590fcd7507b030",
             },
         ),
-        Model(
+        PublishedModel(
             "inpaint",
             "stable-diffusion-v1-5/stable-diffusion-inpainting",
             "8a4288a76071f7280aedbdb3253bdb9e9d5d84bb",
@@ -132,7 +132,7 @@ MODELS = {
             BASE,
             (*_network("unet", "text_encoder", "vae"), *TOKENS),
         ),
-        Model(
+        PublishedModel(
             "position",
             "GeorgeQi/Paint3d_UVPos_Control",
             "main",
@@ -142,7 +142,7 @@ MODELS = {
             ("",),
             ("config.json", "diffusion_pytorch_model.bin"),
         ),
-        Model(
+        PublishedModel(
             "sd15",
             "stable-diffusion-v1-5/stable-diffusion-v1-5",
             "451f4fe16113bff5a5d2269ed5ad43b0592e9a14",
@@ -164,7 +164,7 @@ MODELS = {
                 ),
             },
         ),
-        Model(
+        PublishedModel(
             "inpaint-control",
             "lllyasviel/control_v11p_sd15_inpaint",
             "c96e03a807e64135568ba8aecb66b3a306ec73bd",
@@ -174,7 +174,7 @@ MODELS = {
             ("",),
             _network(""),
         ),
-        Model(
+        PublishedModel(
             "vgg19",
             "torchvision, IMAGENET1K_V1",
             "dcbb9e9d",
@@ -187,7 +187,7 @@ MODELS = {
             {"vgg19-dcbb9e9d.pth": "dcbb9e9d"},  # torchvision names files by the first digits of their sha256
             "https://download.pytorch.org/models/vgg19-dcbb9e9d.pth",
         ),
-        Model(
+        PublishedModel(
             "vgg19-normalised",
             "naoto0804/pytorch-AdaIN",
             "v0.0.0",
@@ -200,7 +200,7 @@ MODELS = {
             {},
             "https://github.com/naoto0804/pytorch-AdaIN/releases/download/v0.0.0/vgg_normalised.pth",
         ),
-        Model(
+        PublishedModel(
             "birefnet",
             "danielgatis/rembg",
             "v0.0.0",

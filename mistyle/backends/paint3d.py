@@ -170,13 +170,13 @@ def paint_atlas(
     result = plan.spread_islands(painted, texels, hole, given)
     if not larger or brush.settings.detail == 0 or min(hole.shape) < side:
         return np.where(hole[..., None], result, encoded).astype(np.float32)
-    return _detailed(brush, np.where(hole[..., None], result, given), encoded, hole, texels, where, side, rng)
+    detailed = _detailed(brush, np.where(hole[..., None], result, given), hole, texels, where, side, rng)
+    return np.where(hole[..., None], detailed, encoded)
 
 
 def _detailed(
     brush: Brush,
     start: Float[np.ndarray, "h w 3"],
-    encoded: Float[np.ndarray, "h w 3"],
     hole: Bool[np.ndarray, "h w"],
     texels: Texels,
     where: Float[np.ndarray, "h w 3"],
@@ -193,9 +193,7 @@ def _detailed(
         painted = inpaint(brush, start[box], mask, where[box], brush.settings.detail, rng)
         total[box] += ramp[..., None] * painted
         share[box] += ramp
-    result = encoded.copy()
-    result[hole] = (total / np.maximum(share, 1e-6)[..., None])[hole]
-    return result
+    return total / np.maximum(share, 1e-6)[..., None]
 
 
 def inpaint(

@@ -2,7 +2,7 @@
 
 Four plugins of ours for Mitsuba, in Python; plain materials do without them (`object_shapes`):
 
-- a BSDF `Surface`: `mistyle_gltf` with the dielectric's F0 as a texture, F90, and a clear coat (bsdf.py `layered`);
+- a BSDF `LayeredSurface`: `mistyle_gltf` with F0 as a texture, F90, and a clear coat (`bsdf.layered`);
 - a texture `Cut`: 1 where another one reaches a cutoff, else 0 (glTF's MASK);
 - an emitter `Glow`: what a mesh radiates from either side, times its opacity. Light paths find it by chance, emitter
   sampling does not: it is seen without noise, and no sample of the surroundings is lost to it;
@@ -222,11 +222,6 @@ def _glow_class(mi: Any) -> type:
 def _path_class(mi: Any) -> type:
     import drjit as dr
 
-    def _balanced(a, b):
-        """Veach's power heuristic for a sample of density a that b could have made as well."""
-        total = dr.fma(a, a, b * b)
-        return dr.select(total > 0, a * a / dr.select(total > 0, total, 1), 0)
-
     class Path(mi.SamplingIntegrator):
         def __init__(self, depth):
             super().__init__(mi.Properties())
@@ -251,47 +246,10 @@ def _path_class(mi: Any) -> type:
                 return state[2]
 
             def step(*state):
-                return self._step(scene, *state)
+                return _next_surface(mi, scene, self.depth, state)
 
             state = dr.while_loop(state, going, step, labels=LABELS)
             return state[5], state[10], []
-
-        def _step(self, scene, sampler, ray, active, depth, passed, result, throughput, before, pdf, delta, valid):
-            """The path one surface further: what is radiated there, what lights reach it, where it goes on."""
-            ctx = mi.BSDFContext()
-            si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
-            # The surroundings light the asset and are not seen.
-            lit = active & (si.is_valid() | (depth > 0))
-            ds = mi.DirectionSample3f(scene, si, before)
-            found = scene.pdf_emitter_direction(before, ds, lit & ~delta)
-            share = dr.select(delta, 1, _balanced(pdf, found))
-            result = result + dr.select(lit, throughput * share * ds.emitter.eval(si, lit), 0)
-            here = active & si.is_valid()
-            goes = here & (depth + 1 < self.depth) & (passed < PASSED)
-            surface = si.bsdf(ray)
-            direct = goes & mi.has_flag(surface.flags(), mi.BSDFFlags.Smooth)
-            ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(goes), True, direct)
-            direct = direct & (ds.pdf != 0)
-            value, at = surface.eval_pdf(ctx, si, si.to_local(ds.d), direct)
-            share = dr.select(ds.delta, 1, _balanced(ds.pdf, at))
-            result = result + dr.select(direct, throughput * value * weight * share, 0)
-            sampled, weight = surface.sample(ctx, si, sampler.next_1d(goes), sampler.next_2d(goes), goes)
-            null = goes & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)
-            valid = valid | (here & ~null)
-            throughput = dr.select(goes, throughput * weight, throughput)
-            return (
-                sampler,
-                si.spawn_ray(si.to_world(sampled.wo)),
-                goes & dr.any(throughput != 0),
-                depth + dr.select(null, mi.UInt32(0), mi.UInt32(1)),
-                passed + dr.select(null, mi.UInt32(1), mi.UInt32(0)),
-                result,
-                throughput,
-                mi.Interaction3f(si),
-                sampled.pdf,
-                mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta),
-                valid,
-            )
 
         def to_string(self):
             return f"Path[{self.depth}]"
@@ -299,10 +257,60 @@ def _path_class(mi: Any) -> type:
     return Path
 
 
+def _balanced(a: Any, b: Any) -> Any:
+    """Veach's power heuristic for a sample of density a that b could have made as well."""
+    import drjit as dr
+
+    total = dr.fma(a, a, b * b)
+    return dr.select(total > 0, a * a / dr.select(total > 0, total, 1), 0)
+
+
+def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tuple[Any, ...]:
+    """A path of at most `most` vertices one surface further: what is radiated there, what lights reach it, where it
+    goes on."""
+    import drjit as dr
+
+    sampler, ray, active, depth, passed, result, throughput, before, pdf, delta, valid = state
+    ctx = mi.BSDFContext()
+    si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
+    # The surroundings light the asset and are not seen.
+    lit = active & (si.is_valid() | (depth > 0))
+    ds = mi.DirectionSample3f(scene, si, before)
+    found = scene.pdf_emitter_direction(before, ds, lit & ~delta)
+    share = dr.select(delta, 1, _balanced(pdf, found))
+    result = result + dr.select(lit, throughput * share * ds.emitter.eval(si, lit), 0)
+    here = active & si.is_valid()
+    goes = here & (depth + 1 < most) & (passed < PASSED)
+    surface = si.bsdf(ray)
+    direct = goes & mi.has_flag(surface.flags(), mi.BSDFFlags.Smooth)
+    ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(goes), True, direct)
+    direct = direct & (ds.pdf != 0)
+    value, at = surface.eval_pdf(ctx, si, si.to_local(ds.d), direct)
+    share = dr.select(ds.delta, 1, _balanced(ds.pdf, at))
+    result = result + dr.select(direct, throughput * value * weight * share, 0)
+    sampled, weight = surface.sample(ctx, si, sampler.next_1d(goes), sampler.next_2d(goes), goes)
+    null = goes & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)
+    valid = valid | (here & ~null)
+    throughput = dr.select(goes, throughput * weight, throughput)
+    return (
+        sampler,
+        si.spawn_ray(si.to_world(sampled.wo)),
+        goes & dr.any(throughput != 0),
+        depth + dr.select(null, mi.UInt32(0), mi.UInt32(1)),
+        passed + dr.select(null, mi.UInt32(1), mi.UInt32(0)),
+        result,
+        throughput,
+        mi.Interaction3f(si),
+        sampled.pdf,
+        mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta),
+        valid,
+    )
+
+
 def _surface_class(mi: Any) -> type:
     import drjit as dr
 
-    class Surface(mi.BSDF):
+    class LayeredSurface(mi.BSDF):
         def __init__(self, textures, edge, coat, coat_roughness):
             super().__init__(mi.Properties())
             self.textures, self.edge, self.coat, self.coat_roughness = textures, edge, coat, coat_roughness
@@ -314,29 +322,23 @@ def _surface_class(mi: Any) -> type:
             return self._eval(si, wo, active, self._values(si, active))
 
         def pdf(self, ctx, si, wo, active=True):
-            return self._pdf(si, wo, active, self._values(si, active))
+            return _density(mi, self, si, wo, active, self._values(si, active))
 
         def eval_pdf(self, ctx, si, wo, active=True):
             values = self._values(si, active)
-            return self._eval(si, wo, active, values), self._pdf(si, wo, active, values)
+            return self._eval(si, wo, active, values), _density(mi, self, si, wo, active, values)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             values = self._values(si, active)
-            shiny, coated, spread, coat = self._strategy(values)
+            shiny, coated, spread, coat = _strategy(mi, self, values)
             above = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
             half, _ = spread.sample(above, sample2)
             outer, _ = coat.sample(above, sample2)
             glossy = sample1 < shiny + coated
             half = dr.select(sample1 < coated, outer, half)
             wo = dr.select(glossy, mi.reflect(si.wi, mi.Normal3f(half)), mi.warp.square_to_cosine_hemisphere(sample2))
-            sampled = dr.zeros(mi.BSDFSample3f)
-            sampled.wo = wo
-            sampled.eta = mi.Float(1)
-            sampled.sampled_type = dr.select(
-                glossy, mi.UInt32(+mi.BSDFFlags.GlossyReflection), mi.UInt32(+mi.BSDFFlags.DiffuseReflection)
-            )
-            sampled.sampled_component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
-            sampled.pdf = self._pdf(si, wo, active, values)
+            sampled = plugins.reflected(mi, wo, glossy)
+            sampled.pdf = _density(mi, self, si, wo, active, values)
             usable = active & (sampled.pdf > 0)
             value = self._eval(si, wo, active, values)
             return sampled, dr.select(usable, value / dr.select(usable, sampled.pdf, 1), 0)
@@ -345,7 +347,7 @@ def _surface_class(mi: Any) -> type:
             return self.textures["base_color"].eval(si, active)
 
         def to_string(self):
-            return f"Surface[{self.textures}, {self.edge}, {self.coat}, {self.coat_roughness}]"
+            return f"LayeredSurface[{self.textures}, {self.edge}, {self.coat}, {self.coat_roughness}]"
 
         def _values(self, si, active) -> Any:
             return (
@@ -362,25 +364,32 @@ def _surface_class(mi: Any) -> type:
             value = bsdf.layered(angles, albedo, roughness, metallic, f0, self.edge, *coat)
             return dr.select(active & angles.valid, value, 0)
 
-        def _strategy(self, values):
-            """The shares of samples that follow the visible normals of base and coat, and their distributions."""
-            _, roughness, metallic, specular = values
-            alpha = dr.maximum(dr.square(roughness), bsdf.ALPHA_FLOOR)
-            shine = dr.clip(dr.maximum(metallic, dr.max(specular)), 0, 1)
-            shine = 0.5 + 0.5 * shine if self.edge > 0 else dr.clip(metallic, 0, 1)
-            coated = 0.3 * self.coat
-            kind = mi.MicrofacetType.GGX
-            coat = mi.MicrofacetDistribution(kind, max(self.coat_roughness**2, bsdf.ALPHA_FLOOR), sample_visible=True)
-            spread = mi.MicrofacetDistribution(kind, alpha, sample_visible=True)
-            return shine * (1 - coated), mi.Float(coated), spread, coat
+    return LayeredSurface
 
-        def _pdf(self, si, wo, active, values):
-            shiny, coated, spread, coat = self._strategy(values)
-            above = active & (si.wi.z > 0) & (wo.z > 0)
-            wi = dr.select(above, si.wi, mi.Vector3f(0, 0, 1))
-            half = dr.normalize(dr.select(above, si.wi + wo, mi.Vector3f(0, 0, 1)))
-            lobes = shiny * spread.pdf(wi, half) + coated * coat.pdf(wi, half)
-            lobes /= 4 * dr.select(above, dr.dot(wo, half), 1)
-            return dr.select(above, dr.fma(1 - shiny - coated, wo.z / dr.pi, lobes), 0)
 
-    return Surface
+def _strategy(mi: Any, layers: Any, values: Any) -> tuple[Any, Any, Any, Any]:
+    """The shares of samples that follow the visible normals of base and coat, and their distributions."""
+    import drjit as dr
+
+    _, roughness, metallic, specular = values
+    alpha = dr.maximum(dr.square(roughness), bsdf.ALPHA_FLOOR)
+    shine = dr.clip(dr.maximum(metallic, dr.max(specular)), 0, 1)
+    shine = 0.5 + 0.5 * shine if layers.edge > 0 else dr.clip(metallic, 0, 1)
+    coated = 0.3 * layers.coat
+    kind = mi.MicrofacetType.GGX
+    coat = mi.MicrofacetDistribution(kind, max(layers.coat_roughness**2, bsdf.ALPHA_FLOOR), sample_visible=True)
+    spread = mi.MicrofacetDistribution(kind, alpha, sample_visible=True)
+    return shine * (1 - coated), mi.Float(coated), spread, coat
+
+
+def _density(mi: Any, layers: Any, si: Any, wo: Any, active: Any, values: Any) -> Any:
+    """The density with which a LayeredSurface's `sample` draws a direction."""
+    import drjit as dr
+
+    shiny, coated, spread, coat = _strategy(mi, layers, values)
+    above = active & (si.wi.z > 0) & (wo.z > 0)
+    wi = dr.select(above, si.wi, mi.Vector3f(0, 0, 1))
+    half = dr.normalize(dr.select(above, si.wi + wo, mi.Vector3f(0, 0, 1)))
+    lobes = shiny * spread.pdf(wi, half) + coated * coat.pdf(wi, half)
+    lobes /= 4 * dr.select(above, dr.dot(wo, half), 1)
+    return dr.select(above, dr.fma(1 - shiny - coated, wo.z / dr.pi, lobes), 0)

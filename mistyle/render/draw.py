@@ -19,6 +19,7 @@ from mistyle.core.view import View
 from mistyle.render import device
 from mistyle.render import scene as scenery
 from mistyle.render.pages import paged_shapes
+from mistyle.render.scene import STUDIO, Staging
 
 # Seeds of passes must not meet those of a neighbouring seed: an odd step visits every number once.
 SEED_STEP = 0x9E3779B1
@@ -115,8 +116,6 @@ def draw_views(
     spp: int = 8,
     seed: int = 0,
     progress: Callable[[float], None] = lambda done: None,
-    *,
-    hdri: Float[np.ndarray, "eh ew 3"] | None = None,
 ) -> list[View]:
     """Render the mesh with its maps (None: neutral grey) from every camera (paper 4.1.1).
 
@@ -125,7 +124,7 @@ def draw_views(
     seed and thread count give the same bytes. `spp` is rounded up to a power of two.
     """
     traced = tracer(mesh)
-    pictures = _pictures(mesh, maps, cameras, template, spp, seed, hdri=hdri, backdrop=False)
+    pictures = _pictures(mesh, maps, cameras, Staging(template, spp, seed, backdrop=False))
     views = []
     for k, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
         hits = gbuffer(traced, camera)
@@ -165,60 +164,38 @@ def _coarse(values: np.ndarray, pixels: int) -> np.ndarray:
 
 
 def picture(
-    mesh: Mesh,
-    maps: Sequence[Maps] | None,
-    camera: Camera,
-    template: str | Path = "studio",
-    spp: int = 64,
-    seed: int = 0,
-    *,
-    hdri: Float[np.ndarray, "eh ew 3"] | None = None,
-    backdrop: bool = True,
+    mesh: Mesh, maps: Sequence[Maps] | None, camera: Camera, staging: Staging = STUDIO
 ) -> Float[np.ndarray, "h w 4"]:
     """One picture for a report: linear rgb (premultiplied) and alpha; with a backdrop alpha is 1 nearly everywhere."""
-    return next(iter(_pictures(mesh, maps, [camera], template, spp, seed, hdri=hdri, backdrop=backdrop)))
+    return next(iter(_pictures(mesh, maps, [camera], staging)))
 
 
 def pictures(
     mesh: Mesh,
     maps: Sequence[Maps] | None,
     cameras: Sequence[Camera],
-    template: str | Path = "studio",
-    spp: int = 64,
-    seed: int = 0,
+    staging: Staging = STUDIO,
     progress: Callable[[float], None] = lambda done: None,
-    *,
-    hdri: Float[np.ndarray, "eh ew 3"] | None = None,
-    backdrop: bool = True,
 ) -> list[Float[np.ndarray, "h w 4"]]:
     """`picture` for several cameras; the object and its textures are loaded once."""
     result = []
-    for image in _pictures(mesh, maps, cameras, template, spp, seed, hdri=hdri, backdrop=backdrop):
+    for image in _pictures(mesh, maps, cameras, staging):
         result.append(image)
         progress(len(result) / len(cameras))
     device.give_back()
     return result
 
 
-def passes(
-    mesh: Mesh,
-    maps: Sequence[Maps],
-    camera: Camera,
-    template: str | Path = "studio",
-    spp: int = 2,
-    seed: int = 0,
-    *,
-    backdrop: bool = True,
-) -> Iterator[Float[np.ndarray, "h w 4"]]:
-    """`picture` again and again, without end: independent ones of `spp` samples a pixel; the scene is loaded once."""
+def passes(mesh: Mesh, maps: Sequence[Maps], camera: Camera, staging: Staging) -> Iterator[Float[np.ndarray, "h w 4"]]:
+    """`picture` again and again, without end, independent of one another; the scene is loaded once."""
     import mitsuba as mi
 
     device.use()
     shapes = _shapes(mesh, maps, max(camera.size))
-    described = scenery.scene_dict(mesh, maps, camera, template, spp=spp, seed=seed, backdrop=backdrop, shapes=shapes)
+    described = scenery.scene_dict(mesh, maps, camera, staging, shapes)
     scene = mi.load_dict(described, optimize=False)
     for k in itertools.count():
-        yield np.array(mi.render(scene, spp=spp, seed=(seed + k * SEED_STEP) % 2**32), dtype=np.float32)
+        yield np.array(mi.render(scene, spp=staging.spp, seed=(staging.seed + k * SEED_STEP) % 2**32), dtype=np.float32)
 
 
 def _shapes(mesh, maps, pixels):
@@ -233,7 +210,7 @@ def _shapes(mesh, maps, pixels):
     return shapes
 
 
-def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
+def _pictures(mesh, maps, cameras, staging):
     """Render camera after camera; the object is loaded once, a template that follows the camera anew for each."""
     import mitsuba as mi
 
@@ -241,12 +218,11 @@ def _pictures(mesh, maps, cameras, template, spp, seed, *, hdri, backdrop):
     shapes = _shapes(mesh, maps, max(max(c.size) for c in cameras))
 
     def loaded(camera):
-        described = scenery.scene_dict(
-            mesh, maps, camera, template, spp=spp, seed=seed, hdri=hdri, backdrop=backdrop, shapes=shapes
-        )
+        described = scenery.scene_dict(mesh, maps, camera, staging, shapes)
         return mi.load_dict(described, optimize=False)
 
-    standing = loaded(cameras[0]) if cameras and not scenery.follows_camera(template) else None
+    spp, seed = staging.spp, staging.seed
+    standing = loaded(cameras[0]) if cameras and not scenery.follows_camera(staging.template) else None
 
     def drawn(camera):
         # A function, so that its scene goes before the next comes: where two live, other kernels have to be compiled.

@@ -77,26 +77,21 @@ def _gltf_class(mi: Any) -> type:
             return self._eval(si, wo, active, self.metallic.eval_1(si, active), self.roughness.eval_1(si, active))
 
         def pdf(self, ctx, si, wo, active=True):
-            return self._pdf(si, wo, active, self.metallic.eval_1(si, active), self.roughness.eval_1(si, active))
+            return _density(mi, si, wo, active, self.metallic.eval_1(si, active), self.roughness.eval_1(si, active))
 
         def eval_pdf(self, ctx, si, wo, active=True):
             metallic, roughness = self.metallic.eval_1(si, active), self.roughness.eval_1(si, active)
             value = self._eval(si, wo, active, metallic, roughness)
-            return value, self._pdf(si, wo, active, metallic, roughness)
+            return value, _density(mi, si, wo, active, metallic, roughness)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
             metallic, roughness = self.metallic.eval_1(si, active), self.roughness.eval_1(si, active)
-            shiny, spread = self._strategy(metallic, roughness)
+            shiny, spread = _strategy(mi, metallic, roughness)
             glossy = sample1 < shiny
             half, _ = spread.sample(mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z)), sample2)
             wo = dr.select(glossy, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
-            sampled = dr.zeros(mi.BSDFSample3f)
-            sampled.wo = dr.detach(wo)
-            sampled.eta = mi.Float(1)
-            diffuse, gloss = mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            sampled.sampled_type = dr.select(glossy, gloss, diffuse)
-            sampled.sampled_component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
-            sampled.pdf = self._pdf(si, sampled.wo, active, metallic, roughness)
+            sampled = reflected(mi, dr.detach(wo), glossy)
+            sampled.pdf = _density(mi, si, sampled.wo, active, metallic, roughness)
             value = self._eval(si, sampled.wo, active, metallic, roughness)
             usable = active & (sampled.pdf > 0)
             return sampled, dr.select(usable, value / dr.select(usable, sampled.pdf, 1), 0)
@@ -114,21 +109,41 @@ def _gltf_class(mi: Any) -> type:
             paint, gloss = bsdf.MODELS["gltf"](angles, roughness, metallic, self.specular)
             return dr.select(active & angles.valid, dr.fma(albedo, paint, gloss), 0)
 
-        def _strategy(self, metallic, roughness):
-            """The share of samples that follow GGX's visible normals, and that distribution; the rest is cosine."""
-            alpha = dr.maximum(dr.square(dr.detach(roughness)), bsdf.ALPHA_FLOOR)
-            share = 0.5 + 0.5 * dr.clip(dr.detach(metallic), 0, 1)
-            return share, mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, sample_visible=True)
-
-        def _pdf(self, si, wo, active, metallic, roughness):
-            shiny, spread = self._strategy(metallic, roughness)
-            above = active & (si.wi.z > 0) & (wo.z > 0)
-            half = dr.normalize(dr.select(above, si.wi + wo, mi.Vector3f(0, 0, 1)))
-            visible = spread.pdf(dr.select(above, si.wi, mi.Vector3f(0, 0, 1)), half)
-            lobe = visible / (4 * dr.select(above, dr.dot(wo, half), 1))
-            return dr.select(above, dr.lerp(wo.z / dr.pi, lobe, shiny), 0)
-
     return Gltf
+
+
+def _strategy(mi: Any, metallic: Any, roughness: Any) -> tuple[Any, Any]:
+    """The share of samples that follow GGX's visible normals, and that distribution; the rest is cosine."""
+    import drjit as dr
+
+    alpha = dr.maximum(dr.square(dr.detach(roughness)), bsdf.ALPHA_FLOOR)
+    share = 0.5 + 0.5 * dr.clip(dr.detach(metallic), 0, 1)
+    return share, mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, sample_visible=True)
+
+
+def _density(mi: Any, si: Any, wo: Any, active: Any, metallic: Any, roughness: Any) -> Any:
+    """The density with which `sample` draws a direction."""
+    import drjit as dr
+
+    shiny, spread = _strategy(mi, metallic, roughness)
+    above = active & (si.wi.z > 0) & (wo.z > 0)
+    half = dr.normalize(dr.select(above, si.wi + wo, mi.Vector3f(0, 0, 1)))
+    visible = spread.pdf(dr.select(above, si.wi, mi.Vector3f(0, 0, 1)), half)
+    lobe = visible / (4 * dr.select(above, dr.dot(wo, half), 1))
+    return dr.select(above, dr.lerp(wo.z / dr.pi, lobe, shiny), 0)
+
+
+def reflected(mi: Any, wo: Any, glossy: Any) -> Any:
+    """A sample of reflection towards `wo`, of the glossy component or the diffuse one; its density is left open."""
+    import drjit as dr
+
+    sampled = dr.zeros(mi.BSDFSample3f)
+    sampled.wo = wo
+    sampled.eta = mi.Float(1)
+    diffuse, gloss = mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+    sampled.sampled_type = dr.select(glossy, gloss, diffuse)
+    sampled.sampled_component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
+    return sampled
 
 
 def _normalmap_class(mi: Any) -> type:
@@ -152,26 +167,26 @@ def _normalmap_class(mi: Any) -> type:
             cb.put("normalmap", self.normalmap, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
 
         def eval(self, ctx, si, wo, active=True):
-            tilted, frame = self._tilt(si, active)
+            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
             inner = frame.to_local(wo)
             active = active & (wo.z * inner.z > 0)
             return dr.select(active, self.nested.eval(ctx, tilted, inner, active), 0)
 
         def pdf(self, ctx, si, wo, active=True):
-            tilted, frame = self._tilt(si, active)
+            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
             inner = frame.to_local(wo)
             active = active & (wo.z * inner.z > 0)
             return dr.select(active, self.nested.pdf(ctx, tilted, inner, active), 0)
 
         def eval_pdf(self, ctx, si, wo, active=True):
-            tilted, frame = self._tilt(si, active)
+            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
             inner = frame.to_local(wo)
             active = active & (wo.z * inner.z > 0)
             value, pdf = self.nested.eval_pdf(ctx, tilted, inner, active)
             return dr.select(active, value, 0), dr.select(active, pdf, 0)
 
         def sample(self, ctx, si, sample1, sample2, active=True):
-            tilted, frame = self._tilt(si, active)
+            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
             sampled, weight = self.nested.sample(ctx, tilted, sample1, sample2, active)
             outer = frame.to_world(sampled.wo)
             active = active & (sampled.wo.z * outer.z > 0)
@@ -180,7 +195,7 @@ def _normalmap_class(mi: Any) -> type:
             return sampled, dr.select(active, weight, 0)
 
         def sh_frame(self, si, active=True):
-            return self._tilt(si, active)[0].sh_frame
+            return _tilted(mi, self.normalmap, self.flip, si, active)[0].sh_frame
 
         def eval_diffuse_reflectance(self, si, active=True):
             return self.nested.eval_diffuse_reflectance(si, active)
@@ -188,41 +203,47 @@ def _normalmap_class(mi: Any) -> type:
         def to_string(self):
             return f"{NORMALMAP}[nested_bsdf={self.nested}, normalmap={self.normalmap}]"
 
-        def _tilt(self, si, active):
-            """The interaction in the bumped frame, and that frame relative to `si.sh_frame`."""
-            s, t = self._tangents(si, active)
-            encoded = self.normalmap.eval_3(si, active)
-            x, y, z = 2 * encoded.x - 1, 2 * encoded.y - 1, 2 * encoded.z - 1
-            x, y = x * s.x + y * t.x, x * s.y + y * t.y
-            if self.flip:
-                turn = dr.select(dr.dot(si.wi, mi.Vector3f(x, y, z)) * si.wi.z <= 0, -1.0, 1.0)
-                x, y = x * turn, y * turn
-            n = dr.normalize(mi.Normal3f(x, y, z))
-            along = mi.Vector3f(s.x, s.y, 0)
-            frame = mi.Frame3f()
-            frame.n = n
-            frame.s = dr.normalize(along - n * dr.dot(n, along))
-            frame.t = dr.cross(n, frame.s)
-            tilted = mi.SurfaceInteraction3f(si)
-            tilted.sh_frame = mi.Frame3f(si.to_world(frame.s), si.to_world(frame.t), si.to_world(frame.n))
-            tilted.wi = frame.to_local(si.wi)
-            return tilted, frame
-
-        def _tangents(self, si: Any, active):
-            """The normal map's two axes in the tangent plane of `si.sh_frame`, 2D."""
-            # No `&=` here: Dr.Jit would change the caller's mask.
-            here = active
-            if dr.is_jit_v(mi.Float):
-                here = here & (si.shape != None)  # noqa: E711
-                here = here & si.shape.has_attribute(TANGENT, here)
-            elif not (active and si.shape is not None and si.shape.has_attribute(TANGENT)):
-                return mi.Vector2f(1, 0), mi.Vector2f(0, 1)
-            world = si.shape.eval_attribute_3(TANGENT, si, here)
-            hand = dr.mulsign(mi.Float(1), si.shape.eval_attribute_1(HANDEDNESS, si, here))
-            local = si.to_local(mi.Vector3f(world.x, world.y, world.z))
-            s = mi.Vector2f(local.x, local.y)
-            here = here & (dr.squared_norm(s) > 1e-12)
-            s = dr.select(here, dr.normalize(dr.select(here, s, 1)), mi.Vector2f(1, 0))
-            return s, mi.Vector2f(-s.y, s.x) * dr.select(here, hand, 1)
-
     return NormalMap
+
+
+def _tilted(mi: Any, normalmap: Any, flip: bool, si: Any, active: Any) -> tuple[Any, Any]:
+    """The interaction in the bumped frame, and that frame relative to `si.sh_frame`."""
+    import drjit as dr
+
+    s, t = _tangents(mi, si, active)
+    encoded = normalmap.eval_3(si, active)
+    x, y, z = 2 * encoded.x - 1, 2 * encoded.y - 1, 2 * encoded.z - 1
+    x, y = x * s.x + y * t.x, x * s.y + y * t.y
+    if flip:
+        turn = dr.select(dr.dot(si.wi, mi.Vector3f(x, y, z)) * si.wi.z <= 0, -1.0, 1.0)
+        x, y = x * turn, y * turn
+    n = dr.normalize(mi.Normal3f(x, y, z))
+    along = mi.Vector3f(s.x, s.y, 0)
+    frame = mi.Frame3f()
+    frame.n = n
+    frame.s = dr.normalize(along - n * dr.dot(n, along))
+    frame.t = dr.cross(n, frame.s)
+    tilted = mi.SurfaceInteraction3f(si)
+    tilted.sh_frame = mi.Frame3f(si.to_world(frame.s), si.to_world(frame.t), si.to_world(frame.n))
+    tilted.wi = frame.to_local(si.wi)
+    return tilted, frame
+
+
+def _tangents(mi: Any, si: Any, active: Any) -> tuple[Any, Any]:
+    """The normal map's two axes in the tangent plane of `si.sh_frame`, 2D."""
+    import drjit as dr
+
+    # No `&=` here: Dr.Jit would change the caller's mask.
+    here = active
+    if dr.is_jit_v(mi.Float):
+        here = here & (si.shape != None)  # noqa: E711
+        here = here & si.shape.has_attribute(TANGENT, here)
+    elif not (active and si.shape is not None and si.shape.has_attribute(TANGENT)):
+        return mi.Vector2f(1, 0), mi.Vector2f(0, 1)
+    world = si.shape.eval_attribute_3(TANGENT, si, here)
+    hand = dr.mulsign(mi.Float(1), si.shape.eval_attribute_1(HANDEDNESS, si, here))
+    local = si.to_local(mi.Vector3f(world.x, world.y, world.z))
+    s = mi.Vector2f(local.x, local.y)
+    here = here & (dr.squared_norm(s) > 1e-12)
+    s = dr.select(here, dr.normalize(dr.select(here, s, 1)), mi.Vector2f(1, 0))
+    return s, mi.Vector2f(-s.y, s.x) * dr.select(here, hand, 1)

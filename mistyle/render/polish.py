@@ -41,31 +41,46 @@ class Polished:
     trace: tuple[float, ...]
 
 
+@dataclass(frozen=True)
+class PolishSettings:
+    """How maps are polished.
+
+    loss      a name of `scene_grad.LOSSES`
+    rate      of Adam, on the albedo (see RATES)
+    metallic  whether it moves too
+    depth     path segments at most
+    spp       samples a pixel for the picture, `spp_grad` for its gradient
+    model     of the surface, and the `frame` of its normal maps, as in `scene.object_shapes`
+    """
+
+    steps: int
+    loss: str = "log_srgb_l1"
+    rate: float = 1e-3
+    metallic: bool = False
+    depth: int = 6
+    spp: int = 16
+    spp_grad: int = 4
+    model: scenery.Model = "principled"
+    frame: scenery.Frame = "mikkt"
+
+
 def polish(
     mesh: Mesh,
     maps: Sequence[Maps],
     captures: Captures,
-    steps: int,
-    *,
-    model: scenery.Model = "principled",
-    frame: scenery.Frame = "mikkt",
-    metallic: bool = False,
-    loss: str = "log_srgb_l1",
-    rate: float = 1e-3,
-    depth: int = 6,
-    spp: int = 16,
-    spp_grad: int = 4,
+    settings: PolishSettings,
     seed: int = 0,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Polished:
-    """`steps` of Adam from `maps`, one picture each, with up to `depth` path segments; see the module.
+    """Adam from `maps`, one picture a step; see the module.
 
-    `spp` samples a pixel for the picture, `spp_grad` for its gradient. Pixels count where the picture's mask says so
-    and the object covers them whole. The same bytes come out with one thread only: Mitsuba adds up texture gradients
-    in another order in every run. Roughness stays at or above `scene_keys.ROUGHNESS_FLOOR`.
+    Pixels count where the picture's mask says so and the object covers them whole. The same bytes come out with one
+    thread only: Mitsuba adds up texture gradients in another order in every run. Roughness stays at or above
+    `scene_keys.ROUGHNESS_FLOOR`.
     """
     device.use()
-    job = _Job(mesh, maps, captures, model, frame, metallic, scene_grad.LOSSES[loss], depth)
+    job = _Job(mesh, maps, captures, settings)
+    steps, spp = settings.steps, settings.spp
     judges = np.unique(np.linspace(0, len(captures) - 1, JUDGES).round().astype(int)).tolist()
     first = values = job.values()
     before = job.judge(first, judges, spp, seed)
@@ -74,11 +89,11 @@ def polish(
     for step in range(steps):
         turn, place = divmod(step, len(captures))
         k = int(np.random.default_rng([seed, turn]).permutation(len(captures))[place])
-        value, gradient = job.gradient(values, k, (spp, spp_grad), scene_grad.seeds(seed, step))
+        value, gradient = job.gradient(values, k, (spp, settings.spp_grad), scene_grad.seeds(seed, step))
         falling = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * step / steps))
         for p, name in zip(job.chosen, job.names, strict=True):
             usable = np.where(np.isfinite(gradient[p.key]), gradient[p.key], 0)
-            change = laplacian.change(moments[p.key], usable, rate * RATES[name] * falling, SHARE)
+            change = laplacian.change(moments[p.key], usable, settings.rate * RATES[name] * falling, SHARE)
             values = values | {p.key: scene_keys.project(p, values[p.key] + change)}
         trace.append(value)
         progress((step + 1) / steps)
@@ -90,16 +105,16 @@ def polish(
 class _Job:
     """The object with its textures, which all scenes share, and one scene per picture, made when it is needed."""
 
-    def __init__(self, mesh, maps, captures, model, frame, metallic, loss, depth) -> None:
+    def __init__(self, mesh: Mesh, maps: Sequence[Maps], captures: Captures, settings: PolishSettings) -> None:
         import mitsuba
 
         self.mi: Any = mitsuba
-        self.start, self.captures, self.loss = tuple(maps), captures, loss
-        self.shapes = scenery.object_shapes(mesh, maps, model=model, frame=frame)
-        engine = {"type": "prb", "max_depth": depth, "rr_depth": depth + 1, "hide_emitters": True}
+        self.start, self.captures, self.loss = tuple(maps), captures, scene_grad.LOSSES[settings.loss]
+        self.shapes = scenery.object_shapes(mesh, maps, model=settings.model, frame=settings.frame)
+        engine = {"type": "prb", "max_depth": settings.depth, "rr_depth": settings.depth + 1, "hide_emitters": True}
         self.engine = self.mi.load_dict(engine)
         self._environments: dict[tuple[int, ...], list[Any]] = {}
-        moving = [n for n in RATES if n != "metallic" or metallic]
+        moving = [n for n in RATES if n != "metallic" or settings.metallic]
         parts = [p for p in range(len(maps)) if f"part{p}" in self.shapes]
         wanted = {scenery.parameters(p)[name]: (p, name) for p in parts for name in moving}
         found = scene_keys.match(self.scene(0), list(wanted))
@@ -160,7 +175,7 @@ class _Job:
         wide = self.mi.TensorXb(aligned(np.broadcast_to(counts[..., None], clean.shape), bool))
         share = max(float(counts.mean()), 1e-9)
         # The weights are the relative loss's, which a polish does not take.
-        return shown, scene_grad.Sight(sensor, self.mi.TensorXf(aligned(clean)), wide, None, share)
+        return shown, scene_grad.ReferenceView(sensor, self.mi.TensorXf(aligned(clean)), wide, None, share)
 
     def gradient(self, values, k: int, spp: tuple[int, int], seeds: tuple[int, int]):
         """Loss of picture k and its gradient by key."""

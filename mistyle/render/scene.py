@@ -15,6 +15,7 @@ What a template may ask for besides:
 
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -291,37 +292,48 @@ def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | 
     return scene
 
 
+@dataclass(frozen=True)
+class Staging:
+    """What stands around the object, and how finely it is drawn.
+
+    template  a name of `scenes/` or a file: lights, floor and integrator; `hdri` replaces the map of its environment
+    spp       samples a pixel, drawn from `seed`
+    backdrop  whether the floor is seen
+    """
+
+    template: str | Path = "studio"
+    spp: int = 64
+    seed: int = 0
+    hdri: Float[np.ndarray, "eh ew 3"] | None = None
+    backdrop: bool = True
+
+
+STUDIO = Staging()
+
+
 def scene_dict(
     mesh: Mesh,
     maps: Sequence[Maps] | None,
-    camera: Camera | None = None,
-    template: str | Path = "paper_views",
-    *,
-    spp: int = 8,
-    seed: int = 0,
-    hdri: Float[np.ndarray, "eh ew 3"] | None = None,
-    backdrop: bool = True,
-    integrator: dict | None = None,
+    camera: Camera | None,
+    staging: Staging,
     shapes: dict[str, Any] | None = None,
-    model: Model = "principled",
-    frame: Frame = "mitsuba",
 ) -> dict:
     """The scene as a dictionary for `mi.load_dict`, with a sensor when a camera is given.
 
-    `maps` None: neutral grey. `shapes` (of `object_shapes`) saves building the object again; mesh, maps, `model` and
-    `frame` are then not looked at, except for the floor's height. `integrator` replaces the template's. Emitters with
-    ids "camera_…" are placed for `camera` (without one they keep the file's places).
+    `maps` None: neutral grey. `shapes` (of `object_shapes`) saves building the object again; mesh and maps are then not
+    looked at, except for the floor's height. Emitters with ids "camera_…" are placed for `camera` (without one they
+    keep the file's places).
     """
     import mitsuba as mi
 
     device.use()
     floor = float(mesh.positions[:, 1].min()) if len(mesh.positions) else -1.0
     heading = _heading(camera) if camera is not None else 0.0
-    loaded = read_template(template, hdri=hdri, turn=heading, floor=floor)
-    result: dict[str, Any] = {"type": "scene", "integrator": integrator or loaded.integrator()}
+    loaded = read_template(staging.template, hdri=staging.hdri, turn=heading, floor=floor)
+    result: dict[str, Any] = {"type": "scene", "integrator": loaded.integrator()}
     below = camera is not None and camera.position[1] < floor
     for k, shape in enumerate(loaded.shapes()):
-        if shape.id() == "object" or (shape.id().startswith("floor") and (below or not backdrop)):
+        if shape.id() == "object" or (shape.id().startswith("floor") and (below or not staging.backdrop)):
             continue
         result[_key(shape.id(), f"shape{k}")] = shape
     for k, emitter in enumerate(loaded.emitters()):
@@ -334,8 +346,8 @@ def scene_dict(
             values = mi.traverse(result[key])
             values["to_world"] = to_world
             values.update()
-        result["sensor"] = sensor_dict(camera, spp, seed)
-    result.update(shapes if shapes is not None else object_shapes(mesh, maps, model=model, frame=frame))
+        result["sensor"] = sensor_dict(camera, staging.spp, staging.seed)
+    result.update(shapes if shapes is not None else object_shapes(mesh, maps))
     return result
 
 

@@ -30,12 +30,12 @@ MANY_PIXELS = 1 << 18  # from which the check takes fewer samples
 AGREEMENT = 0.01  # of the root mean square, beyond the noise
 
 
-class NotFast(Exception):
+class Unsupported(Exception):
     """Why a scene needs Monte Carlo."""
 
 
 @dataclass(frozen=True)
-class Material:
+class MaterialTexels:
     """One shape's material.
 
     roles     what `ROLES` names -> (key of `mi.traverse`, its value as stored: (h, w, c), or (n,) of a literal)
@@ -48,21 +48,21 @@ class Material:
     specular: float
 
 
-class Fast:
+class DeferredRenderer:
     """The scene's pictures as a function of the chosen parameters."""
 
     def __init__(
         self,
         scene: Any,
         chosen: Sequence[Parameter],
-        views: Sequence[scene_grad.Sight],
+        views: Sequence[scene_grad.ReferenceView],
         loss: str,
         engine: Any,
         subsamples: int = 4,
     ) -> None:
-        """Raises NotFast with a sentence where the pictures would not be the scene's; `subsamples` a pixel."""
+        """Raises Unsupported with a sentence where the pictures would not be the scene's; `subsamples` a pixel."""
         if loss not in scene_grad.LOSSES:
-            raise NotFast("the loss is a function of its own.")
+            raise Unsupported("the loss is a function of its own.")
         self.loss, self.chosen, self.subsamples = loss, tuple(chosen), subsamples
         reasons = scene_keys.fast_shapes(scene, engine)
         self.materials = _materials(scene, reasons)
@@ -70,10 +70,10 @@ class Fast:
         held = {key for m in self.materials if m is not None for key, _ in m.roles.values()}
         missing = next((p for p in chosen if p.key not in held), None)
         if missing is not None:
-            raise NotFast(_missing(scene, missing, reasons))
+            raise Unsupported(_missing(scene, missing, reasons))
         kinds = {m.specular for m in self.materials if m is not None}
         if len(kinds) > 1:
-            raise NotFast("its materials differ in `specular`.")
+            raise Unsupported("its materials differ in `specular`.")
         traced = tracer(_mesh(scene))
         cameras = [_camera(view.sensor, k) for k, view in enumerate(views)]
         masks = [self._counts(traced, camera, view) for camera, view in zip(cameras, views, strict=True)]
@@ -115,7 +115,7 @@ class Fast:
             parts.append(rows)
         return np.concatenate(parts)
 
-    def _counts(self, traced: Tracer, camera: Camera, view: scene_grad.Sight) -> np.ndarray:
+    def _counts(self, traced: Tracer, camera: Camera, view: scene_grad.ReferenceView) -> np.ndarray:
         """Pixels that count: those of the mask that see no other material, not even next to them."""
         counts = np.array(view.counts)[..., 0].astype(bool)
         foreign = [k for k, material in enumerate(self.materials) if material is None]
@@ -153,7 +153,7 @@ class Fast:
         variants = [(f, s) for f in (False, True) for s in (False, True)] if bumped else [(False, False)]
         errors = [error(variant) for variant in variants]
         if min(errors) > AGREEMENT:
-            raise NotFast(f"its pictures differ from the scene's own by {min(errors):.1%}.")
+            raise Unsupported(f"its pictures differ from the scene's own by {min(errors):.1%}.")
         return renderer(*variants[int(np.argmin(errors))])
 
 
@@ -197,7 +197,7 @@ def _missing(scene: Any, parameter: Parameter, reasons: Mapping[str, str | None]
     return told or f"{parameter.name} is no map of a plain `principled` on a mesh."
 
 
-def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[Material | None]:
+def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[MaterialTexels | None]:
     """One per shape; None for those that the fast path cannot shade."""
     import mitsuba as mi
 
@@ -210,15 +210,15 @@ def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[Material |
     for shape in scene.shapes():
         # A rectangle counts as a mesh but has no vertices to show.
         if "vertex_positions" not in mi.traverse(shape).keys():
-            raise NotFast(f"{shape.id()} is no mesh ({shape.class_name()}).")
+            raise Unsupported(f"{shape.id()} is no mesh ({shape.class_name()}).")
         plain = reasons.get(shape.id()) is None
         result.append(_material(shape, held, keys) if plain else None)
     if all(material is None for material in result):
-        raise NotFast(next(reason for reason in reasons.values() if reason is not None))
+        raise Unsupported(next(reason for reason in reasons.values() if reason is not None))
     return result
 
 
-def _material(shape: Any, held: Mapping[Any, list], keys: Mapping[Any, str]) -> Material:
+def _material(shape: Any, held: Mapping[Any, list], keys: Mapping[Any, str]) -> MaterialTexels:
     import mitsuba as mi
 
     roles: dict[str, tuple[str, np.ndarray]] = {}
@@ -233,16 +233,16 @@ def _material(shape: Any, held: Mapping[Any, list], keys: Mapping[Any, str]) -> 
         if name in ROLES:
             roles[name] = _stored(child, keys)
         elif name in ABSENT and np.any(np.array(_stored(child, keys)[1])):
-            raise NotFast(f"the material of {shape.id()} has {name}.")
+            raise Unsupported(f"the material of {shape.id()} has {name}.")
     sizes = {value.shape[:2] for _, value in roles.values() if value.ndim == 3}
     if len(sizes) > 1:
-        raise NotFast(f"the textures of {shape.id()} differ in size.")
+        raise Unsupported(f"the textures of {shape.id()} differ in size.")
     table: Any = mi.traverse(bsdf)
     own = next((table[key] for key in table.keys() if key == "specular"), None)
     if own is None:
-        raise NotFast(f"the material of {shape.id()} is given by eta, not by specular.")
+        raise Unsupported(f"the material of {shape.id()} is given by eta, not by specular.")
     size = next(iter(sizes), (2, 2))
-    return Material(roles, (int(size[0]), int(size[1])), float(np.array(own).ravel()[0]))
+    return MaterialTexels(roles, (int(size[0]), int(size[1])), float(np.array(own).ravel()[0]))
 
 
 def _stored(texture: Any, keys: Mapping[Any, str]) -> tuple[str, np.ndarray]:
@@ -250,10 +250,10 @@ def _stored(texture: Any, keys: Mapping[Any, str]) -> tuple[str, np.ndarray]:
 
     table: Any = mi.traverse(texture)
     if "to_uv" in table.keys() and not np.allclose(np.array(table["to_uv"].matrix).squeeze(), np.eye(3), atol=1e-6):
-        raise NotFast("a texture is scaled or turned (to_uv).")
+        raise Unsupported("a texture is scaled or turned (to_uv).")
     name = next((n for n in ("data", "value") if n in table.keys()), None)
     if name is None or texture not in keys:
-        raise NotFast(f"a texture is {texture.class_name()}.")
+        raise Unsupported(f"a texture is {texture.class_name()}.")
     value = np.array(table[name], dtype=np.float32)
     return keys[texture], value if name == "data" else value.reshape(-1)
 
@@ -264,7 +264,7 @@ def _light(emitter: Any) -> Directional | Point:
     table: Any = mi.traverse(emitter)
     name = {"DirectionalEmitter": "irradiance", "PointLight": "intensity"}.get(emitter.class_name())
     if name is None or f"{name}.value" not in table.keys():
-        raise NotFast(f"a light is {emitter.class_name()}.")
+        raise Unsupported(f"a light is {emitter.class_name()}.")
     colour = np.array(table[f"{name}.value"], dtype=float).ravel()
     red, green, blue = (float(c) for c in (colour if len(colour) == 3 else np.repeat(colour[:1], 3)))
     if name == "intensity":
@@ -282,9 +282,9 @@ def _camera(sensor: Any, k: int) -> Camera:
     columns, rows = (int(n) for n in film.size())
     table: Any = mi.traverse(sensor)
     if sensor.class_name() != "PerspectiveCamera" or tuple(film.crop_size()) != tuple(film.size()):
-        raise NotFast(f"sensor {k} is {sensor.class_name()}, or its film is cropped.")
+        raise Unsupported(f"sensor {k} is {sensor.class_name()}, or its film is cropped.")
     if film.rfilter().class_name() != "BoxFilter":
-        raise NotFast(f"the film of sensor {k} has {film.rfilter().class_name()}; expected the box filter.")
+        raise Unsupported(f"the film of sensor {k} has {film.rfilter().class_name()}; expected the box filter.")
     number = {
         name: float(np.array(table[name]).ravel()[0]) if name in table.keys() else 0.0
         for name in ("x_fov", "principal_point_offset_x", "principal_point_offset_y")

@@ -62,10 +62,11 @@ def fit_scene(
     progress       receives the share that is done, 0..1
     """
     device.use()
-    plan = scene_job.Plan(iterations, spp, spp_grad, rate, pyramid, sensors_per_step, seed, solver)
-    given = (scene, keys, sensors, references, masks, only, loss, regularizers, integrator)
+    plan = scene_job.FitPlan(iterations, spp, spp_grad, rate, pyramid, sensors_per_step, seed, solver)
+    unknowns, objective = scene_job.Unknowns(keys, only), scene_job.Objective(loss, regularizers)
+    evidence = scene_job.Evidence(references, sensors, masks)
     with device.plain_errors(DOING):
-        job, notes = scene_job.prepare(*given, plan, fast)
+        job, notes = scene_job.prepare(scene, unknowns, evidence, objective, plan, integrator, fast)
     state = scene_job.begun(job) if resume is None else scene_job.restored(resume, job)
     edge = len(job.views) / (2 * len(job.views) + iterations * sensors_per_step)
     with device.plain_errors(DOING):
@@ -76,7 +77,7 @@ def fit_scene(
 
 
 def _descend(
-    job: scene_job.Job, state: scene_job.State, callback: Any, save: Any, save_every: float, progress: Any
+    job: scene_job.SceneProblem, state: scene_job.FitState, callback: Any, save: Any, save_every: float, progress: Any
 ) -> None:
     """All steps that are left; ends early where the callback says so."""
     saved, stopped = time.monotonic(), False
@@ -99,7 +100,7 @@ def _descend(
             stopping.check()
 
 
-def _interrupted(job: scene_job.Job, state: scene_job.State, save: Any) -> None:
+def _interrupted(job: scene_job.SceneProblem, state: scene_job.FitState, save: Any) -> None:
     """A request to stop came within a round: what was known before it is kept."""
     if save is not None:
         save(scene_job.checkpoint(state, job))
@@ -107,7 +108,11 @@ def _interrupted(job: scene_job.Job, state: scene_job.State, save: Any) -> None:
 
 
 def _finished(
-    job: scene_job.Job, state: scene_job.State, before: Sequence[scene_result.Look], notes: Sequence[str], progress: Any
+    job: scene_job.SceneProblem,
+    state: scene_job.FitState,
+    before: Sequence[scene_result.ViewLook],
+    notes: Sequence[str],
+    progress: Any,
 ) -> FittedScene:
     """The result, measured against the start, undone where it is worse."""
     if (count := state.iteration - _first(job, TAIL)) > 0 and not (job.newton or job.fast):
@@ -139,7 +144,7 @@ def _finished(
     )
 
 
-def _step(job: scene_job.Job, state: scene_job.State) -> None:
+def _step(job: scene_job.SceneProblem, state: scene_job.FitState) -> None:
     """One step of Adam on the mean loss of the next cameras."""
     plan, step = job.plan, state.iteration
     gradient = {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
@@ -174,7 +179,7 @@ def _step(job: scene_job.Job, state: scene_job.State) -> None:
         state.course.append(np.concatenate([scene_result.brief(p, state.values[p.key]) for p in job.chosen]))
 
 
-def _first(job: scene_job.Job, share: float) -> int:
+def _first(job: scene_job.SceneProblem, share: float) -> int:
     """The first of the last steps that are the share of all."""
     return int(np.ceil((1 - share) * job.plan.iterations))
 
@@ -185,17 +190,16 @@ def _falling(step: int, steps: int, noisy: bool) -> float:
     return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * min(step / end, 1.0)))
 
 
-def _gradients(job: scene_job.Job, state: scene_job.State, k: int, seeds: tuple[int, int]):
+def _gradients(job: scene_job.SceneProblem, state: scene_job.FitState, k: int, seeds: tuple[int, int]):
     """Loss and gradient of camera k, and how many values of its picture were no numbers."""
     if job.fast is not None:
         return *job.fast.gradients(state.values, k), 0
     samples = (job.plan.spp, job.plan.spp_grad or 1)
-    return scene_grad.gradients(
-        job.scene, job.table, job.chosen, state.values, job.engine, job.views[k], job.losses[k], samples, seeds
-    )
+    live = scene_grad.LiveScene(job.scene, job.table, job.chosen, job.engine)
+    return scene_grad.gradients(live, state.values, job.views[k], job.losses[k], samples, seeds)
 
 
-def _add(total: dict, found: dict, state: scene_job.State, weight: float, sensor: int | None) -> None:
+def _add(total: dict, found: dict, state: scene_job.FitState, weight: float, sensor: int | None) -> None:
     """Add gradients; texels with a number that is none are noted and held."""
     for key, gradient in found.items():
         wrong = ~np.isfinite(gradient)
@@ -209,7 +213,7 @@ def _add(total: dict, found: dict, state: scene_job.State, weight: float, sensor
         total[key] += np.float32(weight) * gradient
 
 
-def _camera(job: scene_job.Job, step: int, slot: int) -> int:
+def _camera(job: scene_job.SceneProblem, step: int, slot: int) -> int:
     """Which camera is next: every one once a round, each round in another order."""
     place, views = step * job.plan.sensors_per_step + slot, len(job.views)
     return int(np.random.default_rng([job.plan.seed, place // views]).permutation(views)[place % views])

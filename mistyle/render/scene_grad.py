@@ -32,7 +32,7 @@ AROUND, HOLE, DARK = 7, 3, 0.1
 
 
 @dataclass(frozen=True)
-class Sight:
+class ReferenceView:
     """A camera and what it should see: tensors (h, w, 3) of the reference, of the values that count, and of the
     relative loss's weights."""
 
@@ -100,7 +100,7 @@ NAMES = ("relative", *LOSSES)
 SQUARED = ("relative", "l2")
 
 
-def loss_of(loss: str | Loss, view: Sight) -> Loss:
+def loss_of(loss: str | Loss, view: ReferenceView) -> Loss:
     """The function of a named loss for one camera. Raises UsageError for an unknown name."""
     if not isinstance(loss, str):
         return loss
@@ -169,7 +169,7 @@ def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]
     return mi.load_dict(replacement), (f"{note} with max_depth {replacement.get('max_depth', 6)}.",)
 
 
-def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str) -> Sight:
+def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str) -> ReferenceView:
     """Check one reference picture against its camera. Raises InputRefused, calling the camera `name`."""
     import mitsuba
 
@@ -200,7 +200,7 @@ def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str
     if film.base_channels_count() < 3:
         raise InputRefused(f'the film of {name} has one channel; expected <string name="pixel_format" value="rgb"/>.')
     clean = np.where(used[..., None], reference, 0)
-    return Sight(
+    return ReferenceView(
         sensor=sensor,
         reference=mi.TensorXf(aligned(clean)),
         counts=mi.TensorXb(aligned(np.broadcast_to(used[..., None], clean.shape), bool)),
@@ -231,7 +231,7 @@ def picture(scene: Any, integrator: Any, sensor: Any, spp: int, seed: int) -> An
     return total
 
 
-def compare(shown: Any, view: Sight, loss: Loss) -> tuple[float, Any, int]:
+def compare(shown: Any, view: ReferenceView, loss: Loss) -> tuple[float, Any, int]:
     """The loss over the pixels that count, its gradient for the picture, and how many values of it are no numbers.
 
     Pixels that do not count, or are NaN or infinite, are set to the reference's: they have no gradient.
@@ -251,25 +251,32 @@ def compare(shown: Any, view: Sight, loss: Loss) -> tuple[float, Any, int]:
     return float(np.asarray(value).ravel()[0]) / view.share, gradient, broken
 
 
+@dataclass(frozen=True)
+class LiveScene:
+    """A scene whose chosen parameters change, what `mi.traverse` gave of it, and the integrator that draws it."""
+
+    scene: Any
+    table: Any
+    chosen: Sequence[Parameter]
+    integrator: Any
+
+
 def gradients(
-    scene: Any,
-    table: Any,
-    chosen: Sequence[Parameter],
+    live: LiveScene,
     values: Mapping[str, np.ndarray],
-    integrator: Any,
-    view: Sight,
+    view: ReferenceView,
     loss: Loss,
     spp: tuple[int, int],
     seeds: tuple[int, int],
 ) -> tuple[float, dict[str, np.ndarray], int]:
     """Loss of one camera, dL/dvalue of every chosen parameter by key, and the picture's values that are no numbers.
 
-    `table` is what `mi.traverse` gave; `values` are put into the scene first. `spp` and `seeds`: of the picture, of
-    the gradient.
+    The values are put into the scene first. `spp` and `seeds`: of the picture, of the gradient.
     """
     import drjit as dr
     import mitsuba as mi
 
+    scene, table, chosen, integrator = live.scene, live.table, live.chosen, live.integrator
     # Fresh variables each time: a backward pass takes the graph of the one before with it.
     moving = put(table, chosen, values, grad=True)
     shown = picture(scene, integrator, view.sensor, spp[0], seeds[0])
@@ -284,12 +291,9 @@ def gradients(
 
 
 def derivative(
-    scene: Any,
-    table: Any,
-    chosen: Sequence[Parameter],
+    live: LiveScene,
     values: Mapping[str, np.ndarray],
     direction: Mapping[str, np.ndarray],
-    integrator: Any,
     sensor: Any,
     spp: int,
     seed: int,
@@ -301,15 +305,16 @@ def derivative(
     import drjit as dr
     import mitsuba as mi
 
+    table = live.table
     along = mi.Float(0)
     dr.enable_grad(along)
-    for p in chosen:
+    for p in live.chosen:
         kind = type(table[p.key])
         # All directions are arrays, so that every column runs the same kernel.
         table[p.key] = typed(kind, values[p.key]) + typed(kind, direction[p.key]) * along
     table.update()
     dr.forward(along, dr.ADFlag.ClearEdges)
-    image = integrator.render_forward(scene, table, sensor, seed=dr.opaque(mi.UInt32, seed), spp=spp)
+    image = live.integrator.render_forward(live.scene, table, sensor, seed=dr.opaque(mi.UInt32, seed), spp=spp)
     result = np.array(image, dtype=np.float32)[..., :3]
     return np.where(np.isfinite(result), result, np.float32(0))
 
@@ -328,7 +333,7 @@ def regularized(
     return float(np.asarray(total).ravel()[0]), gradient
 
 
-def psnr(shown: Any, view: Sight) -> float:
+def psnr(shown: Any, view: ReferenceView) -> float:
     """PSNR in dB of clipped sRGB over the pixels that count; infinite for equal pictures."""
     counts = np.array(view.counts)
     images = [srgb_from_linear(np.clip(np.nan_to_num(np.array(x)[..., :3]), 0, 1)) for x in (shown, view.reference)]

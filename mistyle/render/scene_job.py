@@ -31,7 +31,7 @@ class Bad:
 
 
 @dataclass(frozen=True)
-class Plan:
+class FitPlan:
     """The settings that decide the result; `spp_grad` None leaves it to the solver."""
 
     iterations: int
@@ -45,26 +45,26 @@ class Plan:
 
 
 @dataclass(frozen=True)
-class Job:
+class SceneProblem:
     """What stands still during the fit."""
 
     scene: Any
     table: Any
     chosen: tuple[Parameter, ...]
-    views: tuple[scene_grad.Sight, ...]
+    views: tuple[scene_grad.ReferenceView, ...]
     engine: Any
     loss: str | scene_grad.Loss
     losses: tuple[scene_grad.Loss, ...]  # of every camera
     regularizers: tuple[Regularizer, ...]
     free: dict[str, np.ndarray]
     scales: dict[str, float]
-    plan: Plan
-    fast: Any = None  # scene_fast.Fast, where its pictures are the scene's
+    plan: FitPlan
+    fast: Any = None  # scene_fast.DeferredRenderer, where its pictures are the scene's
     newton: bool = False  # Gauss–Newton instead of Adam
 
 
 @dataclass
-class State:
+class FitState:
     """What moves, and in `held` which numbers do so no more; all but `bad`, `lost`, `broken` goes into a checkpoint.
 
     start   the values before the first step
@@ -88,10 +88,44 @@ class State:
     broken: dict[int, int] = field(default_factory=dict)
 
 
-def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, integrator, plan: Plan, fast=True):
-    """Check everything and put it together; returns the job and notes."""
+@dataclass(frozen=True)
+class Unknowns:
+    """The parameters to fit, by name, and masks of the numbers that may change (`only`, by name)."""
+
+    keys: str | Sequence[str]
+    only: Mapping[str, np.ndarray] | None = None
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The pictures to fit to, with their sensors and masks; None: the scene's sensors, every pixel."""
+
+    references: Any
+    sensors: Any = None
+    masks: Any = None
+
+
+@dataclass(frozen=True)
+class Objective:
+    """The loss (None: chosen by the way of drawing) and the regularizers that are added to it."""
+
+    loss: str | scene_grad.Loss | None = None
+    regularizers: Sequence[Regularizer] = ()
+
+
+def prepare(
+    scene: Any,
+    unknowns: Unknowns,
+    evidence: Evidence,
+    objective: Objective,
+    plan: FitPlan,
+    integrator: Any = None,
+    fast: bool = True,
+) -> tuple[SceneProblem, list[str]]:
+    """Check everything and put it together; returns the problem and notes."""
     import mitsuba as mi
 
+    keys, loss, regularizers = unknowns.keys, objective.loss, objective.regularizers
     counts = [plan.iterations, plan.spp, plan.sensors_per_step, 1 if plan.spp_grad is None else plan.spp_grad]
     if min(counts) < 1 or not plan.rate > 0:
         raise UsageError("iterations, spp, spp_grad and sensors_per_step must be 1 or more, and rate above 0.")
@@ -101,7 +135,7 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
         raise UsageError(f"the solver '{plan.solver}' is not known; expected {', '.join(SOLVERS)}.")
     engine, notes = scene_grad.ad_integrator(scene, integrator)
     chosen = scene_keys.match(scene, [keys] if isinstance(keys, str) else keys, engine)
-    views = _views(scene, sensors, references, masks)
+    views = _views(scene, evidence.sensors, evidence.references, evidence.masks)
     notes = [*notes, *(f"{p.name}: {note}" for p in chosen for note in p.notes)]
     if len(views) < FEWEST_VIEWS:
         notes.append(
@@ -110,7 +144,7 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
         )
     table = mi.traverse(scene)
     table.properties = {p.key: table.properties[p.key] for p in chosen}
-    free = _free(chosen, only or {})
+    free = _free(chosen, unknowns.only or {})
     scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
     quick, why = _fast(scene, chosen, views, loss or "log_srgb_l1", engine) if fast else (None, "it was not asked for.")
     if loss is None:
@@ -130,7 +164,7 @@ def prepare(scene, keys, sensors, references, masks, only, loss, regularizers, i
         )
     losses = tuple(scene_grad.loss_of(loss, view) for view in views)
     given = (scene, table, chosen, views, engine, loss, losses, tuple(regularizers), free, scales, plan)
-    return Job(*given, fast=quick, newton=newton), notes
+    return SceneProblem(*given, fast=quick, newton=newton), notes
 
 
 def _way(quick: Any, engine: Any, why: str) -> str:
@@ -157,11 +191,11 @@ def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[s
 
 def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
     """The fast path, or why there is none."""
-    from mistyle.render.scene_fast import Fast, NotFast
+    from mistyle.render.scene_fast import DeferredRenderer, Unsupported
 
     try:
-        return Fast(scene, chosen, views, loss if isinstance(loss, str) else "", engine), ""
-    except NotFast as reason:
+        return DeferredRenderer(scene, chosen, views, loss if isinstance(loss, str) else "", engine), ""
+    except Unsupported as reason:
         return None, str(reason)
 
 
@@ -198,29 +232,29 @@ def _scale(parameter: Parameter, values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values, dtype=np.float64)))) or 1.0
 
 
-def first(parameter: Parameter, job: Job) -> np.ndarray:
+def first(parameter: Parameter, job: SceneProblem) -> np.ndarray:
     values = scene_grad.array(job.table[parameter.key], parameter)
     return np.where(job.free[parameter.key], scene_keys.project(parameter, values), values)
 
 
-def begun(job: Job) -> State:
+def begun(job: SceneProblem) -> FitState:
     """The state before the first step."""
     values = {p.key: first(p, job) for p in job.chosen}
     moments = {p.key: laplacian.start(p.shape, job.plan.pyramid) for p in job.chosen}
     held = {p.key: np.zeros(p.shape, bool) for p in job.chosen}
     tail = {p.key: np.zeros(p.shape) for p in job.chosen}
     newton = scene_newton.Newton(scene_newton.gathered(job, values)) if job.newton else None
-    return State(0, values, moments, held, dict(values), tail, [], newton=newton)
+    return FitState(0, values, moments, held, dict(values), tail, [], newton=newton)
 
 
-def _fingerprint(job: Job) -> str:
+def _fingerprint(job: SceneProblem) -> str:
     """What must be the same for a checkpoint to fit."""
     loss = job.loss if isinstance(job.loss, str) else getattr(job.loss, "__name__", type(job.loss).__name__)
     films = [list(view.reference.shape) for view in job.views]
     return json.dumps([[(p.name, p.shape) for p in job.chosen], films, loss, len(job.regularizers), asdict(job.plan)])
 
 
-def checkpoint(state: State, job: Job) -> dict[str, np.ndarray]:
+def checkpoint(state: FitState, job: SceneProblem) -> dict[str, np.ndarray]:
     result = {
         "job": np.array(_fingerprint(job)),
         "iteration": np.array(state.iteration),
@@ -239,7 +273,7 @@ def checkpoint(state: State, job: Job) -> dict[str, np.ndarray]:
     return result
 
 
-def restored(saved: Mapping[str, np.ndarray], job: Job) -> State:
+def restored(saved: Mapping[str, np.ndarray], job: SceneProblem) -> FitState:
     if "job" not in saved or str(saved["job"]) != _fingerprint(job):
         raise UsageError(
             "the checkpoint belongs to another fit: its keys, cameras or settings differ. Start without it, or give "
@@ -257,7 +291,7 @@ def restored(saved: Mapping[str, np.ndarray], job: Job) -> State:
         name: {p.key: np.array(saved[f"{p.name}/{name}"], kind) for p in job.chosen} for name, kind in kinds.items()
     }
     newton = {k.removeprefix("newton/"): v for k, v in saved.items() if k.startswith("newton/")}
-    return State(
+    return FitState(
         int(saved["iteration"]),
         moments=moments,
         trace=[float(x) for x in saved["trace"]],

@@ -171,13 +171,13 @@ def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) 
     values, zero = spread(job, theta, fill), {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
     own = size * job.plan.spp * job.plan.sensors_per_step // (2 * len(theta) * len(job.views))
     spp = job.plan.spp_grad or min(max(own, SPP[0]), SPP[1])
+    live = scene_grad.LiveScene(job.scene, job.table, job.chosen, job.engine)
     result = []
     for n in range(len(theta)):
         one = np.zeros(len(theta))
         one[n] = 1
         seed, sensor = scene_grad.seeds(job.plan.seed, 2**30 + 2 * newton.round + part, k, n)[0], job.views[k].sensor
-        given = (job.scene, job.table, job.chosen, values, spread(job, one, zero), job.engine, sensor)
-        result.append(scene_grad.derivative(*given, spp, seed))
+        result.append(scene_grad.derivative(live, values, spread(job, one, zero), sensor, spp, seed))
     return np.stack(result)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.render import scene_grad, scene_keys, scene_newton
-from mistyle.render.scene_job import Bad, Job, State
+from mistyle.render.scene_job import Bad, FitState, SceneProblem
 from mistyle.render.scene_keys import Parameter
 
 BATCHES = 8  # of the last steps, whose means' spread is the standard error
@@ -63,7 +63,7 @@ class FittedScene:
 
 
 @dataclass(frozen=True)
-class Look:
+class ViewLook:
     """One camera: loss, PSNR and noise as in `Residual`, and the squared difference of every value that counts."""
 
     loss: float
@@ -88,7 +88,7 @@ def pace(p: Parameter, change: np.ndarray, rate: float) -> np.ndarray:
     return moved.sum(axis=0, dtype=np.float64) / np.maximum(count, 1) / rate
 
 
-def looks(job: Job, values: Mapping[str, np.ndarray], progress: Callable[[float], None]) -> list[Look]:
+def looks(job: SceneProblem, values: Mapping[str, np.ndarray], progress: Callable[[float], None]) -> list[ViewLook]:
     """Two pictures of every camera, with the same seeds in every call: no difference comes from the noise alone."""
     scene_grad.put(job.table, job.chosen, values)
     result = []
@@ -100,7 +100,7 @@ def looks(job: Job, values: Mapping[str, np.ndarray], progress: Callable[[float]
     return result
 
 
-def _look(job: Job, k: int, pair: Sequence[Any]) -> Look:
+def _look(job: SceneProblem, k: int, pair: Sequence[Any]) -> ViewLook:
     view = job.views[k]
     counts, reference = np.array(view.counts), np.array(view.reference, np.float64)
     wrong = []
@@ -115,10 +115,10 @@ def _look(job: Job, k: int, pair: Sequence[Any]) -> Look:
     loss = float(squares.sum() / counts.sum())
     if job.loss not in scene_grad.SQUARED:
         loss = scene_grad.compare(mean, view, job.losses[k])[0]
-    return Look(loss, scene_grad.psnr(mean, view), float(min(noise / max(whole, 1e-300), 1)), squares[counts])
+    return ViewLook(loss, scene_grad.psnr(mean, view), float(min(noise / max(whole, 1e-300), 1)), squares[counts])
 
 
-def worse(job: Job, before: Sequence[Look], after: Sequence[Look]) -> bool:
+def worse(job: SceneProblem, before: Sequence[ViewLook], after: Sequence[ViewLook]) -> bool:
     """Whether the pictures fit less well than before, beyond the noise of that comparison."""
     change = sum(a.loss - b.loss for a, b in zip(after, before, strict=True))
     if job.loss not in scene_grad.SQUARED:
@@ -128,7 +128,7 @@ def worse(job: Job, before: Sequence[Look], after: Sequence[Look]) -> bool:
     return bool(change > SURE * spread)
 
 
-def errors(job: Job, state: State) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
+def errors(job: SceneProblem, state: FitState) -> tuple[dict[str, np.ndarray], tuple[str, ...]]:
     """Standard errors of `brief` by key, and the names of what still drifts."""
     if state.newton is not None:
         error, drifts = scene_newton.errors(job, state.newton)
@@ -174,7 +174,7 @@ def _spread(course: np.ndarray, scale: float) -> tuple[np.ndarray, bool]:
     return error, bool((far & (drift > 4 * own)).any())
 
 
-def afterthoughts(job: Job, state: State, unconverged: Sequence[str], undone: bool) -> list[str]:
+def afterthoughts(job: SceneProblem, state: FitState, unconverged: Sequence[str], undone: bool) -> list[str]:
     """Sentences about what did not go as one would expect."""
     notes = []
     if undone:

@@ -38,7 +38,7 @@ class SceneFile:
 
 
 @dataclass(frozen=True)
-class Written:
+class WrittenScene:
     """What `write_scene` wrote: the scene file (None where no element could be replaced), and every texture by key."""
 
     xml: Path | None
@@ -141,7 +141,7 @@ def write_scene(
     fitted: Any,
     write_exr: Callable[..., None],
     write_file: Callable[[Path, bytes], Any] = Path.write_bytes,
-) -> Written:
+) -> WrittenScene:
     """Write the fitted values (a `FittedScene`) as float EXR textures, and the scene file that uses them at `path`.
 
     The scene file is a copy of the one that was loaded: the fitted bitmaps' file names and the fitted literals' values
@@ -160,7 +160,7 @@ def write_scene(
     for p, stem in zip(fitted.parameters, stems, strict=True):
         textures |= _write_value(out, stem, p, fitted.values[p.key], write_exr, live)
     if not isinstance(scene, SceneFile):
-        return Written(None, textures, ("The scene does not come from a file: only its textures were written.",))
+        return WrittenScene(None, textures, ("The scene does not come from a file: only its textures were written.",))
     sources = [Path(str(file)).read_bytes() for file in scene.state.files]
     edits: dict[int, list[scene_source.Edit]] = {0: []}
     notes = []
@@ -171,17 +171,17 @@ def write_scene(
         else:
             edits.setdefault(found[0], []).extend(found[1])
     if not any(edits.values()):
-        return Written(None, textures, tuple(notes))
+        return WrittenScene(None, textures, tuple(notes))
     notes += _rewrite_includes(scene, sources, edits, out, write_file)
     edits[0] += scene_source.surroundings(sources[0], scene.path, scene.defines, out)
     write_file(out, scene_source.spliced(sources[0], edits[0]))
     wrong = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
     if wrong:
         out.unlink()
-        return Written(None, textures, (*notes, f"{out.name} was not kept: {wrong}"))
+        return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {wrong}"))
     if out.parent.resolve() != scene.path.parent.resolve():
         notes.append(f"{out.name} takes its other files from {scene.path.parent}.")
-    return Written(out, textures, tuple(notes))
+    return WrittenScene(out, textures, tuple(notes))
 
 
 def _rewrite_includes(

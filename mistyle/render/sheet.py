@@ -34,7 +34,7 @@ UNIT = 0.01
 
 
 @dataclass(frozen=True)
-class Rig:
+class LightRig:
     """A light of the sheet: its name, the map, and by how many stops it was exposed to bring the grey ball to 0.18."""
 
     name: str
@@ -42,7 +42,7 @@ class Rig:
     stops: float = 0.0
 
 
-def rigs(hdri: Float[np.ndarray, "h w 3"] | None, name: str = "", read: Any = None) -> tuple[Rig, ...]:
+def rigs(hdri: Float[np.ndarray, "h w 3"] | None, name: str = "", read: Any = None) -> tuple[LightRig, ...]:
     """The three lights of the sheet: soft studio, hard key, and the HDRI (None: a clear sky of ours)."""
     key = (
         SphericalGaussian((-0.5773503, 0.5773503, 0.5773503), 1500.0, (600.0, 580.0, 540.0)),
@@ -50,9 +50,9 @@ def rigs(hdri: Float[np.ndarray, "h w 3"] | None, name: str = "", read: Any = No
     )
     sky = Environment(clear_sky(256) if hdri is None else hdri)
     return (
-        Rig("soft studio", light_rig("studio", read)[0]),  # type: ignore[arg-type]
-        Rig("hard key", Environment(bake_environment(key, 256))),
-        Rig(f"HDRI: {name}" if name else "HDRI: clear sky", sky),
+        LightRig("soft studio", light_rig("studio", read)[0]),  # type: ignore[arg-type]
+        LightRig("hard key", Environment(bake_environment(key, 256))),
+        LightRig(f"HDRI: {name}" if name else "HDRI: clear sky", sky),
     )
 
 
@@ -169,12 +169,12 @@ def ball_mean(picture: Float[np.ndarray, "h w 4"], name: str, scale: float = 1.0
     return picture[inside][:, :3].mean(axis=0)
 
 
-def exposed(rig: Rig, seed: int = 0) -> Rig:
+def exposed(rig: LightRig, seed: int = 0) -> LightRig:
     """The rig scaled so that the grey ball's visible half has a mean luminance of 0.18."""
     seen = float(luminance(ball_mean(references(rig.light, 64, seed, 0.5), "grey", 0.5)[None])[0])
     factor = GREY / max(seen, 1e-9)
     light = replace(rig.light, scale=rig.light.scale * factor)
-    return Rig(rig.name, light, float(np.log2(factor)))
+    return LightRig(rig.name, light, float(np.log2(factor)))
 
 
 class Stage:

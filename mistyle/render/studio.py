@@ -16,7 +16,7 @@ occlusion and light are uploaded once for any number of pictures. Maps are packe
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -41,7 +41,7 @@ SPECULAR = 0.04  # F0 of a dielectric of index 1.5
 
 
 @dataclass(frozen=True)
-class Sky:
+class StudioSky:
     """Open sky over each texture set, on grids of `size`² texels: the mean open direction (world, unit) and the share
     of the hemisphere that is open, cosine-weighted, 0..1; row 0 is v = 1."""
 
@@ -125,7 +125,7 @@ def packed(maps: Maps) -> UInt32[np.ndarray, "n 2"]:
 class Studio:
     """An asset ready to be drawn; a class because mesh, light and materials are uploaded once for all pictures."""
 
-    def __init__(self, traced: Tracer, light: np.ndarray, sky: Sky, looks: Sequence[Sequence[Maps]]) -> None:
+    def __init__(self, traced: Tracer, light: np.ndarray, sky: StudioSky, looks: Sequence[Sequence[Maps]]) -> None:
         """`light` is `prefiltered`; `looks` are one `Maps` per texture set each; sets of a look may differ in size."""
         import mitsuba
 
@@ -251,7 +251,7 @@ class Studio:
         size = self._sky_size
         columns = mi.UInt32(size)
         start = part * (size * size)
-        return _bilinear(mi.Vector4f, self._sky, start, columns, columns, uv, valid)
+        return _bilinear(mi.Vector4f, self._sky, _Page(start, columns, columns), uv, valid)
 
     def _fetched(self, levels: Sequence[Any], towards: Any) -> list[Any]:
         """The light of each of the maps numbered `levels` from a unit direction (studio axes)."""
@@ -321,7 +321,7 @@ def _material(look: tuple[Any, ...], part: Any, uv: Any, valid: Any) -> tuple[An
         light = [dr.square(mi.Float(c) / most) for c, most in ((r, 2047), (g, 2047), (b, 1023))]
         return mi.ArrayXf(*light, x, y, z, rough, metal)
 
-    values = _bilinear(mi.Vector2u, texels, start, height, width, uv, valid, unpacked)
+    values = _bilinear(mi.Vector2u, texels, _Page(start, height, width), uv, valid, unpacked)
     return (
         mi.Color3f(values[0], values[1], values[2]),
         mi.Vector3f(values[3], values[4], values[5]),
@@ -330,15 +330,22 @@ def _material(look: tuple[Any, ...], part: Any, uv: Any, valid: Any) -> tuple[An
     )
 
 
-def _bilinear(
-    kind: Any, table: Any, start: Any, height: Any, width: Any, uv: Any, valid: Any, unpacked: Any = lambda row: row
-) -> Any:
-    """The value of a page of `height` x `width` at uv in [0, 1), its v down as Mitsuba has it; pages repeat."""
+class _Page(NamedTuple):
+    """Where a page of a table begins, and its size in texels."""
+
+    start: Any
+    height: Any
+    width: Any
+
+
+def _bilinear(kind: Any, table: Any, page: _Page, uv: Any, valid: Any, unpacked: Any = lambda row: row) -> Any:
+    """The value of a page at uv in [0, 1), its v down as Mitsuba has it; pages repeat."""
     import drjit as dr
     import mitsuba
 
     mi: Any = mitsuba  # its type stubs know one variant only
 
+    start, height, width = page
     x, y = uv.x * mi.Float(width) - 0.5, uv.y * mi.Float(height) - 0.5
     left, top = dr.floor(x), dr.floor(y)
 

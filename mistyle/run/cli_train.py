@@ -6,12 +6,15 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mistyle.core.cores import use_threads
 from mistyle.core.errors import UsageError
 from mistyle.run.cli_models import add_model_options
 from mistyle.run.options import add_job_options, examples, said_settings
+
+if TYPE_CHECKING:
+    from mistyle.backends.consislora_make import TrainingImage
 
 OPTIONS = {
     "seed": "seed",
@@ -61,33 +64,35 @@ def run_train(options: argparse.Namespace) -> int:
     from mistyle.run.progress import Progress
 
     need_extra()
-    wanted = lessons(options.kind, options.source, settings.word)
+    images = training_set(options.kind, options.source, settings.word)
+    from mistyle.backends.consislora_make import LoraFolder, make_all
     from mistyle.backends.consislora_make import check as check_models
-    from mistyle.backends.consislora_make import make_all
 
     use_threads(thread_count(settings))
     check_models(settings.models, settings.train)
     progress = Progress()
     with bar(progress.say) as watch:
-        given = (settings.models, wanted, options.out, settings.train, settings.seed, progress.say, watch)
-        made = make_all(*given, overwrite=options.overwrite)
+        folder = LoraFolder(options.out, options.overwrite)
+        made = make_all(settings.models, images, folder, settings.train, settings.seed, progress.say, watch)
     files = [str(halves.style if options.kind == "style" else halves.content) for halves in made]
     print(json.dumps({"loras": files}) if options.json else "\n".join(files))
     return 0
 
 
-def lessons(kind: str, source: Path, word: str) -> list[tuple[Any, str, Any, str]]:
-    """(kind, name, sRGB picture, word) of every LoRA that was asked for."""
+def training_set(kind: str, source: Path, word: str) -> "list[TrainingImage]":
+    """The pictures to train LoRAs on."""
+    from mistyle.backends.consislora_make import TrainingImage
     from mistyle.core.image import srgb_from_linear
 
     if kind == "style":
         from mistyle.files.read import read_picture
         from mistyle.run.generative import opaque
 
-        return [("style", source.stem, opaque(read_picture(source)), word or "[v]")]
+        return [TrainingImage("style", source.stem, opaque(read_picture(source)), word or "[v]")]
     from mistyle.files.views import read_views
 
-    return [("content", v.camera.name, srgb_from_linear(v.rgb), word or "[c]") for v in read_views(source)]
+    views = read_views(source)
+    return [TrainingImage("content", v.camera.name, srgb_from_linear(v.rgb), word or "[c]") for v in views]
 
 
 @contextmanager

@@ -14,8 +14,8 @@ from mistyle.run.progress import Report
 from mistyle.run.report import BeforeAfter, ReportPicture
 from mistyle.run.stages import Run
 from mistyle.run.stylize_settings import Settings
-from mistyle.stages.coat import Coats
-from mistyle.stages.finish import Finished
+from mistyle.stages.coat import StyleLayers
+from mistyle.stages.finish import StyleFinish
 
 LEVELS = 3  # of VGG-19: relu1_1 to relu3_1
 WEIGHTS = "for example --vgg vgg19-normalised (see mistyle models), or --vgg vgg19.pth as torchvision has it"
@@ -47,9 +47,9 @@ def check_finish(settings: Settings) -> None:
             f"--finish vgg: --stylizer {settings.stylizer} paints views; expected the embedded stylizer, whose "
             "painting knows which place of the picture lies where. Leave out --finish, or use --stylizer embedded"
         )
-    if settings.coat.slots:
+    if settings.paint.slots:
         raise UsageError(
-            f"--finish vgg: found {1 + len(settings.coat.slots)} style pictures; expected one. Leave out --style "
+            f"--finish vgg: found {1 + len(settings.paint.slots)} style pictures; expected one. Leave out --style "
             "SLOT=PICTURE or --finish"
         )
     if settings.surface.glaze > 0:
@@ -62,13 +62,13 @@ def check_finish(settings: Settings) -> None:
     load_features(path, LEVELS)
 
 
-def finish_stage(run: Run, asset: Asset, coats: Coats, atlas: Atlas, baked: Baked) -> tuple[Baked, FinishRecord]:
+def finish_stage(run: Run, asset: Asset, layers: StyleLayers, atlas: Atlas, baked: Baked) -> tuple[Baked, FinishRecord]:
     """The stage "finish": the painted albedo moved by VGG-19's style losses; normal and roughness as they were."""
     s = run.job.settings
-    protect = [s.coat.protect] if s.coat.protect is not None else []
+    protect = [s.paint.protect] if s.paint.protect is not None else []
     # The weights by their bytes.
     inputs = [s.finish, weights_file(s), s.fit.bridge, protect, s.seed]
-    made = run.record("finish", ["bake"], inputs, lambda r: finished(asset, coats, atlas, baked, s, r))
+    made = run.record("finish", ["bake"], inputs, lambda r: finished(asset, layers, atlas, baked, s, r))
     moved = f"the albedo moved by {made.moved:.3f} (sRGB, root mean square)"
     kept = made.style[1] < made.style[0]
     run.progress.note(
@@ -79,20 +79,22 @@ def finish_stage(run: Run, asset: Asset, coats: Coats, atlas: Atlas, baked: Bake
     return after, FinishRecord(baked.maps, after.maps, made.style, made.moved)
 
 
-def finished(asset: Asset, coats: Coats, atlas: Atlas, baked: Baked, settings: Settings, report: Report) -> Finished:
+def finished(
+    asset: Asset, layers: StyleLayers, atlas: Atlas, baked: Baked, settings: Settings, report: Report
+) -> StyleFinish:
     """The painted maps, finished; protected texels stay."""
     from mistyle.measure.features import load_features
     from mistyle.stages.coat import painted_mask
-    from mistyle.stages.finish import Painted, finish
+    from mistyle.stages.finish import PaintedAsset, finish
 
-    protect = settings.coat.protect
+    protect = settings.paint.protect
     only = None if protect is None else tuple(~painted_mask(protect, t) for t in atlas.texels)
-    painted = Painted(asset.mesh, baked.maps, atlas.texels, coats.solutions[0], only)
+    painted = PaintedAsset(asset.mesh, baked.maps, atlas.texels, layers.solutions[0], only)
     features = load_features(weights_file(settings), LEVELS)
     return finish(painted, features, settings.finish, settings.seed, report, bridge=settings.fit.bridge)
 
 
-def laid(baked: Baked, made: Finished) -> Baked:
+def laid(baked: Baked, made: StyleFinish) -> Baked:
     """The painting with its finished albedo; what begins the fit has the same one."""
     pairs = zip(baked.begin, made.albedo, strict=True) if baked.begin else ()
     begin = tuple(replace(maps, albedo=albedo) for maps, albedo in pairs)

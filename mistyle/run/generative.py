@@ -70,9 +70,9 @@ def _check(settings: Settings, say: Callable[[str], None]) -> None:
         from mistyle.backends.diffusion import announcement
         from mistyle.backends.diffusion import check as check_stylizer
 
-        if settings.coat.style_mask is not None:
+        if settings.paint.style_mask is not None:
             raise UsageError("--style-mask: the diffusion stylizer learns whole pictures; crop the picture instead")
-        if settings.coat.direction_map is not None:
+        if settings.paint.direction_map is not None:
             raise UsageError("--direction-map: the diffusion stylizer cannot follow it; leave it out")
         check_stylizer(settings.models, settings.diffusion, settings.rig.resolution)
         if settings.rig.kind in ("paper", "turntable"):
@@ -86,10 +86,10 @@ def _check(settings: Settings, say: Callable[[str], None]) -> None:
 
 def diffusion_job(settings: Settings, style: Picture, name: str, out: Path) -> Any:
     """The stylizer's own job: the style picture without its transparent parts' colours."""
-    from mistyle.backends.diffusion import Job
+    from mistyle.backends.diffusion import DiffusionJob
 
     loras = settings.models.loras or out / "work" / LORAS
-    return Job(settings.models, settings.train, settings.diffusion, opaque(style), name, loras, settings.seed)
+    return DiffusionJob(settings.models, settings.train, settings.diffusion, opaque(style), name, loras, settings.seed)
 
 
 def opaque(style: Picture) -> np.ndarray:

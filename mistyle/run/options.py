@@ -90,14 +90,14 @@ def add_report_option(verb: argparse.ArgumentParser) -> None:
 
 # Option -> dotted setting, for `add_paint_options`.
 PAINT_OPTIONS = {
-    "style_slot": "coat.slots",
-    "style_mask": "coat.style_mask",
-    "protect": "coat.protect",
-    "stroke_size": "coat.stroke_size",
+    "style_slot": "paint.slots",
+    "style_mask": "paint.style_mask",
+    "protect": "paint.protect",
+    "stroke_size": "paint.stroke_size",
     "keep_content": "surface.keep_content",
     "palette_mix": "surface.palette_mix",
     "direction": "surface.direction",
-    "direction_map": "coat.direction_map",
+    "direction_map": "paint.direction_map",
 }
 UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "": 1.0}
 

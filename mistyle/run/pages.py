@@ -21,7 +21,7 @@ from mistyle.run.stylize_job import FINISH, FIRST, RETOUCH, STAGES
 from mistyle.run.summary import MEANINGS, figures
 from mistyle.run.turntable import write_turn
 from mistyle.run.versions import versions
-from mistyle.stages.fit_judge import TOLERANCE, undone_where, worse
+from mistyle.stages.fit_judge import TOLERANCE, regressed, undone_where
 
 SAME = "Under the same studio light"
 UNFITTED = (
@@ -205,5 +205,5 @@ def _kept(fit: Any, phase: str) -> str:
     pairs = {name.partition(".")[2]: pair for name, pair in fit.figures.items() if name.startswith(f"{phase}.")}
     if set(pairs) != set(TOLERANCE):
         return "kept, not judged"
-    slipped = worse(*({name: pair[k] for name, pair in pairs.items()} for k in (0, 1)), times=0.0)
+    slipped = regressed(*({name: pair[k] for name, pair in pairs.items()} for k in (0, 1)), times=0.0)
     return f"kept; worse within the tolerance: {', '.join(slipped)}" if slipped else "kept; no figure got worse"

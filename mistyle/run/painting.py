@@ -18,28 +18,28 @@ from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
 from mistyle.run.stages import Run
 from mistyle.run.stylize_settings import Settings
-from mistyle.stages.coat import Coats
+from mistyle.stages.coat import StyleLayers
 from mistyle.surface.guides import Content
-from mistyle.surface.linefield import Course
-from mistyle.surface.lookup import Solution
-from mistyle.surface.settings import CoatSettings
+from mistyle.surface.linefield import DirectionConstraint
+from mistyle.surface.lookup import PaintedSurface
+from mistyle.surface.settings import PaintSettings
 
 
-def coat_pictures(chosen: CoatSettings) -> list[Path]:
-    """The pictures that a coat names and that must be there."""
+def paint_pictures(chosen: PaintSettings) -> list[Path]:
+    """The pictures that the paint settings name and that must be there."""
     return [path for path in (chosen.style_mask, chosen.protect, chosen.direction_map) if path is not None]
 
 
-def check_coat(chosen: CoatSettings) -> None:
-    """Refuse a coat whose pictures are not there, before anything is rendered."""
-    for path in coat_pictures(chosen):
+def check_paint(chosen: PaintSettings) -> None:
+    """Refuse pictures that are not there, before anything is rendered."""
+    for path in paint_pictures(chosen):
         if not path.is_file():
             raise InputRefused(f"{path}: found nothing; expected a picture. Check the path")
 
 
-def coat_files(chosen: CoatSettings) -> list[Path]:
-    """The files that a coat names: their contents count, not their names."""
-    named = coat_pictures(chosen)
+def paint_files(chosen: PaintSettings) -> list[Path]:
+    """The files that the paint settings name: their contents count, not their names."""
+    named = paint_pictures(chosen)
     for slot in chosen.slots:
         name, _, picture = slot.rpartition("=")
         named += [Path(name), Path(picture)]
@@ -52,40 +52,40 @@ def paint(
     settings: Settings,
     report: Report,
     content: Content | None = None,
-    course: Course | None = None,
-) -> Solution:
-    """The surface painted once with one picture; `content` is the lightness of a texture that it has already, `course`
-    where strokes shall run."""
+    direction: DirectionConstraint | None = None,
+) -> PaintedSurface:
+    """The surface painted once with one picture; `content` is the lightness of a texture that it has already,
+    `direction` where strokes shall run."""
     from mistyle.backends.embedded import solve_surface
 
     return solve_surface(
-        asset.mesh, style, settings.surface, settings.seed, progress=report, content=content, course=course
+        asset.mesh, style, settings.surface, settings.seed, progress=report, content=content, direction=direction
     )
 
 
-def coat(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Coats:
+def paint_layers(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> StyleLayers:
     """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
     from mistyle.run.colour import read_style
-    from mistyle.stages.coat import content, masked_style, painted_course, scaled, slot_masks
+    from mistyle.stages.coat import content, masked_style, painted_direction, scaled, slot_masks
 
-    surface = scaled(settings.surface, asset, settings.coat.stroke_size)
+    surface = scaled(settings.surface, asset, settings.paint.stroke_size)
     settings = settings.model_copy(update={"surface": surface})
-    paths, masks = slot_masks(asset, atlas.texels, settings.coat.slots)
-    pictures = [masked_style(style, settings.coat.style_mask), *(read_style(path, settings.colour) for path in paths)]
+    paths, masks = slot_masks(asset, atlas.texels, settings.paint.slots)
+    pictures = [masked_style(style, settings.paint.style_mask), *(read_style(path, settings.colour) for path in paths)]
     choice = [np.zeros(texels.covered.shape, np.int32) for texels in atlas.texels]
     for number, chosen in enumerate(masks, start=1):
         for texels_of, mask in zip(choice, chosen, strict=True):
             texels_of[mask] = number
-    found = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
-    course = painted_course(settings.coat.direction_map, asset.mesh, atlas.texels)
+    lightness = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
+    direction = painted_direction(settings.paint.direction_map, asset.mesh, atlas.texels)
     solutions = []
     for k, picture in enumerate(pictures):
 
         def part_done(done: float, k: int = k) -> None:
             report((k + done) / len(pictures))
 
-        solutions.append(paint(asset, picture, settings, part_done, found, course))
-    return Coats(tuple(solutions), tuple(choice))
+        solutions.append(paint(asset, picture, settings, part_done, lightness, direction))
+    return StyleLayers(tuple(solutions), tuple(choice))
 
 
 def texel_side(asset: Asset, part: int, texels: Texels) -> float:
@@ -94,12 +94,14 @@ def texel_side(asset: Asset, part: int, texels: Texels) -> float:
     return float(np.sqrt(area / max(int(texels.covered.sum()), 1)))
 
 
-def bake(asset: Asset, coats: Coats, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report) -> Baked:
+def bake(
+    asset: Asset, layers: StyleLayers, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report
+) -> Baked:
     """Section 4.1.4 for a painted surface: texels look the painting up directly; the views say who sees what."""
     from mistyle.stages.backproject import accepted
 
-    maps, seen = painted(asset, coats, atlas, settings), []
-    with_relief = raised(asset, coats, atlas, settings, maps)
+    maps, seen = painted(asset, layers, atlas, settings), []
+    with_relief = raised(asset, layers, atlas, settings, maps)
     for part, texels in enumerate(atlas.texels):
         seen.append(accepted(views, texels, settings.bake, mesh=asset.mesh)[1].reshape(texels.covered.shape))
         report((part + 1) / len(atlas.texels))
@@ -113,7 +115,7 @@ HEIGHT, GLOSS = 0.15, 1.0  # slope of the painting's relief in the normal map, a
 LOOKED_UP = 2**20  # texels whose colour is looked up at one time
 
 
-def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings) -> list[Maps]:
+def painted(asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, settings: Settings) -> list[Maps]:
     """The start maps with the painting's colours in place of the albedo, looked up for every covered texel.
 
     A single solution paints everything.
@@ -125,43 +127,46 @@ def painted(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Setti
     maps = []
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
         side, albedo = texel_side(asset, part, texels), memory.zeros(start.albedo.shape)
-        for solution, at in whose(coats, part, texels):
+        for solution, at in whose(layers, part, texels):
             for rows in pieces(at):
                 here = at[rows]
                 place = texels.position[rows][here], texels.normal[rows][here]
                 albedo[rows][here] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
         sharpen_in_place(albedo, texels)
         pad_in_place([albedo], texels, settings.atlas.padding)
-        coated = replace(start, albedo=albedo, known=texels.covered)
-        if settings.coat.protect is not None:
-            coated = protected(coated, start, painted_mask(settings.coat.protect, texels))
-        maps.append(coated)
+        painted_maps = replace(start, albedo=albedo, known=texels.covered)
+        if settings.paint.protect is not None:
+            painted_maps = protected(painted_maps, start, painted_mask(settings.paint.protect, texels))
+        maps.append(painted_maps)
     return maps
 
 
-def raised(asset: Asset, coats: Coats | Solution, atlas: Atlas, settings: Settings, maps: Sequence[Maps]) -> list[Maps]:
+def raised(
+    asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, settings: Settings, maps: Sequence[Maps]
+) -> list[Maps]:
     """Painted maps with the painting's relief laid upon their normals, and its gloss upon their roughness."""
     from mistyle.backends.embedded import surface_relief
     from mistyle.core.image import nearest_fill_in_place
-    from mistyle.stages.coat import lay_relief, painted_mask, protected
+    from mistyle.stages.coat import PaintRelief, TexelBand, lay_relief, painted_mask, protected
 
-    height = HEIGHT if settings.coat.height is None else settings.coat.height
-    gloss = GLOSS if settings.coat.gloss is None else settings.coat.gloss
+    height = HEIGHT if settings.paint.height is None else settings.paint.height
+    gloss = GLOSS if settings.paint.gloss is None else settings.paint.gloss
     if height == gloss == 0:
         return list(maps)
     result = []
     for part, (texels, flat) in enumerate(zip(atlas.texels, maps, strict=True)):
         side, tangents = texel_side(asset, part, texels), corner_tangents(asset.mesh)
         made = replace(flat, normal=memory.copied(flat.normal), roughness=memory.copied(flat.roughness))
-        for solution, at in whose(coats, part, texels):
+        for solution, at in whose(layers, part, texels):
             for rows in pieces(at):
                 here = at[rows]
-                found = surface_relief(solution, texels.position[rows][here], texels.normal[rows][here], footprint=side)
-                lay_relief(asset, made, texels, rows, here, *found, height, gloss, tangents)
+                place = texels.position[rows][here], texels.normal[rows][here]
+                relief = PaintRelief(*surface_relief(solution, *place, footprint=side))
+                lay_relief(made, TexelBand(texels, rows, here), relief, height, gloss, asset.mesh, tangents)
         chosen = [values for values, used in ((made.normal, height), (made.roughness, gloss)) if used > 0]
         nearest_fill_in_place(chosen, texels.covered)
-        if settings.coat.protect is not None:
-            made = protected(made, flat, painted_mask(settings.coat.protect, texels))
+        if settings.paint.protect is not None:
+            made = protected(made, flat, painted_mask(settings.paint.protect, texels))
         result.append(made)
     return result
 
@@ -174,18 +179,18 @@ def pieces(at: np.ndarray) -> Iterator[slice]:
     return (rows for rows in bands(at.shape[0], at.shape[1], round(LOOKED_UP / share)) if at[rows].any())
 
 
-def whose(coats: Coats | Solution, part: int, texels: Texels) -> list[tuple[Solution, np.ndarray]]:
+def whose(layers: StyleLayers | PaintedSurface, part: int, texels: Texels) -> list[tuple[PaintedSurface, np.ndarray]]:
     """Each solution with the covered texels of a set that it paints."""
-    if isinstance(coats, Solution):
-        return [(coats, texels.covered)]
-    return [(one, texels.covered & (coats.choice[part] == k)) for k, one in enumerate(coats.solutions)]
+    if isinstance(layers, PaintedSurface):
+        return [(layers, texels.covered)]
+    return [(one, texels.covered & (layers.choice[part] == k)) for k, one in enumerate(layers.solutions)]
 
 
-def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> Coats:
+def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> StyleLayers:
     """The stage "surface": the painting, before it is laid into a texture."""
     s, seed = run.job.settings, run.job.settings.seed
-    inputs = [style.rgb, style.alpha, s.surface, s.coat, coat_files(s.coat), seed]
-    return run.record("surface", ["texels"], inputs, lambda r: coat(asset, style, atlas, s, r))
+    inputs = [style.rgb, style.alpha, s.surface, s.paint, paint_files(s.paint), seed]
+    return run.record("surface", ["texels"], inputs, lambda r: paint_layers(asset, style, atlas, s, r))
 
 
 def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View], after: str) -> list[View]:

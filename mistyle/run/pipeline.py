@@ -25,7 +25,7 @@ from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import fit_settings, inpainter_inputs, lights_of_views, opaque, release, texture_inpainter
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
-from mistyle.run.painting import bake, check_coat, coat_files, stylized_stage, surface_stage, unlit_views
+from mistyle.run.painting import bake, check_paint, paint_files, stylized_stage, surface_stage, unlit_views
 from mistyle.run.progress import Progress, Report
 from mistyle.run.stages import Run, claim_run
 from mistyle.run.start import mesh_stage, start_engines
@@ -71,7 +71,7 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     claim_run(job, STAGES, inputs_of(job))
     check(job.settings)
     style = read_style(job.style, job.settings.colour)
-    check_coat(job.settings.coat)
+    check_paint(job.settings.paint)
     check_generative(job.settings, progress.say)
     check_finish(job.settings)
     if job.settings.stylizer != "embedded":
@@ -101,7 +101,7 @@ def report_stage(run: Run, made: Made, progress: Progress) -> None:
 def inputs_of(job: Job) -> list[Path]:
     """Every file and folder of the user's that the job reads."""
     s = job.settings
-    return [*input_files(job.mesh), job.style, *coat_files(s.coat), *filter(None, (s.rig.file, s.draw.scene))]
+    return [*input_files(job.mesh), job.style, *paint_files(s.paint), *filter(None, (s.rig.file, s.draw.scene))]
 
 
 def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> Made:
@@ -208,15 +208,15 @@ def painted_stages(
         swept = swept_stages(run, asset, style, atlas, views)
         write_first(run, asset, atlas, swept[0])
         return *swept, None
-    coats = surface_stage(run, asset, style, atlas)
+    layers = surface_stage(run, asset, style, atlas)
     baked = run.record(
-        "bake", ["views", "surface"], [s.bake, s.refined, s.coat], lambda r: bake(asset, coats, atlas, views, s, r)
+        "bake", ["views", "surface"], [s.bake, s.refined, s.paint], lambda r: bake(asset, layers, atlas, views, s, r)
     )
     if not s.keeps_painting or s.finish.method != "off":
         write_first(run, asset, atlas, baked)
     if s.finish.method == "off":
         return baked, stylized_stage(run, asset, baked, views, "bake"), None
-    baked, finishing = finish_stage(run, asset, coats, atlas, baked)
+    baked, finishing = finish_stage(run, asset, layers, atlas, baked)
     return baked, stylized_stage(run, asset, baked, views, "finish"), finishing
 
 
@@ -245,7 +245,7 @@ def fit(
     report: Report,
 ) -> Any:
     """Section 4.2: normal and roughness, then albedo; of views that show known light, solved for under it."""
-    from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit import FitStart, FitTargets, two_phase
     from mistyle.stages.fit_lit import lit_phases
     from mistyle.stages.unlight import unlit
 
@@ -257,7 +257,13 @@ def fit(
         return lit_phases(asset.mesh, baked.maps, stylized, where, lit, chosen, seed, report, style=look)
     plain = unlit(stylized, baked.gains) if baked.gains else None
     fitted = two_phase(
-        asset.mesh, baked.maps, stylized, where, chosen, seed, report, begin=baked.begin, style=look, unlit=plain
+        asset.mesh,
+        FitStart(baked.maps, begin=baked.begin),
+        FitTargets(stylized, style=look, unlit=plain),
+        where,
+        chosen,
+        seed,
+        report,
     )
     unknown = f"{settings.draw.scene}: the fit does not know this scene's light, so the lit views are not solved for."
     return replace(fitted, notes=(*fitted.notes, unknown)) if solving else fitted
@@ -292,8 +298,8 @@ def repair(
         release(settings)
         # The weight-free inpainter takes the painting again, to which phase 1 has fitted normal and roughness already.
         maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
-    if settings.coat.protect is not None:
-        own = [painted_mask(settings.coat.protect, texels) for texels in atlas.texels]
+    if settings.paint.protect is not None:
+        own = [painted_mask(settings.paint.protect, texels) for texels in atlas.texels]
         maps = [protected(m, start, mask) for m, start, mask in zip(maps, atlas.start, own, strict=True)]
     return Repaired(tuple(maps), tuple(masks))
 
@@ -315,7 +321,7 @@ def settle_relief(
 
     Texels outside the masks keep their bits.
     """
-    from mistyle.stages.fit import two_phase
+    from mistyle.stages.fit import FitStart, FitTargets, two_phase
 
     steps = round(settings.fit.iterations1 * SETTLING)
     if settings.refined == "off" or steps == 0 or not any(mask.any() for mask in masks):
@@ -325,7 +331,13 @@ def settle_relief(
     )
     targets = unlit_views(asset, maps, views, lambda done: None)
     settled = two_phase(
-        asset.mesh, maps, targets, atlas.texels, short, seed=settings.seed + 1, progress=report, only=masks
+        asset.mesh,
+        FitStart(maps, only=masks),
+        FitTargets(targets),
+        atlas.texels,
+        short,
+        seed=settings.seed + 1,
+        progress=report,
     )
     return list(settled.maps)
 

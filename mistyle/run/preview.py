@@ -19,7 +19,7 @@ from mistyle.core.maps import Maps
 from mistyle.run.budget import kept, size_of
 from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas
-from mistyle.run.painting import check_coat, coat, painted, raised, surface_stage
+from mistyle.run.painting import check_paint, paint_layers, painted, raised, surface_stage
 from mistyle.run.progress import Progress, Report
 from mistyle.run.stages import Run, claim_run
 from mistyle.run.start import mesh_stage, start_engines
@@ -48,7 +48,7 @@ def preview(job: Job, progress: Progress) -> dict[str, Any]:
     files = input_files(job.mesh)
     claim_run(job, PREVIEW_STAGES, inputs_of(job))
     style = read_style(job.style, s.colour)
-    check_coat(s.coat)
+    check_paint(s.paint)
     with (
         Run(job, progress, PREVIEW_STAGES) as run,
         kept(s, run.hidden.root, counts, PLAIN, TILED, STYLED) as look_again,
@@ -60,18 +60,18 @@ def preview(job: Job, progress: Progress) -> dict[str, Any]:
         small, after = reduced(s), ["mesh"]
         if small == s:
             atlas = texels_stage(run, asset)
-            coats = surface_stage(run, asset, style, atlas)
+            layers = surface_stage(run, asset, style, atlas)
             after = ["surface"]
 
             def maps_of(report: Report) -> list[Maps]:
-                return raised(asset, coats, atlas, s, painted(asset, coats, atlas, s))
+                return raised(asset, layers, atlas, s, painted(asset, layers, atlas, s))
         else:
             progress.note(sentence(s, small))
 
             def maps_of(report: Report) -> list[Maps]:
                 return painted_maps(asset, style, lay_out(asset, small, lambda done: None), small, report)
 
-        inputs = [style.rgb, style.alpha, s.surface, s.coat, s.seed, s.atlas, s.fit.metallic]
+        inputs = [style.rgb, style.alpha, s.surface, s.paint, s.seed, s.atlas, s.fit.metallic]
         folder = run.stage("preview", after, inputs, lambda f, r: write(f / SHEET, asset, maps_of(r), s.seed))
     told = {"preview": str(folder / SHEET), "seconds": {k: round(v, 3) for k, v in progress.seconds.items()}}
     return {**told, "notes": list(progress.notes)}
@@ -98,8 +98,8 @@ def sentence(full: Settings, small: Settings) -> str:
 
 def painted_maps(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> list[Maps]:
     """The painting with its relief, laid into the texture; nothing of it is kept."""
-    coats = coat(asset, style, atlas, settings, report)
-    return raised(asset, coats, atlas, settings, painted(asset, coats, atlas, settings))
+    layers = paint_layers(asset, style, atlas, settings, report)
+    return raised(asset, layers, atlas, settings, painted(asset, layers, atlas, settings))
 
 
 def write(path: Path, asset: Asset, maps: Sequence[Maps], seed: int) -> None:

@@ -101,7 +101,7 @@ def studio_light() -> Float[np.ndarray, "h w 3"]:
 def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
     """Open sky over every texture set; it has no finer detail than the mesh."""
     from mistyle.render.occlusion import open_sky
-    from mistyle.render.studio import Sky
+    from mistyle.render.studio import StudioSky
     from mistyle.stages.texels import rasterise
 
     pages = np.zeros((len(mesh.parts), SKY_TEXELS, SKY_TEXELS, 4), np.float32)
@@ -111,7 +111,7 @@ def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
         if at.any():
             page[at] = open_sky(traced, texels.position[at], texels.normal[at], rays=SKY_RAYS, seed=seed)
             page[...] = nearest_fill(page, at)
-    return Sky(SKY_TEXELS, pages)
+    return StudioSky(SKY_TEXELS, pages)
 
 
 def path_trace(
@@ -120,10 +120,12 @@ def path_trace(
     """The asset on its backdrop, linear, with as many samples as its noise needs, and the backdrop alone."""
     from mistyle.render.device import give_back
     from mistyle.render.draw import passes
+    from mistyle.render.scene import Staging
     from mistyle.render.settle import settled
 
     most = max(2, settings.report.spp * MOST // PASS)
-    found, behind, _ = settled(passes(asset.mesh, maps, camera, "studio", PASS, settings.seed), guide, GOOD, most)
+    drawn = passes(asset.mesh, maps, camera, Staging("studio", PASS, settings.seed))
+    found, behind, _ = settled(drawn, guide, GOOD, most)
     give_back()
     return found, behind
 

@@ -16,8 +16,8 @@ from pydantic import BaseModel, ValidationError
 from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused, UsageError
 
-# Settings by their earlier names.
-RENAMED = {"surface.style_scale": "surface.stroke_scale"}
+# Settings, and tables of settings, by their earlier names.
+RENAMED = {"surface.style_scale": "surface.stroke_scale", "coat": "paint"}
 
 Root = TypeVar("Root", bound=BaseModel)
 
@@ -76,7 +76,11 @@ def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
         path = ".".join(str(part) for part in first["loc"])
         if first["type"] == "extra_forbidden":
             if path in RENAMED:
-                raise UsageError(f"{origin}: '{path}' is now called '{RENAMED[path]}'; write that") from None
+                inner = first["input"]
+                below = f".{next(iter(inner))}" if isinstance(inner, Mapping) and inner else ""
+                raise UsageError(
+                    f"{origin}: '{path}{below}' is now called '{RENAMED[path]}{below}'; write that"
+                ) from None
             near = difflib.get_close_matches(path, known_keys(root), n=1, cutoff=0.5)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UsageError(f"{origin}: there is no setting '{path}'{hint} (--print-config lists all)") from None

@@ -39,8 +39,8 @@ def style_looks(style: Picture, name: str, settings: Settings, progress: Progres
 
     if settings.stylizer == "diffusion":
         return ()
-    pictures = {name: masked_style(style, settings.coat.style_mask)}
-    for slot in settings.coat.slots:
+    pictures = {name: masked_style(style, settings.paint.style_mask)}
+    for slot in settings.paint.slots:
         path = Path(slot.rpartition("=")[2])
         if path.is_file():  # a slot without its picture is refused where slots are placed
             pictures[slot.rpartition("=")[0] + "=" + path.name] = read_file(path, settings.colour)

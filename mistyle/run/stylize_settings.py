@@ -18,7 +18,7 @@ from mistyle.stages.finish_settings import FinishSettings
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.repair_settings import RepairSettings
 from mistyle.stages.sweep_settings import SweepSettings
-from mistyle.surface.settings import CoatSettings, SurfaceSettings
+from mistyle.surface.settings import PaintSettings, SurfaceSettings
 
 READ_SAMPLES = 8  # per pixel of a view that a stylizer reads
 
@@ -73,7 +73,7 @@ class Settings(BaseModel):
     rig: RigSettings = RigSettings()
     draw: DrawSettings = DrawSettings()
     surface: SurfaceSettings = SurfaceSettings()
-    coat: CoatSettings = CoatSettings()
+    paint: PaintSettings = PaintSettings()
     sweep: SweepSettings = SweepSettings()
     atlas: AtlasSettings = AtlasSettings()
     bake: BakeSettings = BakeSettings()

@@ -13,7 +13,7 @@ from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
 from mistyle.run.stages import Run
 from mistyle.run.stylize_settings import Settings
-from mistyle.stages.mvst import Masker, Painted, Stylizer, Swept, finished, sweep
+from mistyle.stages.mvst import Masker, PaintedView, Stylizer, Swept, ViewPainter, ViewStore, finished, sweep
 
 KEPT = "sweep"  # the folder in work/ that holds the views of an unfinished sweep
 
@@ -24,14 +24,14 @@ def swept_stages(
     """The stages 'surface', 'bake' and 'stylized' of a stylizer that paints view by view (paper 4.1.3 and 4.1.4)."""
     from mistyle.files.views import read_views, write_views
     from mistyle.run.generative import fit_settings
-    from mistyle.run.painting import coat_files
+    from mistyle.run.painting import paint_files
 
     s = run.job.settings
-    inputs = [style.rgb, style.alpha, s.stylizer, s.surface, s.coat, coat_files(s.coat), s.sweep, s.seed]
+    inputs = [style.rgb, style.alpha, s.stylizer, s.surface, s.paint, paint_files(s.paint), s.sweep, s.seed]
     if s.stylizer == "diffusion":
         from mistyle.run.generative import sweep_key
 
-        inputs = [sweep_key(run, style, views), s.coat, s.sweep, s.seed]
+        inputs = [sweep_key(run, style, views), s.paint, s.sweep, s.seed]
     painted = run.record("surface", ["texels", "views"], inputs, lambda r: swept(run, asset, style, atlas, views, r))
     shutil.rmtree(run.hidden.root / KEPT, ignore_errors=True)
     stylized = [finished(view, one) for view, one in zip(views, painted, strict=True)]
@@ -49,8 +49,8 @@ def swept_stages(
 
 def refuse_what_is_not_kept(settings: Settings) -> None:
     """Refuse what only a stylizer of the whole surface can follow, and a segmenter that is not there."""
-    coat = settings.coat
-    named = {"coat.slots": coat.slots, "coat.height": coat.height, "coat.gloss": coat.gloss}
+    paint = settings.paint
+    named = {"paint.slots": paint.slots, "paint.height": paint.height, "paint.gloss": paint.gloss}
     wrong = [name for name, value in named.items() if value]
     if wrong:
         raise UsageError(
@@ -61,19 +61,15 @@ def refuse_what_is_not_kept(settings: Settings) -> None:
 
 
 def stylizer_of(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> Stylizer:
-    """The stylizer that the settings name, ready to paint."""
-    from importlib import import_module
+    """The weight-free stylizer of views, ready to paint."""
+    from mistyle.backends.embedded_view import stylizer
+    from mistyle.stages.coat import content, masked_style, painted_direction, scaled
 
-    from mistyle.backends import STYLIZERS
-    from mistyle.stages.coat import content, masked_style, painted_course, scaled
-
-    surface = scaled(settings.surface, asset, settings.coat.stroke_size)
-    found = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
-    module, _, name = STYLIZERS[settings.stylizer].partition(":")
-    make = getattr(import_module(module), name)
-    course = painted_course(settings.coat.direction_map, asset.mesh, atlas.texels)
-    picture = masked_style(style, settings.coat.style_mask)
-    return make(asset.mesh, picture, surface, settings.seed, report, content=found, course=course)
+    surface = scaled(settings.surface, asset, settings.paint.stroke_size)
+    lightness = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
+    direction = painted_direction(settings.paint.direction_map, asset.mesh, atlas.texels)
+    picture = masked_style(style, settings.paint.style_mask)
+    return stylizer(asset.mesh, picture, surface, settings.seed, report, content=lightness, direction=direction)
 
 
 def masker_of(settings: Settings) -> Masker | None:
@@ -87,7 +83,7 @@ def masker_of(settings: Settings) -> Masker | None:
 
 def swept(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View], report: Report
-) -> tuple[Painted, ...]:
+) -> tuple[PaintedView, ...]:
     """Paint the views one after another; what is finished is kept in work/ until all are."""
     s = run.job.settings
     network = s.stylizer == "diffusion"
@@ -97,20 +93,11 @@ def swept(
         paint = view_stylizer(run, style, views, lambda done: report(0.1 * done))
     else:
         paint = stylizer_of(asset, style, atlas, s, lambda done: report(0.1 * done))
-    kept, key = run.hidden.root / KEPT, run.keys["surface"]
-    result = sweep(
-        views,
-        paint,
-        s.sweep,
-        s.seed,
-        lambda done: report(0.1 + 0.9 * done),
-        masker=masker_of(s),
-        keeps_outlines=not network,
-        kept=kept,
-        key=key,
-    )
+    painter = ViewPainter(paint, masker_of(s), keeps_outlines=not network)
+    store = ViewStore(run.hidden.root / KEPT, run.keys["surface"])
+    result = sweep(views, painter, s.sweep, s.seed, lambda done: report(0.1 + 0.9 * done), store)
     run.progress.say(sentence(result))
-    del paint
+    del paint, painter
     if network:
         release(s)
     return result.painted
@@ -128,7 +115,7 @@ def sentence(result: Swept) -> str:
 def bake(
     asset: Asset,
     stylized: Sequence[View],
-    painted: Sequence[Painted],
+    painted: Sequence[PaintedView],
     atlas: Atlas,
     settings: Settings,
     report: Report,
@@ -152,8 +139,8 @@ def bake(
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
         found = backproject(views, texels, settings.bake, mesh=asset.mesh)
         coated = replace(start, albedo=pad(fill(found, texels), texels, settings.atlas.padding), known=found.known)
-        if settings.coat.protect is not None:
-            coated = protected(coated, start, painted_mask(settings.coat.protect, texels))
+        if settings.paint.protect is not None:
+            coated = protected(coated, start, painted_mask(settings.paint.protect, texels))
         maps.append(coated)
         seen.append(found.seen)
         report((part + 1) / len(atlas.texels))

@@ -23,7 +23,7 @@ ROWS = 2**16  # texels handled at a time; their intermediate arrays then stay in
 
 
 @dataclass(frozen=True)
-class Baked:
+class Backprojection:
     """What the views say about the atlas; zero, False, -1 and 0 where they say nothing.
 
     albedo  linear Rec.709, as the views have it
@@ -45,7 +45,7 @@ def backproject(
     progress: Callable[[float], None] = lambda done: None,
     *,
     mesh: Mesh | None = None,
-) -> Baked:
+) -> Backprojection:
     """Paint every texel from the accepted view that faces it most: w = max(0, n . (c - P) / |c - P|), first of equals.
 
     The paper accepts a view when the projection is in bounds with z > 0, when the depth map max-pooled over 5x5 "to
@@ -71,7 +71,9 @@ def backproject(
 
     threaded(paint, len(views), lambda done: progress(0.7 + 0.3 * done))
     shape = texels.covered.shape
-    return Baked(albedo.reshape(*shape, 3), (chosen >= 0).reshape(shape), chosen.reshape(shape), seen.reshape(shape))
+    return Backprojection(
+        albedo.reshape(*shape, 3), (chosen >= 0).reshape(shape), chosen.reshape(shape), seen.reshape(shape)
+    )
 
 
 def accepted(
@@ -113,7 +115,7 @@ def bake(
     progress: Callable[[float], None] = lambda done: None,
     *,
     mesh: Mesh | None = None,
-) -> Baked:
+) -> Backprojection:
     """`backproject`, `fill` and `stages.texels.pad` in one array: the whole of section 4.1.4 after the rasterisation.
 
     albedo is complete inside the islands and `padding` texels around them; known, view and seen are those of
@@ -320,7 +322,7 @@ def _offsets(window: int) -> list[tuple[int, int]]:
     return sorted(((y, x) for y in reach for x in reach if (y, x) != (0, 0)), key=lambda o: (o[0] ** 2 + o[1] ** 2, o))
 
 
-def fill(baked: Baked, texels: Texels) -> Float[np.ndarray, "h w 3"]:
+def fill(baked: Backprojection, texels: Texels) -> Float[np.ndarray, "h w 3"]:
     """Albedo with every covered texel coloured: unpainted ones take the nearest painted texel's colour, in the atlas
     and inside their own island; where an island has none, the nearest on the surface (3-D distance).
 

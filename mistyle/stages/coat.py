@@ -1,4 +1,4 @@
-"""The coat of paint on an asset: which picture goes where, what of the asset's own look stays, and what the painting
+"""The paint on an asset: which picture goes where, what of the asset's own look stays, and what the painting
 says about height and gloss (before the paper's 4.2, which then refines those maps)."""
 
 from collections.abc import Callable, Sequence
@@ -15,8 +15,8 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.core.tangents import corner_tangents
 from mistyle.stages.frames import texel_frames
-from mistyle.surface.linefield import Course
-from mistyle.surface.lookup import Solution
+from mistyle.surface.linefield import DirectionConstraint
+from mistyle.surface.lookup import PaintedSurface
 from mistyle.surface.settings import SurfaceSettings
 
 PICTURE_STROKES = 32  # strokes side by side along a picture's long side, by which `stroke_size` is turned into a scale
@@ -27,10 +27,10 @@ FLOW_FREE, FLOW_SURE = 0.1, 0.5  # distances from mid grey up to which, and from
 
 
 @dataclass(frozen=True)
-class Coats:
+class StyleLayers:
     """One solution a picture, and per texture set which of them each texel takes (0: the job's own style)."""
 
-    solutions: tuple[Solution, ...]
+    solutions: tuple[PaintedSurface, ...]
     choice: tuple[np.ndarray, ...]
 
 
@@ -106,8 +106,8 @@ def painted_mask(path: Path, texels: Texels) -> Bool[np.ndarray, "h w"]:
     """A picture in the mesh's UVs (row 0 is v = 1) as a mask at the atlas's size: light (and opaque) is True."""
     from mistyle.files.read import read_picture
 
-    found = read_picture(path)
-    light = found.rgb.mean(axis=2) * (1 if found.alpha is None else found.alpha)
+    mask = read_picture(path)
+    light = mask.rgb.mean(axis=2) * (1 if mask.alpha is None else mask.alpha)
     return resize(light.astype(np.float32), texels.covered.shape) > 0.5
 
 
@@ -147,7 +147,7 @@ def nearest_texels(
     return near, chosen
 
 
-def painted_course(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> Course | None:
+def painted_direction(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> DirectionConstraint | None:
     """Where strokes shall run by a picture in the mesh's UVs (row 0 is v = 1): red and green, less one half, are the
     direction along u and v. The further a colour is from mid grey, and the more opaque, the more it counts; half way is
     fully.
@@ -158,12 +158,12 @@ def painted_course(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> C
         return None
     from mistyle.files.read import read_picture
 
-    found = read_picture(path)
-    alpha = np.ones(found.rgb.shape[:2], np.float32) if found.alpha is None else found.alpha
+    flow_map = read_picture(path)
+    alpha = np.ones(flow_map.rgb.shape[:2], np.float32) if flow_map.alpha is None else flow_map.alpha
     near, chosen = nearest_texels(texels)
     tangents, flows, frames = corner_tangents(mesh), [], []
     for t, few in zip(texels, chosen, strict=True):
-        wide = resize(2 * found.rgb[..., :2] - 1, t.covered.shape) * resize(alpha, t.covered.shape)[..., None]
+        wide = resize(2 * flow_map.rgb[..., :2] - 1, t.covered.shape) * resize(alpha, t.covered.shape)[..., None]
         flows.append(wide.reshape(-1, 2)[few])
         place = t.face.ravel()[few], t.position.reshape(-1, 3)[few], t.normal.reshape(-1, 3)[few]
         frames.append(texel_frames(mesh, *place, tangents)[:, :2])
@@ -178,41 +178,59 @@ def painted_course(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> C
             "where strokes run"
         )
 
-    def course(where: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def direction(where: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         index = near(where, facing)
         return world[index], counts[index]
 
-    return course
+    return direction
+
+
+@dataclass(frozen=True)
+class TexelBand:
+    """Chosen texels of some rows of a texture set; `at` masks them within these rows."""
+
+    texels: Texels
+    rows: slice
+    at: Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class PaintRelief:
+    """A painting's relief at some texels, in row order.
+
+    gradient  of its height (world, along the surface)
+    dull      what the paint adds to the roughness
+    """
+
+    gradient: Float[np.ndarray, "t 3"]
+    dull: Float[np.ndarray, " t"]
 
 
 def lay_relief(
-    asset: Asset,
     maps: Maps,
-    texels: Texels,
-    rows: slice,
-    at: Bool[np.ndarray, "h w"],
-    gradient: Float[np.ndarray, "t 3"],
-    dull: Float[np.ndarray, " t"],
+    band: TexelBand,
+    relief: PaintRelief,
     height: float,
     gloss: float,
+    mesh: Mesh,
     tangents: Float[np.ndarray, "f 3 4"],
 ) -> None:
-    """Lay the painting's relief upon the normals of `maps`, and its gloss upon their roughness, in place, for the
-    texels `at` of some `rows`.
+    """Bend the normals of `maps` by `height` times the painting's slope, and add `gloss` times its dullness to their
+    roughness, in place, for the texels of a band.
 
-    `gradient` (world, along the surface) and `dull` belong to these texels in row order. The normal that the asset's
-    map shows is bent by the relief's slope: nothing of it is overwritten. `tangents` are `corner_tangents` of the mesh.
+    The normal that the asset's map shows is bent, not overwritten. `tangents` are `corner_tangents` of the mesh.
     """
+    texels, rows, at = band.texels, band.rows, band.at
     normal, roughness = maps.normal[rows], maps.roughness[rows]
     if height > 0:
         place = texels.face[rows][at], texels.position[rows][at], texels.normal[rows][at]
-        frames = texel_frames(asset.mesh, *place, tangents)
-        world = np.einsum("tk,tkx->tx", normal[at], frames) - np.float32(height) * gradient
+        frames = texel_frames(mesh, *place, tangents)
+        world = np.einsum("tk,tkx->tx", normal[at], frames) - np.float32(height) * relief.gradient
         bent = np.einsum("tx,tkx->tk", world, frames)
         bent[:, 2] = np.maximum(bent[:, 2], 0.05)
         normal[at] = bent / np.linalg.norm(bent, axis=1, keepdims=True)
     if gloss > 0:
-        roughness[at] = np.clip(roughness[at] + np.float32(gloss) * dull, SMOOTHEST, ROUGHEST)
+        roughness[at] = np.clip(roughness[at] + np.float32(gloss) * relief.dull, SMOOTHEST, ROUGHEST)
 
 
 def protected(maps: Maps, start: Maps, mask: Bool[np.ndarray, "h w"]) -> Maps:

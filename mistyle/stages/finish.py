@@ -23,7 +23,7 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.stages import finish_style, fit_table
 from mistyle.stages.finish_settings import JUDGED, FinishSettings
-from mistyle.surface.lookup import Solution
+from mistyle.surface.lookup import PaintedSurface
 
 if TYPE_CHECKING:
     import torch
@@ -46,7 +46,7 @@ LAST_RATE = 0.1  # share of the rate at the end; a cosine leads there
 
 
 @dataclass(frozen=True)
-class Painted:
+class PaintedAsset:
     """The painter's result: maps and texels per texture set, and the solution that says what lies where.
 
     `only`, where given, masks the texels that may change.
@@ -55,12 +55,12 @@ class Painted:
     mesh: Mesh
     maps: tuple[Maps, ...]
     texels: tuple[Texels, ...]
-    solution: Solution
+    solution: PaintedSurface
     only: tuple[Bool[np.ndarray, "_ _"], ...] | None = None
 
 
 @dataclass(frozen=True)
-class Finished:
+class StyleFinish:
     """The finished albedo (linear, one per texture set), and how that went.
 
     trace   style loss of every step: the root of the statistic's distance, by the share of pixels that count
@@ -88,14 +88,14 @@ class Crops:
 
 
 def finish(
-    painted: Painted,
+    painted: PaintedAsset,
     features: "Features",
     settings: FinishSettings,
     seed: int,
     progress: Callable[[float], None] = lambda done: None,
     *,
     bridge: Any = "frozen",
-) -> Finished:
+) -> StyleFinish:
     """Move the albedo of `painted` for `settings.steps` steps, and keep that if the style loss fell.
 
     The same inputs, settings, seed and thread count give the same bytes.
@@ -113,7 +113,7 @@ class Finishing:
     """A finish under way; a class because texture, moments and the count of what was seen change step by step."""
 
     def __init__(
-        self, painted: Painted, features: "Features", settings: FinishSettings, seed: int, bridge: Any = "frozen"
+        self, painted: PaintedAsset, features: "Features", settings: FinishSettings, seed: int, bridge: Any = "frozen"
     ) -> None:
         from mistyle.render import pyramid
         from mistyle.render.draw import tracer
@@ -123,7 +123,7 @@ class Finishing:
         self.traced = tracer(painted.mesh)
         shrink = texels_per_pixel(painted, settings)
         self.pixel = shrink * texel_side(painted)
-        self.exemplar = finish_style.exemplar(painted.solution, self.pixel, features)
+        self.painting = finish_style.painting_features(painted.solution, self.pixel, features)
         self.film = Film(settings.crops, settings.crop_size, bridge)
         self.encoded = [replace(m, albedo=srgb_from_linear(m.albedo)) for m in painted.maps]
         self.table = fit_table.build(self.encoded, painted.texels, shrink, painted.only)
@@ -165,7 +165,7 @@ class Finishing:
         from mistyle.measure.losses import style_statistics
 
         n, size = self.settings.crops, self.settings.crop_size
-        wanted = finish_style.wanted(self.exemplar, crops.places, n, size)
+        target = finish_style.target_features(self.painting, crops.places, n, size)
         # The painter's own first: the film holds one picture at a time until its gradient is taken.
         with torch.no_grad():
             start = torch.from_numpy(self.table.start["albedo"][crops.taps.texels])
@@ -174,7 +174,7 @@ class Finishing:
         style = content = leaf.new_zeros(())
         for k in range(n):
             one, counts = slice(k, k + 1), crops.counts[k : k + 1]
-            mine, theirs = ([level[one] for level in levels] for levels in (maps, wanted))
+            mine, theirs = ([level[one] for level in levels] for levels in (maps, target))
             distance = style_statistics(mine, theirs, counts, counts, kind=self.settings.statistic, rng=rng)
             # By the root and the share that counts: a crop with few pixels, or far off, does not outweigh the others.
             style = style + counts.mean() * (distance + LEAST).sqrt() / n
@@ -212,7 +212,7 @@ class Finishing:
             cameras.append(frontal(solution.positions[k], *frame, self.pixel, size))
         surface = deferred.trace(self.traced, cameras)
         axes = (np.repeat([c.world_from_cam[:3, k] for c in cameras], size * size, axis=0) for k in (0, 1))
-        places = finish_style.places(self.exemplar, surface.position, surface.normal, *axes)
+        places = finish_style.places(self.painting, surface.position, surface.normal, *axes)
         counts = weights(surface, cameras) * places.sure
         seen[np.unique(places.sample[counts > 0.5])] += 1
 
@@ -252,7 +252,7 @@ class Finishing:
             finer = np.where(self.table.still[rows].reshape(size)[..., None], 0, finer)
             values[rows] = np.clip(start[rows] + finer.reshape(-1, 3), 0, 1)
 
-    def result(self, before: float, after: float) -> Finished:
+    def result(self, before: float, after: float) -> StyleFinish:
         """The albedo with what was changed laid upon it."""
         if after >= before:
             # What does not help on crops that no step used stays as the painter left it.
@@ -264,7 +264,7 @@ class Finishing:
             squares, count = squares + float(np.square(change, dtype=np.float64).sum()), count + change.size
             made.append(linear_from_srgb(new.albedo))
         moved = float(np.sqrt(squares / max(count, 1)))
-        return Finished(tuple(made), tuple(self.trace), (before, after), moved)
+        return StyleFinish(tuple(made), tuple(self.trace), (before, after), moved)
 
 
 class Film:
@@ -288,7 +288,7 @@ class Film:
         return (drawn / white.clamp_min(1e-3)).reshape(n, size, size, 3).permute(0, 3, 1, 2)
 
 
-def texels_per_pixel(painted: Painted, settings: FinishSettings) -> int:
+def texels_per_pixel(painted: PaintedAsset, settings: FinishSettings) -> int:
     """As the settings say, and more where the painting would be longer than LONGEST pixels at that scale."""
     solution, shrink = painted.solution, settings.texels_per_pixel
     long = max(solution.painting.shape[:2]) * solution.spacing / max(solution.scale)
@@ -297,7 +297,7 @@ def texels_per_pixel(painted: Painted, settings: FinishSettings) -> int:
     return shrink
 
 
-def texel_side(painted: Painted) -> float:
+def texel_side(painted: PaintedAsset) -> float:
     """The mean side of a texel on the surface, working units, over all texture sets."""
     covered = sum(int(where.covered.sum()) for where in painted.texels)
     return float(np.sqrt(face_areas(painted.mesh).sum() / max(covered, 1)))

@@ -25,6 +25,7 @@ Both phases are judged afterwards (`fit_judge.py`), and undone where they made t
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -38,7 +39,7 @@ from mistyle.core.mesh import Mesh, face_areas
 from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
 from mistyle.stages import fit_judge, fit_table
-from mistyle.stages.fit_run import Loss, Phase, Run, Shot, World
+from mistyle.stages.fit_run import CropBatch, Loss, Phase, PhaseRunner, SceneContext
 from mistyle.stages.fit_settings import FitSettings
 
 DARK = 0.01  # radiance of the clay below which a ratio means nothing
@@ -70,109 +71,135 @@ class Fit:
     agreed: tuple[Float[np.ndarray, "_ _"], ...] = ()
 
 
+@dataclass(frozen=True)
+class FitStart:
+    """The maps as baked, one per texture set.
+
+    begin  where the fit starts instead, empty for the baked maps: their detail finer than the views is kept, they are
+           returned where every phase is undone, and phase 1's clay is compared with clay of the baked maps all the same
+    only   the texels that may change; all others keep their bytes
+    """
+
+    maps: Sequence[Maps]
+    begin: Sequence[Maps] = ()
+    only: Sequence[Bool[np.ndarray, "_ _"]] | None = None
+
+
+@dataclass(frozen=True)
+class FitTargets:
+    """What renders shall look like.
+
+    views   stylized (linear rgb)
+    unlit   the same without light, for phase 2
+    style   the picture (sRGB) whose gradient lowers the albedo's total variation; None: that of the views
+    lights  of phase 1; None: those of `scenes/phase1_directional.xml`
+    """
+
+    views: Sequence[View]
+    unlit: Sequence[View] | None = None
+    style: Float[np.ndarray, "sh sw 3"] | None = None
+    lights: Lights | None = None
+
+
 def two_phase(
     mesh: Mesh,
-    maps: Sequence[Maps],
-    targets: Sequence[View],
+    start: FitStart,
+    targets: FitTargets,
     texels: Sequence[Texels],
     settings: FitSettings,
     seed: int,
     progress: Callable[[float], None] = lambda done: None,
-    *,
-    phase1_lights: Lights | None = None,
-    only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
-    begin: Sequence[Maps] = (),
-    style: Float[np.ndarray, "sh sw 3"] | None = None,
-    unlit: Sequence[View] | None = None,
 ) -> Fit:
-    """Fit `maps` (one per texture set, as baked) so that renders look like `targets` (linear rgb, stylized).
+    """Fit maps (one per texture set) so that renders look like the targets.
 
-    `phase1_lights` replaces those of `scenes/phase1_directional.xml`; `only` names the texels that may change, all
-    others keep their bytes. With `begin` the fit starts at those maps, keeps their detail finer than the views, and
-    returns them where every phase is undone; phase 1's clay is compared with clay of `maps` all the same. With `style`
-    (sRGB) its gradient lowers the albedo's total variation, not the targets'. `unlit` are the targets of phase 2, where
-    light was taken out of them. The same inputs, settings, seed and thread count give the same bytes. A gradient that
-    is not a number ends its phase at the last good state, and a note says where.
+    The same inputs, settings, seed and thread count give the same bytes. A gradient that is not a number ends its phase
+    at the last good state, and a note says where.
     """
-    first = tuple(begin or maps)
+    maps, views = start.maps, targets.views
+    first = tuple(start.begin or maps)
     if settings.metallic == "zero":
-        maps, first = ([replace(m, metallic=np.zeros_like(m.metallic)) for m in each] for each in (maps, first))
+        maps, first = (tuple(replace(m, metallic=np.zeros_like(m.metallic)) for m in each) for each in (maps, first))
     nothing = tuple(np.zeros(m.roughness.shape, np.float32) for m in maps)
-    fit = Fit(tuple(first), nothing, nothing, {}, {}, {}, (), nothing)
-    if settings.refine == "off" or not any(view.mask.any() for view in targets):
+    fit = Fit(first, nothing, nothing, {}, {}, {}, (), nothing)
+    if settings.refine == "off" or not any(view.mask.any() for view in views):
         return fit
-    world = _world(mesh, targets, settings)
-    shrink = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
-    table = fit_table.build(first, texels, shrink, only)
-    if begin:
-        unpainted = fit_table.build(maps, texels, shrink, only).values
+    scene = _scene(mesh, views, settings)
+    shrink = shrinkage(mesh, texels, views, settings.texels_per_pixel)
+    table = fit_table.build(first, texels, shrink, start.only)
+    if start.begin:
+        unpainted = fit_table.build(maps, texels, shrink, start.only).values
         table.plain = table.start | {name: unpainted[name] for name in ("tilt", "roughness")}
-    phases = _phases(settings, phase1_lights or lights("phase1"), targets, style, unlit is not None)
-    judge = fit_judge.bench(world.traced, world.tangents, targets) if settings.judge else None
+    phases = _phases(settings, targets)
+    evaluation = fit_judge.build_evaluation(scene.traced, scene.tangents, views) if settings.judge else None
     total, done = max(sum(phase.iterations for phase in phases), 1), 0
     for phase, rng in zip(phases, np.random.default_rng(seed).spawn(len(phases)), strict=True):
         if phase.iterations:
-            share = (done / total, phase.iterations / total)
+            unlit = targets.unlit
             if phase.name == "phase2" and unlit is not None:
-                world = replace(world, targets=_pictures(unlit))
-                judge = fit_judge.bench(world.traced, world.tangents, unlit) if settings.judge else None
+                scene = replace(scene, targets=_pictures(unlit))
+                if settings.judge:
+                    evaluation = fit_judge.build_evaluation(scene.traced, scene.tangents, unlit)
             with memory.kept():
-                fit = _one_phase(
-                    Run(world, table, phase, settings, rng), fit, tuple(first), only, judge, share, progress
-                )
+                runner = PhaseRunner(scene, table, phase, settings, rng)
+                report = partial(_report, progress, done / total, phase.iterations / total)
+                fit = _one_phase(runner, fit, first, start.only, evaluation, report)
             done += phase.iterations
     return fit
 
 
+def _report(progress: Callable[[float], None], begin: float, length: float, done: float) -> None:
+    """Report progress within a part of the whole."""
+    progress(begin + length * done)
+
+
 def _one_phase(
-    run: Run,
+    runner: PhaseRunner,
     fit: Fit,
     first: tuple[Maps, ...],
-    only: Sequence[Bool[np.ndarray, "h w"]] | None,
-    judge: fit_judge.Bench | None,
-    share: tuple[float, float],
+    only: Sequence[Bool[np.ndarray, "_ _"]] | None,
+    evaluation: fit_judge.EvaluationSet | None,
     progress: Callable[[float], None],
 ) -> Fit:
-    """Run a phase and keep its result unless a figure got worse; `share` is (begin, length) of the whole progress.
+    """Run a phase and keep its result unless a figure got worse.
 
     At the steps of `fit_judge.checks` a phase that is far from keeping what it had is stopped: it would be undone.
     """
-    phase, table, notes = run.phase, run.table, list(fit.notes)
+    phase, table, notes = runner.phase, runner.table, list(fit.notes)
     saved = {name: table.values[name].copy() for name in phase.rates}
 
-    def seen(maps: Sequence[Maps]) -> dict[str, float]:
-        assert judge is not None
-        return fit_judge.figures(judge, maps, phase.lights, gloss=phase.gloss)
+    def figures(maps: Sequence[Maps]) -> dict[str, float]:
+        assert evaluation is not None
+        return fit_judge.evaluate(evaluation, maps, phase.lights, gloss=phase.gloss)
 
-    old = seen(fit.maps) if judge is not None else {}
-    stops = fit_judge.checks(phase.iterations) if judge is not None else ()
+    old = figures(fit.maps) if evaluation is not None else {}
+    stops = fit_judge.checks(phase.iterations) if evaluation is not None else ()
     after, new, stopped = fit.maps, old, 0
     for iteration in range(phase.iterations):
-        note = run.step(iteration)
+        note = runner.step(iteration)
         if note:
             notes.append(note)
             break
-        progress(share[0] + share[1] * (iteration + 1) / phase.iterations)
+        progress((iteration + 1) / phase.iterations)
         if iteration + 1 in stops:
             after = tuple(fit_table.finished(table, first, only))
-            new = seen(after)
-            if fit_judge.worse(old, new, fit_judge.HOPELESS):
+            new = figures(after)
+            if fit_judge.regressed(old, new, fit_judge.HOPELESS):
                 stopped = iteration + 1
                 break
     if not stopped:
         after = tuple(fit_table.finished(table, first, only))
-        new = seen(after) if judge is not None else {}
-    worse = fit_judge.worse(old, new) if judge is not None else []
+        new = figures(after) if evaluation is not None else {}
+    worse = fit_judge.regressed(old, new) if evaluation is not None else []
     if worse:
         early = f" after {stopped} of {phase.iterations} steps" if stopped else ""
         notes.append(f"{phase.name} was undone{early}: {', '.join(worse)} got worse.")
         table.values.update(saved)
     return Fit(
         maps=fit.maps if worse else after,
-        struggle=tuple(fit_table.spread(table, first, run.struggle)),
-        touched=tuple(fit_table.spread(table, first, run.touched)),
-        agreed=tuple(fit_table.spread(table, first, np.abs(run.pulled).mean(axis=1))),
-        trace=fit.trace | {f"{phase.name}.{name}": values for name, values in run.trace.items()},
+        struggle=tuple(fit_table.spread(table, first, runner.struggle)),
+        touched=tuple(fit_table.spread(table, first, runner.touched)),
+        agreed=tuple(fit_table.spread(table, first, np.abs(runner.pulled).mean(axis=1))),
+        trace=fit.trace | {f"{phase.name}.{name}": values for name, values in runner.trace.items()},
         kept=fit.kept | {phase.name: not worse},
         figures=fit.figures | {f"{phase.name}.{name}": (old[name], new[name]) for name in old},
         notes=tuple(notes),
@@ -201,7 +228,7 @@ def _inside(view: View) -> Bool[np.ndarray, "h w"]:
 
 
 def _pictures(targets: Sequence[View]) -> tuple[Any, ...]:
-    """Targets as a World holds them."""
+    """Targets as a SceneContext holds them."""
     import torch
 
     pictures = []
@@ -212,11 +239,11 @@ def _pictures(targets: Sequence[View]) -> tuple[Any, ...]:
     return tuple(pictures)
 
 
-def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
+def _scene(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> SceneContext:
     from mistyle.measure.features import load_features
     from mistyle.render.draw import tracer
 
-    return World(
+    return SceneContext(
         traced=tracer(mesh),
         tangents=corner_tangents(mesh),
         cameras=tuple(view.camera for view in targets),
@@ -226,19 +253,13 @@ def _world(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> World:
     )
 
 
-def _phases(
-    settings: FitSettings,
-    directional: Lights,
-    targets: Sequence[View],
-    style: Float[np.ndarray, "h w 3"] | None = None,
-    unlit: bool = False,
-) -> list[Phase]:
-    """The phases that `refine` names (auto: both); `unlit` where the latter's targets show no light."""
+def _phases(settings: FitSettings, targets: FitTargets) -> list[Phase]:
+    """The phases that `refine` names (auto: both)."""
     flat = settings.painted != "with-light"
     moving = {"tilt": settings.rate_normal, "roughness": settings.rate_roughness}
     first = Phase(
         name="phase1",
-        lights=directional,
+        lights=targets.lights or lights("phase1"),
         one_by_one=flat and settings.lights == "one-per-view",
         clay=flat,
         gloss=True,
@@ -256,23 +277,21 @@ def _phases(
         lights=lights("phase2"),
         one_by_one=False,
         clay=False,
-        gloss=not (flat or unlit),
+        gloss=not (flat or targets.unlit is not None),
         rates={"albedo": settings.rate_albedo} | {name: rate * reduced for name, rate in moving.items() if reduced},
-        variation={"albedo": _albedo_variation(settings, targets, style)},
+        variation={"albedo": _albedo_variation(settings, targets)},
         iterations=settings.iterations2,
         loss=_colour_loss(settings),
     )
     return [second] if alone else [first, second]
 
 
-def _albedo_variation(
-    settings: FitSettings, targets: Sequence[View], style: Float[np.ndarray, "h w 3"] | None
-) -> float:
+def _albedo_variation(settings: FitSettings, targets: FitTargets) -> float:
     from mistyle.measure.losses import adaptive_tv_weight, mean_gradient
 
-    if style is not None:
-        return adaptive_tv_weight(mean_gradient(style), settings.tv_albedo)
-    gradients = [mean_gradient(srgb_from_linear(np.nan_to_num(view.rgb)), view_mask(view)) for view in targets]
+    if targets.style is not None:
+        return adaptive_tv_weight(mean_gradient(targets.style), settings.tv_albedo)
+    gradients = [mean_gradient(srgb_from_linear(np.nan_to_num(view.rgb)), view_mask(view)) for view in targets.views]
     return adaptive_tv_weight(float(np.mean(gradients)), settings.tv_albedo)
 
 
@@ -280,21 +299,21 @@ def _relief_loss(settings: FitSettings) -> Loss:
     """Phase 1 for targets painted without light."""
     from mistyle.measure import losses
 
-    def loss(shot: Shot, features, rng):
-        radius = settings.radius * shot.zoomed
-        grey = losses.srgb_from_linear(losses.luminance(losses.linear_from_srgb(shot.target)))
-        strokes = losses.without_light(grey, shot.mask, radius, standard=True)
-        smooth = losses.blur(strokes, settings.smooth * shot.zoomed)
+    def loss(batch: CropBatch, features, rng):
+        radius = settings.radius * batch.zoomed
+        grey = losses.srgb_from_linear(losses.luminance(losses.linear_from_srgb(batch.target)))
+        strokes = losses.without_light(grey, batch.mask, radius, standard=True)
+        smooth = losses.blur(strokes, settings.smooth * batch.zoomed)
         expected, mask = losses.stroke_shading(
-            smooth, shot.position, shot.normal, shot.light, shot.mask, settings.relief
+            smooth, batch.position, batch.normal, batch.light, batch.mask, settings.relief
         )
         expected = expected + settings.sheen * strokes * mask
-        before = losses.luminance(shot.plain).clamp_min(DARK)
-        shading = (losses.luminance(shot.render) / before - 1) * mask
-        maps, wanted = losses.masked_features(features, shading, expected, mask, mask)
-        result = {"style": settings.style1 * losses.style_aligned(maps, wanted, mask)}
+        before = losses.luminance(batch.plain).clamp_min(DARK)
+        shading = (losses.luminance(batch.render) / before - 1) * mask
+        maps, theirs = losses.masked_features(features, shading, expected, mask, mask)
+        result = {"style": settings.style1 * losses.style_aligned(maps, theirs, mask)}
         if settings.statistics:
-            distance = losses.style_statistics(maps, wanted, mask, mask, kind=settings.statistic, rng=rng)
+            distance = losses.style_statistics(maps, theirs, mask, mask, kind=settings.statistic, rng=rng)
             result["statistics"] = settings.statistics * distance
         return result
 
@@ -305,11 +324,11 @@ def _lit_loss(settings: FitSettings) -> Loss:
     """Phase 1 for targets that show light: grey render and grey target as they are."""
     from mistyle.measure import losses
 
-    def loss(shot: Shot, features, rng):
-        grey = losses.srgb_from_linear(losses.luminance(shot.render))
-        target = losses.srgb_from_linear(losses.luminance(losses.linear_from_srgb(shot.target)))
-        maps, wanted = losses.masked_features(features, grey, target, shot.mask, shot.mask)
-        return {"style": settings.style1 * losses.style_aligned(maps, wanted, shot.mask)}
+    def loss(batch: CropBatch, features, rng):
+        grey = losses.srgb_from_linear(losses.luminance(batch.render))
+        target = losses.srgb_from_linear(losses.luminance(losses.linear_from_srgb(batch.target)))
+        maps, expected = losses.masked_features(features, grey, target, batch.mask, batch.mask)
+        return {"style": settings.style1 * losses.style_aligned(maps, expected, batch.mask)}
 
     return loss
 
@@ -318,16 +337,16 @@ def _colour_loss(settings: FitSettings) -> Loss:
     """Phase 2: 15 style + 5 sliced Wasserstein in RGB (total variation is added by the table; statistics on demand)."""
     from mistyle.measure import losses
 
-    def loss(shot: Shot, features, rng):
-        colour = losses.srgb_from_linear(shot.render)
-        chosen = shot.mask[:, 0] > 0
-        mine, theirs = colour.permute(0, 2, 3, 1)[chosen], shot.target.permute(0, 2, 3, 1)[chosen]
+    def loss(batch: CropBatch, features, rng):
+        colour = losses.srgb_from_linear(batch.render)
+        chosen = batch.mask[:, 0] > 0
+        mine, theirs = colour.permute(0, 2, 3, 1)[chosen], batch.target.permute(0, 2, 3, 1)[chosen]
         distance = losses.sliced_wasserstein(mine, theirs, rng, settings.projections, settings.colour_samples)
-        maps, wanted = losses.masked_features(features, colour, shot.target, shot.mask, shot.mask)
-        result = {"style": settings.style2 * losses.style_aligned(maps, wanted, shot.mask)}
+        maps, expected = losses.masked_features(features, colour, batch.target, batch.mask, batch.mask)
+        result = {"style": settings.style2 * losses.style_aligned(maps, expected, batch.mask)}
         result["colour"] = settings.colour2 * distance
         if settings.statistics2:
-            distance = losses.style_statistics(maps, wanted, shot.mask, shot.mask, kind=settings.statistic, rng=rng)
+            distance = losses.style_statistics(maps, expected, batch.mask, batch.mask, kind=settings.statistic, rng=rng)
             result["statistics"] = settings.statistics2 * distance
         return result
 

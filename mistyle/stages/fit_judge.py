@@ -36,7 +36,7 @@ HIGHER_IS_BETTER = {"detail": True, "style": False, "views": False}
 
 
 @dataclass(frozen=True)
-class Bench:
+class EvaluationSet:
     """Windows of views to judge by, each with the window of a neighbouring view that shows the same place.
 
     What does not hang on the maps is found once: the windows' `surfaces` and those of the neighbours (traced), which
@@ -54,7 +54,7 @@ class Bench:
     shaders: dict[bool, Any]
 
 
-def bench(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[View]) -> Bench:
+def build_evaluation(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[View]) -> EvaluationSet:
     """Windows of up to VIEWS evenly chosen targets, about the middle of what they see; WINDOW pixels at most."""
     from mistyle.measure import metrics
     from mistyle.measure.overlap import overlap
@@ -80,7 +80,7 @@ def bench(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[V
     surfaces = [tuple(deferred.trace(traced, [each.camera], tangents) for each in pair) for pair in pairs]
     masks = [view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1) for view in views]
     pictures = [srgb_from_linear(np.nan_to_num(view.rgb)) for view in views]
-    return Bench(
+    return EvaluationSet(
         traced,
         tuple(views),
         tuple(surfaces),
@@ -92,7 +92,7 @@ def bench(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[V
     )
 
 
-def figures(where: Bench, maps: Sequence[Maps], lights: Lights, *, gloss: bool = True) -> dict[str, float]:
+def evaluate(where: EvaluationSet, maps: Sequence[Maps], lights: Lights, *, gloss: bool = True) -> dict[str, float]:
     """detail, style and views of `maps` under `lights`, with or without the reflection at dielectric surfaces."""
     from mistyle.measure import metrics
 
@@ -123,7 +123,7 @@ def checks(iterations: int) -> tuple[int, ...]:
     return tuple(step for step in steps if FEWEST <= step < iterations)
 
 
-def worse(before: dict[str, float], after: dict[str, float], times: float = 1.0) -> list[str]:
+def regressed(before: dict[str, float], after: dict[str, float], times: float = 1.0) -> list[str]:
     """The figures that got worse by more than so many times their tolerance."""
     result = []
     for name, (share, absolute) in TOLERANCE.items():
@@ -174,7 +174,7 @@ def _tables(maps: Sequence[Maps]) -> tuple[list[tuple[int, int]], Float[np.ndarr
     return sizes, table
 
 
-def _draw(where: Bench, table: tuple, surface: Any, lights: Lights, gloss: bool) -> Float[np.ndarray, "h w 3"]:
+def _draw(where: EvaluationSet, table: tuple, surface: Any, lights: Lights, gloss: bool) -> Float[np.ndarray, "h w 3"]:
     import torch
 
     from mistyle.render import deferred, seam

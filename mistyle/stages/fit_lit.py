@@ -20,7 +20,7 @@ from mistyle.core.light import Lights, has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.stages.fit import Fit, shrinkage, two_phase, view_mask
+from mistyle.stages.fit import Fit, FitStart, FitTargets, shrinkage, two_phase, view_mask
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.fit_table import ROUGHNESS_FLOOR
 from mistyle.stages.recover import Recovered, recover
@@ -72,10 +72,14 @@ def lit_phases(
     begun = laid(maps, solved.start, solved.maps) if better else list(maps)
     only_albedo = settings.model_copy(update={"iterations1": 0})
     fit = two_phase(
-        mesh, begun, targets, texels, only_albedo, seed,
+        mesh,
+        FitStart(begun),
+        FitTargets(targets, solved.unlit, style),
+        texels,
+        only_albedo,
+        seed,
         lambda done: progress(SOLVED_SHARE + (1 - SOLVED_SHARE) * done),
-        style=style, unlit=solved.unlit,
-    )  # fmt: skip
+    )
     undone = () if better else ("phase1 was undone: the solved maps explain the views worse than the baked ones.",)
     return replace(
         fit,

@@ -13,7 +13,7 @@ from mistyle.core.light import Directional, Lights, direction_in_world
 from mistyle.core.maps import place_of
 from mistyle.stages import fit_table
 from mistyle.stages.fit_settings import FitSettings
-from mistyle.stages.fit_table import Table
+from mistyle.stages.fit_table import FitTable
 
 if TYPE_CHECKING:
     import torch
@@ -26,11 +26,11 @@ LAST_RATE = 0.1  # share of the learning rate at the end of a phase; a cosine le
 
 
 @dataclass(frozen=True)
-class Shot:
+class CropBatch:
     """One step's crops, rendered, beside their targets: n crops of s x s pixels (torch).
 
     render linear, target sRGB (n, 3, s, s); `plain` the same render with the normals and roughness of the unpainted
-    surface, where the phase asks for it; mask (n, 1, s, s) 0 or 1; position and normal (n, 3, s, s) world; `light`
+    surface, where the phase asks for it; mask (n, 1, s, s) 0 or 1; world position and normal (n, 3, s, s); `light`
     (n, 3) the direction to each crop's light, or to where the mean of its lights stands, None under ambient light;
     `zoomed` crop pixels per pixel of the view.
     """
@@ -45,12 +45,12 @@ class Shot:
     zoomed: float
 
 
-# (shot, features, generator) -> weighted losses by name
-Loss = Callable[[Shot, Callable[[Any], list[Any]], np.random.Generator], "dict[str, torch.Tensor]"]
+# (batch, features, generator) -> weighted losses by name
+Loss = Callable[[CropBatch, Callable[[Any], list[Any]], np.random.Generator], "dict[str, torch.Tensor]"]
 
 
 @dataclass(frozen=True)
-class World:
+class SceneContext:
     """What stands still during the fit; `targets` are (4, h, w): sRGB and the mask of pixels that are wholly inside."""
 
     traced: Any
@@ -76,13 +76,13 @@ class Phase:
     loss: Loss
 
 
-class Run:
+class PhaseRunner:
     """A phase under way: its trace, and what the last steps say about where the albedo struggles."""
 
     def __init__(
-        self, world: World, table: Table, phase: Phase, settings: FitSettings, rng: np.random.Generator
+        self, scene: SceneContext, table: FitTable, phase: Phase, settings: FitSettings, rng: np.random.Generator
     ) -> None:
-        self.world, self.table, self.phase, self.settings, self.rng = world, table, phase, settings, rng
+        self.scene, self.table, self.phase, self.settings, self.rng = scene, table, phase, settings, rng
         self.shader = shader(settings, phase.gloss)
         self.trace: dict[str, list[float]] = {}
         self.order: list[int] = []
@@ -121,10 +121,10 @@ class Run:
 
         settings = self.settings
         while len(self.order) < settings.crops:
-            self.order += self.rng.permutation(len(self.world.cameras)).tolist()
+            self.order += self.rng.permutation(len(self.scene.cameras)).tolist()
         views, self.order = self.order[: settings.crops], self.order[settings.crops :]
         return sample_crops(
-            self.rng, self.world.masks, settings.crops, settings.crop_size, settings.crop_scale, views=views
+            self.rng, self.scene.masks, settings.crops, settings.crop_size, settings.crop_scale, views=views
         )
 
     def _gradients(
@@ -138,8 +138,8 @@ class Run:
         from mistyle.render import deferred, seam
 
         size, count = self.settings.crop_size, self.settings.crops
-        cameras = [zoom(self.world.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in crops]
-        surface = deferred.trace(self.world.traced, cameras, self.world.tangents)
+        cameras = [zoom(self.scene.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in crops]
+        surface = deferred.trace(self.scene.traced, cameras, self.scene.tangents)
         lit, towards = self._light(surface)
         where = seam.taps(surface, self.table.sizes)
 
@@ -151,15 +151,15 @@ class Run:
 
         plain = picture(self.table.plain, {})[0] if self.phase.clay else None
         render, leaves = picture(self.table.values, self.phase.rates)
-        wanted = torch.stack([crop_picture(self.world.targets[c.view], c, size) for c in crops])
+        target = torch.stack([crop_picture(self.scene.targets[c.view], c, size) for c in crops])
 
         def image(values: np.ndarray) -> "torch.Tensor":
             return torch.from_numpy(values).reshape(count, size, size, -1).permute(0, 3, 1, 2)
 
-        mask = (image(np.abs(surface.facing) > GRAZING) & (wanted[:, 3:] > 0.999)).float()
+        mask = (image(np.abs(surface.facing) > GRAZING) & (target[:, 3:] > 0.999)).float()
         position, normal = image(surface.position), image(surface.normal)
-        shot = Shot(render, plain, wanted[:, :3], mask, position, normal, towards, size / crops[0].width)
-        losses = self.phase.loss(shot, self.world.features, self.rng)
+        batch = CropBatch(render, plain, target[:, :3], mask, position, normal, towards, size / crops[0].width)
+        losses = self.phase.loss(batch, self.scene.features, self.rng)
         for name, value in losses.items():
             self._note(name, float(value.detach()))
         torch.stack(list(losses.values())).sum().backward()
@@ -177,12 +177,12 @@ class Run:
 
         beams = [light for light in self.phase.lights if isinstance(light, Directional)]
         if not self.phase.one_by_one:
-            lit = deferred.light(self.world.traced, surface, self.phase.lights, shadows=not self.phase.clay)
+            lit = deferred.light(self.scene.traced, surface, self.phase.lights, shadows=not self.phase.clay)
             rows = [beams] * len(surface.cameras)
         else:
             first, self.beam = self.beam, self.beam + len(surface.cameras)
             alone = [beams[k % len(beams)] for k in range(first, self.beam)]
-            lit, rows = deferred.light_each(self.world.traced, surface, alone, shadows=False), [[b] for b in alone]
+            lit, rows = deferred.light_each(self.scene.traced, surface, alone, shadows=False), [[b] for b in alone]
         if not beams:
             return lit, None
         towards = [_mean_direction(row, camera) for row, camera in zip(rows, surface.cameras, strict=True)]
@@ -198,8 +198,8 @@ class Run:
         a gradient of zero, so the values are looked at too where the loss is no number."""
         broken = not all(np.isfinite(values[-1]) for values in self.trace.values())
         looked_at = {name: self.table.values[name][texels] for name in self.table.values} if broken else {}
-        for found in (looked_at, gradients):
-            for name, values in found.items():
+        for tables in (looked_at, gradients):
+            for name, values in tables.items():
                 if not np.isfinite(values.sum(dtype=np.float64)):
                     return name, int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         return (next(iter(gradients)), 0) if broken else None
@@ -207,7 +207,7 @@ class Run:
     def _stopped(self, iteration: int, name: str, texel: int, crop: "Crop") -> str:
         part, row, column = place_of(texel, self.table.sizes)
         shape = "x".join(map(str, self.table.sizes[part]))
-        view = self.world.cameras[crop.view].name
+        view = self.scene.cameras[crop.view].name
         return (
             f"{self.phase.name} stopped before step {iteration + 1}: {name} or its gradient is not a number at texel "
             f"(row {row}, column {column} of {shape}) of texture set {part}, seen in view {view}; "

@@ -29,7 +29,7 @@ FILL = 6  # texels of the table by which a change is continued beyond the last t
 
 
 @dataclass
-class Table:
+class FitTable:
     """All texels (t) of all texture sets at the fit's resolution, row by row, set after set; changes as the fit goes.
 
     tilt is the tangent-space normal's x and y. `start` keeps the values before the fit, `plain` those of an unpainted
@@ -67,7 +67,7 @@ def build(
     texels: Sequence[Texels],
     shrink: int,
     only: Sequence[Bool[np.ndarray, "h w"]] | None = None,
-) -> Table:
+) -> FitTable:
     """A table of `maps` shrunk by the factor `shrink`: means over covered texels; uncovered ones take the nearest.
 
     With `only`, cells without a texel of these masks stand still.
@@ -90,7 +90,7 @@ def build(
     values = {name: np.concatenate([r[name] for r in rows]) for name in CHANNELS}
     values = {name: project(name, table) for name, table in values.items()}
     start = {name: table.copy() for name, table in values.items()}
-    return Table(
+    return FitTable(
         tuple(sizes),
         values,
         start,
@@ -112,7 +112,7 @@ def project(name: str, values: Float[np.ndarray, "*t c"]) -> Float[np.ndarray, "
 
 
 def step(
-    table: Table, name: str, texels: Int[np.ndarray, " n"], gradient: Float[np.ndarray, "n c"], rate: float
+    table: FitTable, name: str, texels: Int[np.ndarray, " n"], gradient: Float[np.ndarray, "n c"], rate: float
 ) -> None:
     """One step of Adam for the given texels; those whose gradient is zero neither move nor forget (`mask_updates`).
 
@@ -171,7 +171,7 @@ class Pairs:
     count: tuple[int, ...]
 
 
-def pairs(table: Table, texels: Int[np.ndarray, " n"]) -> Pairs:
+def pairs(table: FitTable, texels: Int[np.ndarray, " n"]) -> Pairs:
     """Which of the given texels (sorted) are neighbours in the same island."""
     own = np.arange(len(texels))
     table.place[texels] = own
@@ -190,7 +190,7 @@ def pairs(table: Table, texels: Int[np.ndarray, " n"]) -> Pairs:
     return Pairs(texels, tuple(following), tuple(preceding), tuple(count))
 
 
-def variation(table: Table, name: str, near: Pairs) -> tuple[float, Float[np.ndarray, "n c"]]:
+def variation(table: FitTable, name: str, near: Pairs) -> tuple[float, Float[np.ndarray, "n c"]]:
     """Total variation among the texels of `near` and its gradient: means of |difference| to the right and below.
 
     Of the albedo as it is (the paper's L_TV(A)); of the other maps what the fit changed, or an asset's own normal map
@@ -215,7 +215,9 @@ def variation(table: Table, name: str, near: Pairs) -> tuple[float, Float[np.nda
     return total, gradient.numpy()
 
 
-def finished(table: Table, maps: Sequence[Maps], only: Sequence[Bool[np.ndarray, "h w"]] | None = None) -> list[Maps]:
+def finished(
+    table: FitTable, maps: Sequence[Maps], only: Sequence[Bool[np.ndarray, "h w"]] | None = None
+) -> list[Maps]:
     """The maps as they came with what the fit changed laid upon them, at their own resolution (inside `only`)."""
     result = []
     for k, material in enumerate(maps):
@@ -247,7 +249,7 @@ def _laid(
     return result
 
 
-def spread(table: Table, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) -> list[Float[np.ndarray, "h w"]]:
+def spread(table: FitTable, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) -> list[Float[np.ndarray, "h w"]]:
     """A figure per texel of the table at the maps' resolution (each texel takes that of the cell it lies in)."""
     result = []
     for k, (material, part) in enumerate(zip(maps, table.parts, strict=True)):
@@ -259,7 +261,7 @@ def spread(table: Table, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) 
     return result
 
 
-def _change(table: Table, k: int, name: str) -> Float[np.ndarray, "H W c"] | None:
+def _change(table: FitTable, k: int, name: str) -> Float[np.ndarray, "H W c"] | None:
     """What the fit changed, at the table's resolution; None where nothing."""
     part, size = table.parts[k], table.sizes[k]
     change = (table.values[name][part] - table.start[name][part]).reshape(*size, -1)

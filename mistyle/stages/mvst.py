@@ -35,7 +35,7 @@ FEATHER = 8.0  # pixels from the prior over which the histogram match sets in
 
 
 @dataclass(frozen=True)
-class Painted:
+class PaintedView:
     """One finished view.
 
     rgb     linear Rec.709, not multiplied by coverage
@@ -57,56 +57,71 @@ class Swept:
     """The finished views in the order in which they came; `order` is that in which they were painted."""
 
     views: tuple[View, ...]
-    painted: tuple[Painted, ...]
+    painted: tuple[PaintedView, ...]
     order: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class ViewPainter:
+    """What paints a view.
+
+    stylizer        (view, prior, rng) -> rgb, linear; the prior is None for the first view. The view comes with the
+                    rendered colours and geometry; colours off the mesh are not used
+    masker          says what is foreground in a stylized view; None: the rendered coverage
+    keeps_outlines  the stylizer cannot move silhouettes: little need be cut off beside them, and depth need not follow
+                    them (`stages/outline.py`)
+    """
+
+    stylizer: Stylizer
+    masker: Masker | None = None
+    keeps_outlines: bool = False
+
+
+@dataclass(frozen=True)
+class ViewStore:
+    """A folder for finished views, under a key: all that the result hangs on besides settings, seed and rig."""
+
+    folder: Path
+    key: str
 
 
 def sweep(
     views: Sequence[View],
-    stylizer: Stylizer,
+    painter: ViewPainter,
     settings: SweepSettings,
     seed: int,
     progress: Callable[[float], None] = lambda done: None,
-    *,
-    masker: Masker | None = None,
-    keeps_outlines: bool = False,
-    kept: Path | None = None,
-    key: str = "",
+    store: ViewStore | None = None,
 ) -> Swept:
-    """Paint every view by `stylizer(view, prior, rng) -> rgb` (linear; prior None for the first view).
+    """Paint every view from what the views before show.
 
-    `view` comes with the rendered colours and geometry; what the stylizer gives off the mesh is not used. `masker` is
-    shown the stylized view and says what is foreground in it; the default is the rendered coverage. `keeps_outlines`
-    tells that the stylizer cannot move silhouettes, so that little need be cut off beside them and depth need not
-    follow them (`stages/outline.py`). With a folder `kept`
-    every finished view is written there under `key` (all that the result hangs on besides `settings`, `seed` and the
-    rig): a sweep that was killed goes on in the view it was in, and ends with the same pictures.
+    With a store a sweep that was killed goes on in the view it was in, and ends with the same pictures.
 
     Raises ValueError where the stylizer's answer has the wrong shape or is not finite on the mesh.
     """
     if not views:
         raise ValueError("there are no views to paint; pass at least one")
     order = visiting([view.camera for view in views], settings.order)
-    chosen = settings.warp
-    follows = masker is not None and (not keeps_outlines if (f := settings.follow_outline) is None else f)
-    if chosen.erosion is None and keeps_outlines:
+    chosen, masked = settings.warp, painter.masker is not None
+    follows = masked and (not painter.keeps_outlines if (f := settings.follow_outline) is None else f)
+    if chosen.erosion is None and painter.keeps_outlines:
         chosen = chosen.model_copy(update={"erosion": STILL_EROSION})
-    whole_key = digest([key, settings, seed, order, keeps_outlines, follows, masker is not None])
-    done: dict[int, Painted] = {}
+    key = "" if store is None else digest([store.key, settings, seed, order, painter.keeps_outlines, follows, masked])
+    done: dict[int, PaintedView] = {}
     lifted: list[Lifted] = []
     for turn, k in enumerate(order):
-        file = None if kept is None else kept / f"view_{k:03d}.npz"
-        found = None if file is None else read_kept(file, whole_key)
-        if found is None:
+        file = None if store is None else store.folder / f"view_{k:03d}.npz"
+        own = None if file is None else read_kept(file, key)
+        if own is None:
             prior = composite(lifted, views[k], chosen) if lifted else None
             anchor = (views[order[0]], done[order[0]]) if done else None
             rng = np.random.default_rng([seed, k])
-            found = paint_view(views[k], prior, anchor, stylizer, masker, settings, rng, follows)
+            own = paint_view(views[k], prior, anchor, painter, settings, rng, follows)
             if file is not None:
-                write_kept(file, whole_key, found)
-        done[k] = found
-        shown = drawn(views[k], found) if follows else finished(views[k], found)
-        lifted.append(lift(shown, chosen, found.mask))
+                write_kept(file, key, own)
+        done[k] = own
+        shown = drawn(views[k], own) if follows else finished(views[k], own)
+        lifted.append(lift(shown, chosen, own.mask))
         progress((turn + 1) / len(order))
     painted = tuple(done[k] for k in range(len(views)))
     return Swept(tuple(finished(v, p) for v, p in zip(views, painted, strict=True)), painted, tuple(order))
@@ -129,26 +144,25 @@ def visiting(cameras: Sequence[Camera], kind: str) -> list[int]:
 def paint_view(
     view: View,
     prior: Prior | None,
-    anchor: tuple[View, Painted] | None,
-    stylizer: Stylizer,
-    masker: Masker | None,
+    anchor: tuple[View, PaintedView] | None,
+    painter: ViewPainter,
     settings: SweepSettings,
     rng: np.random.Generator,
     follows: bool = False,
-) -> Painted:
+) -> PaintedView:
     """One view: stylize, find its foreground, draw its colours towards the anchor's.
 
     What lies off the mesh is kept where depth is to follow the outline, and only where the segmenter sees foreground.
     """
-    rgb = np.asarray(stylizer(view, prior, rng))
+    rgb = np.asarray(painter.stylizer(view, prior, rng))
     if rgb.shape != view.rgb.shape or not np.isfinite(rgb[view.mask]).all():
         raise ValueError(
             f"view '{view.camera.name}': the stylizer gave an array of shape {rgb.shape}, or values that are not"
             f" finite; expected finite colours of shape {view.rgb.shape}"
         )
     seen, drift = view.mask, 1.0
-    if masker is not None:
-        seen = masker(replace(view, rgb=np.nan_to_num(rgb).astype(np.float32)))
+    if painter.masker is not None:
+        seen = painter.masker(replace(view, rgb=np.nan_to_num(rgb).astype(np.float32)))
         drift = overlap(seen, view.mask)
     shown = seen | view.mask if follows else view.mask
     rgb = np.where(shown[..., None] & np.isfinite(rgb), rgb, 0).astype(np.float32)
@@ -158,14 +172,14 @@ def paint_view(
     if anchor is not None and settings.histogram > 0:
         rgb = towards(rgb, mask, known, anchor[1], settings.histogram)
     share = float(known[view.mask].mean()) if view.mask.any() else 0.0
-    return Painted(rgb, mask, seen, share, drift)
+    return PaintedView(rgb, mask, seen, share, drift)
 
 
 def towards(
     rgb: Float[np.ndarray, "h w 3"],
     mask: Bool[np.ndarray, "h w"],
     known: Bool[np.ndarray, "h w"],
-    anchor: Painted,
+    anchor: PaintedView,
     strength: float,
 ) -> Float[np.ndarray, "h w 3"]:
     """Colours matched (in sRGB) to the anchor's, foreground against foreground; what came from the prior stays.
@@ -181,17 +195,17 @@ def towards(
     return linear_from_srgb(encoded + weight.astype(np.float32) * (matched - encoded))
 
 
-def finished(view: View, painted: Painted) -> View:
+def finished(view: View, painted: PaintedView) -> View:
     """The view with its painted colours, premultiplied by coverage as rendered ones are."""
     return replace(view, rgb=painted.rgb * view.coverage[..., None])
 
 
-def drawn(view: View, painted: Painted) -> View:
+def drawn(view: View, painted: PaintedView) -> View:
     """The view as its stylizer drew it: the geometry moved to the outline of what is seen there."""
     return replace(follow(view, painted.seen), rgb=painted.rgb)
 
 
-def write_kept(file: Path, key: str, painted: Painted) -> None:
+def write_kept(file: Path, key: str, painted: PaintedView) -> None:
     """One finished view on disk, whole or not at all."""
     numbers = np.array([painted.known, painted.drift])
 
@@ -201,13 +215,13 @@ def write_kept(file: Path, key: str, painted: Painted) -> None:
     atomic_write(file, write)
 
 
-def read_kept(file: Path, key: str) -> Painted | None:
+def read_kept(file: Path, key: str) -> PaintedView | None:
     """A finished view that was kept under this key; None where there is none that can be read."""
     try:
         with np.load(file, allow_pickle=False) as arrays:
             if str(arrays["key"]) != key:
                 return None
             known, drift = arrays["numbers"]
-            return Painted(arrays["rgb"], arrays["mask"], arrays["seen"], float(known), float(drift))
+            return PaintedView(arrays["rgb"], arrays["mask"], arrays["seen"], float(known), float(drift))
     except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
         return None

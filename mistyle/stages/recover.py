@@ -128,14 +128,12 @@ def polished(
     progress: Callable[[float], None],
 ) -> Float[np.ndarray, "a 8"]:
     """Steps through `prb` from `table`; a result that explains the pictures no better is dropped, with a note."""
-    from mistyle.render.polish import polish
+    from mistyle.render.polish import PolishSettings, polish
     from mistyle.render.shade import pack, unpack
 
     s = work.settings
-    done = polish(
-        work.traced.mesh, unpack(table, work.where.sizes), captures, s.polish, model=s.model, frame=s.frame,
-        metallic=s.metallic, loss=s.loss, rate=s.polish_rate, depth=s.polish_depth, seed=seed, progress=progress,
-    )  # fmt: skip
+    chosen = PolishSettings(s.polish, s.loss, s.polish_rate, s.metallic, s.polish_depth, model=s.model, frame=s.frame)
+    done = polish(work.traced.mesh, unpack(table, work.where.sizes), captures, chosen, seed, progress)
     trace["polish.loss"], trace["polish.whole"] = list(done.trace), list(done.loss)
     if not done.loss[1] < done.loss[0]:
         work.notes.append(f"The polish was undone: the loss went from {done.loss[0]:.3g} to {done.loss[1]:.3g}.")

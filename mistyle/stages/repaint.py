@@ -9,6 +9,7 @@ RePaint itself, every repeat but the first is re-noised. tests/test_repaint.py h
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,17 +18,25 @@ Array = Any  # a NumPy array, or a torch tensor; then `rng` is a torch.Generator
 Denoiser = Callable[[Array, float], Array]  # (latent, sigma) -> the clean latent it expects
 
 
+@dataclass(frozen=True)
+class Resampling:
+    """How a latent is resampled: blocks of `L` steps, each `r` times over, and the share of steps that are passed once
+    more at the end without the prior."""
+
+    L: int = 10
+    r: int = 10
+    refine: float = 0.1
+
+
 def sample(
     denoise: Denoiser,
     prior: Array | None,
     mask: Array | None,
     sigmas: Sequence[float],
-    L: int = 10,
-    r: int = 10,
+    resampling: Resampling = Resampling(),
     *,
     rng: Any,
     like: Array | None = None,
-    refine: float = 0.1,
 ) -> Array:
     """A latent whose part under `mask` (1: known) is `prior` and whose rest goes with it.
 
@@ -38,6 +47,7 @@ def sample(
     more without the prior, which smooths the border; refine = 0 leaves that out, and the known part is the prior
     exactly. Calls `denoise` steps * r + int(refine * steps) times. The same generator state gives the same result.
     """
+    L, r, refine = resampling.L, resampling.r, resampling.refine
     levels = [float(s) for s in sigmas]
     if len(levels) < 2 or levels[-1] != 0 or any(a <= b for a, b in zip(levels, levels[1:], strict=False)):
         raise ValueError("sigmas must fall from step to step and end with 0; pass the sampler's noise levels")

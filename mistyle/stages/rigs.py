@@ -40,7 +40,7 @@ class Planned:
 
 
 @dataclass(frozen=True)
-class Surface:
+class VisibilitySamples:
     """Points that stand for equal areas: shading normals, and unit normals of their faces on the outer side."""
 
     positions: Float[np.ndarray, "s 3"]
@@ -77,7 +77,7 @@ def next_best_views(mesh: Mesh, settings: RigSettings, traced: Any = None) -> Pl
     )
 
 
-def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> Surface:
+def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> VisibilitySamples:
     """`count` points of equal area, stratified over the faces in their order. Raises InputRefused without area."""
     areas = face_areas(mesh)
     total = float(areas.sum())
@@ -92,7 +92,7 @@ def sample_surface(mesh: Mesh, count: int, seed: int = 0) -> Surface:
     normals = np.einsum("sk,skc->sc", bary, mesh.corner_normals[face])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
     fronts = face_fronts(mesh)[face]
-    return Surface(positions.astype(np.float32), normals.astype(np.float32), fronts)
+    return VisibilitySamples(positions.astype(np.float32), normals.astype(np.float32), fronts)
 
 
 def face_fronts(mesh: Mesh) -> Float[np.ndarray, "f 3"]:

@@ -21,7 +21,7 @@ FEWEST = 12  # bits of a bucket's number: with few points too, cells that are ne
 
 
 @dataclass(frozen=True)
-class Cells:
+class PointGrid:
     """Points by bucket: those of bucket b stand in rows range[2 b] to range[2 b + 1] of the sorted arrays.
 
     at      flat (n 4): position, and a number of the point's own
@@ -39,13 +39,13 @@ class Cells:
     crowd: float
 
 
-def cells(
+def point_grid(
     dj: ModuleType,
     positions: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     size: float,
     number: Int[np.ndarray, " n"] | None = None,
-) -> Cells:
+) -> PointGrid:
     """Points sorted into cubes of side `size`; `number` (under 2^32) goes along with them."""
     count = len(positions)
     buckets = 1 << max(int(np.ceil(np.log2(max(count, 2)))), FEWEST)
@@ -64,7 +64,7 @@ def cells(
     at = np.concatenate([positions[member].astype(np.float32), numbers.view(np.float32)[:, None]], axis=1)
     own = member.astype(np.uint32).view(np.float32)[:, None]
     facing = np.concatenate([normals[member].astype(np.float32), own], axis=1)
-    return Cells(
+    return PointGrid(
         size=size,
         mask=buckets - 1,
         range=whole(dj, np.stack([end - held, end], axis=1)),
@@ -76,7 +76,7 @@ def cells(
 
 
 def each_near(
-    dj: ModuleType, found: Cells, point: Any, state: tuple[Any, ...], visit: Callable[..., tuple[Any, ...]]
+    dj: ModuleType, grid: PointGrid, point: Any, state: tuple[Any, ...], visit: Callable[..., tuple[Any, ...]]
 ) -> tuple[Any, ...]:
     """Fold `visit(row, inside, *state)` over the rows of the 27 cells about `point`.
 
@@ -84,16 +84,16 @@ def each_near(
     """
     import drjit as dr
 
-    scale = dr.opaque(dj.Float, float(np.float32(1 / found.size)))
+    scale = dr.opaque(dj.Float, float(np.float32(1 / grid.size)))
     base = [dj.Int(dr.floor(point[axis] * scale)) for axis in range(3)]
-    mask = dr.opaque(dj.UInt, found.mask)
+    mask = dr.opaque(dj.UInt, grid.mask)
 
     def bucket(k: Any) -> Any:
         step = (dj.Int(k % 3) - 1, dj.Int(k // 3 % 3) - 1, dj.Int(k // 9) - 1)
         key = dj.UInt(0)
         for axis, prime in enumerate(PRIMES):
             key ^= dj.UInt(base[axis] + step[axis]) * dj.UInt(prime)
-        return dr.gather(dj.Array2u, found.range, key & mask)
+        return dr.gather(dj.Array2u, grid.range, key & mask)
 
     def body(k: Any, at: Any, end: Any, *inner: Any) -> tuple[Any, ...]:
         inside = at < end
@@ -108,7 +108,7 @@ def each_near(
     return dr.while_loop((dj.UInt(0), first, last, *state), lambda k, *rest: k < 27, body)[3:]
 
 
-def thin(dj: ModuleType, found: Cells, radius: float) -> Bool[np.ndarray, " n"]:
+def thin(dj: ModuleType, grid: PointGrid, radius: float) -> Bool[np.ndarray, " n"]:
     """Which points stay when a point removes all others of its side within `radius`, taken by falling number.
 
     Found in parallel rounds: a point that outranks all its undecided neighbours stays, and who is near one that stays
@@ -116,35 +116,42 @@ def thin(dj: ModuleType, found: Cells, radius: float) -> Bool[np.ndarray, " n"]:
     """
     import drjit as dr
 
-    def number(bits: Any) -> Any:
-        return dr.reinterpret_array(dj.UInt, bits)
-
-    fate = dr.zeros(dj.UInt, len(found.row))
+    fate = dr.zeros(dj.UInt, len(grid.row))
     limit = dr.opaque(dj.Float, float(radius) ** 2)
-    open_ones = found.row
+    open_ones = grid.row
     while len(open_ones):
         i = whole(dj, open_ones)
-        own: Any = dr.gather(dj.Array4f, found.at, i)
-        normal: Any = dr.gather(dj.Array4f, found.facing, i)
-        mine = number(own[3])
-
-        def visit(j: Any, inside: Any, beaten: Any, gone: Any, i=i, own=own, normal=normal, mine=mine, fate=fate):
-            other, facing = dr.gather(dj.Array4f, found.at, j), dr.gather(dj.Array4f, found.facing, j)
-            step = [other[axis] - own[axis] for axis in range(3)]
-            near = inside & (step[0] * step[0] + step[1] * step[1] + step[2] * step[2] <= limit) & (j != i)
-            near &= facing[0] * normal[0] + facing[1] * normal[1] + facing[2] * normal[2] > 0
-            its = dr.gather(dj.UInt, fate, j)
-            beaten |= near & (its == UNDECIDED) & (number(other[3]) > mine)
-            return beaten, gone | (near & (its == STAYS))
-
-        beaten, gone = each_near(dj, found, own, (dj.Bool(False), dj.Bool(False)), visit)
-        now = dr.select(gone, dj.UInt(GONE), dr.select(beaten, dj.UInt(UNDECIDED), dj.UInt(STAYS)))
+        now = _fates(dj, grid, fate, i, limit)
         after = dj.UInt(fate)
         dr.scatter(after, now, i)
         dr.eval(after, now)
         fate = after
         open_ones = open_ones[now.numpy() == UNDECIDED]
-    return (fate.numpy() == STAYS)[found.row]
+    return (fate.numpy() == STAYS)[grid.row]
+
+
+def _fates(dj: ModuleType, grid: PointGrid, fate: Any, i: Any, limit: Any) -> Any:
+    """The fates of the points in rows `i` after one more round; `limit` is the squared radius."""
+    import drjit as dr
+
+    def number(bits: Any) -> Any:
+        return dr.reinterpret_array(dj.UInt, bits)
+
+    own: Any = dr.gather(dj.Array4f, grid.at, i)
+    normal: Any = dr.gather(dj.Array4f, grid.facing, i)
+    mine = number(own[3])
+
+    def visit(j: Any, inside: Any, beaten: Any, gone: Any) -> tuple[Any, Any]:
+        other, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
+        step = [other[axis] - own[axis] for axis in range(3)]
+        near = inside & (step[0] * step[0] + step[1] * step[1] + step[2] * step[2] <= limit) & (j != i)
+        near &= facing[0] * normal[0] + facing[1] * normal[1] + facing[2] * normal[2] > 0
+        its = dr.gather(dj.UInt, fate, j)
+        beaten |= near & (its == UNDECIDED) & (number(other[3]) > mine)
+        return beaten, gone | (near & (its == STAYS))
+
+    beaten, gone = each_near(dj, grid, own, (dj.Bool(False), dj.Bool(False)), visit)
+    return dr.select(gone, dj.UInt(GONE), dr.select(beaten, dj.UInt(UNDECIDED), dj.UInt(STAYS)))
 
 
 def near(
@@ -159,15 +166,15 @@ def near(
     import drjit as dr
 
     count = len(positions)
-    found = cells(dj, positions, normals, reach)
-    row = whole(dj, found.row)
+    grid = point_grid(dj, positions, normals, reach)
+    row = whole(dj, grid.row)
     i = dr.arange(dj.UInt, count)
-    own, normal = dr.gather(dj.Array4f, found.at, row), dr.gather(dj.Array4f, found.facing, row)
+    own, normal = dr.gather(dj.Array4f, grid.at, row), dr.gather(dj.Array4f, grid.facing, row)
     limit, weight = dr.opaque(dj.Float, float(reach) ** 2), dr.opaque(dj.Float, float(turning) ** 2)
     listed = whole(dj, np.repeat(np.arange(count, dtype=np.uint32), most))
 
     def visit(j: Any, inside: Any, held: Any) -> tuple[Any]:
-        other, facing = dr.gather(dj.Array4f, found.at, j), dr.gather(dj.Array4f, found.facing, j)
+        other, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
         away = dr.square(other[0] - own[0]) + dr.square(other[1] - own[1]) + dr.square(other[2] - own[2])
         turn = [dr.square(facing[axis] - normal[axis]) for axis in range(3)]
         away += weight * (turn[0] + turn[1] + turn[2])
@@ -175,6 +182,6 @@ def near(
         dr.scatter(listed, dr.reinterpret_array(dj.UInt, facing[3]), i * most + held, take)
         return (dr.select(take, held + 1, held),)
 
-    each_near(dj, found, own, (dr.zeros(dj.UInt, count),), visit)
+    each_near(dj, grid, own, (dr.zeros(dj.UInt, count),), visit)
     dr.eval(listed)
     return listed.numpy().reshape(count, most).astype(np.int32)

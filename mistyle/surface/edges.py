@@ -20,9 +20,9 @@ EVEN = 0.9  # share of a line of the border that has its colour
 def pixel_grid(rgb: Float[np.ndarray, "h w 3"]) -> tuple[int, int]:
     """Sides (down, across) of one art pixel in picture pixels; (0, 0) where the picture is no pixel art."""
     lab = style.lab_from_srgb(rgb)
-    found = [grid_along(np.abs(np.diff(lab[..., 0], axis=axis)), axis) for axis in (0, 1)]
-    if min(found) > 1:
-        return found[0], found[1]
+    sizes = [grid_along(np.abs(np.diff(lab[..., 0], axis=axis)), axis) for axis in (0, 1)]
+    if min(sizes) > 1:
+        return sizes[0], sizes[1]
     return (1, 1) if hard_pixels(lab) else (0, 0)
 
 
@@ -69,11 +69,11 @@ def border(rgb: Float[np.ndarray, "h w 3"], exact: bool) -> style.Crop:
     size = style.long_side(rgb.shape, min(long, 512))
     lab = style.lab_from_srgb(style.resized(rgb, size))
     sides = [lab, lab.swapaxes(0, 1), lab[::-1], lab[:, ::-1].swapaxes(0, 1)]
-    found = [margin(side) for side in sides]
+    margins = [margin(side) for side in sides]
     colours = [np.median(side[:2].reshape(-1, 3), axis=0) for side in sides]
     result = []
-    for k, (share, colour) in enumerate(zip(found, colours, strict=True)):
-        alike = sum(found[j] > 0 and np.abs(colours[j] - colour).sum() < ALIKE for j in range(4) if j != k)
+    for k, (share, colour) in enumerate(zip(margins, colours, strict=True)):
+        alike = sum(margins[j] > 0 and np.abs(colours[j] - colour).sum() < ALIKE for j in range(4) if j != k)
         least = 0.0 if exact else EDGE * long / rgb.shape[k % 2]
         result.append(max(share + 0.4 * least, least) if share > 0 and alike else least)
     return result[0], result[1], result[2], result[3]

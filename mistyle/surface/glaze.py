@@ -21,7 +21,7 @@ def glaze(
     levels: Sequence[Level],
     guide: Guide,
     lightness: Float[np.ndarray, " n"],
-    pages: style.Pages,
+    exemplar: style.Exemplar,
     settings: PlainSettings,
 ) -> Float[np.ndarray, " n"]:
     """What to add to the `lightness` (Lab / 100) of the finest level's samples; zero for paintings of two tones.
@@ -29,14 +29,14 @@ def glaze(
     The detail guide says how light a place should be against its surroundings; the same band of the lightness that the
     samples show is taken from it.
     """
-    strength = settings.glaze * style.middle_tones(pages.lab[:, 0])
+    strength = settings.glaze * style.middle_tones(exemplar.lab[:, 0])
     fine = levels[-1]
     if strength == 0 or len(levels) < 3:
         return np.zeros(len(fine.directed), np.float32)
     shown = band(levels, lightness)
-    wanted = guide.detail * np.float32(settings.relief * pages.band.std())
+    target = guide.detail * np.float32(settings.relief * exemplar.band.std())
     sure = np.minimum(np.abs(guide.detail), 1).astype(np.float32)
-    missing = np.float32(strength) * sure * (wanted - shown)
+    missing = np.float32(strength) * sure * (target - shown)
     return smooth(fine, np.clip(missing, -THICKEST, THICKEST), 2)
 
 

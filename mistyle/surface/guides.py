@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 from mistyle.surface.creases import LEAST_RELIEF, bounded, cavity_of, creases
 from mistyle.surface.linefield import KEY
 from mistyle.surface.places import light, place_fields, without
-from mistyle.surface.samples import Level, Points, carry, drop, smooth, workers
+from mistyle.surface.samples import Level, SurfacePoints, carry, drop, smooth, workers
 from mistyle.surface.settings import ResolvedSettings
 
 Occlusion = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -41,7 +41,7 @@ class Guide:
     directed: Float[np.ndarray, " n"]
 
 
-def guides(
+def level_guides(
     levels: Sequence[Level],
     palette: Float[np.ndarray, "m 3"],
     occlusion: Occlusion,
@@ -69,16 +69,16 @@ def guides(
         details = mixed(details, detail(levels, lit, cavity), settings.form)
     kept = 0.0
     if content is not None and settings.keep_content > 0:
-        found = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
-        kept = settings.keep_content * min(float(found[-1].std()) / LEAST_CONTENT, 1.0)
-        tone, details = with_content(levels, tone, details, found, kept)
+        lightness = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
+        kept = settings.keep_content * min(float(lightness[-1].std()) / LEAST_CONTENT, 1.0)
+        tone, details = with_content(levels, tone, details, lightness, kept)
     shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
     colour = colour_field(tone[middle], fields, shown, palette, rng)
     typical, spread = palette[:, 0].mean(), CALM + (1 - CALM) * max(settings.form, kept)
     colour[:, 0] = typical + spread * (colour[:, 0] - typical)
     return [
-        Guide(carry(base, colour, level.points), wanted, level.directed)
-        for level, wanted in zip(levels, details, strict=True)
+        Guide(carry(base, colour, level.points), own, level.directed)
+        for level, own in zip(levels, details, strict=True)
     ]
 
 
@@ -89,14 +89,14 @@ def mixed(
     return [(1 - share) * a + share * b for a, b in zip(first, second, strict=True)]
 
 
-def places(levels: Sequence[Level], base: Points, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+def places(levels: Sequence[Level], base: SurfacePoints, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
     """`place_fields` at the points of `base`, found on the finest level that is small enough.
 
     The first, of lightness, grows upwards in the mean: heads and lids are light, and dark strokes draw their features.
     """
     small = next((level for level in reversed(levels) if len(level.directed) <= FIELD_POINTS), levels[0])
-    found = carry(small.points, place_fields(small, drop(base, openness, small.points)), base)
-    rest = without(found, light(base.normals, openness))
+    fields = carry(small.points, place_fields(small, drop(base, openness, small.points)), base)
+    rest = without(fields, light(base.normals, openness))
     if (rest[:, 0] * base.positions[:, 1]).sum() < 0:
         rest[:, 0] = -rest[:, 0]
     return (rest / np.maximum(rest.std(axis=0), 1e-9)).astype(np.float32)

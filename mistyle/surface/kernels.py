@@ -43,8 +43,9 @@ class Tables:
 
 
 @dataclass(frozen=True)
-class Book:
-    """The four pages on the device: sizes, first pixel, colour, descriptor, pixel of the unturned picture."""
+class ExemplarArrays:
+    """The exemplar on the device: sizes and first pixels of its four pages; per pixel its colour, its descriptor and
+    the pixel of the unturned picture."""
 
     height: Any
     width: Any
@@ -55,8 +56,8 @@ class Book:
 
 
 @dataclass(frozen=True)
-class Place:
-    """Where each sample's centre lies in the book: page, column and row in pixels (index coordinates)."""
+class FieldArrays:
+    """The nearest-neighbour field on the device: page, column and row in pixels (index coordinates) of each sample."""
 
     page: Any
     x: Any
@@ -64,19 +65,33 @@ class Place:
 
 
 @dataclass(frozen=True)
-class Wanted:
-    """What each sample looks for: its descriptor (as wide as a style pixel's) and how much the band matters to it."""
+class TargetDescriptors:
+    """Per sample the descriptor that it looks for (as wide as a style pixel's), and the weight of its band."""
 
     descriptor: Any
     band_weight: Any
 
 
 @dataclass(frozen=True)
-class Ends:
-    """1 for samples with whose picture nobody shall go on, else 0; and how far (pixels) about it that holds."""
+class PatchSizeLimit:
+    """1 for samples whose picture no neighbour may go on with, else 0; and the radius (pixels) where that holds."""
 
     sample: Any
     around: Any
+
+
+@dataclass(frozen=True)
+class Prices:
+    """Costs of a place besides its descriptor.
+
+    weights  flat: coherence, variety, one over the squared difference of patches that makes a seam count in full
+    use      per pixel of the unturned picture how often it is taken (1 = its target)
+    limit    pieces that are as large as they may get
+    """
+
+    weights: Any
+    use: Any
+    limit: PatchSizeLimit | None = None
 
 
 def module(name: str) -> ModuleType:
@@ -232,7 +247,7 @@ def _components(dj: ModuleType, count: int, member: Callable[[Any], Any], colour
     return result
 
 
-def vote(dj: ModuleType, table: Tables, book: Book, place: Place) -> Any:
+def vote(dj: ModuleType, table: Tables, exemplar: ExemplarArrays, field: FieldArrays) -> Any:
     """The colour of every sample, flat (n 3): what the patches of its 25 neighbours show where it lies, averaged."""
     import drjit as dr
 
@@ -241,18 +256,18 @@ def vote(dj: ModuleType, table: Tables, book: Book, place: Place) -> Any:
     def body(k: Any, total: Any, weights: Any) -> tuple[Any, ...]:
         slot = i * 25 + k
         j = dr.gather(dj.UInt, table.neighbour, slot) & ~TURNED
-        page = dr.gather(dj.UInt, place.page, j)
+        page = dr.gather(dj.UInt, field.page, j)
         step = dr.gather(dj.Array2f, table.offset, slot)
-        height, width = dr.gather(dj.Float, book.height, page), dr.gather(dj.Float, book.width, page)
-        x = dr.clip(dr.gather(dj.Float, place.x, j) + step[0], 0, width - 1.001)
-        y = dr.clip(dr.gather(dj.Float, place.y, j) + step[1], 0, height - 1.001)
+        height, width = dr.gather(dj.Float, exemplar.height, page), dr.gather(dj.Float, exemplar.width, page)
+        x = dr.clip(dr.gather(dj.Float, field.x, j) + step[0], 0, width - 1.001)
+        y = dr.clip(dr.gather(dj.Float, field.y, j) + step[1], 0, height - 1.001)
         left, top = dr.floor(x), dr.floor(y)
         right, down = x - left, y - top
         row = dj.UInt(width)
-        pixel = dr.gather(dj.UInt, book.start, page) + dj.UInt(top) * row + dj.UInt(left)
+        pixel = dr.gather(dj.UInt, exemplar.start, page) + dj.UInt(top) * row + dj.UInt(left)
 
         def colour(index: Any) -> Any:
-            return dr.gather(dj.Array3f, book.colour, index)
+            return dr.gather(dj.Array3f, exemplar.colour, index)
 
         upper = dr.lerp(colour(pixel), colour(pixel + 1), right)
         lower = dr.lerp(colour(pixel + row), colour(pixel + row + 1), right)
@@ -266,102 +281,54 @@ def vote(dj: ModuleType, table: Tables, book: Book, place: Place) -> Any:
     return result
 
 
-def continued(dj: ModuleType, table: Tables, book: Book, place: Place, slot: Any) -> tuple[Any, Any, Any]:
+def continued(
+    dj: ModuleType, table: Tables, exemplar: ExemplarArrays, field: FieldArrays, slot: Any
+) -> tuple[Any, Any, Any]:
     """Where a sample would lie if it went on with the picture of the neighbour in table entry `slot`: page, x, y."""
     import drjit as dr
 
     entry = dr.gather(dj.UInt, table.neighbour, slot)
     j, turned = entry & ~TURNED, entry >= TURNED
     step = dr.gather(dj.Array2f, table.offset, slot)
-    page = dr.gather(dj.UInt, place.page, j)
-    x, y = dr.gather(dj.Float, place.x, j) + step[0], dr.gather(dj.Float, place.y, j) + step[1]
-    x = dr.select(turned, dr.gather(dj.Float, book.width, page) - 1 - x, x)
-    y = dr.select(turned, dr.gather(dj.Float, book.height, page) - 1 - y, y)
+    page = dr.gather(dj.UInt, field.page, j)
+    x, y = dr.gather(dj.Float, field.x, j) + step[0], dr.gather(dj.Float, field.y, j) + step[1]
+    x = dr.select(turned, dr.gather(dj.Float, exemplar.width, page) - 1 - x, x)
+    y = dr.select(turned, dr.gather(dj.Float, exemplar.height, page) - 1 - y, y)
     return dr.select(turned, (page + 2) % PAGES, page), x, y
 
 
 def search(
     dj: ModuleType,
     table: Tables,
-    book: Book,
-    place: Place,
-    wanted: Wanted,
-    use: Any,
-    prices: Any,
-    also: Place | None,
-    ends: Ends | None = None,
-) -> tuple[Any, Place]:
+    exemplar: ExemplarArrays,
+    field: FieldArrays,
+    targets: TargetDescriptors,
+    prices: Prices,
+    also: FieldArrays | None = None,
+) -> tuple[Any, FieldArrays]:
     """One round: every sample takes the best of its own place, those its neighbours suggest, and fixed steps about it.
 
-    `use` says per pixel of the unturned picture how often it is taken (1 = average). `prices` is flat
-    (coherence, variety, one over the squared difference of patches that makes a seam count in full). `also` offers one
-    more place per sample (from `exhaustive`). Returns costs and places.
+    `also` offers one more place per sample (from `exhaustive`). Returns costs and places.
     """
     import drjit as dr
 
     i = dr.arange(dj.UInt, table.count)
-    target = [dr.gather(dj.Array4f, wanted.descriptor, i * (WIDTH // 4) + k) for k in range(WIDTH // 4)]
-    band_weight = dr.gather(dj.Float, wanted.band_weight, i)
-    coherence = dr.gather(dj.Float, prices, dj.UInt(0)) * target[CLOSED // 4][CLOSED % 4]
-    variety = dr.gather(dj.Float, prices, dj.UInt(1))
-    beside = [continued(dj, table, book, place, i * 25 + slot) for slot in BESIDE]
-    seam = dr.gather(dj.Float, prices, dj.UInt(2))
-    end = (
-        [dr.gather(dj.Float, ends.sample, dr.gather(dj.UInt, table.neighbour, i * 25 + s) & ~TURNED) for s in BESIDE]
-        if ends
-        else []
-    )
-    around = dr.square(dr.gather(dj.Float, ends.around, dj.UInt(0))) if ends else None
-
-    def inside(page: Any, x: Any, y: Any) -> tuple[Any, Any]:
-        width, height = dr.gather(dj.Float, book.width, page), dr.gather(dj.Float, book.height, page)
-        return dr.clip(x, BORDER, width - 1 - BORDER), dr.clip(y, BORDER, height - 1 - BORDER)
-
-    def pixel_at(page: Any, x: Any, y: Any) -> Any:
-        row = dj.UInt(dr.gather(dj.Float, book.width, page))
-        return dr.gather(dj.UInt, book.start, page) + dj.UInt(dr.round(y)) * row + dj.UInt(dr.round(x))
-
-    def leading(pixel: Any) -> list[Any]:
-        return [dr.gather(dj.Array4f, book.descriptor, pixel * (WIDTH // 4) + k) for k in range(SEEN // 4)]
-
-    shown = [leading(pixel_at(page, *inside(page, u, v))) for page, u, v in beside]
-
-    def cost(page: Any, x: Any, y: Any) -> Any:
-        pixel = pixel_at(page, x, y)
-        total = variety * dr.gather(dj.Float, use, dr.gather(dj.UInt, book.origin, pixel))
-        own = leading(pixel)
-        for k in range(WIDTH // 4):
-            here = own[k] if k < len(own) else dr.gather(dj.Array4f, book.descriptor, pixel * (WIDTH // 4) + k)
-            gap = target[k] - here
-            if k < LINEAR // 4:
-                total += dr.squared_norm(gap)
-            else:
-                total += dr.square(gap[0]) + band_weight * dr.square(gap[1])
-        for k, (other, u, v) in enumerate(beside):
-            away = dr.square(u - x) + dr.square(v - y)
-            apart = sum((dr.squared_norm(a - b) for a, b in zip(own, shown[k], strict=True)), start=dj.Float(0))
-            visible = HIDDEN_SEAM + (1 - HIDDEN_SEAM) * dr.minimum(apart * seam, 1)
-            price = coherence * visible * dr.select(other == page, dr.minimum(away, 4) / 4, 1)
-            if ends is not None:
-                near = dr.select(other == page, dr.maximum(1 - away / around, 0), 0)
-                price = dr.select(end[k] > 0, STAY * near, price)
-            total += price
-        return total
+    cost = _cost(dj, table, exemplar, field, targets, prices)
 
     def better(best: tuple[Any, ...], page: Any, x: Any, y: Any) -> tuple[Any, ...]:
-        x, y = inside(page, x, y)
+        x, y = _inside(dj, exemplar, page, x, y)
         price = cost(page, x, y)
         take = price < best[0]
         return tuple(dr.select(take, new, old) for new, old in zip((price, page, x, y), best, strict=True))
 
-    best: tuple[Any, ...] = (cost(place.page, place.x, place.y), place.page, place.x, place.y)
+    best: tuple[Any, ...] = (cost(field.page, field.x, field.y), field.page, field.x, field.y)
     if also is not None:
         best = better(best, also.page, also.x, also.y)
     slots = whole(dj, np.array(FOLLOW))
     probes = floats(dj, PROBES)
 
     def follow(k: Any, *best: Any) -> tuple[Any, ...]:
-        page, x, y = continued(dj, table, book, place, i * 25 + dr.gather(dj.UInt, slots, k))
+        page, x, y = continued(dj, table, exemplar, field, i * 25 + dr.gather(dj.UInt, slots, k))
         return (k + 1, *better(best, page, x, y))
 
     def probe(k: Any, *best: Any) -> tuple[Any, ...]:
@@ -372,4 +339,79 @@ def search(
     best = dr.while_loop((dj.UInt(0), *best), lambda k, *rest: k < len(PROBES), probe)[1:]
     dr.eval(best)
     price, page, x, y = best
-    return price, Place(page, x, y)
+    return price, FieldArrays(page, x, y)
+
+
+def _cost(
+    dj: ModuleType,
+    table: Tables,
+    exemplar: ExemplarArrays,
+    field: FieldArrays,
+    targets: TargetDescriptors,
+    prices: Prices,
+) -> Callable[[Any, Any, Any], Any]:
+    """The cost of taking a place (page, x, y), for all samples; neighbours stand where `field` has them."""
+    import drjit as dr
+
+    i = dr.arange(dj.UInt, table.count)
+    target = _descriptor(dj, targets.descriptor, i, WIDTH)
+    band_weight = dr.gather(dj.Float, targets.band_weight, i)
+    coherence = dr.gather(dj.Float, prices.weights, dj.UInt(0)) * target[CLOSED // 4][CLOSED % 4]
+    variety, seam = (dr.gather(dj.Float, prices.weights, dj.UInt(k)) for k in (1, 2))
+    limit, closed, around = prices.limit, [], None
+    if limit is not None:
+        members = [dr.gather(dj.UInt, table.neighbour, i * 25 + slot) & ~TURNED for slot in BESIDE]
+        closed = [dr.gather(dj.Float, limit.sample, j) for j in members]
+        around = dr.square(dr.gather(dj.Float, limit.around, dj.UInt(0)))
+    beside = [continued(dj, table, exemplar, field, i * 25 + slot) for slot in BESIDE]
+    shown = [
+        _descriptor(dj, exemplar.descriptor, _pixel_at(dj, exemplar, page, *_inside(dj, exemplar, page, u, v)), SEEN)
+        for page, u, v in beside
+    ]
+
+    def cost(page: Any, x: Any, y: Any) -> Any:
+        pixel = _pixel_at(dj, exemplar, page, x, y)
+        total = variety * dr.gather(dj.Float, prices.use, dr.gather(dj.UInt, exemplar.origin, pixel))
+        own = _descriptor(dj, exemplar.descriptor, pixel, SEEN)
+        for k in range(WIDTH // 4):
+            here = own[k] if k < len(own) else dr.gather(dj.Array4f, exemplar.descriptor, pixel * (WIDTH // 4) + k)
+            gap = target[k] - here
+            if k < LINEAR // 4:
+                total += dr.squared_norm(gap)
+            else:
+                total += dr.square(gap[0]) + band_weight * dr.square(gap[1])
+        for k, (other, u, v) in enumerate(beside):
+            away = dr.square(u - x) + dr.square(v - y)
+            apart = sum((dr.squared_norm(a - b) for a, b in zip(own, shown[k], strict=True)), start=dj.Float(0))
+            visible = HIDDEN_SEAM + (1 - HIDDEN_SEAM) * dr.minimum(apart * seam, 1)
+            price = coherence * visible * dr.select(other == page, dr.minimum(away, 4) / 4, 1)
+            if around is not None:
+                near = dr.select(other == page, dr.maximum(1 - away / around, 0), 0)
+                price = dr.select(closed[k] > 0, STAY * near, price)
+            total += price
+        return total
+
+    return cost
+
+
+def _inside(dj: ModuleType, exemplar: ExemplarArrays, page: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """A place moved so far from the page's edges that its patch lies on the page."""
+    import drjit as dr
+
+    width, height = dr.gather(dj.Float, exemplar.width, page), dr.gather(dj.Float, exemplar.height, page)
+    return dr.clip(x, BORDER, width - 1 - BORDER), dr.clip(y, BORDER, height - 1 - BORDER)
+
+
+def _pixel_at(dj: ModuleType, exemplar: ExemplarArrays, page: Any, x: Any, y: Any) -> Any:
+    """The flat index of the pixel nearest to a place."""
+    import drjit as dr
+
+    row = dj.UInt(dr.gather(dj.Float, exemplar.width, page))
+    return dr.gather(dj.UInt, exemplar.start, page) + dj.UInt(dr.round(y)) * row + dj.UInt(dr.round(x))
+
+
+def _descriptor(dj: ModuleType, values: Any, index: Any, width: int) -> list[Any]:
+    """The first `width` entries of a descriptor, by fours."""
+    import drjit as dr
+
+    return [dr.gather(dj.Array4f, values, index * (WIDTH // 4) + k) for k in range(width // 4)]

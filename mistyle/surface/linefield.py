@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.surface.samples import Points, nearest, unit
+from mistyle.surface.samples import SurfacePoints, nearest, unit
 
 KEY = np.array([-0.5, 0.75, 0.6]) / np.linalg.norm([-0.5, 0.75, 0.6])  # a painter's light: above, left, in front
 UP = np.array([0.0, 1.0, 0.0])
@@ -19,9 +19,9 @@ AROUND = 17  # neighbours of a point, itself included
 ROUNDS = 60
 HOLD = 0.06  # share of the data in each round of diffusion
 LEVEL_LINES = 0.02  # weight of horizontal strokes where nothing else speaks
-PAINTED_LINES = 2.0  # weight of strokes whose course somebody painted: as much as a form can say
+PAINTED_LINES = 2.0  # weight of strokes whose direction somebody painted: as much as a form can say
 
-Course = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+DirectionConstraint = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """What a person wants: (positions, normals) of surface points -> unit directions (n, 3) along the surface, and how much
 they count against the form, 0..1."""
 
@@ -30,22 +30,24 @@ they count against the form, 0..1."""
 class LineField:
     """Tensors T = sum w d d^T (unit lines d, weights w) at a few thousand points of the surface."""
 
-    points: Points
+    points: SurfacePoints
     tensors: Float[np.ndarray, "n 3 3"]
 
 
-def line_field(points: Points, follow: str = "curvature", course: Course | None = None) -> LineField:
+def line_field(
+    points: SurfacePoints, follow: str = "curvature", direction: DirectionConstraint | None = None
+) -> LineField:
     """The field at `points` (5,000 to 10,000 are enough; the diffusion reaches some tens of spacings).
 
     `follow` "curvature" asks the form; "up" makes strokes run up and down, "around" level, wherever the surface is not
-    level itself. Where `course` counts it takes the place of either.
+    level itself. Where `direction` counts it takes the place of either.
     """
     index = nearest(points, points, AROUND)[1]
     normals = points.normals.astype(np.float64)
     weight = ((normals[index] * normals[:, None]).sum(axis=2) > 0.1).astype(np.float64)
     data = observed(points, normals, index, weight) if follow == "curvature" else asked(normals, follow)
-    if course is not None:
-        towards, share = course(points.positions, points.normals)
+    if direction is not None:
+        towards, share = direction(points.positions, points.normals)
         data = (1 - share)[:, None, None] * data + PAINTED_LINES * lines(towards.astype(np.float64), share)
     project = np.eye(3) - normals[:, :, None] * normals[:, None, :]
     share = weight / weight.sum(axis=1, keepdims=True)
@@ -64,7 +66,7 @@ def asked(normals: Float[np.ndarray, "n 3"], follow: str) -> Float[np.ndarray, "
 
 
 def observed(
-    points: Points, normals: Float[np.ndarray, "n 3"], index: np.ndarray, weight: Float[np.ndarray, "n k"]
+    points: SurfacePoints, normals: Float[np.ndarray, "n 3"], index: np.ndarray, weight: Float[np.ndarray, "n k"]
 ) -> Float[np.ndarray, "n 3 3"]:
     """What each point itself says about the direction, before diffusion."""
     first = any_tangent(normals)
@@ -113,7 +115,7 @@ def any_tangent(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return unit(np.cross(normals, helper))
 
 
-def directions(field: LineField, points: Points) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+def directions(field: LineField, points: SurfacePoints) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """Unit tangents at `points` and how sure they are (0..1: difference over sum of the tensor's eigenvalues)."""
     distance, index = nearest(field.points, points, 4)
     weight = 1 / (distance + 1e-6)

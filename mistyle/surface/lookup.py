@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 
 from mistyle.surface import kernels, style
 from mistyle.surface import relief as reliefs
+from mistyle.surface.field import NearestNeighbourField
 from mistyle.surface.samples import Level, as_points, lifted, workers
 
 CHUNK = 1 << 19
@@ -21,7 +22,7 @@ CRISP = {"cut": 8.0, "blend": 2.0}  # power of a piece's share of the votes, by 
 
 
 @dataclass(frozen=True)
-class Solution:
+class PaintedSurface:
     """Where each sample of the surface lies in the painting.
 
     positions, normals  of the samples, working space
@@ -53,7 +54,7 @@ class Solution:
 
 @dataclass(frozen=True)
 class Canvas:
-    """A finished solution on the device, and the painting with its size."""
+    """A painted surface on the device, and the painting with its size."""
 
     position: Any
     tangent: Any
@@ -66,27 +67,17 @@ class Canvas:
     width: Any
 
 
-def solution(
-    level: Level,
-    page: Int[np.ndarray, " n"],
-    x: Float[np.ndarray, " n"],
-    y: Float[np.ndarray, " n"],
-    size: tuple[int, int],
-    painting: Float[np.ndarray, "h w 3"],
-    glaze: Float[np.ndarray, " n"] | None = None,
-    piece: Int[np.ndarray, " n"] | None = None,
-    *,
-    borders: str = "cut",
-    look_up: str = "bilinear",
-) -> Solution:
-    """A solution from places on the turned pages of a smaller painting of `size` (height, width)."""
+def painted_surface(
+    level: Level, field: NearestNeighbourField, size: tuple[int, int], painting: Float[np.ndarray, "h w 3"]
+) -> PaintedSurface:
+    """A surface painted by the field of an exemplar of `size` (height, width): one piece, no glaze."""
     height, width = size
     # Page k is np.rot90(picture, k): undo it for pixel corners, where page 1 has (x, y) at picture (width - y, x).
-    x, y = x + 0.5, y + 0.5
+    page, x, y = field.page, field.x + 0.5, field.y + 0.5
     across = np.choose(page, [x, width - y, width - x, y])
     down = np.choose(page, [y, x, height - y, height - x])
     scale = (painting.shape[1] / width, painting.shape[0] / height)
-    return Solution(
+    return PaintedSurface(
         positions=level.points.positions,
         normals=level.points.normals,
         tangent=level.tangent,
@@ -95,15 +86,15 @@ def solution(
         spacing=level.points.spacing,
         scale=scale,
         painting=painting,
-        glaze=np.zeros(len(page), np.float32) if glaze is None else glaze,
-        piece=np.zeros(len(page), np.int32) if piece is None else piece.astype(np.int32),
-        crisp=CRISP[borders],
-        whole_pixels=look_up == "nearest",
+        glaze=np.zeros(len(page), np.float32),
+        piece=np.zeros(len(page), np.int32),
+        crisp=CRISP["cut"],
+        whole_pixels=False,
     )
 
 
 def colour(
-    solution: Solution,
+    surface: PaintedSurface,
     positions: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     *,
@@ -117,18 +108,18 @@ def colour(
     pixel) in working units: the painting is blurred to it, 0 leaves it sharp. A point off the surface gets the colour
     of the nearest sample's tangent plane.
     """
-    glazed = bool(solution.glaze.any())
+    glazed = bool(surface.glaze.any())
     out = np.empty((len(positions), 3), np.float32)
-    for part, found, index, weight in looked_up(solution, positions, normals, solution.painting, footprint, device):
-        values = np.clip(found[:, :3], 0, 1)
+    for part, shown, index, weight in looked_up(surface, positions, normals, surface.painting, footprint, device):
+        values = np.clip(shown[:, :3], 0, 1)
         if glazed:
-            values = style.lightened(values, (solution.glaze[index] * weight).sum(axis=1, dtype=np.float32))
+            values = style.lightened(values, (surface.glaze[index] * weight).sum(axis=1, dtype=np.float32))
         out[part] = values
     return out
 
 
 def relief(
-    solution: Solution,
+    surface: PaintedSurface,
     positions: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     *,
@@ -137,16 +128,16 @@ def relief(
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
     """The gradient of the painted height along the surface (world vectors, root mean square about 1), and what the
     painting adds to the roughness. A height h bends the unit normal n to that of n - grad h."""
-    found = reliefs.relief(solution.painting)
-    picture = np.concatenate([found.slope, found.dull[..., None]], axis=2)
+    own = reliefs.relief(surface.painting)
+    picture = np.concatenate([own.slope, own.dull[..., None]], axis=2)
     gradient, dull = np.empty((len(positions), 3), np.float32), np.empty(len(positions), np.float32)
-    for part, values, _, _ in looked_up(solution, positions, normals, picture, footprint, device, slopes=True):
+    for part, values, _, _ in looked_up(surface, positions, normals, picture, footprint, device, slopes=True):
         gradient[part], dull[part] = values[:, :3], values[:, 3]
     return gradient, dull
 
 
 def looked_up(
-    solution: Solution,
+    surface: PaintedSurface,
     positions: Float[np.ndarray, "n 3"],
     normals: Float[np.ndarray, "n 3"],
     picture: Float[np.ndarray, "h w 3"],
@@ -158,23 +149,19 @@ def looked_up(
     """What a picture as large as the painting shows at surface points, in chunks: which points, values, nearest samples
     and their weights. `slopes` takes the first two channels for a vector along the picture's x and y."""
     dj = kernels.module(device)
-    tree = as_points(solution.positions, solution.normals, solution.spacing).tree
-    pixel = solution.spacing / max(solution.scale)  # one pixel of the painting on the surface
+    tree = as_points(surface.positions, surface.normals, surface.spacing).tree
+    pixel = surface.spacing / max(surface.scale)  # one pixel of the painting on the surface
     if footprint > pixel:
         picture = style.blurred(picture, 0.4 * footprint / pixel)
-    if not solution.whole_pixels:
+    if not surface.whole_pixels:
         picture = style.for_bilinear(picture)
-    across = np.cross(solution.tangent, solution.normals)
-    per_unit = np.array(solution.scale) / solution.spacing
-    canvas = on_canvas(
-        dj, solution.positions, solution.tangent, across, solution.turn, solution.centre, per_unit, picture
-    )
-    whole_pixels = solution.whole_pixels and footprint <= pixel
+    canvas = on_canvas(dj, surface, picture)
+    whole_pixels = surface.whole_pixels and footprint <= pixel
     for low in range(0, len(positions), CHUNK):
         p, n = positions[low : low + CHUNK], normals[low : low + CHUNK]
-        count = min(AROUND, len(solution.positions))
-        distance, index = tree.query(lifted(p, n, solution.spacing), k=np.arange(1, count + 1), workers=workers())
-        index, weight = blended(distance / solution.spacing, index, solution.piece, solution.crisp)
+        count = min(AROUND, len(surface.positions))
+        distance, index = tree.query(lifted(p, n, surface.spacing), k=np.arange(1, count + 1), workers=workers())
+        index, weight = blended(distance / surface.spacing, index, surface.piece, surface.crisp)
         yield slice(low, low + len(p)), paint(dj, canvas, p, index, weight, slopes, whole_pixels), index, weight
 
 
@@ -207,29 +194,21 @@ def blended(
     return index, weight / weight.sum(axis=1, keepdims=True)
 
 
-def on_canvas(
-    dj: ModuleType,
-    positions: Float[np.ndarray, "n 3"],
-    tangent: Float[np.ndarray, "n 3"],
-    across: Float[np.ndarray, "n 3"],
-    turn: Int[np.ndarray, " n"],
-    centre: Float[np.ndarray, "n 2"],
-    scale: Float[np.ndarray, " 2"],
-    painting: Float[np.ndarray, "h w 3"],
-) -> Canvas:
-    """A solution moved to the device; `scale` is pixels (x, y) per working unit."""
+def on_canvas(dj: ModuleType, surface: PaintedSurface, picture: Float[np.ndarray, "h w 3"]) -> Canvas:
+    """A painted surface on the device; `picture` is as large as its painting. Scales are pixels per working unit."""
     import drjit as dr
 
+    scale = np.array(surface.scale) / surface.spacing
     return Canvas(
-        position=kernels.floats(dj, positions),
-        tangent=kernels.floats(dj, tangent),
-        across=kernels.floats(dj, across),
-        turn=kernels.whole(dj, turn),
-        centre=kernels.floats(dj, centre),
+        position=kernels.floats(dj, surface.positions),
+        tangent=kernels.floats(dj, surface.tangent),
+        across=kernels.floats(dj, np.cross(surface.tangent, surface.normals)),
+        turn=kernels.whole(dj, surface.turn),
+        centre=kernels.floats(dj, surface.centre),
         scale=dj.Array2f(dr.opaque(dj.Float, float(scale[0])), dr.opaque(dj.Float, float(scale[1]))),
-        painting=kernels.floats(dj, painting),
-        height=dr.opaque(dj.Float, float(painting.shape[0])),
-        width=dr.opaque(dj.Float, float(painting.shape[1])),
+        painting=kernels.floats(dj, picture),
+        height=dr.opaque(dj.Float, float(picture.shape[0])),
+        width=dr.opaque(dj.Float, float(picture.shape[1])),
     )
 
 

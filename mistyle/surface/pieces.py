@@ -9,19 +9,21 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from mistyle.surface import style
+from mistyle.surface.field import NearestNeighbourField, pixels
 from mistyle.surface.kernels import BESIDE
 from mistyle.surface.samples import Level
+from mistyle.surface.style import Exemplar
 
 SAME = 2.0  # pixels by which a neighbour's picture may be missed and still be the same piece
 
 
-def labels(level: Level, pages: style.Pages, page: np.ndarray, x: np.ndarray, y: np.ndarray) -> Int[np.ndarray, " n"]:
+def labels(level: Level, exemplar: Exemplar, field: NearestNeighbourField) -> Int[np.ndarray, " n"]:
     """Which piece each sample belongs to, given its place."""
+    page, x, y = field.page, field.x, field.y
     count, beside = len(page), np.array(BESIDE)
     other, turned = level.neighbours[:, beside], level.turned[:, beside]
     goes_on = np.stack([x[other], y[other]], axis=-1) + level.offsets[:, beside]
-    height, width = pages.shapes[page[other]].astype(np.float32).transpose(2, 0, 1)
+    height, width = exemplar.shapes[page[other]].astype(np.float32).transpose(2, 0, 1)
     goes_on = np.where(turned[..., None], np.stack([width - 1, height - 1], axis=-1) - goes_on, goes_on)
     same = np.where(turned, (page[other] + 2) % 4, page[other]) == page[:, None]
     jump = ((goes_on - np.stack([x, y], axis=-1)[:, None]) ** 2).sum(axis=-1)
@@ -37,15 +39,14 @@ def reach(piece: Int[np.ndarray, " n"], at: Float[np.ndarray, "n 2"]) -> Float[n
     return np.linalg.norm(at - middle[piece], axis=1)
 
 
-def on_picture(pages: style.Pages, pixel: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    """Where pixels of the book lie in the unturned picture (x, y), in shares of its long side."""
-    height, width = pages.size
-    origin = pages.origin[pixel]
+def on_picture(exemplar: Exemplar, pixel: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
+    """Where pixels of the exemplar lie in the unturned picture (x, y), in shares of its long side."""
+    height, width = exemplar.size
+    origin = exemplar.origin[pixel]
     return np.stack([origin % width, origin // width], axis=1) / max(height, width)
 
 
-def too_far(
-    level: Level, pages: style.Pages, page: np.ndarray, x: np.ndarray, y: np.ndarray, pixel: np.ndarray, largest: float
-) -> Bool[np.ndarray, " n"]:
+def too_far(level: Level, exemplar: Exemplar, field: NearestNeighbourField, largest: float) -> Bool[np.ndarray, " n"]:
     """The samples at which a piece has got wider than `largest`, a share of the picture's long side."""
-    return reach(labels(level, pages, page, x, y), on_picture(pages, pixel)) > largest / 2
+    at = on_picture(exemplar, pixels(exemplar, field))
+    return reach(labels(level, exemplar, field), at) > largest / 2

@@ -79,8 +79,8 @@ def place_fields(level: Level, openness: Float[np.ndarray, " n"]) -> Float[np.nd
     The first of the vibrations of which enough is left when the light is taken out, lowest first; where too few are,
     the others follow in the order of what is left of them.
     """
-    found = vibrations(level, MODES)
-    rest = without(found, light(level.points.normals, openness))
+    modes = vibrations(level, MODES)
+    rest = without(modes, light(level.points.normals, openness))
     left = rest.std(axis=0)
     order = np.concatenate([np.flatnonzero(left >= FIRM), np.argsort(-left, kind="stable")])
     chosen = list(dict.fromkeys(order.tolist()))[:FIELDS]

@@ -46,7 +46,7 @@ class StyleReading:
     rectilinear   how much of the contrast runs along two axes at right angles
     border        what is not picture on each side (top, left, bottom, right), shares of the height or width
 
-    Lettering, cartouches and signatures are not found: `coat.style_mask` takes them out.
+    Lettering, cartouches and signatures are not found: `paint.style_mask` takes them out.
     """
 
     unit: float
@@ -128,9 +128,9 @@ def structural_unit(lab: Float[np.ndarray, "h w 3"]) -> tuple[float, float]:
     long = max(lab.shape[:2])
     sigma, clarity = first_scale(lab)
     fine = lab[..., 0] - style.blurred(lab[..., 0], LOCAL * sigma)
-    found = [first_peak(curve) for curve in correlations(fine, long)]
-    rise = max(one[1] for one in found)
-    lag = min(one[0] for one in found if one[1] >= ALL_BUT * rise)
+    peaks = [first_peak(curve) for curve in correlations(fine, long)]
+    rise = max(one[1] for one in peaks)
+    lag = min(one[0] for one in peaks if one[1] >= ALL_BUT * rise)
     unit = lag if rise >= PERIODIC else PERIOD * sigma
     return float(np.clip(unit / long, 1 / long, LARGEST_UNIT)), clarity
 

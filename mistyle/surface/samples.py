@@ -30,7 +30,7 @@ CENTRE = 12
 
 
 @dataclass(frozen=True)
-class Points:
+class SurfacePoints:
     """Blue noise on a surface: unit normals, `spacing` h = sqrt(area / n), `tree` a k-d tree of [p, 3 h normal]."""
 
     positions: Float[np.ndarray, "n 3"]
@@ -50,7 +50,7 @@ class Level:
     offsets     (x, y) of the sample in its neighbour's frame, in spacings, within -4..4
     """
 
-    points: Points
+    points: SurfacePoints
     tangent: Float[np.ndarray, "n 3"]
     across: Float[np.ndarray, "n 3"]
     directed: Float[np.ndarray, " n"]
@@ -79,8 +79,8 @@ def sample_normals(mesh: Mesh) -> Float[np.ndarray, "f 3 3"]:
     normals = face_normals(mesh)
     inward = ((normals * mesh.corner_normals.sum(axis=1)).sum(axis=1) < 0)[:, None]
     faces = np.where(inward, mesh.faces[:, ::-1], mesh.faces)
-    found = crease_normals(mesh.positions, faces, same_points(mesh.positions))
-    return np.where(inward[..., None], found[:, ::-1], found)
+    normals = crease_normals(mesh.positions, faces, same_points(mesh.positions))
+    return np.where(inward[..., None], normals[:, ::-1], normals)
 
 
 def spread(
@@ -89,7 +89,7 @@ def spread(
     count: int,
     rng: np.random.Generator,
     dj: ModuleType | None = None,
-) -> Points:
+) -> SurfacePoints:
     """Blue-noise points on the mesh: about 0.8 `count` of them, no two of one side nearer than 0.8 sqrt(area / count).
 
     Stratified candidates by area, thinned by random priority (a parallel form of dart throwing). `corner_normals`
@@ -135,12 +135,12 @@ def combined(
     return result
 
 
-def as_points(positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], spacing: float) -> Points:
+def as_points(positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], spacing: float) -> SurfacePoints:
     """Points with their tree; `spacing` is h."""
     from scipy.spatial import KDTree
 
     positions, normals = positions.astype(np.float32), normals.astype(np.float32)
-    return Points(positions, normals, spacing, KDTree(lifted(positions, normals, spacing)))
+    return SurfacePoints(positions, normals, spacing, KDTree(lifted(positions, normals, spacing)))
 
 
 def lifted(
@@ -158,12 +158,12 @@ def thin(
     dj: ModuleType,
 ) -> Int[np.ndarray, " m"]:
     """Which points stay when a point removes all others of its side within `radius`, taken in random order."""
-    found = cells.cells(dj, positions, normals, radius, rng.permutation(len(positions)))
-    if found.crowd <= CROWDED:
-        return np.flatnonzero(cells.thin(dj, found, radius))
+    grid = cells.point_grid(dj, positions, normals, radius, rng.permutation(len(positions)))
+    if grid.crowd <= CROWDED:
+        return np.flatnonzero(cells.thin(dj, grid, radius))
     index = np.flatnonzero(first_per_cell(positions, normals, radius / 3))
-    found = cells.cells(dj, positions[index], normals[index], radius, rng.permutation(len(index)))
-    return index[cells.thin(dj, found, radius)]
+    grid = cells.point_grid(dj, positions[index], normals[index], radius, rng.permutation(len(index)))
+    return index[cells.thin(dj, grid, radius)]
 
 
 def first_per_cell(
@@ -197,7 +197,9 @@ def in_order(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     return np.sort((morton(positions) << 32) | np.arange(len(positions))) & 0xFFFFFFFF
 
 
-def nearest(source: Points, target: Points, count: int) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]:
+def nearest(
+    source: SurfacePoints, target: SurfacePoints, count: int
+) -> tuple[Float[np.ndarray, "n k"], Int[np.ndarray, "n k"]]:
     """The `count` points of `source` nearest to each of `target` in the lifted space: distances and indices."""
     count = min(count, len(source.positions))
     query = lifted(target.positions, target.normals, source.spacing)
@@ -205,7 +207,9 @@ def nearest(source: Points, target: Points, count: int) -> tuple[Float[np.ndarra
     return distance.astype(np.float32), index.astype(np.int32)
 
 
-def carry(source: Points, values: Float[np.ndarray, "n ..."], target: Points) -> Float[np.ndarray, "m ..."]:
+def carry(
+    source: SurfacePoints, values: Float[np.ndarray, "n ..."], target: SurfacePoints
+) -> Float[np.ndarray, "m ..."]:
     """Values of one set of points at another: the four nearest, weighted by 1 / (distance + 0.3 h)."""
     distance, index = nearest(source, target, 4)
     weight = 1 / (distance + np.float32(0.3 * source.spacing))
@@ -213,13 +217,15 @@ def carry(source: Points, values: Float[np.ndarray, "n ..."], target: Points) ->
     return np.einsum("nk,nk...->n...", weight, values[index]).astype(np.float32)
 
 
-def drop(source: Points, values: Float[np.ndarray, "n ..."], target: Points) -> Float[np.ndarray, "m ..."]:
+def drop(
+    source: SurfacePoints, values: Float[np.ndarray, "n ..."], target: SurfacePoints
+) -> Float[np.ndarray, "m ..."]:
     """Values of one set of points at another: those of the nearest."""
     return values[nearest(source, target, 1)[1][:, 0]]
 
 
 def with_tables(
-    points: Points, tangent: Float[np.ndarray, "n 3"], directed: Float[np.ndarray, " n"], dj: ModuleType
+    points: SurfacePoints, tangent: Float[np.ndarray, "n 3"], directed: Float[np.ndarray, " n"], dj: ModuleType
 ) -> Level:
     """A level from its points and tangents (unit, orthogonal to the normals): adds the 5 x 5 tables.
 

@@ -154,7 +154,7 @@ class ResolvedSettings(PlainSettings):
     crop: tuple[Share, Share, Share, Share]
 
 
-class CoatSettings(BaseModel):
+class PaintSettings(BaseModel):
     """Where the paint goes and what it leaves."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")

@@ -25,7 +25,7 @@ RAREST = 0.01  # share of the most common colour's pixels below which a colour i
 
 
 @dataclass(frozen=True)
-class Painting:
+class StyleImage:
     """A style picture: encoded sRGB 0..1, and which of its pixels may be used."""
 
     rgb: Float[np.ndarray, "h w 3"]
@@ -33,14 +33,14 @@ class Painting:
 
 
 @dataclass(frozen=True)
-class Pages:
+class Exemplar:
     """A painting at one size; flat arrays run over the pages one after another, row by row.
 
     lab     CIE Lab / 100            broad   the same, blurred: the large areas of colour
     grain   (cos 2t, sin 2t) times 0..1, t being the direction of the strokes from the x axis
     band    lightness of middle-sized strokes, around 0
     origin  which pixel of the unturned page this is
-    wanted  for those pixels: how often it should be used, 1 on average
+    target_use  of those pixels: how often each should be used, 1 on average
     allowed whether a whole 5x5 patch fits there and is opaque
     """
 
@@ -53,7 +53,7 @@ class Pages:
     band: Float[np.ndarray, " m"]
     origin: Int[np.ndarray, " m"]
     allowed: Bool[np.ndarray, " m"]
-    wanted: Float[np.ndarray, " k"]
+    target_use: Float[np.ndarray, " k"]
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def filled(
 
 def prepare(
     rgb: Float[np.ndarray, "h w 3"], crop: Crop = UNCROPPED, alpha: Float[np.ndarray, "h w"] | None = None
-) -> Painting:
+) -> StyleImage:
     """A painting fit for synthesis: cropped (shares at the top, left, bottom, right), at most 2048 px long, at least
     8 px and a third of its length wide.
 
@@ -117,7 +117,7 @@ def prepare(
         while picture.shape[axis] < max(8, picture.shape[1 - axis] / SLIMMEST):
             picture = np.concatenate([picture, np.flip(picture, axis)], axis=axis)
             opaque = np.concatenate([opaque, np.flip(opaque, axis)], axis=axis)
-    return Painting(np.ascontiguousarray(picture), opaque)
+    return StyleImage(np.ascontiguousarray(picture), opaque)
 
 
 def long_side(shape: tuple[int, ...], long: float) -> tuple[int, int]:
@@ -159,7 +159,7 @@ def grain(lightness: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
     return np.stack([yy - xx, -2 * xy], axis=2) / (xx + yy + 1e-5)[..., None]
 
 
-def pages(painting: Painting, long: float, liveliness: float, mix: float = 0.0) -> Pages:
+def exemplar(painting: StyleImage, long: float, liveliness: float, mix: float = 0.0) -> Exemplar:
     """The painting with its longer side at `long` pixels, in four quarter turns; the rest as in `palette`."""
     size = long_side(painting.opaque.shape, long)
     lab = lab_from_srgb(resized(painting.rgb, size))
@@ -179,7 +179,7 @@ def pages(painting: Painting, long: float, liveliness: float, mix: float = 0.0) 
 
     # A quarter turn adds 90 degrees to every direction and 180 to its double.
     sign = np.repeat(np.array([1, -1, 1, -1], np.float32), height * width)[:, None]
-    return Pages(
+    return Exemplar(
         size=(height, width),
         shapes=np.array([(height, width), (width, height)] * 2),
         starts=np.arange(4) * height * width,
@@ -190,26 +190,28 @@ def pages(painting: Painting, long: float, liveliness: float, mix: float = 0.0) 
         origin=turned(origin),
         # Where nothing is opaque at this size, transparent pixels (filled from their neighbours) must do.
         allowed=turned(opaque if opaque.any() else inner),
-        wanted=(demand(lab, broad, sigma, liveliness) * rarity(broad, mix)).reshape(-1),
+        target_use=(demand(lab, broad, sigma, liveliness) * rarity(broad, mix)).reshape(-1),
     )
 
 
-def page(book: Pages, values: np.ndarray, k: int) -> np.ndarray:
+def page(exemplar: Exemplar, values: np.ndarray, k: int) -> np.ndarray:
     """Page k of a flat array as an image."""
-    height, width = book.shapes[k]
-    return values[book.starts[k] : book.starts[k] + height * width].reshape(height, width, *values.shape[1:])
+    height, width = exemplar.shapes[k]
+    return values[exemplar.starts[k] : exemplar.starts[k] + height * width].reshape(height, width, *values.shape[1:])
 
 
-def patch_basis(book: Pages, rng: np.random.Generator) -> Basis:
+def patch_basis(exemplar: Exemplar, rng: np.random.Generator) -> Basis:
     """The 16 leading principal components of the painting's patches."""
-    chosen = np.flatnonzero(book.allowed)
+    chosen = np.flatnonzero(exemplar.allowed)
     chosen = np.sort(rng.choice(chosen, min(BASIS_PATCHES, len(chosen)), replace=False, shuffle=False))
     sample = []
     for k in range(kernels.PAGES):
-        height, width = book.shapes[k]
-        mine = chosen[(chosen >= book.starts[k]) & (chosen < book.starts[k] + height * width)] - book.starts[k]
+        height, width = exemplar.shapes[k]
+        mine = (
+            chosen[(chosen >= exemplar.starts[k]) & (chosen < exemplar.starts[k] + height * width)] - exemplar.starts[k]
+        )
         row, column = mine // width, mine % width
-        lab = page(book, book.lab, k)
+        lab = page(exemplar, exemplar.lab, k)
         sample.append(np.stack([lab[row + dy, column + dx] for dy in range(-2, 3) for dx in range(-2, 3)], axis=1))
     patches = np.concatenate(sample).reshape(-1, 75).astype(np.float64)
     mean = patches.mean(axis=0)
@@ -237,7 +239,7 @@ def middle_tones(lightness: Float[np.ndarray, "..."]) -> float:
 def demand(
     lab: Float[np.ndarray, "h w 3"], broad: Float[np.ndarray, "h w 3"], sigma: float, liveliness: float
 ) -> Float[np.ndarray, "h w"]:
-    """How much each part of the painting is wanted, 1 on average: evenly, or (liveliness 1) by its contrast."""
+    """How much of each part of the painting is asked for, 1 on average: evenly, or (liveliness 1) by its contrast."""
     busy = np.sqrt(blurred(((lab - broad) ** 2).sum(axis=2), sigma))
     return (1 - liveliness) + liveliness * busy / max(float(busy.mean()), 1e-6)
 
@@ -262,7 +264,7 @@ def rarity(colours: Float[np.ndarray, "*n 3"], mix: float) -> Float[np.ndarray, 
 
 
 def palette(
-    painting: Painting, liveliness: float, rng: np.random.Generator, mix: float = 0.0
+    painting: StyleImage, liveliness: float, rng: np.random.Generator, mix: float = 0.0
 ) -> Float[np.ndarray, "n 3"]:
     """Large-area colours (Lab / 100) in the proportions in which the surface shall have them.
 
@@ -275,7 +277,7 @@ def palette(
     broad = blurred(small, sigma)
     # Never quite zero, so that a picture with a single opaque pixel still has a palette.
     opaque = np.maximum(resized(painting.opaque.astype(np.float32), size), 1e-6)
-    wanted = demand(small, broad, sigma, liveliness) * opaque * rarity(broad, mix)
-    share = np.cumsum(wanted.reshape(-1).astype(np.float64))
+    weight = demand(small, broad, sigma, liveliness) * opaque * rarity(broad, mix)
+    share = np.cumsum(weight.reshape(-1).astype(np.float64))
     at = (np.arange(PALETTE_COLOURS) + rng.random(PALETTE_COLOURS)) / PALETTE_COLOURS * share[-1]
     return broad.reshape(-1, 3)[np.minimum(np.searchsorted(share, at), len(share) - 1)]

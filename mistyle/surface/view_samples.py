@@ -6,7 +6,6 @@ are turned along the strokes and taken from the grid, and never reach over a dep
 the picture, not on the surface: they are not foreshortened.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,15 +13,12 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.camera import world_from_px
 from mistyle.core.image import distance_to, gaussian, srgb_from_linear
-from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
 from mistyle.surface import kernels, lookup, style
-from mistyle.surface.chosen import settled
-from mistyle.surface.guides import Content, Guide, Occlusion
-from mistyle.surface.linefield import Course
-from mistyle.surface.samples import CENTRE, GRID, Level, Points, as_points, carry, drop, unit
-from mistyle.surface.settings import ResolvedSettings, SurfaceSettings
-from mistyle.surface.synthesis import Pins, prepared, synthesise
+from mistyle.surface.guides import Guide
+from mistyle.surface.samples import CENTRE, GRID, Level, SurfacePoints, as_points, carry, drop, unit
+from mistyle.surface.settings import ResolvedSettings
+from mistyle.surface.synthesis import ColourConstraints, MeshGuides, synthesise
 
 STEEP = 4.0  # depth per width of a surface seen at 76 degrees
 LEAST_STEP = 0.05  # a depth difference that may be one surface at any resolution
@@ -35,17 +31,7 @@ TOWARDS = np.array([0.0, 0.0, -1.0], np.float32)  # the sheet's normal: to the v
 
 
 @dataclass(frozen=True)
-class Ground:
-    """What the mesh asks of the painting: levels and guides, coarse to fine, the same for every view."""
-
-    levels: tuple[Level, ...]
-    wanted: tuple[Guide, ...]
-    painting: style.Painting
-    settings: ResolvedSettings
-
-
-@dataclass(frozen=True)
-class Sheet:
+class ViewLevel:
     """One level of a view: its samples as a flat level, in pixels, and which pixel and cell each of them is.
 
     pixel  flat index in the view       cell  flat index in the level's grid of `size` (rows, columns)
@@ -59,30 +45,8 @@ class Sheet:
     side: int
 
 
-def ground(
-    mesh: Mesh,
-    picture_rgb: Float[np.ndarray, "h w 3"],
-    settings: SurfaceSettings | ResolvedSettings,
-    seed: int,
-    occlusion: Occlusion,
-    progress: Callable[[float], None] = lambda done: None,
-    *,
-    alpha: Float[np.ndarray, "h w"] | None = None,
-    content: Content | None = None,
-    course: Course | None = None,
-    device: str = "llvm",
-) -> Ground:
-    """The guides of `mesh` for a painting (encoded sRGB, 0..1); as in `mistyle.surface.synthesis.solve`."""
-    dj = kernels.module(device)
-    settings = settled(picture_rgb, alpha, settings)
-    painting, levels, wanted = prepared(
-        mesh, picture_rgb, settings, seed, occlusion, progress, alpha, content, course, dj
-    )
-    return Ground(tuple(levels), tuple(wanted), painting, settings)
-
-
 def paint_view(
-    view: View, prior: Prior | None, base: Ground, seed: int, device: str = "llvm"
+    view: View, prior: Prior | None, base: MeshGuides, seed: int, device: str = "llvm"
 ) -> Float[np.ndarray, "h w 3"]:
     """Encoded sRGB (0..1) of the view's foreground, zero elsewhere.
 
@@ -94,16 +58,16 @@ def paint_view(
     active = view.mask if prior is None else beside_unknown(view, prior, MARGIN * finest_side(view, base))
     if not active.any():
         return result if prior is None else joined(result, prior, view.mask)
-    sheets = view_sheets(view, active, base)
-    pins = None if prior is None else [pinned(sheet.cell, sheet.side, view, prior) for sheet in sheets]
-    settings = at_same_size(base, sheets[-1], view)
-    levels, wanted = [s.level for s in sheets], [s.guide for s in sheets]
-    choice, book = synthesise(levels, wanted, base.painting, settings, seed, dj, pins=pins)
-    found = lookup.solution(levels[-1], choice.page, choice.x, choice.y, book.size, base.painting.rgb)
+    views = view_levels(view, active, base)
+    constraints = None if prior is None else [constrain(own.cell, own.side, view, prior) for own in views]
+    levels, guides = tuple(own.level for own in views), tuple(own.guide for own in views)
+    flat = MeshGuides(levels, guides, base.picture, at_same_size(base, views[-1], view))
+    field, exemplar = synthesise(flat, seed, dj, constraints=constraints)
+    surface = lookup.painted_surface(levels[-1], field, exemplar.size, base.picture.rgb)
     pixels = np.flatnonzero(active)
     positions = flat_positions(view, pixels)
     normals = np.broadcast_to(TOWARDS, positions.shape)
-    result.reshape(-1, 3)[pixels] = lookup.colour(found, positions, normals, footprint=1.0, device=device)
+    result.reshape(-1, 3)[pixels] = lookup.colour(surface, positions, normals, footprint=1.0, device=device)
     return result if prior is None else joined(result, prior, view.mask)
 
 
@@ -117,9 +81,9 @@ def footprint(view: View) -> float:
     return float(np.median(view.depth[view.mask])) / view.camera.focal
 
 
-def at_same_size(base: Ground, sheet: Sheet, view: View) -> ResolvedSettings:
+def at_same_size(base: MeshGuides, level: ViewLevel, view: View) -> ResolvedSettings:
     """The settings with which strokes are as large as on the mesh's own samples, whose spacing is no whole pixels."""
-    ratio = sheet.side * footprint(view) / base.levels[-1].points.spacing
+    ratio = level.side * footprint(view) / base.levels[-1].points.spacing
     return base.settings.model_copy(update={"stroke_scale": base.settings.stroke_scale * ratio})
 
 
@@ -130,31 +94,31 @@ def flat_positions(view: View, pixels: Int[np.ndarray, " n"]) -> Float[np.ndarra
     return np.stack([columns + 0.5, rows + 0.5, depth], axis=1).astype(np.float32)
 
 
-def finest_side(view: View, base: Ground) -> int:
+def finest_side(view: View, base: MeshGuides) -> int:
     """Pixels along a cell of the finest level: about the spacing of the mesh's finest samples."""
     return max(1, round(base.levels[-1].points.spacing / footprint(view)))
 
 
-def view_sheets(view: View, active: Bool[np.ndarray, "h w"], base: Ground) -> list[Sheet]:
+def view_levels(view: View, active: Bool[np.ndarray, "h w"], base: MeshGuides) -> list[ViewLevel]:
     """The levels of a view's active pixels, coarse to fine, cells twice as wide from level to level. Levels that would
     have too few samples are left out."""
     finest = finest_side(view, base)
-    sheets = []
-    for k, (level, guide) in enumerate(zip(base.levels[::-1], base.wanted[::-1], strict=True)):
-        made = view_sheet(view, active, finest * 2**k, level, guide)
-        if k > 0 and len(made.pixel) < FEWEST:
+    levels = []
+    for k, (level, guide) in enumerate(zip(base.levels[::-1], base.guides[::-1], strict=True)):
+        own = view_level(view, active, finest * 2**k, level, guide)
+        if k > 0 and len(own.pixel) < FEWEST:
             break
-        sheets.append(made)
-    return sheets[::-1]
+        levels.append(own)
+    return levels[::-1]
 
 
-def view_sheet(view: View, active: Bool[np.ndarray, "h w"], side: int, level: Level, guide: Guide) -> Sheet:
+def view_level(view: View, active: Bool[np.ndarray, "h w"], side: int, level: Level, guide: Guide) -> ViewLevel:
     """One level with cells of side x side pixels; a cell's sample is its active pixel nearest to the middle."""
     pixel, cell, size = representatives(active, side)
     camera, width = view.camera, view.camera.size[1]
     px = np.stack([pixel % width, pixel // width], axis=1) + 0.5
     depth = view.depth.reshape(-1)[pixel]
-    at = Points(
+    at = SurfacePoints(
         world_from_px(camera, px, depth.astype(np.float64)).astype(np.float32),
         view.normal.reshape(-1, 3)[pixel],
         level.points.spacing,
@@ -164,7 +128,9 @@ def view_sheet(view: View, active: Bool[np.ndarray, "h w"], side: int, level: Le
     directed = drop(level.points, guide.directed, at) * length
     own = Guide(carry(level.points, guide.colour, at), carry(level.points, guide.detail, at), directed)
     points = as_points(flat_positions(view, pixel), np.broadcast_to(TOWARDS, (len(pixel), 3)), float(side))
-    return Sheet(sheet_level(points, tangent, directed, cell, size, depth, camera.focal), own, pixel, cell, size, side)
+    return ViewLevel(
+        flat_level(points, tangent, directed, cell, size, depth, camera.focal), own, pixel, cell, size, side
+    )
 
 
 def representatives(
@@ -197,8 +163,8 @@ def on_screen(
     return unit(flat).astype(np.float32), np.clip(length, 0, 1).astype(np.float32)
 
 
-def sheet_level(
-    points: Points,
+def flat_level(
+    points: SurfacePoints,
     tangent: Float[np.ndarray, "n 3"],
     directed: Float[np.ndarray, " n"],
     cell: Int[np.ndarray, " n"],
@@ -239,7 +205,7 @@ def sheet_level(
     return Level(points, tangent, across, directed, neighbours, turned, np.clip(offsets, -4, 4))
 
 
-def pinned(cell: Int[np.ndarray, " n"], side: int, view: View, prior: Prior) -> Pins:
+def constrain(cell: Int[np.ndarray, " n"], side: int, view: View, prior: Prior) -> ColourConstraints:
     """The prior's colours in cells of side x side pixels: the mean (in sRGB) of known pixels where they are enough."""
     known = prior.known & view.mask
     colour = np.where(known[..., None], srgb_from_linear(prior.rgb), 0)
@@ -247,7 +213,7 @@ def pinned(cell: Int[np.ndarray, " n"], side: int, view: View, prior: Prior) -> 
     total = _sums(colour, side).reshape(-1, 3)[cell]
     count, whole = (s.reshape(-1)[cell] for s in shares)
     mean = (total / np.maximum(count, 1)[:, None]).astype(np.float32)
-    return Pins(count >= PINNED_SHARE * whole, style.lab_from_srgb(mean[None])[0])
+    return ColourConstraints(count >= PINNED_SHARE * whole, style.lab_from_srgb(mean[None])[0])
 
 
 def _sums(values: np.ndarray, side: int) -> np.ndarray:
