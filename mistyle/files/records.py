@@ -14,6 +14,7 @@ import numpy as np
 from mistyle.core import memory
 from mistyle.core.errors import InputRefused
 from mistyle.files.own import read_own
+from mistyle.files.record_tree import from_tree, to_tree
 
 
 def save_record(folder: Path, record: Any) -> None:
@@ -38,44 +39,33 @@ def load_record(folder: Path) -> Any:
 
 
 def _pack(value: Any, arrays: dict[str, np.ndarray]) -> Any:
-    if isinstance(value, np.ndarray):
+    """The tree of a value, whose arrays are added to `arrays` under names of their own."""
+
+    def leaf(value: Any) -> dict[str, Any] | None:
+        if not isinstance(value, np.ndarray):
+            return None
         name = f"a{len(arrays):03d}"
         arrays[name] = value
         return {"array": name}
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        fields = {f.name: _pack(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
-        return {"record": f"{type(value).__module__}:{type(value).__qualname__}", "fields": fields}
-    if isinstance(value, (tuple, list)):
-        return {"tuple" if isinstance(value, tuple) else "list": [_pack(item, arrays) for item in value]}
-    if isinstance(value, dict):
-        return {"dict": [[key, _pack(item, arrays)] for key, item in value.items()]}
-    if isinstance(value, Path):
-        return {"path": str(value)}
-    if isinstance(value, np.generic):
-        return value.item()
-    if value is None or isinstance(value, (bool, int, float, str)):
-        return value
-    raise TypeError(f"a {type(value).__name__} cannot be part of a record")
+
+    return to_tree(value, leaf, _name)
+
+
+def _name(value: Any) -> str:
+    if not dataclasses.is_dataclass(value) or isinstance(value, type):
+        raise TypeError(f"a {type(value).__name__} cannot be part of a record")
+    return f"{type(value).__module__}:{type(value).__qualname__}"
 
 
 def _unpack(tree: Any, folder: Path) -> Any:
-    if not isinstance(tree, dict):
-        return tree
-    ((kind, value),) = [(k, v) for k, v in tree.items() if k != "fields"]
-    if kind == "array":
+    def leaf(kind: str, value: Any) -> Any:
+        if kind != "array":
+            raise ValueError(f"unknown kind '{kind}'")
         if not (isinstance(value, str) and value.isalnum()):
             raise ValueError(f"bad array name {value!r}")
         return memory.load(folder / f"{value}.npy")
-    if kind == "record":
-        return _class(value)(**{k: _unpack(v, folder) for k, v in tree["fields"].items()})
-    if kind in ("tuple", "list"):
-        items = [_unpack(item, folder) for item in value]
-        return tuple(items) if kind == "tuple" else items
-    if kind == "dict":
-        return {key: _unpack(item, folder) for key, item in value}
-    if kind == "path":
-        return Path(value)
-    raise ValueError(f"unknown kind '{kind}'")
+
+    return from_tree(tree, leaf, _class)
 
 
 def _class(name: str) -> type:

@@ -6,19 +6,18 @@ table [dtype, shape]; or [dtype, shape, address] for large arrays that the recei
 side builds nothing else: a process that a hostile file has taken over can send wrong numbers, but no code.
 """
 
-import dataclasses
 import importlib
 import json
 import math
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from mistyle.files.lending import LENT
+from mistyle.files.record_tree import from_tree, to_tree
 
 # Records that may be sent, by the name they have on the way. A reader that returns another record adds it here.
 RECORDS = {
@@ -139,56 +138,48 @@ def _allowed(table: Iterable[Any]) -> list[tuple[str, tuple[int, ...], int | Non
 
 
 def _pack(value: Any, arrays: list[np.ndarray], seen: dict[int, int]) -> Any:
-    if value is None or isinstance(value, bool | str | int | float):
-        return value
-    if isinstance(value, np.ndarray):
-        if id(value) not in seen:
-            if not DTYPE.fullmatch(value.dtype.str):
-                raise TypeError(f"an array of {value.dtype} cannot be sent")
-            seen[id(value)] = len(arrays)
-            arrays.append(np.asarray(value, order="C"))
-        return {"array": seen[id(value)]}
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, Json):
-        return {"json": value.tree}
-    if isinstance(value, bytes | bytearray | memoryview):
-        arrays.append(np.frombuffer(value, np.uint8))
-        return {"bytes": len(arrays) - 1}
-    if isinstance(value, Path):
-        return {"path": str(value)}
-    if isinstance(value, tuple | list):
-        return {"tuple" if isinstance(value, tuple) else "list": [_pack(item, arrays, seen) for item in value]}
-    if isinstance(value, dict):
-        return {"dict": [[_pack(k, arrays, seen), _pack(v, arrays, seen)] for k, v in value.items()]}
+    """The tree of a value, whose arrays are added to `arrays`, each once."""
+
+    def leaf(value: Any) -> dict[str, Any] | None:
+        if isinstance(value, np.ndarray):
+            if id(value) not in seen:
+                if not DTYPE.fullmatch(value.dtype.str):
+                    raise TypeError(f"an array of {value.dtype} cannot be sent")
+                seen[id(value)] = len(arrays)
+                arrays.append(np.asarray(value, order="C"))
+            return {"array": seen[id(value)]}
+        if isinstance(value, Json):
+            return {"json": value.tree}
+        if isinstance(value, bytes | bytearray | memoryview):
+            arrays.append(np.frombuffer(value, np.uint8))
+            return {"bytes": len(arrays) - 1}
+        return None
+
+    return to_tree(value, leaf, _name)
+
+
+def _name(value: Any) -> str:
     name = NAMES.get(f"{type(value).__module__}:{type(value).__qualname__}")
     if name is None:
         raise TypeError(f"a {type(value).__name__} cannot be sent")
-    fields = {f.name: _pack(getattr(value, f.name), arrays, seen) for f in dataclasses.fields(value)}
-    return {"record": name, "fields": fields}
+    return name
 
 
 def _unpack(tree: Any, arrays: list[np.ndarray]) -> Any:
-    if not isinstance(tree, dict):
-        if isinstance(tree, list):
-            raise ValueError("a bare list")
-        return tree
-    if "record" in tree:
-        module, _, name = RECORDS[tree["record"]].partition(":")
-        fields = {key: _unpack(value, arrays) for key, value in tree["fields"].items()}
-        return getattr(importlib.import_module(module), name)(**fields)
-    ((kind, value),) = tree.items()
-    if kind == "array":
-        return arrays[value]
-    if kind == "bytes":
-        return arrays[value].tobytes()
-    if kind == "json":
-        return value
-    if kind == "path":
-        return Path(value)
-    if kind in ("tuple", "list"):
-        items = [_unpack(item, arrays) for item in value]
-        return tuple(items) if kind == "tuple" else items
-    if kind == "dict":
-        return {_unpack(key, arrays): _unpack(item, arrays) for key, item in value}
-    raise ValueError(f"a value of kind {kind!r}")
+    """The value of a tree, built of the records in RECORDS alone."""
+
+    def leaf(kind: str, value: Any) -> Any:
+        if kind == "array":
+            return arrays[value]
+        if kind == "bytes":
+            return arrays[value].tobytes()
+        if kind == "json":
+            return value
+        raise ValueError(f"a value of kind {kind!r}")
+
+    return from_tree(tree, leaf, _class)
+
+
+def _class(name: str) -> type:
+    module, _, found = RECORDS[name].partition(":")
+    return getattr(importlib.import_module(module), found)

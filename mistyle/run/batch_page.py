@@ -1,11 +1,11 @@
 """OUT/batch.html: every asset of a batch on one sheet, with figures to sort by; opens from disk with no network."""
 
 import base64
-import hashlib
 from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from mistyle.files.html import csp_hash, template
 from mistyle.files.output import write_file
 from mistyle.run.batch_plan import BatchPlan
 
@@ -44,20 +44,17 @@ for (const button of document.querySelectorAll('th button')) button.addEventList
 
 def write_page(plan: BatchPlan, summary: dict[str, Any]) -> Path:
     """Write OUT/batch.html from a batch's summary; names and messages are escaped, and no connection is allowed."""
-    from jinja2 import Environment, FileSystemLoader
-
     rows = [_row(plan, row) for row in summary["rows"]]
     names = sorted({name for row in rows for name in row["values"] if name not in COLUMNS})
-    page = Environment(autoescape=True, loader=FileSystemLoader(Path(__file__).parent)).get_template("batch.html.j2")
-    text = page.render(
+    text = template(Path(__file__).with_name("batch.html.j2")).render(
         title=f"Batch {plan.out.name}",
         s=summary,
         rows=rows,
         columns=[*COLUMNS, *names],
         style=STYLE,
         script=SCRIPT,
-        style_hash=_hash(STYLE),
-        script_hash=_hash(SCRIPT),
+        style_hash=csp_hash(STYLE),
+        script_hash=csp_hash(SCRIPT),
     )
     write_file(plan.out, "batch.html", text.encode(), overwrite=plan.overwrite)
     return plan.out / "batch.html"
@@ -90,7 +87,3 @@ def _thumbnail(path: Path) -> str:
         made = BytesIO()
         picture.convert("RGB").save(made, "webp", quality=80)
     return base64.b64encode(made.getvalue()).decode()
-
-
-def _hash(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()

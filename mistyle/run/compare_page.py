@@ -4,13 +4,12 @@ Every text is escaped (jinja2; the data block has no `<`). The content-security 
 style by their hashes, pictures from its own folder, and nothing else.
 """
 
-import base64
-import hashlib
 import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mistyle.files.html import csp_hash, template
 from mistyle.measure.compare_metrics import METRICS
 from mistyle.measure.compare_protocols import PROTOCOL_BETTER
 from mistyle.run.compare_pictures import GREY, STOPS, WIDE, PairPictures
@@ -18,21 +17,12 @@ from mistyle.run.compare_pictures import GREY, STOPS, WIDE, PairPictures
 
 def page(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -> str:
     """The page as text; `record` is compare.json's content, `written` says what pictures each folder has."""
-    import jinja2
     from markupsafe import Markup
 
     here = Path(__file__).parent
-    env = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(here),
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    env.filters |= {"figure": figure}
     style, script = ((here / name).read_text(encoding="utf-8") for name in ("compare.css", "compare.js"))
     names = list(dict.fromkeys(name for row in record["rows"] for name in row["values"]))
-    return env.get_template("compare.html.j2").render(
+    return template(here / "compare.html.j2", figure=figure).render(
         record=record,
         names=names,
         better={n: METRICS[n].better if n in METRICS else PROTOCOL_BETTER[n] for n in names},
@@ -40,8 +30,8 @@ def page(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -> str:
         # Both files are ours and hold no text of others.
         style=Markup(style),
         script=Markup(script),
-        style_hash=_hash(style),
-        script_hash=_hash(script),
+        style_hash=csp_hash(style),
+        script_hash=csp_hash(script),
     )
 
 
@@ -54,10 +44,6 @@ def data_block(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -
 
 def _pictures(found: PairPictures | None) -> dict[str, Any]:
     return {} if found is None else {"wide": found.wide, "span": found.span, "maps": list(found.maps)}
-
-
-def _hash(text: str) -> str:
-    return base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
 
 
 def figure(value: Any) -> str:

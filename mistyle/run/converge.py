@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.files.html import csp_hash, template
 from mistyle.files.output import claim, replace_files
 from mistyle.files.store import atomic_write
 from mistyle.measure.compare_metrics import definitions, measure_colour
@@ -281,25 +282,21 @@ def _chart(record: dict[str, Any], key: str, label: str, axis: str) -> Chart:
 
 def page(record: dict[str, Any]) -> str:
     """The page as text; every text is escaped, scripts and connections are forbidden."""
-    import base64
-    import hashlib
-
-    import jinja2
     from markupsafe import Markup
 
     from mistyle.run.charts import svg
     from mistyle.run.compare_page import figure
 
     here = Path(__file__).parent
-    env = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(here), autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True
-    )
-    env.filters |= {"figure": lambda v: figure(None if isinstance(v, float) and not math.isfinite(v) else v)}
+
+    def number(value: Any) -> str:
+        return figure(None if isinstance(value, float) and not math.isfinite(value) else value)
+
     style = (here / "compare.css").read_text(encoding="utf-8")
-    return env.get_template("converge.html.j2").render(
+    return template(here / "converge.html.j2", figure=number).render(
         record=record,
         metrics=METRICS,
         charts=[Markup(svg(chart)) for chart in charts(record)],  # the chart escapes its own texts
         style=Markup(style),
-        style_hash=base64.b64encode(hashlib.sha256(style.encode()).digest()).decode(),
+        style_hash=csp_hash(style),
     )

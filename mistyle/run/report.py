@@ -7,8 +7,6 @@ allowed by their hashes. The asset can be turned in three dimensions where it is
 The page works without scripts too: the turntable then stands still, and the asset is a picture.
 """
 
-import base64
-import hashlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -18,6 +16,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from mistyle.files.html import csp_hash, template
 from mistyle.files.store import atomic_write
 from mistyle.run.charts import Chart, svg
 from mistyle.run.report_model import PageModel, TooLarge, packed, viewer_script
@@ -221,16 +220,13 @@ def render(report: Report, scale: float = 1.0, encoder: Encoder | None = None) -
 @cache
 def _template() -> Any:
     """The page's template, compiled."""
-    import jinja2
     from markupsafe import Markup
 
-    loader = jinja2.FileSystemLoader(Path(__file__).parent)
-    env = jinja2.Environment(
-        loader=loader, autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
-    )
-    # The chart's own texts are escaped by svg().
-    env.filters |= {"seconds": seconds, "size": size, "slug": slug, "svg": lambda chart: Markup(svg(chart))}
-    return env.get_template("report.html.j2")
+    def drawing(chart: Chart) -> Any:
+        return Markup(svg(chart))  # svg() escapes the chart's own texts
+
+    path = Path(__file__).with_name("report.html.j2")
+    return template(path, seconds=seconds, size=size, slug=slug, svg=drawing)
 
 
 def policy(scripts: Sequence[str]) -> str:
@@ -238,7 +234,7 @@ def policy(scripts: Sequence[str]) -> str:
 
     The viewer, the second script, reads the asset and its textures from blobs of the page.
     """
-    hashes = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    hashes = [csp_hash(script) for script in scripts]
     blobs = len(scripts) > 1
     rules = {
         "default-src": "'none'",
