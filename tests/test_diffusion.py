@@ -284,21 +284,21 @@ def walks_as_diffusers(pipeline) -> None:
     from mistyle.stages.repaint import Resampling, sample
 
     seen = view()
-    asked = diffusion._asked(pipeline, QUICK, seen, (SIDE, SIDE), ())
+    conditioning = diffusion._conditioning(pipeline, QUICK, seen, (SIDE, SIDE), ())
     levels = diffusion_denoise.noise_levels(pipeline.scheduler, 4)
     noise = torch.randn((1, 4, 16, 16), generator=torch.Generator().manual_seed(0))
     ours = sample(
-        diffusion_denoise.denoiser(pipeline, asked),
+        diffusion_denoise.denoiser(pipeline, conditioning),
         None,
         None,
         levels,
-        Resampling(refine=0),
+        Resampling(refine=0.0),
         rng=torch.Generator().manual_seed(0),
         like=torch.zeros_like(noise),
     )
     theirs = pipeline(
         diffusion.prompt_of(QUICK),
-        image=[p[:1] for p in asked.conditions],
+        image=[p[:1] for p in conditioning.conditions],
         controlnet_conditioning_scale=[QUICK.depth, QUICK.canny],
         latents=noise,
         num_inference_steps=4,
@@ -312,12 +312,12 @@ def test_pinned_latents_end_as_the_prior_and_the_rest_does_not(pipeline):
     from mistyle.stages.repaint import Resampling, sample
 
     known, mask = diffusion_denoise.prior_latent(pipeline.vae, half_prior(), (SIDE, SIDE), 2)
-    asked = diffusion._asked(pipeline, QUICK, view(), (SIDE, SIDE), ())
-    denoise = diffusion_denoise.denoiser(pipeline, asked)
+    conditioning = diffusion._conditioning(pipeline, QUICK, view(), (SIDE, SIDE), ())
+    denoise = diffusion_denoise.denoiser(pipeline, conditioning)
     levels = diffusion_denoise.noise_levels(pipeline.scheduler, 4)
 
     def run():
-        return sample(denoise, known, mask, levels, Resampling(2, 3, refine=0), rng=torch.Generator().manual_seed(5))
+        return sample(denoise, known, mask, levels, Resampling(2, 3, refine=0.0), rng=torch.Generator().manual_seed(5))
 
     end, again = run(), run()
     pinned = mask.bool().expand_as(end)

@@ -128,8 +128,8 @@ def test_torch_tensors_pass_through():
     ],
 )
 def test_what_cannot_be_sampled_is_refused(wrong, rng):
-    right = {"prior": np.zeros((2, 2)), "mask": np.ones(2), "sigmas": [2.0, 1.0, 0.0], "L": 1, "r": 1}
+    right = {"prior": np.zeros((2, 2)), "mask": np.ones(2), "sigmas": [2.0, 1.0, 0.0], "L": 1, "r": 1, "refine": 0.0}
     given = right | wrong
-    positional = [given[name] for name in ("prior", "mask", "sigmas", "L", "r")]
+    positional = [given[name] for name in ("prior", "mask", "sigmas")]
     with pytest.raises(ValueError):
-        sample(ideal, *positional, rng=rng, refine=given.get("refine", 0.0))
+        sample(ideal, *positional, Resampling(given["L"], given["r"], given["refine"]), rng=rng)
