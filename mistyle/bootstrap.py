@@ -26,7 +26,7 @@ ROOT = PACKAGE.parent
 VENV = ROOT / ".venv"
 CONSTRAINTS = PACKAGE / "constraints.txt"
 ENTERED = "_MISTYLE_ENTERED"  # set for the process that the set-up hands over to
-HELP = "mistyle: a mesh and one style picture in; the same mesh with stylized, physically based textures out.\n"
+HELP = "mistyle: one mesh and one style picture in; the same mesh with stylized, physically based textures out.\n"
 NEEDED_BYTES = 3_000_000_000
 
 
@@ -75,7 +75,7 @@ def _help(arguments: list[str]) -> int:
         return _command_line(arguments)
     except ImportError as error:
         if not ready(home(), set()):
-            print(f"{HELP}Not set up yet ({error}). `python3 -m mistyle doctor` does that, or any other verb.")
+            print(f"{HELP}Not set up yet ({error}). `python3 -m mistyle doctor` or any other verb sets it up.")
             return 0
     enter(arguments, extras=set())
     return _command_line(arguments)

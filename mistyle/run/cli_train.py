@@ -26,7 +26,7 @@ OPTIONS = {
 def add_train(verbs: Any) -> None:
     verb = verbs.add_parser(
         "train",
-        help="LoRAs for the diffusion stylizer: of a style picture, or of rendered views",
+        help="train LoRAs of a style picture or of views, for the diffusion stylizer",
         **examples(
             """
             mistyle train style starry_night.jpg -o loras/ --models DIR
@@ -35,9 +35,9 @@ def add_train(verbs: Any) -> None:
             """
         ),
     )
-    verb.add_argument("kind", nargs="?", choices=["style", "content"], help="what to learn")
+    verb.add_argument("kind", nargs="?", choices=["style", "content"], help="style of a picture, or content of views")
     verb.add_argument("source", type=Path, nargs="?", metavar="PICTURE|VIEWS_DIR")
-    verb.add_argument("-o", "--out", type=Path, metavar="DIR", help="where LoRAs are kept; the same command goes on")
+    verb.add_argument("-o", "--out", type=Path, metavar="DIR", help="folder of LoRAs; rerun to resume")
     verb.add_argument("--word", help="the prompt's word for the picture (default [v] for style, [c] for content)")
     verb.add_argument("--steps", type=int, metavar="N", help="steps of the first phase (default 1500)")
     add_model_options(verb)
