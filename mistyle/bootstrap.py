@@ -64,7 +64,7 @@ def start(arguments: Sequence[str]) -> int:
 
         return doctor.main("--json" in arguments)
     except KeyboardInterrupt:
-        say("interrupted; the same command goes on where the set-up stopped")
+        say("interrupted; rerun to resume the set-up")
         return 130
     return _tests(arguments) if verb == "test" else _command_line(arguments)
 
@@ -351,7 +351,7 @@ def _stoppable() -> Iterator[None]:
     try:
         yield
     except SystemExit:
-        say("stopped; the same command goes on where the set-up stopped")
+        say("stopped; rerun to resume the set-up")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)

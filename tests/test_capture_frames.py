@@ -399,7 +399,7 @@ def test_what_nerfstudio_applied_is_undone(tmp_path, matrix, scale, rows):
         ({"applied_transform": "none"}, "3 or 4 rows of 4"),
         ({"applied_transform": np.diag([1, 1, -1, 1]).tolist()}, "mirrors"),
         ({"applied_transform": np.diag([0, 1, 1, 1]).tolist()}, "mirrors"),
-        ({"applied_transform": np.diag([1, 2, 3, 1]).tolist()}, "no rotation in applied_transform"),
+        ({"applied_transform": np.diag([1, 2, 3, 1]).tolist()}, "not a rotation in applied_transform"),
         ({"applied_transform": (np.eye(4) * 2).tolist()}, "projective matrix in applied_transform"),
     ],
 )

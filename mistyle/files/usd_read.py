@@ -208,7 +208,7 @@ def mesh_prims(pxr: Any, stage: Any, path: Path, notes: list[str]) -> Iterator[t
             inside = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
             yield prim, str(inside.GetPath()), np.array(cache.GetLocalToWorldTransform(prim))
         elif prim.IsA(pxr.UsdGeom.Gprim):
-            notes.append("Shapes that are no surfaces (curves, points, volumes) were left out.")
+            notes.append("Shapes that are not surfaces (curves, points, volumes) were left out.")
 
 
 def _shown(pxr: Any, prim: Any, time: Any, notes: list[str]) -> bool:
@@ -230,7 +230,7 @@ def _prototypes(pxr: Any, prim: Any, cache: Any, time: Any, notes: list[str]) ->
     which = np.array(instancer.GetProtoIndicesAttr().Get(time) or [], np.int64)
     at = instancer.GetPositionsAttr().Get(time)
     turns, scales = instancer.GetOrientationsAttr().Get(time), instancer.GetScalesAttr().Get(time)
-    notes.append("Of a point instancer each prototype was read once, where its first instance stands.")
+    notes.append("Each prototype of a point instancer was read once, at its first instance.")
     world = np.array(cache.GetLocalToWorldTransform(prim))
     for k, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
         own, first = prim.GetStage().GetPrimAtPath(target), np.flatnonzero(which == k)
@@ -294,7 +294,7 @@ def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, n
     mesh = pxr.UsdGeom.Mesh(prim)
     shape = polygons(pxr, prim, path, max_faces)
     if is_shape(prim):
-        notes.append("Shapes that are no meshes (spheres, cubes and the like) were read as meshes.")
+        notes.append("Shapes other than meshes (spheres, cubes and the like) were read as meshes.")
     elif shape is None and mesh.GetPointsAttr().HasAuthoredValue() and _triples(mesh.GetPointsAttr().Get(time)) is None:
         notes.append("A mesh whose points are of another type than point3f[] was left out.")
     if shape is None or not len(shape.corner):
@@ -304,7 +304,7 @@ def _piece(pxr, prim, owner, matrix, time, path, max_faces, number, materials, n
     if "SkelBindingAPI" in prim.GetAppliedSchemas():
         notes.append("A skinned mesh was read in the pose of its skeleton at the first time.")
     elif not is_shape(prim) and mesh.GetPointsAttr().ValueMightBeTimeVarying():
-        notes.append("Of an animated mesh the first frame was read.")
+        notes.append("Only the first frame of an animated mesh was read.")
     if not np.isfinite(matrix).all():
         raise refuse(path, f"{prim.GetPath()} with a transform that is not finite", "finite numbers", "Export it again")
     linear = matrix[:3, :3]
@@ -440,7 +440,7 @@ def _uvs(pxr, mesh, shape: Polygons, material, materials: list[Found], time, not
     for name in dict.fromkeys(materials[k].primvar for k in np.unique(material)):
         found = uv_primvar(pxr, mesh, [name] if name else [])
         if found and name and found.GetPrimvarName() != name:
-            notes.append(f"There are no texture coordinates '{name}' on a mesh; '{found.GetPrimvarName()}' were taken.")
+            notes.append(f"There are no texture coordinates '{name}' on a mesh; '{found.GetPrimvarName()}' were used.")
         table = _table(found, time) if found else None
         values = _spread(table, found.GetInterpolation(), shape, 2, "UVs", notes) if found else None
         if values is not None:

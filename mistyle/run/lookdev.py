@@ -211,7 +211,7 @@ def sheet(
     rows = (
         Row("Three lights, each exposed so that the grey ball is 18 %", tuple(heroes)),
         Row("Soft studio from five sides: the asset turns, the light stands still", tuple(cameras)),
-        Row("What lies behind", tuple(strip)),
+        Row("AOVs", tuple(strip)),
         Row(f"{lights[2].name}, turned about the asset", tuple(turned)),
     )
     return Sheet(subject.path.stem, facts(subject), rows, burn_in(subject, settings, day)), width, scale

@@ -124,9 +124,9 @@ def steps(made: Any, refined: Sequence[Pair]) -> tuple[Step, ...]:
         (
             "The surface is painted once, so the views agree by construction."
             if made.job.settings.stylizer == "embedded"
-            else "Views are painted one after another; what earlier ones show of a view is kept in it."
+            else "Views are painted one after another and keep the pixels that earlier views show."
         )
-        + " Paint one over in stylized/, run the same command again, and it goes into the texture.",
+        + " Paint one over in stylized/ and rerun: the paint goes into the texture.",
         "4.1.3",
         shots=tuple(Shot(view_picture(v), angle(v.camera)) for v in made.stylized),
         facts=look_facts(made.looks),

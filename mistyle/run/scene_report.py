@@ -63,8 +63,8 @@ def noise_text(fitted: Any) -> str:
     shares = [r.noise[1] for r in fitted.residuals]
     between = f"{min(shares):.0%}" if len(shares) == 1 else f"{min(shares):.0%} to {max(shares):.0%}"
     return (
-        f"{between} of what is left between a step's picture and its reference is the render's own noise (measured "
-        "from two renders). The rest is noise of the reference and what the parameters cannot explain."
+        f"{between} of the difference between a step's picture and its reference is render noise (measured from two "
+        "renders). The rest is noise of the reference and error that the parameters cannot explain."
     )
 
 

@@ -99,8 +99,8 @@ class Settings(BaseModel):
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     stylizer: Literal["embedded", "embedded-view", "diffusion"] = Field(
         default="embedded",
-        description="embedded paints the surface once; embedded-view paints one view after another, each going on from "
-        "those before; diffusion does so with SDXL (needs models)",
+        description="embedded paints the surface once; embedded-view paints view after view from earlier ones; "
+        "diffusion does the same with SDXL (needs models)",
     )
     inpainter: Literal["fill", "paint3d"] = Field(
         default="fill", description="fill takes the painting again; paint3d is Stable Diffusion (needs models)"

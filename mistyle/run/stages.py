@@ -21,14 +21,14 @@ from mistyle.run.settings import Settings, thread_count
 
 STAGES = {
     "mesh": "read the mesh",
-    "texels": "lay out the texture",
+    "texels": "rasterise the UVs",
     "views": "render the views",
     "surface": "paint the surface",
     "bake": "bake the texture",
     "stylized": "draw the stylized views",
     "fit": "fit normal, roughness and albedo",
-    "masks": "mark what the fit left open",
-    "repair": "repair what the fit left open",
+    "masks": "compute the struggle mask",
+    "repair": "repair the texture",
     "asset": "write the asset",
     "report": "write the report",
 }
@@ -37,16 +37,16 @@ REFINING = ("fit", "masks", "repair")
 # Before fit and repair, in the place of "asset".
 FIRST = {"first asset": "write the first asset"}
 # Only where views were edited.
-RETOUCH = {"retouch": "lay the edited views into the texture"}
+RETOUCH = {"retouch": "bake the edited views"}
 # Only with --finish.
 FINISH = {"finish": "finish the painting"}
 # Those of `mistyle fit`.
 MATERIAL_STAGES = {
     "mesh": "read the mesh",
-    "texels": "lay out the texture",
+    "texels": "rasterise the UVs",
     "cameras": "place the cameras",
-    "pictures": "look through the pictures",
-    "light": "find the light",
+    "pictures": "check the pictures",
+    "light": "solve for the light",
     "recover": "fit the material",
     "measure": "measure the fit",
     "asset": "write the asset",
