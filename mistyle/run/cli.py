@@ -35,7 +35,7 @@ from mistyle.run.options import (
     add_report_option,
     asset_name,
     examples,
-    said_settings,
+    given_settings,
 )
 
 Command = Callable[[argparse.Namespace], int]
@@ -302,7 +302,7 @@ def _settings(options: argparse.Namespace, preset: str | None = None) -> Any:
     """The resolved settings of a command."""
     from mistyle.run.settings import merge, resolve
 
-    return resolve(options.preset or preset, options.config, merge(_rig(options), said_settings(options, OPTIONS)))
+    return resolve(options.preset or preset, options.config, merge(_rig(options), given_settings(options, OPTIONS)))
 
 
 def _rig(options: argparse.Namespace) -> dict[str, Any]:
@@ -329,7 +329,7 @@ def _need(options: argparse.Namespace, *names: str) -> None:
         raise UsageError(f"{options.verb} needs {wanted}; see mistyle {options.verb} --help")
 
 
-def _tell_plan(options: argparse.Namespace, estimate: dict[str, Any]) -> int:
+def _print_plan(options: argparse.Namespace, estimate: dict[str, Any]) -> int:
     from mistyle.run.plan import describe_plan
 
     print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
@@ -363,7 +363,7 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     job = _job(options, mesh, style, preset, name)
     settings = job.settings
     if options.dry_run:
-        return _tell_plan(options, plan(job))
+        return _print_plan(options, plan(job))
     progress = Progress()
     if options.preview and options.variations:
         raise UsageError("--preview and --variations: give one of them; --variations shows several paintings")
@@ -402,7 +402,7 @@ def _render(options: argparse.Namespace) -> int:
         from mistyle.run.verbs import claim_views
 
         claim_views(options.mesh, options.out, settings, options.overwrite)
-        return _tell_plan(options, plan_render(options.mesh, options.out, settings))
+        return _print_plan(options, plan_render(options.mesh, options.out, settings))
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import render_views
 
@@ -424,7 +424,7 @@ def _bake(options: argparse.Namespace) -> int:
         from mistyle.run.verbs import claim_baked
 
         claim_baked(options.mesh, options.views, options.out, called, options.overwrite)
-        return _tell_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
+        return _print_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import bake_views
 

@@ -17,7 +17,7 @@ from mistyle.run.options import (
     add_delivery_options,
     add_overwrite_option,
     examples,
-    said_settings,
+    given_settings,
 )
 
 
@@ -182,7 +182,7 @@ def _batch(options: argparse.Namespace) -> int:
     from mistyle.run.deliver import with_delivery
 
     given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
-    plan = with_delivery(given, said_settings(options, DELIVERY_OPTIONS))
+    plan = with_delivery(given, given_settings(options, DELIVERY_OPTIONS))
     if options.dry_run:
         told = dry_run(plan, choices)
         print(json.dumps(told) if options.json else describe_dry_run(told))
@@ -239,7 +239,7 @@ def _farm(options: argparse.Namespace) -> int:
 
     choices = Choices(workers=options.workers, threads=options.threads)
     given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
-    plan = with_delivery(given, said_settings(options, DELIVERY_OPTIONS))
+    plan = with_delivery(given, given_settings(options, DELIVERY_OPTIONS))
     files = export(
         plan,
         options.bundle or plan.out / "farm",

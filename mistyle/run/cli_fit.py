@@ -19,7 +19,7 @@ from mistyle.run.options import (
     add_report_option,
     asset_name,
     examples,
-    said_settings,
+    given_settings,
 )
 
 # Option of the command line -> dotted setting.
@@ -182,7 +182,7 @@ def material_settings(options: argparse.Namespace) -> Any:
     from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
     from mistyle.run.settings import resolve
 
-    said = said_settings(options, OPTIONS)
+    said = given_settings(options, OPTIONS)
     return resolve(options.preset, options.config, said, root=MaterialSettings, presets=MATERIAL_PRESETS)
 
 
@@ -196,7 +196,7 @@ def _fit_scene(options: argparse.Namespace) -> int:
 
     if options.report is not None:
         raise UsageError("--report belongs to a fit of MESH and REFERENCES; fit --scene always writes its whole report")
-    said = said_settings(options, SCENE_OPTIONS)
+    said = given_settings(options, SCENE_OPTIONS)
     settings = resolve(options.preset, options.config, said, root=SceneSettings, presets=SCENE_PRESETS)
     defines = given_defines(options.defines)
     if options.print_config:

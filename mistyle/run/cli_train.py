@@ -11,7 +11,7 @@ from typing import Any
 from mistyle.core.cores import use_threads
 from mistyle.core.errors import UsageError
 from mistyle.run.cli_models import add_model_options
-from mistyle.run.options import add_job_options, examples, said_settings
+from mistyle.run.options import add_job_options, examples, given_settings
 
 OPTIONS = {
     "seed": "seed",
@@ -50,7 +50,7 @@ def run_train(options: argparse.Namespace) -> int:
     from mistyle.run.settings import as_toml, resolve, thread_count
     from mistyle.run.train_settings import TRAIN_PRESETS, TrainJobSettings
 
-    said = said_settings(options, OPTIONS)
+    said = given_settings(options, OPTIONS)
     settings = resolve(options.preset, options.config, said, root=TrainJobSettings, presets=TRAIN_PRESETS)
     if options.print_config:
         sys.stdout.write(as_toml(settings))

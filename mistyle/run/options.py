@@ -203,7 +203,7 @@ def add_mesh_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--lit", action="store_const", const=True, help="turn unlit glTF materials into lit ones")
 
 
-def said_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict[str, Any]:
+def given_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict[str, Any]:
     """The settings given on the command line, nested; `names` maps options to dotted settings."""
     from mistyle.run.settings import assignments, merge
 
