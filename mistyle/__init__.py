@@ -141,7 +141,7 @@ def fit_scene(
 
     Returns a `FittedScene`: values before and after by key, their standard errors, residuals with the share that is
     render noise, what has not converged, and notes. A result worse than its start is undone, with a note. A texel
-    whose gradient is not a number keeps its last good value from then on, and is reported. Raises UsageError for keys or
+    whose gradient is not a number keeps its last good value, and is reported. Raises UsageError for keys or
     settings that cannot be, InputRefused for references and for what Mitsuba cannot render.
     """
     from dataclasses import replace

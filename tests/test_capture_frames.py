@@ -460,7 +460,7 @@ def test_several_pictures_in_a_file_are_no_animation(tmp_path):
     first, other = Image.fromarray(quadrants()), Image.fromarray(quadrants()[::-1])
     first.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[other])
     Image.fromarray(quadrants()).save(tmp_path / "a.tif", save_all=True, append_images=[Image.fromarray(quadrants())])
-    for name, what in (("a.jpg", "MPO"), ("a.tif", "pages")):
+    for name, what in (("a.jpg", "MPO"), ("a.tif", "first page")):
         found = read_picture(tmp_path / name)
         assert what in found.notes[0] and "animation" not in found.notes[0]
         assert np.abs(found.rgb * 255 - quadrants()).mean() < 5

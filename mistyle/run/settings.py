@@ -159,7 +159,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fit": {"refine": "all", "iterations1": 400, "iterations2": 600, "crops": 8, "lights": "together"},
         "diffusion": {"content": "per-view"},
     },
-    # To the letter, also where mistyle/stylization/README.md lists departures; the paper gives no step counts, these are those of `fine`.
+    # To the letter, also where mistyle/stylization/README.md lists departures. The paper gives no step counts;
+    # these are those of `fine`.
     "paper": {
         "stylizer": "diffusion",
         "inpainter": "paint3d",
