@@ -164,6 +164,19 @@ def verbs() -> frozenset[str]:
     return frozenset(name for a in actions if isinstance(a, argparse._SubParsersAction) for name in a.choices)
 
 
+def resolves(name: str) -> bool:
+    """Whether a dotted name leads to a module, or to a name that its module or package mentions."""
+    at, parts = ROOT / "mistyle", name.split(".")[1:]
+    while parts and (at / parts[0]).is_dir():
+        at = at / parts.pop(0)
+    if parts and (at / f"{parts[0]}.py").is_file():
+        at = at / f"{parts.pop(0)}.py"
+    source = at / "__init__.py" if at.is_dir() else at
+    return (
+        not parts or source.is_file() and re.search(rf"\b{parts[0]}\b", source.read_text(encoding="utf-8")) is not None
+    )
+
+
 def inline_problems(text: str) -> Iterator[str]:
     """Commands, settings and files that the prose names in backticks."""
     tables = {key.partition(".")[0] for key in settings() if "." in key}
@@ -177,6 +190,9 @@ def inline_problems(text: str) -> Iterator[str]:
         for key in re.findall(r"(?:^|--set )([a-z]\w*\.[a-z]\w*(?:\.\w+)?)(?==|$)", code):
             if key.partition(".")[0] in tables and key not in settings():
                 yield f"`{code}`: there is no setting {key}"
+        for name in re.findall(r"\bmistyle(?:\.[a-zA-Z_]\w*)+", code) if MOVED else ():
+            if not resolves(name):
+                yield f"`{code}`: {name} does not exist"
         named = re.fullmatch(r"((?:mistyle|tests|benchmarks|scenes)/[\w/.-]+\.\w+)", code)
         if named and not (ROOT / code).exists() and (MOVED or not code.startswith("mistyle/")):
             yield f"`{code}`: no such file"
@@ -248,6 +264,21 @@ def test_a_broken_readme_is_found(text, problem):
 def test_sound_text_has_no_problems():
     text = "```shell\nmistyle bake a.obj views/ -o out/   # back\n```\n`fit.crops` [b](README.md#licence) <https://a.b>"
     assert problems(ROOT / "README.md", text) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "there"),
+    [
+        ("mistyle.stylize", True),
+        ("mistyle.core.errors", True),
+        ("mistyle.core.errors.MistyleError", True),
+        ("mistyle.core.absent", False),
+        ("mistyle.core.errors.Absent", False),
+        ("mistyle.absent.errors", False),
+    ],
+)
+def test_dotted_names_resolve(name, there):
+    assert resolves(name) == there
 
 
 def test_the_first_page_is_short():
