@@ -190,7 +190,7 @@ def inline_problems(text: str) -> Iterator[str]:
         for key in re.findall(r"(?:^|--set )([a-z]\w*\.[a-z]\w*(?:\.\w+)?)(?==|$)", code):
             if key.partition(".")[0] in tables and key not in settings():
                 yield f"`{code}`: there is no setting {key}"
-        for name in re.findall(r"\bmistyle(?:\.[a-zA-Z_]\w*)+", code) if MOVED else ():
+        for name in re.findall(r"(?<![\w./])mistyle(?:\.[a-zA-Z_]\w*)+", code) if MOVED else ():
             if not resolves(name):
                 yield f"`{code}`: {name} does not exist"
         named = re.fullmatch(r"((?:mistyle|tests|benchmarks|scenes)/[\w/.-]+\.\w+)", code)
