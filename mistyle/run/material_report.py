@@ -129,8 +129,8 @@ def steps(made: Any) -> tuple[Step, ...]:
     parts, longest = list(zip(made.asset.mesh.parts, made.texels, strict=True)), Sizes().of(kind_in_step(2))
     trust = Step(
         "Confidence",
-        "How well the references determine each texel's material: dark blue not at all, yellow well; and by how many "
-        "pictures it is seen.",
+        "How well the references determine each texel's material (dark blue: not at all, yellow: well), and how many "
+        "pictures see it.",
         shots=tuple(
             Shot(picture, f"{name}: {what}", sharp=True)
             for k, (name, t) in enumerate(parts)

@@ -27,8 +27,7 @@ from mistyle.stages.fit_judge import TOLERANCE, undone_where, worse
 
 SAME = "Under the same studio light"
 UNFITTED = (
-    "The painting's own relief and gloss. The views were drawn from these very maps, so a fit to them has little to "
-    "add, and none ran: --refine all runs it."
+    "The painting's own relief and gloss. The views were drawn from these maps, so no fit ran; --refine all runs it."
 )
 
 
@@ -163,7 +162,7 @@ def refining(made: Any, pairs: Sequence[Pair], longest: int) -> tuple[Step, ...]
     repair = Step(
         "Repair",
         "Texels that the fit could not settle or that no view saw, painted again from the surface. The masks lie in "
-        "masks/: paint one over, run the same command again, and it decides.",
+        "masks/: edit one and rerun to repair its white texels.",
         "4.3",
         shots=tuple(
             Shot(mask_over(made.repaired.mask[k], made.repaired.maps[k], t, longest), f"{name}: repaired texels")
@@ -221,9 +220,7 @@ def mask_over(mask: np.ndarray, maps: Maps, texels: Texels, longest: int) -> np.
 
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
     """Each phase: kept (and what got worse all the same) or undone, and the figures that decided."""
-    kept = [
-        (phase, _kept(fit, phase) if good else "undone: it made a figure worse") for phase, good in fit.kept.items()
-    ]
+    kept = [(phase, _kept(fit, phase) if good else "undone: a metric got worse") for phase, good in fit.kept.items()]
     figures = []
     for name, (before, after) in fit.figures.items():
         undone = "" if fit.kept[name.partition(".")[0]] else f" (undone: the result has {before:.4g})"

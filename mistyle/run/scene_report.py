@@ -16,7 +16,7 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "psnr_after": ("mean PSNR of the sensors' pictures after the fit (sRGB, peak 1), dB", "higher"),
     "render_noise": ("share of the remaining squared difference that is noise of one step's render, 0..1", ""),
     "unconverged": ("parameters that still moved at the end", "lower"),
-    "bad_gradients": ("gradients that were no numbers; their texels stayed as they were in that step", "lower"),
+    "bad_gradients": ("gradients that were not numbers; their texels kept their values in that step", "lower"),
 }
 
 
