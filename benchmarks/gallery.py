@@ -3,10 +3,10 @@
     python -m benchmarks.gallery --models DIR [--list FILE] [--only PATTERN] [--out DIR] [--judge] [--quick] [--json F]
 
 Models are the glTF and USD files of DIR, or those that FILE names (paths relative to DIR, one a line, '#' begins a
-comment; default: DIR/models.txt where there is one). `benchmarks/gallery_models.txt` lists the files that the README's
-figures are of, with the repositories and commits that they were taken from. Both sides see the same camera (35 degrees
-to the right, 15 up, the model's sphere in a field of view of 30 degrees) and one soft sky of three colours; both
-pictures lie over the same grey and have the same exposure, 256 pixels a side and 32 samples a pixel. Blender is a
+comment; default: DIR/models.txt where there is one). `benchmarks/gallery_models.txt` lists the files of the figures in
+benchmarks/README.md, with the repositories and commits that they were taken from. Both sides see the same camera (35
+degrees to the right, 15 up, the model's sphere in a field of view of 30 degrees) and one soft sky of three colours.
+Both pictures lie over the same grey and have the same exposure, 256 pixels a side and 32 samples a pixel. Blender is a
 check, not a dependency: --blender or $MISTYLE_BLENDER_PYTHON names a Python in which `import bpy` works. It keeps its
 pictures in OUT/cycles, so that a second run draws only our side.
 

@@ -1,4 +1,4 @@
-"""Pictures of what the settings do, for the README: `python -m benchmarks.settings_strip [--out scenes/strips]`
+"""Strips of pictures for mistyle/stylization/README.md: `python -m benchmarks.settings_strip [--out scenes/strips]`
 
 One strip a setting: the demo mesh painted with the demo picture, everything else at its default, values growing from
 left to right. Writes small JPGs (under 60 kB) and nothing else. --quick: two values of one setting, coarse.

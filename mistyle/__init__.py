@@ -25,8 +25,8 @@ def stylize(
     """Mesh + one style picture -> stylized asset, textures and report in the folder `out` (the paper's section 4).
 
     `settings` are nested as `mistyle stylize --print-config` prints them, for example `fit={"refine": "off"}`.
-    Returns the paths of what was written and the figures of `run.json`; goes on from the last finished stage when
-    `out` holds an earlier run of the same job. Raises `mistyle.core.errors.MistyleError`.
+    Returns the paths of the written files and the figures of `run.json`; resumes if `out` holds an earlier run of the
+    same job. Raises `mistyle.core.errors.MistyleError`.
     """
     from pathlib import Path
 
@@ -57,7 +57,7 @@ def fit(
     `pictures` is a folder with camera.json, transforms.json or a COLMAP model, and the pictures; `lights` a
     lights.json (None: the one in the folder; "unknown": solved for). `settings` are nested as `mistyle fit
     --print-config` prints them, for example `recover={"metallic": True}` or `references={"hold_out": 2}`.
-    Returns the paths of what was written and the figures of `run.json`. Raises `mistyle.core.errors.MistyleError`.
+    Returns the paths of the written files and the figures of `run.json`. Raises `mistyle.core.errors.MistyleError`.
     """
     from pathlib import Path
 
@@ -136,13 +136,13 @@ def fit_scene(
     only              by key (or name): bool, which numbers of a value may change; all others keep their bytes
     channels          of EXR references by path: a prefix ("image"), or three names with commas
     save, resume      `save` receives a dictionary of arrays every `save_every` seconds, and when the callback ends or
-                      breaks off the fit; given back as `resume`, with all else as it was, the fit goes on to the same
+                      breaks off the fit; given back as `resume`, with all else as it was, the fit continues to the same
                       result (the same bytes with one thread)
     progress          receives the share that is done, 0..1
 
     Returns a `FittedScene`: values before and after by key, their standard errors, residuals with the share that is
-    render noise, what has not converged, and notes. A result worse than its start is undone, and said. A texel whose
-    gradient is not a number keeps its last good value from then on, and is reported. Raises UsageError for keys or
+    render noise, what has not converged, and notes. A result worse than its start is undone, with a note. A texel
+    whose gradient is not a number keeps its last good value, and is reported. Raises UsageError for keys or
     settings that cannot be, InputRefused for references and for what Mitsuba cannot render.
     """
     from dataclasses import replace

@@ -34,7 +34,7 @@ from mistyle.environment import (
 )
 
 ENTERED = "_MISTYLE_ENTERED"  # set for the process that the set-up hands over to
-HELP = "mistyle: a mesh and one style picture in; the same mesh with stylized, physically based textures out.\n"
+HELP = "mistyle: one mesh and one style picture in; the same mesh with stylized, physically based textures out.\n"
 
 
 def start(arguments: Sequence[str], command_line: Callable[[list[str]], int], doctor: Callable[[bool], int]) -> int:
@@ -61,7 +61,7 @@ def start(arguments: Sequence[str], command_line: Callable[[list[str]], int], do
             return _over(arguments, dict(os.environ))
         return doctor("--json" in arguments)
     except KeyboardInterrupt:
-        say("interrupted; the same command goes on where the set-up stopped")
+        say("interrupted; rerun to resume the set-up")
         return 130
     return _tests(arguments) if verb == "test" else command_line(arguments)
 
@@ -72,7 +72,7 @@ def _help(arguments: list[str], command_line: Callable[[list[str]], int]) -> int
         return command_line(arguments)
     except ImportError as error:
         if not ready(home(), set()):
-            print(f"{HELP}Not set up yet ({error}). `python3 -m mistyle doctor` does that, or any other verb.")
+            print(f"{HELP}Not set up yet ({error}). `python3 -m mistyle doctor` or any other verb sets it up.")
             return 0
     enter(arguments, extras=set())
     return command_line(arguments)
@@ -208,7 +208,7 @@ def _stoppable() -> Iterator[None]:
     try:
         yield
     except SystemExit:
-        say("stopped; the same command goes on where the set-up stopped")
+        say("stopped; rerun to resume the set-up")
         raise
     finally:
         signal.signal(signal.SIGTERM, before)

@@ -123,7 +123,7 @@ def _renderers() -> list[Row]:
 
 def _torch() -> list[Row]:
     gpu = _gpu()
-    there = [Row("GPU", gpu or "none that answers; everything runs on the CPU", "ok" if gpu else "optional")]
+    there = [Row("GPU", gpu or "none; everything runs on the CPU", "ok" if gpu else "optional")]
     number = _version("torch")
     if not number:
         return [*there, Row("torch", "not installed", "missing")]
@@ -188,4 +188,4 @@ def _weights() -> Row:
     )
     if path:
         return Row("VGG-19 weights", f"MISTYLE_VGG names {path}, which is not there", "optional", fix)
-    return Row("VGG-19 weights", "none; the embedded features are used, which need none", "optional", fix)
+    return Row("VGG-19 weights", "none; the embedded features need none", "optional", fix)

@@ -63,7 +63,7 @@ def make_venv(venv: Path, python: Path) -> None:
         return
     ours = {"mistyle.json", "mistyle.json.part", "mistyle.lock", "llvm"}
     if not (venv / "mistyle.json").exists() and {p.name for p in venv.iterdir()} - ours:
-        raise SetupError(f"{venv} is no working virtual environment, and mistyle did not make it; move it away")
+        raise SetupError(f"{venv} is not a working virtual environment, and mistyle did not make it; move it away")
     if shutil.disk_usage(venv).free < NEEDED_BYTES:
         raise SetupError(f"{venv} needs {NEEDED_BYTES / 1e9:.0f} GB of free disk space for the packages; make room")
     for path in venv.iterdir():
@@ -287,7 +287,7 @@ def _sentence(output: str) -> str:
     if cause := re.search(UNREACHABLE, output):
         return (
             f"pip cannot reach its package registry ({cause[0]}); check the network, the proxy and `pip config list`, "
-            "then run the same command again: it goes on where it stopped"
+            "then rerun to resume"
         )
     # The second is what pip says of a single package that is pinned twice and not there at all.
     if lost := re.search(r"No matching distribution found for (\S+)|Cannot install (\S+) because", output):

@@ -114,5 +114,5 @@ def test_ray_that_cannot_serve_says_so_instead_of_waiting(tmp_path):
     from mistyle.core.errors import MistyleError
 
     plan = plan_in(tmp_path / "out")
-    with pytest.raises(MistyleError, match="offers .* GPUs, each shard asks for 2"):
+    with pytest.raises(MistyleError, match="offers .* GPUs, each shard needs 2"):
         run_batch(plan, Choices(engine="ray", threads=1, gpus=2))

@@ -399,7 +399,7 @@ def test_what_nerfstudio_applied_is_undone(tmp_path, matrix, scale, rows):
         ({"applied_transform": "none"}, "3 or 4 rows of 4"),
         ({"applied_transform": np.diag([1, 1, -1, 1]).tolist()}, "mirrors"),
         ({"applied_transform": np.diag([0, 1, 1, 1]).tolist()}, "mirrors"),
-        ({"applied_transform": np.diag([1, 2, 3, 1]).tolist()}, "no rotation in applied_transform"),
+        ({"applied_transform": np.diag([1, 2, 3, 1]).tolist()}, "not a rotation in applied_transform"),
         ({"applied_transform": (np.eye(4) * 2).tolist()}, "projective matrix in applied_transform"),
     ],
 )
@@ -460,7 +460,7 @@ def test_several_pictures_in_a_file_are_no_animation(tmp_path):
     first, other = Image.fromarray(quadrants()), Image.fromarray(quadrants()[::-1])
     first.save(tmp_path / "a.jpg", format="MPO", save_all=True, append_images=[other])
     Image.fromarray(quadrants()).save(tmp_path / "a.tif", save_all=True, append_images=[Image.fromarray(quadrants())])
-    for name, what in (("a.jpg", "MPO"), ("a.tif", "pages")):
+    for name, what in (("a.jpg", "MPO"), ("a.tif", "first page")):
         found = read_picture(tmp_path / name)
         assert what in found.notes[0] and "animation" not in found.notes[0]
         assert np.abs(found.rgb * 255 - quadrants()).mean() < 5

@@ -183,7 +183,7 @@ def test_lights_of_every_kind_beside_or_elsewhere(tmp_path):
     with pytest.raises(InputRefused, match="inside"):
         read_captures(tmp_path, lights=tmp_path / "rig" / "night.json")
     (tmp_path / "lights.json").unlink()
-    with pytest.raises(InputRefused, match='what light each picture was taken in.*"views": {"v0": .*directional'):
+    with pytest.raises(InputRefused, match='the light of each picture.*"views": {"v0": .*directional'):
         read_captures(tmp_path)
     (tmp_path / "lights.json").write_text(json.dumps({"views": {"v0": [flash]}}))
     with pytest.raises(InputRefused, match="no lights for the view 'v1' .2 of 3"):

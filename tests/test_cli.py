@@ -1,5 +1,6 @@
 """The command line as a person meets it: quick help, one sentence for an error, the right exit code."""
 
+import argparse
 import json
 import subprocess
 import sys
@@ -7,7 +8,7 @@ import time
 
 import pytest
 
-from mistyle.run.cli import main, parser
+from mistyle.run.cli import USED, main, parser
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -30,6 +31,31 @@ def test_every_verb_explains_itself(verb, capsys):
         main([verb, "--help"])
     assert stopped.value.code == 0
     assert "--preset" in capsys.readouterr().out
+
+
+def every_verb() -> dict[str, argparse.ArgumentParser]:
+    """All verbs of the command line by name."""
+    (verbs,) = (action for action in parser()._actions if isinstance(action, argparse._SubParsersAction))
+    return dict(verbs.choices)
+
+
+def test_help_lists_ten_verbs_first_and_the_others_under_more():
+    text = parser().format_help()
+    commands, more = text.split("commands:")[1].split("examples:")[0].split("more:")
+
+    def listed(part: str) -> list[str]:
+        return [line.split()[0] for line in part.splitlines() if line.startswith("  ") and line[2] != " "]
+
+    assert listed(commands) == list(USED)
+    assert {*listed(commands), *listed(more), "doctor"} == set(every_verb())
+    assert not set(USED) & set(listed(more))
+    assert "mistyle doctor" in text.splitlines()[-1]
+
+
+@pytest.mark.parametrize("verb", every_verb())
+def test_every_verb_has_examples(verb):
+    text = every_verb()[verb].format_help()
+    assert f"mistyle {verb}" in text.partition("examples:")[2]
 
 
 def test_options_name_existing_settings():

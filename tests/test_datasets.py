@@ -240,7 +240,7 @@ def test_tensoir_refusals(tensoir):
     for change, reason in (
         ({"imw": 0}, "imw"),
         ({"cam_transform_mat": "1,2,3"}, "reshape"),
-        ({"cam_transform_mat": ",".join(["1"] * 16)}, "no rotation"),
+        ({"cam_transform_mat": ",".join(["1"] * 16)}, "not a rotation"),
         ({"cam_angle_x": 4}, "cam_angle_x"),
     ):
         meta.write_text(json.dumps(whole | change))

@@ -22,7 +22,7 @@ from mistyle.run.cli import main, parser
 from mistyle.run.deliver import DeliveryRequest, deliver, export
 from mistyle.run.deliver_settings import FORMATS
 from mistyle.run.finished import read_finished
-from mistyle.run.options import DELIVERY_OPTIONS, asset_name, said_settings
+from mistyle.run.options import DELIVERY_OPTIONS, asset_name, given_settings
 from mistyle.run.progress import Progress
 from mistyle.run.stylize_settings import Settings, resolve
 from mistyle.stages.export import write_asset
@@ -229,7 +229,7 @@ def test_what_cannot_be_delivered_is_refused(made, tmp_path):
         export(tmp_path / "broken.json", tmp_path / "out", DeliveryRequest(formats=["glb"]))
     elsewhere = {"name": "ball", "parts": [{"name": "ball", "textures": "../../secret"}], "files": []}
     (tmp_path / "broken.json").write_text(json.dumps(elsewhere))
-    with pytest.raises(InputRefused, match="no name of a file"):
+    with pytest.raises(InputRefused, match="not a file name"):
         export(tmp_path / "broken.json", tmp_path / "out", DeliveryRequest(formats=["glb"]))
     (tmp_path / "broken.json").write_text("[" * 100_000)
     with pytest.raises(InputRefused, match="nested without end"):
@@ -329,7 +329,7 @@ def test_the_command_line_says_it_for_stylize_fit_and_batch(tmp_path):
     fit = parser().parse_args(["fit", "m.obj", "r", "-o", "out", "--target", "arnold", "--formats", "maps"])
     assert material_settings(fit).deliver.chosen_targets == ("arnold",)
     batch = parser().parse_args(["batch", "jobs.toml", "-o", "out", "--target", "arnold", "--name", "x_v{v}"])
-    said = said_settings(batch, DELIVERY_OPTIONS)
+    said = given_settings(batch, DELIVERY_OPTIONS)
     jobs = (Record(name="a", kind="stylize", mesh=Path("m.obj"), settings=settings_of({}).model_dump(mode="json")),)
     changed = with_delivery(BatchPlan(tmp_path, jobs), said)
     assert changed.jobs[0].settings["deliver"]["target"] == ["arnold"]

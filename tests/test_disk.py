@@ -226,7 +226,7 @@ def test_fetching_models_names_the_full_disk_and_not_the_network(tmp_path, monke
     monkeypatch.setattr(models_fetch, "_download", full)
     assert main(["models", "fetch", "depth", "--models", str(tmp_path / "models"), "--allow-download"]) == 1
     words = capsys.readouterr().err
-    assert "No space left" in words and "goes on" in words and "network" not in words
+    assert "No space left" in words and "rerun to resume" in words and "network" not in words
     assert (tmp_path / "models" / "depth" / models_fetch.PARTIAL / "part").read_bytes() == b"so far"
 
 

@@ -129,7 +129,7 @@ def test_shared_texels_need_shared_vertex_colours(tmp_path: Path) -> None:
     other["attributes"]["COLOR_0"] = file.accessor(CORNERS[::-1].copy())
     asset = read(file, tmp_path)
     assert asset.source.uv == "new" and noted(asset, "unwrapped anew", "different vertex colours")
-    assert noted(read(file, tmp_path, uv="keep"), "the first face's were taken")
+    assert noted(read(file, tmp_path, uv="keep"), "each texel takes those of its first face")
 
 
 def test_results_have_no_vertex_colours_and_carry_their_alpha(tmp_path: Path) -> None:

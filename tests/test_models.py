@@ -159,7 +159,7 @@ def test_a_broken_download_goes_on_where_it_stopped(hub, tmp_path):
     Hub.files["diffusion_pytorch_model.fp16.safetensors"] = safetensors.torch.save({"a": torch.randn(6, 1_000_000)})
     Hub.cut = 15_000_000
     first = fetch(hub, tmp_path / "models", "depth")
-    assert first.returncode == 4 and "run the same command again" in first.stderr, first.stderr
+    assert first.returncode == 4 and "rerun to resume" in first.stderr, first.stderr
     Hub.cut, Hub.asked = 0, []
     second = fetch(hub, tmp_path / "models", "depth")
     assert second.returncode == 0, second.stderr

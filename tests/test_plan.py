@@ -30,7 +30,7 @@ def test_amounts_of_memory(text, expected):
 
 @pytest.mark.parametrize("text", ["", "much", "0", "-3G", "4X", "nan", "1e9"])
 def test_what_is_no_amount_of_memory(text):
-    with pytest.raises(argparse.ArgumentTypeError, match="for example 4G"):
+    with pytest.raises(argparse.ArgumentTypeError, match="not a valid memory size; write 4G"):
         gigabytes(text)
 
 

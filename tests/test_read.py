@@ -218,7 +218,7 @@ BROKEN_OBJ = {
     "f -9 1 2": "before the first",
     "f 1/7 2/2 3/3": "texture coordinate 7",
     "f 1//1 2//1 3//1": "normal 1",
-    "f a b c": "no list of indices",
+    "f a b c": "a face that is not indices",
     "v 1 2\nf 1 2 3": "2 numbers",
     "v 1 x 2\nf 1 2 3": "'x'",
     "v nan 0 0\nf 1 2 5": "not finite",

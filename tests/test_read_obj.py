@@ -163,7 +163,7 @@ def test_what_is_not_understood_is_said(tmp_path: Path) -> None:
     raw = read_obj(path, 100)
     assert raw.notes == (
         "The opacity of material 'mat' was not read.",
-        "Of m.mtl these statements were not read: Ks, Ns, map_Ke, wibble.",
+        "m.mtl: these statements were not read: Ks, Ns, map_Ke, wibble.",
         "Lines and points were left out.",
         "Statements that OBJ does not have were left out: 'foo'.",
     )
@@ -186,7 +186,7 @@ KD = {"0.5": (0.5, 0.5, 0.5), "0.1 0.2 0.3": (0.1, 0.2, 0.3), "spectral a.rfl 1"
 def test_colours_of_one_number_or_three(kd: str, tmp_path: Path) -> None:
     raw = read_obj(square(tmp_path, f"newmtl mat\nKd {kd}\n"), 100)
     assert raw.materials[0].albedo_factor == KD[kd]
-    assert raw.notes == (("Of m.mtl these statements were not read: Kd.",) if "spectral" in kd else ())
+    assert raw.notes == (("m.mtl: these statements were not read: Kd.",) if "spectral" in kd else ())
 
 
 STATEMENTS = {

@@ -90,7 +90,7 @@ def test_a_shared_texture_is_known_by_every_user(plain):
         ("mirror.bsdf.roughness.value", "gradient of exactly zero"),
         ("chair.to_world", "geometry"),
         ("cam.x_fov", "camera"),
-        ("wood.base_color.to_uv", "no array of real numbers"),
+        ("wood.base_color.to_uv", "not an array of real numbers"),
         ("wall.bsdf.brdf_0.roughness.value", None),
         ("wood.roughness.data", None),
         ("wall.bsdf.base_color.value", None),
@@ -178,7 +178,7 @@ def test_a_scene_with_exr_files_loads_with_one_thread(folder):
 
 
 def test_a_file_that_is_no_scene_is_refused(folder, tmp_path):
-    with pytest.raises(InputRefused, match="there is no such scene file"):
+    with pytest.raises(InputRefused, match="no such scene file"):
         scene_xml.load_scene_for_fit(tmp_path / "none.xml")
     (tmp_path / "bad.xml").write_text('<scene version="3.0.0"><shape type="nothing"/></scene>', encoding="utf-8")
     with pytest.raises(InputRefused, match="Mitsuba cannot load this scene"):

@@ -156,7 +156,7 @@ def test_a_linked_folder_stays_linked(tmp_path):
 
 
 def test_stage_names_cannot_leave_the_folder(tmp_path):
-    with Keeper(tmp_path) as keeper, pytest.raises(ValueError, match="no name for a stage"):
+    with Keeper(tmp_path) as keeper, pytest.raises(ValueError, match="not a valid stage name"):
         keeper.put("../x", "k", text(""))
 
 

@@ -225,7 +225,7 @@ def test_shapes_have_their_area_and_face_outwards(kind: str, axis: str, tmp_path
     assert found.normals is not None and (np.einsum("fc,fkc->fk", vectors, found.normals) > 0).all()
     if kind != "Plane":
         assert (np.einsum("fc,fkc->fk", vectors, corners) > -1e-9).all()
-    assert any("no meshes" in note for note in found.notes)
+    assert any("other than meshes" in note for note in found.notes)
 
 
 RIG = """

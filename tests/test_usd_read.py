@@ -106,7 +106,7 @@ def test_several_meshes_instances_and_what_is_hidden(tmp_path):
     np.testing.assert_array_equal(found.twin, [0, 1, 2, 3, 4, 5, 3, 4, 5])
     np.testing.assert_allclose(found.positions[5:10] - found.positions[10:15], np.tile([5, 0, 0], (5, 1)))
     told = " ".join(found.notes)
-    assert all(word in told for word in ("Invisible", "proxy", "no surfaces", "share their texels"))
+    assert all(word in told for word in ("Invisible", "proxy", "not surfaces", "share their texels"))
 
 
 def test_a_point_instancer_of_millions_costs_one_prototype(tmp_path):

@@ -28,13 +28,13 @@ class ModelSettings(BaseModel):
         "CPU. VAEs stay float32",
     )
     prediction: Literal["auto", "epsilon", "v_prediction"] = Field(
-        default="auto", description="what an SDXL checkpoint predicts; auto: as its scheduler or its file says"
+        default="auto", description="prediction type of an SDXL checkpoint; auto: read from its scheduler or file"
     )
     offload: bool = Field(
         default=False,
         description="keep on the GPU only the network that runs: slower, the same pictures",
     )
-    memory: float = Field(default=0, ge=0, description="GB that may be used; 0 asks the device")
+    memory: float = Field(default=0, ge=0, description="GB that may be used; 0: the device's free memory")
 
 
 class TrainSettings(BaseModel):
@@ -74,7 +74,7 @@ class DiffusionSettings(BaseModel):
         "style LoRA, none beside an IP-Adapter",
     )
     adapter: Literal["lora", "ip"] = Field(
-        default="lora", description="what carries the style: a trained LoRA, or an IP-Adapter on the style block"
+        default="lora", description="style adapter: a trained LoRA, or an IP-Adapter on the style block"
     )
     subject: str = Field(default="[c]", description="the prompt's word for the content")
     look: str = Field(default="[v]", description="the prompt's word for the style")
@@ -103,9 +103,9 @@ class Paint3dSettings(BaseModel):
         description="inpainting UNet (the paper), or SD 1.5 with an inpaint ControlNet (Paint3D)",
     )
     prompt: str = Field(
-        default="UV map, texture of an object, even flat lighting, high quality", description="what to paint"
+        default="UV map, texture of an object, even flat lighting, high quality", description="text prompt"
     )
-    negative: str = Field(default=LIGHTING, description="what not to paint: light and shadow belong to the renderer")
+    negative: str = Field(default=LIGHTING, description="negative prompt: light and shadow belong to the renderer")
     size: int = Field(default=1024, ge=16, le=2048, description="pixels of a side that the model paints at once")
     overlap: int = Field(default=128, ge=0, description="pixels that crops share, and context around holes")
     detail: float = Field(

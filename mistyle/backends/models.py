@@ -215,8 +215,8 @@ def verify(name: str, place: Path, folder: Path | None) -> None:
         if entry is None and not found.startswith(model.sha256[relative]):
             raise EnvironmentMissing(
                 f"{path}: sha256 is {found}, expected {model.sha256[relative]}, which is the file of {model.repo}. "
-                f"Remove it and {how_to_get(model, folder)}; if these weights are meant, put them into a folder of "
-                f"models and say so: mistyle models adopt {name} --models {folder or Path('models')}"
+                f"Remove it and {how_to_get(model, folder)}; to use these weights anyway, put them into a folder of "
+                f"models and run: mistyle models adopt {name} --models {folder or Path('models')}"
             )
         noted[relative] = {"sha256": found, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
         changed = True

@@ -32,7 +32,7 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
     if not allowed:
         raise UsageError(
             f"fetching '{name}' downloads about {model.gigabytes} GB from {model.repo} under its licence "
-            f"({model.licence}); say so with --allow-download"
+            f"({model.licence}); allow it with --allow-download"
         )
     models.need_extra()
     from huggingface_hub.errors import HfHubHTTPError
@@ -50,13 +50,11 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
         if isinstance(error, OSError) and error.errno in (*faults.FULL, errno.EFBIG, *faults.NOT_TO_BE_WRITTEN):
             raise MistyleError(
                 f"{place}: cannot be written ({os.strerror(error.errno or 0)}); '{name}' takes about {model.gigabytes} "
-                "GB. See to the disk, or name another folder with --models, and run the same command again: it goes on "
-                "where it stopped"
+                "GB. Make room or name another folder with --models, and rerun to resume"
             ) from None
         raise EnvironmentMissing(
             f"{model.repo} could not be fetched: {str(error).splitlines()[0]}; check the network (HF_ENDPOINT, proxy, "
-            "HF_HUB_OFFLINE; HF_TOKEN where the licence must be accepted) and run the same command again: it goes on "
-            "where it stopped"
+            "HF_HUB_OFFLINE; HF_TOKEN where the licence must be accepted) and rerun to resume"
         ) from None
     entries = {path: _checked(place / path, wanted.get(path), fetched=path not in own) for path in _files(place)}
     if not entries:
@@ -199,7 +197,7 @@ def _refuse_others(pickle: Path, target: Path) -> None:
     config, there = pickle.with_name("config.json"), target.with_name("config.json")
     differs = config.is_file() and there.is_file() and config.read_bytes() != there.read_bytes()
     for path in (target,) * target.exists() + (there,) * differs:
-        raise UsageError(f"{path}: this file is there and would be replaced. Move it away, or say --overwrite")
+        raise UsageError(f"{path}: this file is there and would be replaced. Move it away, or add --overwrite")
 
 
 def listing(folder: Path | None) -> list[dict[str, Any]]:

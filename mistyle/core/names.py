@@ -58,7 +58,7 @@ def checked(name: str) -> str:
     if is_safe(name):
         return name
     size = len(name.encode(errors="replace"))
-    why = f"{size} bytes of UTF-8" if size > ASSET else "what does not suit file names"
+    why = f"{size} bytes of UTF-8" if size > ASSET else "characters that do not suit file names"
     wanted = f"letters, digits, '-', '_' and '.', at most {ASSET} bytes"
     raise UsageError(f"--name {name!r}: found {why}, expected {wanted}; try {safe_name(name)!r}")
 

@@ -78,7 +78,7 @@ def check() -> None:
     _state.raised = True
     if _state.asked == signal.SIGINT:
         raise KeyboardInterrupt
-    raise Stopped("stopped on request; the same command again goes on from what was finished")
+    raise Stopped("stopped on request; rerun to resume")
 
 
 @contextlib.contextmanager

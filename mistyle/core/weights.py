@@ -47,12 +47,12 @@ def header(path: Path) -> tuple[dict[str, Any], int]:
 def _check(table: Any, size: int) -> None:
     """The header's entries against each other and the `size` bytes of data behind it."""
     if not isinstance(table, dict):
-        raise ValueError("a header that is no table")
+        raise ValueError("a header that is not a table")
     spans = []
     for name, entry in table.items():
         if name == "__metadata__":
             if not isinstance(entry, dict) or not all(isinstance(v, str) for v in entry.values()):
-                raise ValueError("metadata that are no table of texts")
+                raise ValueError("metadata that are not a table of texts")
             continue
         if not isinstance(entry, dict) or not {"dtype", "shape", "data_offsets"} <= set(entry):
             raise ValueError(f"the tensor {name[:80]!r} without dtype, shape and data_offsets")

@@ -323,7 +323,7 @@ def check_rotation(rotation: Float[np.ndarray, "3 3"], where: str, path: Path) -
     """Refuse a matrix that is not a rotation within RIGID."""
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > RIGID or np.linalg.det(rotation) < 0:
         fix = "Take scale and mirroring out of the matrix"
-        raise refuse(path, f"a matrix that is no rotation in {where}", "an orthonormal right-handed one", fix)
+        raise refuse(path, f"a matrix that is not a rotation in {where}", "an orthonormal right-handed one", fix)
 
 
 def _unfit(path: Path, error: ValidationError, expected: str) -> InputRefused:

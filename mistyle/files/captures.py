@@ -316,7 +316,7 @@ def _checked(picture: Path, shot: CapturedPicture) -> int:
     if shot.pixels == "upright" and orientation > 4:
         height, width = width, height
     if (height, width) != shot.lens.size:
-        expected = f"{shot.lens.size[1]} x {shot.lens.size[0]}, as its camera says (view '{shot.camera.name}')"
+        expected = f"{shot.lens.size[1]} x {shot.lens.size[0]}, the size of its camera (view '{shot.camera.name}')"
         fix = "Hand in the pictures that the cameras were made for, neither scaled nor cropped"
         if (width, height) == shot.lens.size:
             fix = (
@@ -334,7 +334,7 @@ def _lights(home: Path, file: Path | None, names: list[str]) -> tuple[Lights, ..
             'Write one, such as {"lights": [{"type": "environment", "file": "studio.hdr"}]} or {"views": {"'
             f'{names[0]}": [{{"type": "directional", "direction": [0, 1, 0], "irradiance": [3, 3, 3]}}], ...}}}}'
         )
-        raise refuse(found, "no file", "what light each picture was taken in", fix)
+        raise refuse(found, "no file", "the light of each picture", fix)
     maps: dict[str, np.ndarray] = {}
 
     def load(name: str) -> Float[np.ndarray, "h w 3"]:

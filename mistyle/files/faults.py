@@ -68,7 +68,7 @@ def _sentence(error: Exception, path: Path, temporary: Path | None) -> MistyleEr
     if code == errno.EROFS or (code in NOT_TO_BE_WRITTEN and inside):
         return UsageError(
             f"{path}: cannot be written ({os.strerror(code)}); {NOTHING}. "
-            "Choose another output folder, or ask for the right to write there"
+            "Choose another output folder, or get permission to write there"
         )
     if code in (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR) and inside:
         return UsageError(
@@ -153,7 +153,7 @@ def unexpected(error: OSError) -> MistyleError | None:
             "Put it back, and run the same command again"
         )
     if error.errno in NOT_TO_BE_WRITTEN:
-        return InputRefused(f"{named}: cannot be opened ({error.strerror}); ask for the right to it")
+        return InputRefused(f"{named}: cannot be opened ({error.strerror}); get permission to read it")
     if error.errno in BROKEN:
         return MistyleError(f"{named}: the disk, or the connection to it, failed ({error.strerror}); run again")
     return None

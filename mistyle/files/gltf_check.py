@@ -19,8 +19,8 @@ from mistyle.files.gltf_schema import Document, JsonBuffer
 
 AGAIN = "Export the file again"
 DECOMPRESS = (
-    "Write it without compression: open it in Blender and export glTF with Compression off, or ask the program that "
-    "made it for an uncompressed file"
+    "Write it without compression: open it in Blender and export glTF with Compression off, or export an "
+    "uncompressed file from the program that made it"
 )
 # What may be required: these change neither the vertices nor how they are found, or are handled by the reader.
 READABLE = {
@@ -174,7 +174,7 @@ def _unpack(path: Path, say: Callable[[str], None]) -> tuple[dict[str, Any], mem
     if version != 2:
         raise refuse(path, f".glb version {version}", "version 2", "Convert it to glTF 2.0")
     if total > size:
-        raise refuse(path, f"{size} bytes", f"{total} as its header says", "The file is cut off; copy it again")
+        raise refuse(path, f"{size} bytes", f"{total} by its header", "The file is cut off; copy it again")
     chunks, at = [], 12
     while at + 8 <= total and len(chunks) < 2:
         length, kind = struct.unpack("<I4s", read_part(path, at, 8))
@@ -222,7 +222,7 @@ def data_uri(uri: str, path: Path) -> bytes:
     try:
         return base64.b64decode(body, validate=True)
     except (binascii.Error, ValueError) as error:
-        raise refuse(path, f"a data URI that is no base64 ({error})", "base64", AGAIN) from error
+        raise refuse(path, f"a data URI that is not base64 ({error})", "base64", AGAIN) from error
 
 
 def _check_indices(d: Document, path: Path) -> None:

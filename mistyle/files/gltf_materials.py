@@ -154,7 +154,7 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
         )
     with_maps = [n for n in drawn if any(k.endswith("Texture") for k in extension(entry["extensions"], n))]
     if any(n != "KHR_materials_specular" for n in with_maps):
-        notes.append(f"Of {' and '.join(with_maps)} of material '{name}' the factors were read, not the textures.")
+        notes.append(f"Material '{name}': the factors of {' and '.join(with_maps)} were read, not the textures.")
     more = [n for n in more if n not in _DRAWN]
     if more:
         notes.append(
@@ -162,8 +162,8 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
         )
     if GLOSSY in entry.get("extensions", {}):
         notes.append(
-            f"Of material '{name}' ({GLOSSY}) diffuse colour and glossiness are painted on; its specular colour is "
-            "drawn, and a finished asset has no such thing."
+            f"Material '{name}' ({GLOSSY}): diffuse colour and glossiness are painted; its specular colour is drawn, "
+            "but a finished asset has none."
         )
     elif "pbrMetallicRoughness" not in entry and "KHR_materials_unlit" not in entry.get("extensions", {}):
         notes.append(

@@ -214,7 +214,7 @@ def _instances(tree: Tree, buffers: Buffers, node: Tree, room: int, notes: list[
     primitives = [p for p in tree["meshes"][node["mesh"]]["primitives"] if "POSITION" in p["attributes"]]
     corners = sum(tree["accessors"][p.get("indices", p["attributes"]["POSITION"])]["count"] for p in primitives)
     if len(found) * corners > 3 * room:
-        notes.append(f"Of {len(found)} instances ({INSTANCING}) the first was read; all of them show the same texels.")
+        notes.append(f"Only the first of {len(found)} instances ({INSTANCING}) was read; all show the same texels.")
         return found[:1]
     return found
 
@@ -283,7 +283,7 @@ def _indices(tree: Tree, buffers: Buffers, primitive: Tree, path: Path) -> Int[n
     if "indices" in primitive:
         accessor = tree["accessors"][primitive["indices"]]
         if accessor["type"] != "SCALAR" or accessor["componentType"] not in (5121, 5123, 5125):
-            raise refuse(path, "indices that are no unsigned integers", "unsigned scalars", AGAIN)
+            raise refuse(path, "indices that are not unsigned integers", "unsigned scalars", AGAIN)
     return triangles(tree, buffers, primitive)
 
 

@@ -113,7 +113,7 @@ def _shown(pixels: Shaped[np.ndarray, "h w"], header: dict[str, Any], path: Path
     x, y, width, height = window_of(header, "dataWindow")
     sx, sy, shown_width, shown_height = window_of(header, "displayWindow")
     if pixels.shape != (height, width):
-        raise refuse(path, f"{pixels.shape} texels", f"{(height, width)} as its header says", AGAIN)
+        raise refuse(path, f"{pixels.shape} texels", f"{(height, width)} by its header", AGAIN)
     if (x, y, width, height) == (sx, sy, shown_width, shown_height):
         return pixels
     result = np.zeros((shown_height, shown_width), pixels.dtype)

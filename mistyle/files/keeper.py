@@ -137,5 +137,5 @@ class Keeper:
 
 def _checked(stage: str) -> str:
     if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9_-]*", stage):
-        raise ValueError(f"'{stage}' is no name for a stage; use letters, digits, '-' and '_'")
+        raise ValueError(f"'{stage}' is not a valid stage name; use letters, digits, '-' and '_'")
     return stage

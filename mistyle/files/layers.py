@@ -128,7 +128,7 @@ def _groups(part: Any, several: bool, path: Path) -> list[tuple[str, dict[str, n
     for name, channel in part.channels.items():
         pixels = np.asarray(channel.pixels)
         if pixels.shape != (window[3], window[2]):
-            raise refuse(path, f"{pixels.shape} texels", f"{(window[3], window[2])} as its header says", AGAIN)
+            raise refuse(path, f"{pixels.shape} texels", f"{(window[3], window[2])} by its header", AGAIN)
         layer, _, short = name.rpartition(".")
         groups.setdefault(_full(called, layer), {})[short] = pixels
     return [(name, planes, window, display) for name, planes in groups.items()]

@@ -112,7 +112,7 @@ def read_off(path: Path, max_faces: int) -> Raw:
     notes, colours = small_faces(sizes), None
     behind = [len(p) - 1 - int(n) for p, n in zip(polygons, sizes, strict=True)]
     if more < texture + normal + 3 * colour:
-        notes.append("Its vertices have fewer numbers than its header says; only positions were read.")
+        notes.append("Its vertices have fewer numbers than its header declares; only positions were read.")
         texture, colour, normal = 0, False, 0
     if colour:
         colours = linear_colours(_off_table(rows, 3 + normal, 3, path))[triangles]
@@ -141,7 +141,7 @@ def _off_faces(polygons: list[list[bytes]], path: Path) -> tuple[Int[np.ndarray,
         corners = np.array([int(c) for p, n in zip(polygons, sizes, strict=True) for c in p[1 : n + 1]], np.int64)
     except (ValueError, OverflowError) as error:
         raise refuse(
-            path, f"a face that is no list of whole numbers ({str(error)[:80]})", "count and indices", AGAIN
+            path, f"a face that is not a list of whole numbers ({str(error)[:80]})", "count and indices", AGAIN
         ) from error
     if (sizes < 0).any() or len(corners) != sizes.sum():
         raise refuse(path, "a face with fewer indices than it announces", "as many", CUT_OFF)

@@ -123,7 +123,7 @@ def unread(entries: Sequence[MtlEntry]) -> list[str]:
             odd = key == "kd" and "map_kd" not in entry.values and np.isnan(_numbers(entry, key, [np.nan])[0])
             if ignored or odd:  # odd: a spectrum
                 left.setdefault(entry.library.name, {})[entry.spelled[key]] = None
-    said = (f"Of {library} these statements were not read: {', '.join(keys)}." for library, keys in left.items())
+    said = (f"{library}: these statements were not read: {', '.join(keys)}." for library, keys in left.items())
     return [*notes, *said]
 
 

@@ -150,7 +150,7 @@ def _corners(
         else:
             index = np.array([[int(x or b"0") for x in (t.split(b"/") + [b"", b""])[:3]] for t in flat])
     except (ValueError, OverflowError) as error:
-        raise refuse(path, f"a face that is no list of indices ({str(error)[:80]})", "f v/vt/vn ...", AGAIN) from error
+        raise refuse(path, f"a face that is not indices ({str(error)[:80]})", "f v/vt/vn ...", AGAIN) from error
     index = np.pad(index.astype(np.int64), ((0, 0), (0, 3 - index.shape[1]))) if index.shape[1] < 3 else index[:, :3]
     counts = [len(lines[k]) for k in (b"v", b"vt", b"vn")]
     if (index < 0).any():

@@ -77,7 +77,7 @@ def colour_space(name: str, config: str | None = None, *, linear: bool = True) -
     except ocio.Exception as error:
         said = str(error).split("\n")[0][:200]
         raise UsageError(
-            f"--colorspace {name!r}: {where} does not say how its colours lie to others ({said}); it needs the role "
+            f"--colorspace {name!r}: {where} does not relate its colours to other spaces ({said}); it needs the role "
             "aces_interchange, as the ACES configs have it"
         ) from None
     return ColourSpace(space.getName(), where, _interop(to) if linear else "", to, back)

@@ -163,9 +163,7 @@ def _why(root: Path) -> str:
     if (root / RECORD).is_file():
         return "" if read_written(root) is not NOTHING else f" ({RECORD}, the list of what it wrote here, is damaged)"
     if any(next(root.glob(pattern), None) for pattern in OLDER):
-        return (
-            " (an older version of mistyle may have: it kept no list of its files, so they cannot be told from yours)"
-        )
+        return " (an older version of mistyle may have: it kept no list of its files, so they look like yours)"
     return ""
 
 

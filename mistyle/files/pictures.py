@@ -58,7 +58,7 @@ def read_pixels(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.
         _load(image, str(path))
     orientation = _orientation(image)
     if orientation > 1 and pixels == "upright":
-        notes.append("The picture was turned upright as its EXIF orientation says.")
+        notes.append("The picture was turned upright by its EXIF orientation.")
     rgb, alpha = _pixels(image, data, str(path), notes)
     rgb, alpha = (
         None if part is None else _as_wanted(part, orientation, image.format == "TIFF", pixels) for part in (rgb, alpha)
@@ -207,8 +207,8 @@ def _open(data: bytes, where: str) -> tuple[Any, list[str]]:
         raise refuse(where, f"{image.width} x {image.height} pixels", "at least one pixel", CONVERT)
     if image.width * image.height > MAX_PIXELS:
         raise _too_large(where, f"{image.width} x {image.height} pixels")
-    taken = {"MPO": "pictures in the MPO file only the first", "TIFF": "pages only the first"}
-    notes = [f"Of the {taken.get(str(image.format), 'animation only the first frame')} was taken."] if several else []
+    taken = {"MPO": "first picture of the MPO file", "TIFF": "first page"}
+    notes = [f"Only the {taken.get(str(image.format), 'first frame of the animation')} was read."] if several else []
     return image, notes
 
 

@@ -105,7 +105,7 @@ def prepare(
             path, f"{len(area)} faces, all without area", "at least one triangle with an area", "Export the mesh again"
         )
     points = same_points(raw.positions)
-    notes = list(raw.notes) + ([f"The mesh was {TURNED}, as asked."] if up == "z" else [])
+    notes = list(raw.notes) + ([f"The mesh was {TURNED}, as requested."] if up == "z" else [])
     if up == "y" and lies_on_its_side(raw.positions, raw.faces):
         notes.append(SIDEWAYS)
     normals = _normals(raw, work, points, work_from_user, notes)
@@ -185,8 +185,8 @@ def _plan(
     name = raw.materials[material].name
     own = _own(raw, rows)
     if uv == "new":
-        notes.append(f"Material '{name}' was unwrapped anew, as asked.")
-        return _Plan(rows, None, "asked for")
+        notes.append(f"Material '{name}' was unwrapped anew, as requested.")
+        return _Plan(rows, None, "requested")
     layout, reason = _layout(raw, raw.uvs, rows, points, area)
     if reason and raw.authored is not None:
         other, no = _layout(raw, raw.authored, rows, points, area)
@@ -198,7 +198,7 @@ def _plan(
             _say(name, other.verdicts, len(own) < len(rows), notes)
             return _Plan(rows, other, "")
     if layout is not None and reason == TORN and uv == "keep":
-        notes.append(f"Of material '{name}' {reason}; of each texel the first face's were taken.")
+        notes.append(f"Material '{name}': {reason}; each texel takes those of its first face.")
         reason = ""
     if layout is not None and not reason:
         _say(name, layout.verdicts, len(own) < len(rows), notes)

@@ -34,7 +34,7 @@ def mesh(path: Path, reader: str, max_faces: int) -> Raw | Indexed:
     """The mesh with all its textures decoded. `reader` is "module:function", of files/read_mesh.py."""
     module, _, function = reader.partition(":")
     if not module.startswith("mistyle.files."):
-        raise ValueError(f"{reader} is no reader of mistyle")
+        raise ValueError(f"{reader} is not a reader of mistyle")
     with _usd(path):
         found: Raw | Indexed = getattr(import_module(module), function)(path, max_faces)
         raw = found.raw if isinstance(found, Indexed) else found

@@ -132,7 +132,7 @@ def _piece(reading: _Reading, prim: Any, owner: str, matrix: Float[np.ndarray, "
     mesh = pxr.UsdGeom.Mesh(prim)
     shape = polygons(pxr, prim, reading.path, reading.max_faces)
     if is_shape(prim):
-        notes.append("Shapes that are no meshes (spheres, cubes and the like) were read as meshes.")
+        notes.append("Shapes other than meshes (spheres, cubes and the like) were read as meshes.")
     elif shape is None and mesh.GetPointsAttr().HasAuthoredValue() and triples(mesh.GetPointsAttr().Get(time)) is None:
         notes.append("A mesh whose points are of another type than point3f[] was left out.")
     if shape is None or not len(shape.corner):
@@ -142,7 +142,7 @@ def _piece(reading: _Reading, prim: Any, owner: str, matrix: Float[np.ndarray, "
     if "SkelBindingAPI" in prim.GetAppliedSchemas():
         notes.append("A skinned mesh was read in the pose of its skeleton at the first time.")
     elif not is_shape(prim) and mesh.GetPointsAttr().ValueMightBeTimeVarying():
-        notes.append("Of an animated mesh the first frame was read.")
+        notes.append("Only the first frame of an animated mesh was read.")
     if not np.isfinite(matrix).all():
         found = f"{prim.GetPath()} with a transform that is not finite"
         raise refuse(reading.path, found, "finite numbers", "Export it again")

@@ -88,7 +88,7 @@ def mesh_prims(pxr: Any, stage: Any, path: Path, notes: list[str]) -> Iterator[t
             inside = prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
             yield prim, str(inside.GetPath()), np.array(cache.GetLocalToWorldTransform(prim))
         elif prim.IsA(pxr.UsdGeom.Gprim):
-            notes.append("Shapes that are no surfaces (curves, points, volumes) were left out.")
+            notes.append("Shapes that are not surfaces (curves, points, volumes) were left out.")
 
 
 def _shown(pxr: Any, prim: Any, time: Any, notes: list[str]) -> bool:
@@ -110,7 +110,7 @@ def _prototypes(pxr: Any, prim: Any, cache: Any, time: Any, notes: list[str]) ->
     which = np.array(instancer.GetProtoIndicesAttr().Get(time) or [], np.int64)
     at = instancer.GetPositionsAttr().Get(time)
     turns, scales = instancer.GetOrientationsAttr().Get(time), instancer.GetScalesAttr().Get(time)
-    notes.append("Of a point instancer each prototype was read once, where its first instance stands.")
+    notes.append("Each prototype of a point instancer was read once, at its first instance.")
     world = np.array(cache.GetLocalToWorldTransform(prim))
     for k, target in enumerate(instancer.GetPrototypesRel().GetForwardedTargets()):
         own, first = prim.GetStage().GetPrimAtPath(target), np.flatnonzero(which == k)

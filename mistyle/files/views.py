@@ -202,7 +202,7 @@ def _view(
     height, width = rgb.shape[:2]
     if (height, width) != camera.size:
         if height * camera.size[1] != width * camera.size[0]:
-            expected = f"{camera.size[1]} x {camera.size[0]} as camera.json says, or that aspect ratio"
+            expected = f"{camera.size[1]} x {camera.size[0]} by camera.json, or that aspect ratio"
             raise refuse(path, f"{width} x {height} pixels", expected, "Do not crop or stretch the picture")
         camera = resized(camera, (height, width))
     if not np.isfinite(rgb).all():

@@ -79,7 +79,7 @@ METRICS = {
             "mean over the mask of CIEDE2000 (colour-science; kL = kC = kH = 1) between CIELAB colours, white D65, of "
             "the pictures clipped to 0..1",
         ),
-        Metric("de2000_p95", "lower", "ΔE00", "95th percentile over the mask of what de2000 is the mean of"),
+        Metric("de2000_p95", "lower", "ΔE00", "95th percentile over the mask of CIEDE2000"),
         Metric(
             "relmse",
             "lower",
@@ -141,7 +141,7 @@ class MetricValues:
 def definitions(viewing: Viewing, names: Sequence[str]) -> dict[str, str]:
     """What every metric of `names` is, with the numbers of `viewing` filled in."""
     if viewing.exposures is None:
-        exposures = "as many exposures as the reference asks for"
+        exposures = "as many exposures as the reference needs"
     else:
         first, last, count = viewing.exposures
         exposures = f"{count} exposures from {first:+.2f} to {last:+.2f} stops"

@@ -145,7 +145,7 @@ def _missing(variant: str) -> str:
         return f"Mitsuba's {variant} does not answer on this machine (no device or no driver). Use llvm_ad_rgb instead."
     if (ours := known_llvm()) and not os.environ.get("DRJIT_LIBLLVM_PATH"):
         return (
-            f"Dr.Jit was imported before it could be told of the LLVM that works ({ours}). Call"
+            f"Dr.Jit was imported before it could load the working LLVM ({ours}). Call"
             " `mistyle.environment.use_llvm()` before the first import of mitsuba or drjit."
         )
     if not dr.has_backend(dr.JitBackend.LLVM):

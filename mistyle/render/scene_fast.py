@@ -194,7 +194,7 @@ def _by_value(role: str, gradient: Float[np.ndarray, "n c"], value: np.ndarray) 
 
 def _missing(scene: Any, parameter: Parameter, reasons: Mapping[str, str | None]) -> str:
     told = next((f"{name}: {reason}" for name, reason in reasons.items() if reason is not None), None)
-    return told or f"{parameter.name} is no map of a plain `principled` on a mesh."
+    return told or f"{parameter.name} is not a map of a plain `principled` on a mesh."
 
 
 def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[MaterialTexels | None]:
@@ -210,7 +210,7 @@ def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[MaterialTe
     for shape in scene.shapes():
         # A rectangle counts as a mesh but has no vertices to show.
         if "vertex_positions" not in mi.traverse(shape).keys():
-            raise Unsupported(f"{shape.id()} is no mesh ({shape.class_name()}).")
+            raise Unsupported(f"{shape.id()} is not a mesh ({shape.class_name()}).")
         plain = reasons.get(shape.id()) is None
         result.append(_material(shape, held, keys) if plain else None)
     if all(material is None for material in result):

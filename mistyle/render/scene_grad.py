@@ -148,7 +148,7 @@ def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]
                 f"the integrator '{wanted}' cannot be made; expected for example 'prb'. {error}"
             ) from error
         if not isinstance(made, mi.Integrator):
-            raise UsageError(f"'{wanted}' is no integrator; expected for example 'prb'.")
+            raise UsageError(f"'{wanted}' is not an integrator; expected for example 'prb'.")
         return made, ()
     own = scene.integrator()
     if own is None:

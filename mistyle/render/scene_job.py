@@ -146,7 +146,7 @@ def prepare(
     table.properties = {p.key: table.properties[p.key] for p in chosen}
     free = _free(chosen, unknowns.only or {})
     scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
-    quick, why = _fast(scene, chosen, views, loss or "log_srgb_l1", engine) if fast else (None, "it was not asked for.")
+    quick, why = _fast(scene, chosen, views, loss or "log_srgb_l1", engine) if fast else (None, "it was not requested.")
     if loss is None:
         loss = "relative" if quick is None else "log_srgb_l1"
     unsuited = "regularizers came" if regularizers else scene_newton.refusal(chosen, free, views, loss)

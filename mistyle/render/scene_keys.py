@@ -245,7 +245,7 @@ def _unknown(listed: Sequence[Parameter], pattern: str) -> str:
         literal = [p for p in listed if any(fnmatchcase(name, f"{stem}.value") for name in p.names)]
         if literal:
             return (
-                f"'{pattern}': {literal[0].name} is a literal, one value for the whole surface, not a texture. Ask for "
+                f"'{pattern}': {literal[0].name} is a literal, one value for the whole surface, not a texture. Name "
                 f"'{stem}.value' to fit that value, or put a texture of the size to be fitted in its place in the "
                 'scene file (<texture type="bitmap"> with a float image).'
             )
@@ -296,7 +296,7 @@ def _reason(node: Any, owner: Any, role: str, kind: str, flags: Any, value: Any,
             '<string name="format" value="variant"/>.'
         )
     if storage not in ("float16", "float32", "float64"):
-        return f"it is no array of real numbers ({type(value).__name__})."
+        return f"it is not an array of real numbers ({type(value).__name__})."
     if int(flags) & int(mi.ParamFlags.ReadOnly):
         return "Mitsuba marks it as read-only."
     if int(flags) & int(mi.ParamFlags.NonDifferentiable):

@@ -67,7 +67,7 @@ def edits_of(
     """
     place = _find(state, p)
     if place is None:
-        return "its element could not be told from the others."
+        return "its element could not be distinguished from the others."
     node, literal = place
     found = _edits(node, literal, sources[node.file_index], p, values, file)
     return found if isinstance(found, str) else (node.file_index, found)

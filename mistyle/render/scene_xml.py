@@ -59,7 +59,7 @@ def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = Non
 
     file = Path(path)
     if not file.is_file():
-        raise InputRefused(f"{file}: there is no such scene file.")
+        raise InputRefused(f"{file}: no such scene file.")
     given = {name: str(value) for name, value in (defines or {}).items()}
     config: Any = mi.parser.ParserConfig(device.use())
     config.merge_equivalent = config.merge_meshes = False

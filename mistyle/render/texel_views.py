@@ -86,7 +86,7 @@ def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
             elif isinstance(light, SOFT):
                 continue
             else:
-                raise ValueError(f"{type(light).__name__} is no light that the solver knows")
+                raise ValueError(f"{type(light).__name__} is not a light that the solver supports")
             near.append(float(isinstance(light, Point)))
             width2.append(0.0)
         cells.append(len(near))
@@ -159,4 +159,4 @@ def _shadow(point: Any, light: Light, camera: Camera) -> Any:
         return point.spawn_ray(mi.Vector3f(direction_in_world(light, camera).tolist()))
     if isinstance(light, Point):
         return point.spawn_ray_to(mi.Point3f(position_in_world(light, camera).tolist()))
-    raise ValueError(f"{type(light).__name__} is no delta light")
+    raise ValueError(f"{type(light).__name__} is not a delta light")

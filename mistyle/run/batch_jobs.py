@@ -184,7 +184,7 @@ def _globbed(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
             try:
                 matches = sorted(p for p in root.glob(str(inner)) if p.is_file())
             except (ValueError, NotImplementedError, OSError) as error:
-                raise InputRefused(f"{origin}: '{pattern[:200]}' is no pattern of file names ({error})") from None
+                raise InputRefused(f"{origin}: '{pattern[:200]}' is not a pattern of file names ({error})") from None
             if not matches:
                 raise InputRefused(f"{origin}: '{pattern}' matches no file in {base}; check the pattern")
             found += matches

@@ -115,7 +115,7 @@ def indices(text: str, count: int) -> tuple[int, ...]:
         found += range(int(first), int(last if dash else first) + 1)
     wrong = [n for n in found if n >= count]
     if wrong:
-        raise UsageError(f"--index {text}: the plan has {count} shards, numbered from 0; there is no {wrong[0]}")
+        raise UsageError(f"--index {text}: the plan has {count} shards, numbered from 0; found {wrong[0]}")
     return tuple(dict.fromkeys(found))
 
 

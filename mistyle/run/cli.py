@@ -7,7 +7,7 @@ failed, 75 stopped and resumable, 130 interrupted.
 import argparse
 import json
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,34 +35,47 @@ from mistyle.run.options import (
     add_report_option,
     asset_name,
     examples,
-    said_settings,
+    given_settings,
 )
 
 Command = Callable[[argparse.Namespace], int]
+
+
+# What people use, in this order; --help lists every other verb after them.
+USED = ("demo", "stylize", "fit", "render", "bake", "compare", "lookdev", "batch", "export", "view")
+
+
+class _TwoGroups(argparse.RawDescriptionHelpFormatter):
+    """Lists the verbs of USED, then those left under "more"."""
+
+    def _iter_indented_subactions(self, action: argparse.Action) -> Iterator[argparse.Action]:
+        rank = {verb: k for k, verb in enumerate(USED)}
+        yield from sorted(super()._iter_indented_subactions(action), key=lambda verb: rank.get(verb.dest, len(USED)))
+
+    def _format_action(self, action: argparse.Action) -> str:
+        text = super()._format_action(action)
+        first, _, rest = text.partition("COMMAND\n")
+        if not isinstance(action, argparse._SubParsersAction) or not rest:
+            return text
+        lines = rest.splitlines(keepends=True)
+        more = max(k for k, line in enumerate(lines) if line.split()[:1] == [USED[-1]]) + 1
+        return "".join([*lines[:more], "\nmore:\n", *lines[more:]])
 
 
 def parser() -> argparse.ArgumentParser:
     """Every verb with its options and examples."""
     top = argparse.ArgumentParser(
         prog="mistyle",
-        description="A mesh and one style picture in; the same mesh with stylized, physically based textures out.",
-        **examples(
-            """
-            python3 -m mistyle demo                                 see it work: mesh, style and report made here
-            mistyle stylize bunny.obj starry_night.jpg -o out/      the main job
-            mistyle stylize chair.glb wave.jpg -o out/ --preset draft
-            mistyle render bunny.obj -o views/                      the 16 views of the paper, with depth and normals
-            mistyle bake bunny.obj views/ -o baked/                 edited views back onto the texture
-            mistyle fit chair.glb photographs/ -o fitted/           albedo, normal and roughness from pictures
-            mistyle batch jobs.toml -o OUT/                         hundreds of them, resumable, on a farm too
-            mistyle view out/                                       the report: 3-D, maps, what was seen, times
-            mistyle compare a.exr b.exr -o diff/                    how two renders differ, to look at and as a gate
-            mistyle doctor                                          what this machine has, what is missing
-            """
-        ),
+        description="One mesh and one style picture in; the same mesh with stylized, physically based textures out.",
+        epilog="examples:\n"
+        "  python3 -m mistyle demo                                 sets up and stylizes a mesh that comes along\n"
+        "  mistyle stylize bunny.obj starry_night.jpg -o out/      writes asset, textures and report\n"
+        "  mistyle stylize --help                                  options and examples of a verb\n\n"
+        "mistyle doctor prints what this machine has, what is missing, and the command that fixes it.",
+        formatter_class=_TwoGroups,
     )
     top.add_argument("--version", action="version", version=f"mistyle {__version__}")
-    verbs = top.add_subparsers(dest="verb", metavar="COMMAND", required=True)
+    verbs = top.add_subparsers(dest="verb", metavar="COMMAND", required=True, title="commands")
     _add_stylize(verbs)
     _add_demo(verbs)
     _add_render(verbs)
@@ -77,12 +90,19 @@ def parser() -> argparse.ArgumentParser:
     add_view(verbs)
     add_lookdev(verbs)
     add_verify(verbs)
+    # Without help: the footer names it.
     doctor = verbs.add_parser(
-        "doctor", help="what was found on this machine, what is missing, and the command that fixes it"
+        "doctor",
+        description="Prints what this machine has, what is missing, and the command that fixes it.",
+        **examples("mistyle doctor --json"),
     )
     doctor.add_argument("--json", action="store_true", help="one JSON object on stdout")
     doctor.set_defaults(command=_doctor)
-    test = verbs.add_parser("test", help="set everything up and run the whole test suite (arguments go to pytest)")
+    test = verbs.add_parser(
+        "test",
+        help="set up and run the test suite; arguments go to pytest",
+        **examples("python3 -m mistyle test tests/test_cli.py -x"),
+    )
     test.add_argument("arguments", nargs="*", help="passed on to pytest")
     test.set_defaults(command=_test)
     return top
@@ -95,7 +115,7 @@ def _add_view_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument("--resolution", type=int, metavar="N", help="pixels along each side of a view")
     verb.add_argument("--spp", type=int, metavar="N", help="samples per pixel of the rendered views")
     verb.add_argument(
-        "--scene", type=Path, help="a Mitsuba scene whose shape 'object' gives way to the mesh (trusted like code)"
+        "--scene", type=Path, help="a Mitsuba scene; the mesh replaces its shape 'object' (trusted like code)"
     )
     verb.add_argument(
         "--paper-files", action="store_true", default=None, help="also write 8-bit depth maps and Canny edges"
@@ -107,12 +127,12 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--stylizer",
         choices=["embedded", "embedded-view", "diffusion"],
-        help="embedded (default) paints the surface once; embedded-view paints view after view, each from those "
-        "before; diffusion does so with SDXL (needs models)",
+        help="embedded (default) paints the surface once; embedded-view paints view after view from earlier "
+        "ones; diffusion does the same with SDXL (needs models)",
     )
     verb.add_argument("--atlas", type=int, metavar="N", help="texture size")
     verb.add_argument(
-        "--samples", type=int, metavar="N", help="surface samples of the stylizer: more means finer strokes"
+        "--samples", type=int, metavar="N", help="surface samples of the stylizer; more samples give finer strokes"
     )
     verb.add_argument(
         "--stroke-scale", type=float, metavar="X", help="size of the strokes on the surface, 1 is the default"
@@ -134,10 +154,10 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--refine",
         choices=["auto", "off", "normal-roughness", "albedo", "all"],
-        help="which maps the differentiable fit may change (auto: all; where the embedded stylizer paints, the albedo, "
-        "and nothing in drafts)",
+        help="maps that the differentiable fit may change (auto: all; for the embedded stylizer the albedo, in drafts "
+        "none)",
     )
-    verb.add_argument("--metallic", choices=["keep", "zero", "fit"], help="what becomes of the asset's own metalness")
+    verb.add_argument("--metallic", choices=["keep", "zero", "fit"], help="keep, zero or fit the asset's metalness")
     verb.add_argument(
         "--vgg",
         type=Path,
@@ -148,11 +168,11 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
         "--preview",
         action="store_true",
-        help="only paint, without fit and repair: four views and the maps on one sheet, OUT/preview/preview.png; the "
-        "same command without it goes on from there",
+        help="only paint, without fit and repair: four views and the maps on OUT/preview/preview.png; the same "
+        "command without it resumes from there",
     )
     verb.add_argument(
-        "--variations", type=int, metavar="N", help="only try N seeds and stroke sizes, quickly, on one contact sheet"
+        "--variations", type=int, metavar="N", help="only paint N seeds and stroke sizes on one contact sheet"
     )
     _add_dry_run(verb)
     add_memory_option(verb)
@@ -161,15 +181,13 @@ def _add_style_options(verb: argparse.ArgumentParser) -> None:
 
 
 def _add_dry_run(verb: argparse.ArgumentParser) -> None:
-    verb.add_argument(
-        "--dry-run", action="store_true", help="print the plan with estimated time, memory and disk, and stop"
-    )
+    verb.add_argument("--dry-run", action="store_true", help="print estimated time, memory and disk, and stop")
 
 
 def _add_stylize(verbs: Any) -> None:
     verb = verbs.add_parser(
         "stylize",
-        help="mesh + style picture -> stylized asset, textures and report",
+        help="paint a mesh in the style of a picture: asset, textures and report",
         **examples(
             """
             mistyle stylize bunny.obj starry_night.jpg -o out/
@@ -188,7 +206,7 @@ def _add_stylize(verbs: Any) -> None:
     )
     verb.add_argument("mesh", type=Path, nargs="?", metavar="MESH", help=".obj .ply .stl .off .glb .gltf .usd .usdz")
     verb.add_argument("style", type=Path, nargs="?", metavar="STYLE", help="any picture")
-    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; the same command again goes on there")
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; rerun to resume")
     add_job_options(verb)
     add_mesh_options(verb)
     _add_view_options(verb)
@@ -209,7 +227,7 @@ def _add_demo(verbs: Any) -> None:
 def _add_render(verbs: Any) -> None:
     verb = verbs.add_parser(
         "render",
-        help="render a mesh from a rig of cameras: EXR layers, PNG, camera and light files",
+        help="render views of a mesh: layered EXR, PNG, camera and light files",
         **examples(
             """
             mistyle render bunny.obj -o views/
@@ -232,7 +250,7 @@ def _add_render(verbs: Any) -> None:
 def _add_bake(verbs: Any) -> None:
     verb = verbs.add_parser(
         "bake",
-        help="project pictures of known cameras onto the mesh's texture",
+        help="project pictures of known cameras onto the texture",
         **examples(
             """
             mistyle bake bunny.obj views/ -o baked/
@@ -285,7 +303,7 @@ def _settings(options: argparse.Namespace, preset: str | None = None) -> Any:
     from mistyle.run.settings import merge
     from mistyle.run.stylize_settings import resolve
 
-    return resolve(options.preset or preset, options.config, merge(_rig(options), said_settings(options, OPTIONS)))
+    return resolve(options.preset or preset, options.config, merge(_rig(options), given_settings(options, OPTIONS)))
 
 
 def _rig(options: argparse.Namespace) -> dict[str, Any]:
@@ -312,7 +330,7 @@ def _need(options: argparse.Namespace, *names: str) -> None:
         raise UsageError(f"{options.verb} needs {wanted}; see mistyle {options.verb} --help")
 
 
-def _tell_plan(options: argparse.Namespace, estimate: dict[str, Any]) -> int:
+def _print_plan(options: argparse.Namespace, estimate: dict[str, Any]) -> int:
     from mistyle.run.plan import describe_plan
 
     print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
@@ -346,7 +364,7 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     job = _job(options, mesh, style, preset, name)
     settings = job.settings
     if options.dry_run:
-        return _tell_plan(options, plan(job))
+        return _print_plan(options, plan(job))
     progress = Progress()
     if options.preview and options.variations:
         raise UsageError("--preview and --variations: give one of them; --variations shows several paintings")
@@ -385,7 +403,7 @@ def _render(options: argparse.Namespace) -> int:
         from mistyle.run.verbs import claim_views
 
         claim_views(options.mesh, options.out, settings, options.overwrite)
-        return _tell_plan(options, plan_render(options.mesh, options.out, settings))
+        return _print_plan(options, plan_render(options.mesh, options.out, settings))
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import render_views
 
@@ -407,7 +425,7 @@ def _bake(options: argparse.Namespace) -> int:
         from mistyle.run.verbs import claim_baked
 
         claim_baked(options.mesh, options.views, options.out, called, options.overwrite)
-        return _tell_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
+        return _print_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
     from mistyle.run.progress import Progress
     from mistyle.run.verbs import bake_views
 

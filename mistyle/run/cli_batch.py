@@ -17,7 +17,7 @@ from mistyle.run.options import (
     add_delivery_options,
     add_overwrite_option,
     examples,
-    said_settings,
+    given_settings,
 )
 
 
@@ -31,13 +31,13 @@ def add_batch(verbs: Any) -> None:
 def _add_batch(verbs: Any) -> None:
     verb = verbs.add_parser(
         "batch",
-        help="many jobs: a list, a grid of meshes and styles, or a folder; resumes, retries, one page of results",
+        help="run many jobs from a list, a grid or a folder; rerun to resume",
         **examples(
             """
             mistyle batch jobs.toml -o OUT/                        [[job]] and [[grid]] entries; also .yaml
             mistyle batch props/ -o OUT/ --dry-run                 every mesh in it with every picture in it
             mistyle batch jobs.toml -o OUT/ --workers 8 --watch    eight at a time, with a live table
-            mistyle batch OUT/plan.json                            go on with what is not done
+            mistyle batch OUT/plan.json                            resume unfinished jobs
             mistyle batch jobs.toml -o /share/OUT --engine ray --address auto --gpus 0.5
             """
         ),
@@ -49,7 +49,7 @@ def _add_batch(verbs: Any) -> None:
     verb.add_argument("--address", help="Ray: address of a running cluster, or auto; without it one of this machine")
     verb.add_argument("--gpus", type=float, default=0.0, metavar="X", help="Ray: GPUs of each job, a share is allowed")
     verb.add_argument(
-        "--wait", type=float, default=300.0, metavar="S", help="Ray: give up when nothing begins for so long"
+        "--wait", type=float, default=300.0, metavar="S", help="Ray: seconds without a started job before giving up"
     )
     verb.add_argument("--timeout", type=float, metavar="S", help="stop a job that takes longer")
     verb.add_argument("--only", nargs="+", default=[], metavar="NAME", help="only these jobs of the plan")
@@ -75,14 +75,14 @@ def _add_machine_options(verb: argparse.ArgumentParser) -> None:
         type=int,
         default=0,
         metavar="N",
-        help="of each job; results depend on it (default: cores / workers)",
+        help="threads of each job; results depend on them (default: cores / workers)",
     )
 
 
 def _add_shard(verbs: Any) -> None:
     verb = verbs.add_parser(
         "shard",
-        help="one job of a batch's plan; what every worker of a farm runs",
+        help="run one job of a batch's plan, as farm workers do",
         **examples(
             """
             mistyle shard OUT/plan.json --index 3
@@ -100,12 +100,16 @@ def _add_shard(verbs: Any) -> None:
 
 def _add_map_option(verb: argparse.ArgumentParser) -> None:
     verb.add_argument(
-        "--path-map", action="append", default=[], metavar="FROM=TO", help="how this machine sees a folder of the plan"
+        "--path-map", action="append", default=[], metavar="FROM=TO", help="this machine's path of a folder of the plan"
     )
 
 
 def _add_farm(verbs: Any) -> None:
-    farm = verbs.add_parser("farm", help="a batch as files for a farm's queue")
+    farm = verbs.add_parser(
+        "farm",
+        help="write a batch as files for a farm's queue",
+        **examples("mistyle farm export jobs.toml -o OUT/ --as openjd"),
+    )
     kinds = farm.add_subparsers(dest="farm", metavar="ACTION", required=True)
     verb = kinds.add_parser(
         "export",
@@ -123,8 +127,8 @@ def _add_farm(verbs: Any) -> None:
     verb.add_argument("--as", dest="form", choices=["openjd", "sbatch", "commands"], default="openjd")
     verb.add_argument("--bundle", type=Path, metavar="DIR", help="where the files go (default OUT/farm)")
     verb.add_argument("--program", default="mistyle", help="how a worker calls mistyle (default mistyle)")
-    verb.add_argument("--memory", type=float, default=8.0, metavar="GB", help="memory that a task asks for")
-    verb.add_argument("--gpus", type=int, default=0, metavar="N", help="GPUs that a task asks for")
+    verb.add_argument("--memory", type=float, default=8.0, metavar="GB", help="memory that a task requests")
+    verb.add_argument("--gpus", type=int, default=0, metavar="N", help="GPUs that a task requests")
     verb.add_argument("--chunk", type=int, default=1, metavar="N", help="Open Job Description: shards of a task")
     _add_machine_options(verb)
     _add_map_option(verb)
@@ -138,7 +142,7 @@ def _add_farm(verbs: Any) -> None:
 def _add_pack(verbs: Any) -> None:
     verb = verbs.add_parser(
         "pack",
-        help="a folder that installs mistyle where there is no network",
+        help="write a folder that installs mistyle without a network",
         **examples(
             """
             mistyle pack -o mistyle-offline/                   then there: ./install.sh /opt/mistyle
@@ -178,7 +182,7 @@ def _batch(options: argparse.Namespace) -> int:
     from mistyle.run.batch_plan import with_delivery
 
     given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
-    plan = with_delivery(given, said_settings(options, DELIVERY_OPTIONS))
+    plan = with_delivery(given, given_settings(options, DELIVERY_OPTIONS))
     if options.dry_run:
         told = dry_run(plan, choices)
         print(json.dumps(told) if options.json else describe_dry_run(told))
@@ -234,7 +238,7 @@ def _farm(options: argparse.Namespace) -> int:
 
     choices = Choices(workers=options.workers, threads=options.threads)
     given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
-    plan = with_delivery(given, said_settings(options, DELIVERY_OPTIONS))
+    plan = with_delivery(given, given_settings(options, DELIVERY_OPTIONS))
     needs = ShardNeeds(
         threads_each(choices),
         options.memory,

@@ -14,7 +14,7 @@ from mistyle.run.options import add_overwrite_option, examples, given_defines
 def add_compare(verbs: Any) -> None:
     verb = verbs.add_parser(
         "compare",
-        help="how two renders, renderers, versions or settings differ: numbers, limits, and a page to look at",
+        help="measure how renders or renderers differ: metrics, limits, a page",
         **examples(
             """
             mistyle compare reference.exr test.exr -o diff/                 all metrics, every layer, diff/index.html
@@ -39,7 +39,7 @@ def add_compare(verbs: Any) -> None:
 def add_converge(verbs: Any) -> None:
     verb = verbs.add_parser(
         "converge",
-        help="how fast renderers converge on a scene: error against samples and seconds, slopes, efficiency",
+        help="measure how fast renderers converge: error against samples and seconds",
         **examples(
             """
             mistyle converge room.xml --with mitsuba:path,mitsuba:direct -o curves/
@@ -56,13 +56,13 @@ def add_converge(verbs: Any) -> None:
     verb.add_argument("--seeds", type=int, default=4, metavar="N", help="independent renders of each (default 4)")
     verb.add_argument("--reference", type=Path, metavar="FILE.exr", help="the converged picture")
     verb.add_argument(
-        "--reference-spp", type=int, metavar="N", help="or how many samples of A make it (16 x --max-spp)"
+        "--reference-spp", type=int, metavar="N", help="or samples of the reference render of A (16 x --max-spp)"
     )
-    verb.add_argument("--lights", default="studio", metavar="A", help="of a mesh: studio, key, grazing, FILE.hdr")
-    verb.add_argument("--size", type=int, default=256, metavar="N", help="of a mesh: pixels along each side")
-    verb.add_argument("--sensor", type=int, default=0, metavar="K", help="of a scene file: the sensor")
+    verb.add_argument("--lights", default="studio", metavar="A", help="light of a mesh: studio, key, grazing, FILE.hdr")
+    verb.add_argument("--size", type=int, default=256, metavar="N", help="pixels along each side, for a mesh")
+    verb.add_argument("--sensor", type=int, default=0, metavar="K", help="sensor of a scene file")
     verb.add_argument(
-        "-D", dest="defines", action="append", default=[], metavar="NAME=VALUE", help="of a scene file: as for mitsuba"
+        "-D", dest="defines", action="append", default=[], metavar="NAME=VALUE", help="as for mitsuba, for a scene file"
     )
     verb.add_argument("--blender", metavar="PYTHON", help="Python with bpy, for blender:cycles")
     verb.add_argument("--threads", type=int, metavar="N", help="threads of blender:cycles (default: all)")
@@ -128,8 +128,8 @@ def _tell_curves(options: argparse.Namespace, record: dict[str, Any]) -> None:
 
 
 def _add_what(verb: argparse.ArgumentParser) -> None:
-    what = verb.add_argument_group("what is compared")
-    what.add_argument("--metrics", metavar="A,B", help="only these (default: all; --list-metrics says what they are)")
+    what = verb.add_argument_group("pictures and metrics")
+    what.add_argument("--metrics", metavar="A,B", help="only these (default: all; --list-metrics defines them)")
     what.add_argument("--list-metrics", action="store_true", help="every metric with its definition, and stop")
     what.add_argument("--layer", action="append", default=[], metavar="NAME", help="only this layer; may be repeated")
     what.add_argument("--mask", metavar="alpha|FILE", help="pixels that count: the reference's alpha, or a picture")
@@ -137,12 +137,12 @@ def _add_what(verb: argparse.ArgumentParser) -> None:
         "--window", choices=["display", "overlap"], default="display", help="overlap: where both have data"
     )
     what.add_argument(
-        "--protocol", choices=["stanford-orb", "tensoir", "idiff"], help="the numbers of that code instead"
+        "--protocol", choices=["stanford-orb", "tensoir", "idiff"], help="the metrics of that evaluation code instead"
     )
     what.add_argument("--ppd", type=float, metavar="N", help="pixels per degree for FLIP (default 67.02)")
     what.add_argument("--peak", type=float, default=1.0, metavar="X", help="peak of the linear PSNR (default 1)")
     what.add_argument(
-        "--exposures", metavar="FIRST,LAST,N", help="stops for HDR-FLIP (default: what the reference asks for)"
+        "--exposures", metavar="FIRST,LAST,N", help="stops for HDR-FLIP (default: derived from the reference)"
     )
     what.add_argument(
         "--lpips", nargs=2, type=Path, metavar=("BACKBONE", "HEADS"), help="weights of LPIPS-squeeze v0.1"
@@ -152,12 +152,14 @@ def _add_what(verb: argparse.ArgumentParser) -> None:
 
 
 def _add_limits(verb: argparse.ArgumentParser) -> None:
-    limits = verb.add_argument_group("limits; exit code 5 when one is not kept")
+    limits = verb.add_argument_group("limits; a failed one ends with exit code 5")
     limits.add_argument("--max", action="append", default=[], metavar="METRIC=X", help="at most X")
     limits.add_argument("--min", action="append", default=[], metavar="METRIC=X", help="at least X")
     limits.add_argument("--limits", type=Path, metavar="compare.toml", help="limits from a file, also per image")
-    limits.add_argument("--allow-nonfinite", action="store_true", help="NaN and infinite pixels are no failure")
-    limits.add_argument("--allow-missing", action="store_true", help="pictures that only one folder has are no failure")
+    limits.add_argument("--allow-nonfinite", action="store_true", help="NaN and infinite pixels do not fail the gate")
+    limits.add_argument(
+        "--allow-missing", action="store_true", help="pictures that only one folder has do not fail the gate"
+    )
     limits.add_argument("--baseline", type=Path, metavar="DIR", help="the approved pictures: REFERENCE is not given")
     limits.add_argument("--approve", action="append", default=[], metavar="NAME", help="take TEST's NAME into DIR")
 
@@ -365,7 +367,7 @@ def _crop(text: str | None) -> tuple[int, int, int, int] | None:
 
 
 def told(options: argparse.Namespace, record: dict[str, Any]) -> int:
-    """Print what was found, and the exit code: 5 where a limit was not kept."""
+    """Print the record and return the exit code: 5 if a limit failed."""
     if options.json:
         print(json.dumps(record))
     else:
@@ -388,7 +390,7 @@ def _print(record: dict[str, Any], out: Path) -> None:
             mean, worst = (v if isinstance(v, str) else "n/a" if v is None else f"{v:.5g}" for v in _two(value))
             several = f"   worst {worst}" if part["images"] > 1 else ""
             print(f"  {name:<12} {mean:>10}{several}")
-    print("what the metrics are:")
+    print("definitions of the metrics:")
     for name, text in record["definitions"].items():
         print(f"  {name}: {text}")
     print(f"page      {out / 'index.html'}\ntables    {out / 'compare.csv'}, compare.json, junit.xml")

@@ -1,4 +1,4 @@
-"""The verb that shows what mistyle does on what comes with it: `mistyle demo`."""
+"""The verb `mistyle demo`: `stylize` on the meshes and paintings of `scenes/`."""
 
 import argparse
 import json
@@ -19,7 +19,7 @@ def add_demo(verbs: Any, add_options: Callable[[argparse.ArgumentParser], None])
     verb = verbs.add_parser(
         "demo",
         conflict_handler="resolve",
-        help="run the main job on a mesh and a painting that come with mistyle",
+        help="stylize a mesh with a painting, both of which come with mistyle",
         **examples(
             f"""
             mistyle demo                                 {PAINTINGS[DEFAULT].mesh} and {DEFAULT}, into mistyle-demo/

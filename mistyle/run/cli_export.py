@@ -12,10 +12,10 @@ from mistyle.run.options import NAME_HELP, add_overwrite_option, examples
 def add_export(verbs: Any) -> None:
     verb = verbs.add_parser(
         "export",
-        help="a finished asset for Blender, Unreal, Unity, Houdini or Arnold: maps packed, USD, MaterialX, OBJ",
+        help="write a finished asset for Blender, Unreal, Unity, Houdini or Arnold",
         **examples(
             """
-            mistyle export out/ -o delivered/ --target unreal                    what a run made, packed for Unreal
+            mistyle export out/ -o delivered/ --target unreal                    a run's asset, packed for Unreal
             mistyle export out/ -o delivered/ --target houdini --formats usd,mtlx,maps
             mistyle export out/asset/ -o web/ --formats glb
             mistyle export out/ -o show/ --name '{mesh}_{style}_v{v:03}'         v001, v002, ... side by side
@@ -35,9 +35,9 @@ def add_export(verbs: Any) -> None:
     )
     verb.add_argument("--name", default="{asset}", metavar="PATTERN", help=NAME_HELP.format(default=""))
     verb.add_argument("--texture-name", metavar="PATTERN", help="texture files: {asset} {map} {udim} {ext}")
-    verb.add_argument("--source", type=Path, metavar="FILE", help="where the USD file now is that a look lies on")
+    verb.add_argument("--source", type=Path, metavar="FILE", help="present path of the USD file under a look")
     verb.add_argument(
-        "--metres-per-unit", type=float, default=1.0, metavar="X", help="what USD says of the mesh's units"
+        "--metres-per-unit", type=float, default=1.0, metavar="X", help="metresPerUnit of USD (default 1)"
     )
     verb.add_argument("--colorspace", metavar="NAME", help="linear space of EXR textures (default: linear Rec.709)")
     add_overwrite_option(verb)
@@ -81,7 +81,7 @@ def _export(options: argparse.Namespace) -> int:
 def add_verify(verbs: Any) -> None:
     verb = verbs.add_parser(
         "verify",
-        help="open what was written with other people's readers, and render it in Cycles and in Mitsuba",
+        help="open written files with independent readers, render them in Cycles and Mitsuba",
         **examples(
             """
             mistyle verify out/                                  a run folder: its manifest, its GLB, what was delivered

@@ -20,7 +20,7 @@ from mistyle.run.options import (
     asset_name,
     examples,
     given_defines,
-    said_settings,
+    given_settings,
 )
 
 # Option of the command line -> dotted setting.
@@ -52,14 +52,14 @@ SCENE_OPTIONS = {
 def add_fit(verbs: Any) -> None:
     verb = verbs.add_parser(
         "fit",
-        help="albedo, normal and roughness of a mesh from pictures under known light; or parameters of a Mitsuba scene",
+        help="recover albedo, normal and roughness from pictures, or parameters of a Mitsuba scene",
         **examples(
             """
             mistyle fit chair.glb photographs/ -o fitted/                    camera.json or transforms.json, lights.json
             mistyle fit chair.glb colmap/ -o fitted/ --align --light unknown  a COLMAP model, light not known
             mistyle fit helmet.glb renders/ -o fitted/ --uv new --metallic --material gltf
-            mistyle fit chair.glb photographs/ -o fitted/ --dry-run          how long, how much memory and disk
-            mistyle fit --scene room.xml --list                              what could be fitted in a Mitsuba scene
+            mistyle fit chair.glb photographs/ -o fitted/ --dry-run          estimated time, memory and disk
+            mistyle fit --scene room.xml --list                              parameters of a scene that can be fitted
             mistyle fit --scene room.xml --references shots/ -o out/ --optimize 'chair.*.base_color' wall.bsdf.roughness
             """
         ),
@@ -72,10 +72,8 @@ def add_fit(verbs: Any) -> None:
         metavar="REFERENCES",
         help="a folder with camera.json, transforms.json or a COLMAP model, and its pictures",
     )
-    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; the same command again goes on there")
-    verb.add_argument(
-        "--dry-run", action="store_true", help="print the plan with estimated time, memory and disk, and stop"
-    )
+    verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="run folder; rerun to resume")
+    verb.add_argument("--dry-run", action="store_true", help="print estimated time, memory and disk, and stop")
     add_job_options(verb, ("draft", "standard"), "draft: a texture of 512²; standard (default): 1024²")
     add_memory_option(verb)
     add_mesh_options(verb)
@@ -90,19 +88,21 @@ def _add_reference_options(verb: argparse.ArgumentParser) -> None:
     given.add_argument(
         "--lights", type=Path, metavar="FILE", help="a lights.json (default: the one beside the cameras)"
     )
-    given.add_argument("--light", choices=["known", "unknown"], default="known", help="unknown: solve for it too")
+    given.add_argument(
+        "--light", choices=["known", "unknown"], default="known", help="unknown: solve for the light too"
+    )
     given.add_argument("--masks", type=Path, metavar="DIR", help="a mask per picture, by name; white counts")
     given.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")
     given.add_argument(
-        "--pictures", type=Path, metavar="DIR", help="where the pictures are, if not where the cameras' file says"
+        "--pictures", type=Path, metavar="DIR", help="folder of the pictures (default: the paths in the cameras' file)"
     )
     given.add_argument(
         "--align", action="store_true", default=None, help="find the similarity from the mesh to the cameras' space"
     )
     given.add_argument("--refine-poses", action="store_true", default=None, help="improve the cameras before fitting")
-    given.add_argument("--hold-out", type=int, metavar="N", help="keep N pictures from the fit, to measure it by")
+    given.add_argument("--hold-out", type=int, metavar="N", help="hold N pictures out of the fit and measure them")
     given.add_argument(
-        "--hold-out-light", type=int, metavar="K", help="keep the pictures of the K-th light (from 0) from the fit"
+        "--hold-out-light", type=int, metavar="K", help="hold the pictures of the K-th light (from 0) out of the fit"
     )
 
 
@@ -129,15 +129,20 @@ def _add_scene_options(verb: argparse.ArgumentParser) -> None:
         "--references", dest="shots", type=Path, metavar="DIR", help="a picture per sensor, by id or order"
     )
     scene.add_argument("--optimize", nargs="+", default=[], metavar="KEY", help="parameters to fit; globs")
-    scene.add_argument("--list", action="store_true", help="list what can be fitted, and why the rest cannot, and stop")
+    scene.add_argument(
+        "--list", action="store_true", help="list the parameters that can be fitted and why others cannot"
+    )
     scene.add_argument(
         "--loss",
         choices=["auto", "relative", "log_srgb_l1", "l2"],
-        help="relative (default where renders have noise): squared, over the reference's square; free of noise bias",
+        help="relative (default for noisy renders): squared, over the reference's square; free of noise bias",
     )
     scene.add_argument("--spp", type=int, metavar="N", help="samples a pixel of a step's picture (default 16)")
     scene.add_argument(
-        "--spp-grad", type=int, metavar="N", help="and of its derivative (default 8 for numbers, 1 for textures)"
+        "--spp-grad",
+        type=int,
+        metavar="N",
+        help="samples a pixel of its derivative (default 8 for numbers, 1 for textures)",
     )
     scene.add_argument(
         "--channels", metavar="PREFIX|A,B,C", help="channels of EXR references that hold more than R, G, B"
@@ -152,7 +157,7 @@ _ONLY_SCENE = ("optimize", "list", "defines", "sensor", "loss", "spp", "spp_grad
 
 
 def run_fit(options: argparse.Namespace) -> int:
-    """Dispatch to the two uses, and say so where they are mixed."""
+    """Dispatch to the two uses; UsageError if they are mixed."""
     if options.scene is not None:
         if options.mesh is not None:
             raise UsageError("give either MESH and REFERENCES, or --scene SCENE.xml with --references DIR, not both")
@@ -178,7 +183,7 @@ def material_settings(options: argparse.Namespace) -> Any:
     from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
     from mistyle.run.settings import resolve
 
-    said = said_settings(options, OPTIONS)
+    said = given_settings(options, OPTIONS)
     return resolve(options.preset, options.config, said, root=MaterialSettings, presets=MATERIAL_PRESETS)
 
 
@@ -192,7 +197,7 @@ def _fit_scene(options: argparse.Namespace) -> int:
 
     if options.report is not None:
         raise UsageError("--report belongs to a fit of MESH and REFERENCES; fit --scene always writes its whole report")
-    said = said_settings(options, SCENE_OPTIONS)
+    said = given_settings(options, SCENE_OPTIONS)
     settings = resolve(options.preset, options.config, said, root=SceneSettings, presets=SCENE_PRESETS)
     defines = given_defines(options.defines)
     if options.print_config:

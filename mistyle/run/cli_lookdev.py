@@ -1,4 +1,4 @@
-"""The verbs that look at what was made: `mistyle view` and `mistyle lookdev`."""
+"""The verbs `mistyle view` and `mistyle lookdev`."""
 
 import argparse
 import json
@@ -14,11 +14,11 @@ from mistyle.run.options import add_overwrite_option, examples
 def add_view(verbs: Any) -> None:
     verb = verbs.add_parser(
         "view",
-        help="open the report of a finished run: one file, the asset in 3-D, no network",
+        help="open the report of a finished run",
         **examples(
             """
             mistyle view out/                 in the browser
-            mistyle view out/ --print         only where it lies
+            mistyle view out/ --print         print its path only
             """
         ),
     )
@@ -31,10 +31,10 @@ def add_view(verbs: Any) -> None:
 def add_lookdev(verbs: Any) -> None:
     verb = verbs.add_parser(
         "lookdev",
-        help="a look-dev sheet of any asset: three lights, five sides, grey and chrome ball, ColorChecker, turntables",
+        help="draw a look-dev sheet of an asset: three lights, five sides, turntables",
         **examples(
             """
-            mistyle lookdev out/ -o sheet/                              of what a run made
+            mistyle lookdev out/ -o sheet/                              the asset of a run
             mistyle lookdev helmet.glb -o sheet/ --hdri venice_sunset.hdr
             mistyle lookdev helmet.glb -o sheet/ --turntable 48 --hdri-turn 48
             mistyle lookdev out/ -o sheet/ --size 280 --spp 16           quick and small
@@ -90,7 +90,7 @@ def report_of(place: Path) -> Path:
             return path.resolve()
     raise InputRefused(
         f"{place}: found no report; expected a finished run folder with report/index.html. "
-        "`mistyle stylize` and `mistyle fit` write one; an unfinished run goes on with the same command"
+        "`mistyle stylize` and `mistyle fit` write one; rerun an unfinished job to resume it"
     )
 
 

@@ -1,4 +1,4 @@
-"""`mistyle models`: what models the generative stages use, where they are, and fetching them when told to."""
+"""`mistyle models`: lists the models of the generative stages and fetches them on request."""
 
 import argparse
 import json
@@ -36,11 +36,11 @@ def add_generative_options(verb: argparse.ArgumentParser) -> None:
     """Options of the generative stylizer and inpainter."""
     group = verb.add_argument_group("generative stages (need models: see mistyle models)")
     group.add_argument(
-        "--inpainter", choices=["fill", "paint3d"], help="what repairs the texture: fill needs no models (default)"
+        "--inpainter", choices=["fill", "paint3d"], help="inpainter of the repair; fill (default) needs no models"
     )
     add_model_options(group)
     group.add_argument("--style-lora", type=Path, metavar="FILE", help="a style LoRA trained elsewhere (.safetensors)")
-    group.add_argument("--loras", type=Path, metavar="DIR", help="where trained LoRAs are kept and looked for")
+    group.add_argument("--loras", type=Path, metavar="DIR", help="folder of trained LoRAs")
     group.add_argument(
         "--content",
         choices=["auto", "none", "shared", "per-view"],
@@ -49,16 +49,16 @@ def add_generative_options(verb: argparse.ArgumentParser) -> None:
     group.add_argument(
         "--style-adapter", choices=["lora", "ip"], help="lora: trained on the style; ip: an IP-Adapter, no training"
     )
-    group.add_argument("--prompt", help="what the texture inpainter paints")
+    group.add_argument("--prompt", help="text prompt of the texture inpainter")
 
 
 def add_models(verbs: Any) -> None:
     verb = verbs.add_parser(
         "models",
-        help="models of the generative stages: which, where, licences; fetch them",
+        help="list models of the generative stages with licences, or fetch them",
         **examples(
             """
-            mistyle models --models DIR                             what is there, what is missing, and the layout
+            mistyle models --models DIR                             present and missing models, and the layout
             mistyle models fetch sdxl depth canny --models DIR --allow-download
             mistyle models convert position paint3d.bin --models DIR     a pickle once into safetensors
             mistyle models adopt sdxl --models DIR                  take DIR/sdxl though it is not the published one
@@ -136,7 +136,7 @@ def _list(options: argparse.Namespace) -> int:
         for file, value in row["sha256"].items():
             print(f"  sha256 {value}{'…' * (len(value) < 64)}  {file}")
     print(
-        "\nNothing is downloaded unless you say so: mistyle models fetch NAME --models DIR --allow-download. "
+        "\nNothing is downloaded without --allow-download: mistyle models fetch NAME --models DIR --allow-download. "
         "Each model's licence is yours to accept.\nRevisions and hashes come from other projects' lock files; they "
         "are compared with what is fetched, and with what was copied there by hand."
     )

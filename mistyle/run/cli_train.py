@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from mistyle.core.cores import use_threads
 from mistyle.core.errors import UsageError
 from mistyle.run.cli_models import add_model_options
-from mistyle.run.options import add_job_options, examples, said_settings
+from mistyle.run.options import add_job_options, examples, given_settings
 
 if TYPE_CHECKING:
     from mistyle.backends.consislora_make import TrainingImage
@@ -29,7 +29,7 @@ OPTIONS = {
 def add_train(verbs: Any) -> None:
     verb = verbs.add_parser(
         "train",
-        help="LoRAs for the diffusion stylizer: of a style picture, or of rendered views",
+        help="train LoRAs of a style picture or of views, for the diffusion stylizer",
         **examples(
             """
             mistyle train style starry_night.jpg -o loras/ --models DIR
@@ -38,9 +38,9 @@ def add_train(verbs: Any) -> None:
             """
         ),
     )
-    verb.add_argument("kind", nargs="?", choices=["style", "content"], help="what to learn")
+    verb.add_argument("kind", nargs="?", choices=["style", "content"], help="style of a picture, or content of views")
     verb.add_argument("source", type=Path, nargs="?", metavar="PICTURE|VIEWS_DIR")
-    verb.add_argument("-o", "--out", type=Path, metavar="DIR", help="where LoRAs are kept; the same command goes on")
+    verb.add_argument("-o", "--out", type=Path, metavar="DIR", help="folder of LoRAs; rerun to resume")
     verb.add_argument("--word", help="the prompt's word for the picture (default [v] for style, [c] for content)")
     verb.add_argument("--steps", type=int, metavar="N", help="steps of the first phase (default 1500)")
     add_model_options(verb)
@@ -53,7 +53,7 @@ def run_train(options: argparse.Namespace) -> int:
     from mistyle.run.settings import as_toml, resolve, thread_count
     from mistyle.run.train_settings import TRAIN_PRESETS, TrainJobSettings
 
-    said = said_settings(options, OPTIONS)
+    said = given_settings(options, OPTIONS)
     settings = resolve(options.preset, options.config, said, root=TrainJobSettings, presets=TRAIN_PRESETS)
     if options.print_config:
         sys.stdout.write(as_toml(settings))

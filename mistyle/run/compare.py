@@ -37,7 +37,7 @@ ALPHA = (
 )
 NONFINITE = (
     "Pixels with a NaN or infinite channel are left out of every metric, magenta in every picture, and fail their row "
-    "unless --allow-nonfinite; in data layers equal infinities (depth where nothing is) are no failure."
+    "unless --allow-nonfinite; in data layers equal infinities (background depth) do not fail it."
 )
 FILES = ("compare.json", "compare.csv", "junit.xml", "index.html")
 # What a frame is ranked by: the first of these that it has.

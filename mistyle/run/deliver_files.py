@@ -214,7 +214,7 @@ def _look_layer(
     asset = load_record(record)
     source = chosen.source or asset.source.path
     if not source.is_file():
-        raise UsageError(f"{source}: the USD file that this run read is not there; say where it is with --source")
+        raise UsageError(f"{source}: the USD file that this run read is not there; give its path with --source")
     layer = f"{identifier(source.stem)}_look.usda"
     fields = fields_for(finished.manifest, chosen.target)
     variant = identifier(fields["style"]) + (f"_v{chosen.version:03}" if chosen.version is not None else "")

@@ -28,7 +28,7 @@ def fields_of(pattern: str) -> dict[str, str]:
         if name is None:
             continue
         if not re.fullmatch(r"[a-z]+", name) or conversion or not re.fullmatch(r"|0?[1-9]d?", spec or ""):
-            raise ValueError(f"'{{{name}}}' is no plain field such as {{v}} or {{v:03}}")
+            raise ValueError(f"'{{{name}}}' is not a plain field such as {{v}} or {{v:03}}")
         found[name] = spec or ""
     return found
 
@@ -81,7 +81,7 @@ class DeliverSettings(BaseModel):
     textures: Annotated[str, BeforeValidator(checked_textures)] = Field(
         default=TEXTURES, description="pattern of texture files: {asset} {map} {udim} {ext}"
     )
-    metres_per_unit: float = Field(default=1.0, gt=0, description="what USD says of the mesh's units")
+    metres_per_unit: float = Field(default=1.0, gt=0, description="metresPerUnit of USD")
 
     @property
     def wanted(self) -> bool:

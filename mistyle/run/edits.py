@@ -30,7 +30,7 @@ EDITABLE = {
 }
 # What is made anew, in words.
 REDONE = {
-    "stylized": "what is new there is laid into the texture; fit, repair, asset and report are redone",
+    "stylized": "new paint is baked into the texture; fit, repair, asset and report are redone",
     "masks": "repair, asset and report are redone",
     "asset": "the asset and the report are redone",
 }

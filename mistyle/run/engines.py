@@ -117,7 +117,7 @@ def reason(code: int, memory: bool = False) -> str:
     if name != "SIGKILL":
         return f"the process crashed in native code ({name})"
     by = "by the system, which had run out of memory" if memory else "most likely by the system, for lack of memory"
-    return f"the process was killed ({name}), {by}: run fewer at a time (--workers), or ask for less (a smaller atlas)"
+    return f"the process was killed ({name}), {by}: run fewer at a time (--workers), or use a smaller atlas"
 
 
 def _killed_for_memory() -> int:
@@ -286,8 +286,8 @@ def _on_ray(
     for name, asked in (("CPU", threads), ("GPU", gpus)):
         if asked > offered.get(name, 0):
             raise MistyleError(
-                f"the Ray cluster offers {offered.get(name, 0):g} {name}s, each shard asks for {asked:g}: it would "
-                "wait for ever. Add machines, or ask for less (--threads, --gpus)"
+                f"the Ray cluster offers {offered.get(name, 0):g} {name}s, each shard needs {asked:g}: it would "
+                "wait for ever. Add machines, or request less (--threads, --gpus)"
             )
     task = library.remote(num_cpus=threads, num_gpus=gpus, max_retries=3)(_ray_shard)
     begun = {index: _begun(plan, index) for index in todo}
@@ -313,7 +313,7 @@ def _on_ray(
         if not started and not ended and time.monotonic() - since > wait:
             raise MistyleError(
                 f"no shard has begun within {wait:g} s on the Ray cluster: it is busy, or no machine has {threads} "
-                f"free cores and {gpus:g} GPUs. Look at `ray status`, ask for less, or raise --wait"
+                f"free cores and {gpus:g} GPUs. Look at `ray status`, request less, or raise --wait"
             )
     return ended
 

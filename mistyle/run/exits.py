@@ -19,7 +19,7 @@ def run(command: Command, options: argparse.Namespace) -> int:
         except MistyleError as error:
             return _failed(options, error)
         except KeyboardInterrupt:
-            print("mistyle: interrupted; the same command again goes on from what was finished", file=sys.stderr)
+            print("mistyle: interrupted; rerun to resume", file=sys.stderr)
             return 130
         except BrokenPipeError:
             return 1

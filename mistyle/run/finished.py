@@ -54,7 +54,7 @@ def read_listing(place: Path) -> tuple[Path, dict[str, Any]]:
         _ = [part["name"] for part in manifest["parts"]], manifest["files"]
         for name in (str(manifest["name"]), *stems):
             if name != Path(name).name:
-                raise TypeError(f"{name[:80]!r} is no name of a file")
+                raise TypeError(f"{name[:80]!r} is not a file name")
     except (KeyError, TypeError) as error:
         raise InputRefused(
             f"{listing}: not the list of an asset of ours ({error}); export what mistyle wrote"

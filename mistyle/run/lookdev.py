@@ -228,7 +228,7 @@ def sheet(
     rows = (
         PanelRow("Three lights, each exposed so that the grey ball is 18 %", tuple(heroes)),
         PanelRow("Soft studio from five sides: the asset turns, the light stands still", tuple(cameras)),
-        PanelRow("What lies behind", tuple(strip)),
+        PanelRow("AOVs", tuple(strip)),
         PanelRow(f"{lights[2].name}, turned about the asset", tuple(turned)),
     )
     return Sheet(subject.path.stem, facts(subject), rows, burn_in(subject, settings, day)), width, scale

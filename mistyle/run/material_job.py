@@ -8,10 +8,10 @@ from mistyle.run.material_settings import MaterialSettings
 
 MATERIAL_STAGES = {
     "mesh": "read the mesh",
-    "texels": "lay out the texture",
+    "texels": "rasterise the UVs",
     "cameras": "place the cameras",
-    "pictures": "look through the pictures",
-    "light": "find the light",
+    "pictures": "check the pictures",
+    "light": "solve for the light",
     "recover": "fit the material",
     "measure": "measure the fit",
     "asset": "write the asset",

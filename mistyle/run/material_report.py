@@ -27,7 +27,7 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "psnr_fitted": ("mean PSNR (sRGB, peak 1) of the pictures that the material was fitted to, dB", "higher"),
     "psnr_held_out": ("mean PSNR (sRGB, peak 1) of the pictures that were kept from the fit, dB", "higher"),
     "conversion_error": (
-        "mean relative difference of the same maps under the other material model: what a viewer of that model adds",
+        "mean relative difference of the same maps under the other material model",
         "lower",
     ),
     "outline_overlap": ("mean overlap of the mesh's outline with alpha or masks, intersection over union", "higher"),
@@ -116,7 +116,7 @@ def steps(made: Any) -> tuple[Step, ...]:
     )
     compare = Step(
         "References and predictions",
-        "What the pictures show, and what the fitted material shows from the same camera under the same light.",
+        "References beside predictions from the same camera under the same light.",
         pairs=pairs,
         shots=differences,
         columns=4,
@@ -135,8 +135,8 @@ def steps(made: Any) -> tuple[Step, ...]:
     parts, longest = list(zip(made.asset.mesh.parts, made.texels, strict=True)), Sizes().of(kind_in_step(2))
     trust = Step(
         "Confidence",
-        "How well the references determine each texel's material: dark blue not at all, yellow well; and by how many "
-        "pictures it is seen.",
+        "How well the references determine each texel's material (dark blue: not at all, yellow: well), and how many "
+        "pictures see it.",
         shots=tuple(
             ReportPicture(picture, f"{name}: {what}", sharp=True)
             for k, (name, t) in enumerate(parts)

@@ -25,7 +25,7 @@ class ReferenceSettings(BaseModel):
         ge=0,
         le=1,
         description="overlap of the mesh's outline with alpha or mask (intersection over union) below which a warning "
-        "says that the picture's camera does not fit the mesh",
+        "reports that the picture's camera does not fit the mesh",
     )
     average: int = Field(
         default=0,

@@ -27,7 +27,7 @@ def add_job_options(
     presets: Sequence[str] = ("draft", "standard", "fine", "paper"),
     preset_help: str = PRESET_HELP,
 ) -> None:
-    """Options that every job has; None means: not said here."""
+    """Options that every job has; None: not given."""
     verb.add_argument("--preset", choices=presets, help=preset_help)
     verb.add_argument(
         "--config", type=Path, metavar="JOB.toml", help="settings from a file, as --print-config prints them"
@@ -39,19 +39,19 @@ def add_job_options(
         metavar="KEY=VALUE",
         help="any setting by its dotted name, as --print-config prints them",
     )
-    verb.add_argument("--seed", type=int, help="every random choice follows from it (default 0)")
-    verb.add_argument("--threads", type=int, help="threads to use; the result depends on it (default: all cores)")
+    verb.add_argument("--seed", type=int, help="seed of all random choices (default 0)")
+    verb.add_argument("--threads", type=int, help="threads; the result depends on them (default: all cores)")
     verb.add_argument("--json", action="store_true", help="one JSON object on stdout, logs on stderr")
     verb.add_argument("--print-config", action="store_true", help="print every setting as TOML and stop")
     add_overwrite_option(verb)
 
 
 def add_overwrite_option(verb: argparse.ArgumentParser) -> None:
-    """What may be covered in an output folder."""
+    """Which files of an output folder may be replaced."""
     verb.add_argument(
         "--overwrite",
         action="store_true",
-        help="replace files of colliding names that mistyle did not write, or that were edited; never an input",
+        help="replace colliding files that mistyle did not write or that were edited; never an input",
     )
 
 
@@ -64,14 +64,14 @@ def gigabytes(text: str) -> float:
     except ValueError:
         found = 0.0
     if not 0 < found < 1e5:
-        raise argparse.ArgumentTypeError(f"'{text}' is no amount of memory; for example 4G or 4096M")
+        raise argparse.ArgumentTypeError(f"'{text}' is not a valid memory size; write 4G or 4096M")
     return found
 
 
 def add_memory_option(verb: argparse.ArgumentParser) -> None:
-    """How much of the machine's memory a job may take."""
+    """The memory budget of a job."""
     verb.add_argument(
-        "--memory", type=gigabytes, metavar="4G", help="main memory that the job may take; refused where it cannot"
+        "--memory", type=gigabytes, metavar="4G", help="memory budget; a job that cannot keep it is refused"
     )
 
 
@@ -80,7 +80,7 @@ REPORT_OPTIONS = {"report": "report.detail"}
 
 
 def add_report_option(verb: argparse.ArgumentParser) -> None:
-    """How much of a report a job makes."""
+    """The extent of the report."""
     verb.add_argument(
         "--report",
         choices=["none", "page", "full"],
@@ -109,11 +109,11 @@ def length(text: str) -> float:
     try:
         return float(number) * UNITS[unit]
     except (ValueError, KeyError):
-        raise argparse.ArgumentTypeError(f"'{text}' is no length; write 3cm, 30mm, 0.03m or a bare number") from None
+        raise argparse.ArgumentTypeError(f"'{text}' is not a length; write 3cm, 30mm, 0.03m or a bare number") from None
 
 
 def add_paint_options(verb: argparse.ArgumentParser) -> None:
-    """What a person may say about the paint itself."""
+    """Options of the paint: pictures per part, masks, stroke size and direction."""
     verb.add_argument(
         "--style",
         dest="style_slot",
@@ -134,22 +134,22 @@ def add_paint_options(verb: argparse.ArgumentParser) -> None:
         help="width of a stroke (a 32nd of the picture) on the mesh, so that a set of props matches",
     )
     verb.add_argument(
-        "--keep-content", type=float, metavar="0..1", help="how much the mesh's own texture rules light and dark"
+        "--keep-content", type=float, metavar="0..1", help="how far the mesh's own texture decides light and dark"
     )
     verb.add_argument(
         "--palette-mix",
         type=float,
         metavar="0..1",
-        help="1 gives rare colours of the picture as much room as common ones",
+        help="1 gives rare colours of the picture as much area as common ones",
     )
     verb.add_argument(
-        "--direction", choices=["curvature", "up", "around"], help="what strokes follow (default: the form)"
+        "--direction", choices=["curvature", "up", "around"], help="direction of strokes (default: the form)"
     )
     verb.add_argument(
         "--direction-map",
         type=Path,
         metavar="PICTURE",
-        help="painted directions in the mesh's UVs, red along u and green along v (a flow map); grey leaves it open",
+        help="painted directions in the mesh's UVs, red along u and green along v (a flow map); grey: the form decides",
     )
 
 
@@ -164,8 +164,8 @@ DELIVERY_OPTIONS = {
 
 
 def add_delivery_options(verb: argparse.ArgumentParser, where: str = "OUT/delivered/<target>") -> None:
-    """What other programs get at the end, and in which colour space."""
-    made = verb.add_argument_group("for other programs", f"files in {where}, as soon as one of these is given")
+    """Formats, targets and colour space of the files for other programs."""
+    made = verb.add_argument_group("for other programs", f"any of these writes files into {where}")
     made.add_argument("--formats", action="append", metavar="F,F", help="glb,usd,mtlx,obj,maps (default maps,glb)")
     made.add_argument(
         "--target", action="append", metavar="T,T", help="blender (default),unreal,unity-urp,unity-hdrp,houdini,arnold"
@@ -173,7 +173,7 @@ def add_delivery_options(verb: argparse.ArgumentParser, where: str = "OUT/delive
     made.add_argument(
         "--texture-name", metavar="PATTERN", help="texture files: {asset} {map} {udim} {ext} are filled in"
     )
-    made.add_argument("--metres-per-unit", type=float, metavar="X", help="what USD says of the mesh's units (1)")
+    made.add_argument("--metres-per-unit", type=float, metavar="X", help="metresPerUnit of USD (default 1)")
     made.add_argument(
         "--colorspace",
         metavar="NAME",
@@ -183,13 +183,13 @@ def add_delivery_options(verb: argparse.ArgumentParser, where: str = "OUT/delive
 
 
 NAME_HELP = (
-    "name of the asset{default}; with fields in it, such as '{{mesh}}_{{style}}_v{{v:03}}', the name of what is "
-    "delivered: {{v}} counts up and nothing delivered before is overwritten"
+    "name of the asset{default}; with fields, such as '{{mesh}}_{{style}}_v{{v:03}}', the name of delivered files: "
+    "{{v}} counts up and never overwrites a delivery"
 )
 
 
 def asset_name(options: argparse.Namespace, *parts: str) -> str:
-    """The asset's own name: as --name says, unless that is a pattern for what is delivered; else made of the parts."""
+    """The asset's name: --name unless that is a pattern of delivered files, else the joined parts."""
     name = getattr(options, "name", None)
     return names.asset_name(None if not name or "{" in name else name, *parts)
 
@@ -200,14 +200,12 @@ def add_mesh_options(verb: argparse.ArgumentParser) -> None:
         choices=["auto", "keep", "new"],
         help="authored UVs: keep, replace, or (auto) replace only where unusable",
     )
-    verb.add_argument("--up", choices=["y", "z"], help="the axis of the mesh file that points up (default y)")
-    verb.add_argument(
-        "--lit", action="store_const", const=True, help="unlit glTF materials become lit ones in the asset"
-    )
+    verb.add_argument("--up", choices=["y", "z"], help="the up axis of the mesh file (default y)")
+    verb.add_argument("--lit", action="store_const", const=True, help="turn unlit glTF materials into lit ones")
 
 
-def said_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict[str, Any]:
-    """What the command line says of the settings, nested; `names` maps options to dotted settings."""
+def given_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict[str, Any]:
+    """The settings given on the command line, nested; `names` maps options to dotted settings."""
     from mistyle.run.settings import assignments, merge
 
     said: dict[str, Any] = {}

@@ -25,8 +25,7 @@ from mistyle.stages.fit_judge import TOLERANCE, regressed, undone_where
 
 SAME = "Under the same studio light"
 UNFITTED = (
-    "The painting's own relief and gloss. The views were drawn from these very maps, so a fit to them has little to "
-    "add, and none ran: --refine all runs it."
+    "The painting's own relief and gloss. The views were drawn from these maps, so no fit ran; --refine all runs it."
 )
 
 
@@ -115,9 +114,9 @@ def steps(made: Any, refined: Sequence[BeforeAfter]) -> tuple[Step, ...]:
         (
             "The surface is painted once, so the views agree by construction."
             if made.job.settings.stylizer == "embedded"
-            else "Views are painted one after another; what earlier ones show of a view is kept in it."
+            else "Views are painted one after another and keep the pixels that earlier views show."
         )
-        + " Paint one over in stylized/, run the same command again, and it goes into the texture.",
+        + " Paint one over in stylized/ and rerun: the paint goes into the texture.",
         "4.1.3",
         shots=tuple(ReportPicture(view_picture(v), angle(v.camera)) for v in made.stylized),
         facts=look_facts(made.looks),
@@ -154,7 +153,7 @@ def refining(made: Any, pairs: Sequence[BeforeAfter], longest: int) -> tuple[Ste
     repair = Step(
         "Repair",
         "Texels that the fit could not settle or that no view saw, painted again from the surface. The masks lie in "
-        "masks/: paint one over, run the same command again, and it decides.",
+        "masks/: edit one and rerun to repair its white texels.",
         "4.3",
         shots=tuple(
             ReportPicture(
@@ -191,9 +190,7 @@ def view_picture(view: View) -> np.ndarray:
 
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
     """Each phase: kept (and what got worse all the same) or undone, and the figures that decided."""
-    kept = [
-        (phase, _kept(fit, phase) if good else "undone: it made a figure worse") for phase, good in fit.kept.items()
-    ]
+    kept = [(phase, _kept(fit, phase) if good else "undone: a metric got worse") for phase, good in fit.kept.items()]
     figures = []
     for name, (before, after) in fit.figures.items():
         undone = "" if fit.kept[name.partition(".")[0]] else f" (undone: the result has {before:.4g})"

@@ -106,7 +106,7 @@ def describe_plan(estimate: dict[str, Any]) -> str:
     lines = [f"{estimate['mesh']} {relation} -> {estimate['out']}"]
     lines += [f"  {row['what']:<36} about {row['seconds']:7.1f} s" for row in estimate["stages"]]
     sets = "1 texture set" if estimate["texture_sets"] == 1 else f"{estimate['texture_sets']} texture sets"
-    lines.append(f"  in all about {estimate['seconds']} s for {sets}, if nothing is taken over")
+    lines.append(f"  in all about {estimate['seconds']} s for {sets}, without reused stages")
     files = ", large arrays in files" if estimate["in_files"] else ""
     lines.append(f"  memory at most about {estimate['memory_gb']} GB{files}")
     lines.append(f"  disk about {estimate['disk_gb']} GB; free there: {estimate['free_gb']} GB")

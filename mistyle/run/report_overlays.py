@@ -55,7 +55,7 @@ def confidence(values: Float[np.ndarray, "h w"], texels: Texels, longest: int) -
         return layer(viridis(share), np.full(share.shape, OPACITY, np.float32), texels.covered[at])
 
     picture = in_bands(values.shape[:2], rows, longest, sharp=True)
-    return Overlay("confidence", picture, "dark blue: the pictures say nothing of it; yellow: they determine it well")
+    return Overlay("confidence", picture, "dark blue: undetermined by the pictures; yellow: well determined")
 
 
 def struggle(

@@ -16,7 +16,7 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "psnr_after": ("mean PSNR of the sensors' pictures after the fit (sRGB, peak 1), dB", "higher"),
     "render_noise": ("share of the remaining squared difference that is noise of one step's render, 0..1", ""),
     "unconverged": ("parameters that still moved at the end", "lower"),
-    "bad_gradients": ("gradients that were no numbers; their texels stayed as they were in that step", "lower"),
+    "bad_gradients": ("gradients that were not numbers; their texels kept their values in that step", "lower"),
 }
 
 
@@ -63,8 +63,8 @@ def noise_text(fitted: Any) -> str:
     shares = [r.noise[1] for r in fitted.residuals]
     between = f"{min(shares):.0%}" if len(shares) == 1 else f"{min(shares):.0%} to {max(shares):.0%}"
     return (
-        f"{between} of what is left between a step's picture and its reference is the render's own noise (measured "
-        "from two renders). The rest is noise of the reference and what the parameters cannot explain."
+        f"{between} of the difference between a step's picture and its reference is render noise (measured from two "
+        "renders). The rest is noise of the reference and error that the parameters cannot explain."
     )
 
 

@@ -7,14 +7,14 @@ from mistyle.run.stylize_settings import Settings
 
 STAGES = {
     "mesh": "read the mesh",
-    "texels": "lay out the texture",
+    "texels": "rasterise the UVs",
     "views": "render the views",
     "surface": "paint the surface",
     "bake": "bake the texture",
     "stylized": "draw the stylized views",
     "fit": "fit normal, roughness and albedo",
-    "masks": "mark what the fit left open",
-    "repair": "repair what the fit left open",
+    "masks": "compute the struggle mask",
+    "repair": "repair the texture",
     "asset": "write the asset",
     "report": "write the report",
 }
@@ -23,7 +23,7 @@ REFINING = ("fit", "masks", "repair")
 # Before fit and repair, in the place of "asset".
 FIRST = {"first asset": "write the first asset"}
 # Only where views were edited.
-RETOUCH = {"retouch": "lay the edited views into the texture"}
+RETOUCH = {"retouch": "bake the edited views"}
 # Only with --finish.
 FINISH = {"finish": "finish the painting"}
 EVERY_STAGE = STAGES | RETOUCH | FINISH

@@ -63,8 +63,8 @@ class Settings(BaseModel):
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     stylizer: Literal["embedded", "embedded-view", "diffusion"] = Field(
         default="embedded",
-        description="embedded paints the surface once; embedded-view paints one view after another, each going on from "
-        "those before; diffusion does so with SDXL (needs models)",
+        description="embedded paints the surface once; embedded-view paints view after view from earlier ones; "
+        "diffusion does the same with SDXL (needs models)",
     )
     inpainter: Literal["fill", "paint3d"] = Field(
         default="fill", description="fill takes the painting again; paint3d is Stable Diffusion (needs models)"
@@ -123,7 +123,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fit": {"refine": "all", "iterations1": 400, "iterations2": 600, "crops": 8, "lights": "together"},
         "diffusion": {"content": "per-view"},
     },
-    # To the letter, where README lists departures too; its steps of the fit are not given, they are those of `fine`.
+    # To the letter, also where mistyle/stylization/README.md lists departures. The paper gives no step counts;
+    # these are those of `fine`.
     "paper": {
         "stylizer": "diffusion",
         "inpainter": "paint3d",

@@ -40,12 +40,12 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
 
 # What each figure of `figures` means, and which way is up; those of the fit are named <phase>.<figure>.
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
-    "residual": ("what the maps do not explain of lit views under their own light, relative to the views", "lower"),
+    "residual": ("residual of lit views under their own light, relative to the views", "lower"),
     "painted_share": ("share of the covered texels whose albedo was painted", "higher"),
     "seen_share": ("share of the covered texels that at least one view sees", "higher"),
     "repaired_share": ("share of the covered texels that were painted again after the fit", ""),
     "light_up_over_down": (
-        "mean albedo of what faces up over that of what faces down; 1 is no light from above in the albedo",
+        "mean albedo facing up over mean albedo facing down; 1: without light from above",
         "",
     ),
     "light_correlation": (

@@ -174,8 +174,8 @@ def painted_direction(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -
     world /= np.maximum(np.linalg.norm(world, axis=1, keepdims=True), 1e-9)
     if not counts.any():
         raise InputRefused(
-            f"{path}: mid grey or transparent everywhere; a direction map says with red (along u) and green (along v) "
-            "where strokes run"
+            f"{path}: mid grey or transparent everywhere; a direction map holds stroke directions in red (along u) "
+            "and green (along v)"
         )
 
     def direction(where: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

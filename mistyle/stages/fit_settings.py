@@ -18,8 +18,7 @@ class FitSettings(BaseModel):
     )
     refine_painted: Literal["off", "normal-roughness", "albedo", "all"] = Field(
         default="albedo",
-        description="what auto refines of a painted surface, whose views are drawn from the maps that they would fit; "
-        "drafts: off",
+        description="maps of a painted surface that auto refines (its views are drawn from these maps); drafts: off",
     )
     painted: Literal["auto", "without-light", "with-light"] = Field(
         default="auto",

@@ -79,7 +79,7 @@ class RecoverSettings(BaseModel):
         default=0.003, gt=0, le=1, description="Adam's first rate in each; it falls to zero along a cosine"
     )
     levels: int = Field(default=5, ge=1, le=16, description="levels of the pyramid that preconditions Adam")
-    loss: Literal["log_srgb_l1", "l2"] = Field(default="log_srgb_l1", description="what Adam minimises")
+    loss: Literal["log_srgb_l1", "l2"] = Field(default="log_srgb_l1", description="loss that Adam minimises")
     subsamples: int = Field(
         default=9,
         ge=1,

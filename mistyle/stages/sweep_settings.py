@@ -26,7 +26,7 @@ class WarpSettings(BaseModel):
         default=0.2,
         ge=0,
         lt=1,
-        description="cosine below which a source sees a surface too flatly to say anything about it",
+        description="cosine below which a source sees a surface at too grazing an angle to be used",
     )
     sharpness: float = Field(
         default=0.5,

@@ -1,4 +1,4 @@
-"""Which settings a painting asks for: the table of `mistyle/surface/README.md` as functions of its reading."""
+"""Which settings a painting asks for: the table of `mistyle/stylization/README.md` as functions of its reading."""
 
 import numpy as np
 from jaxtyping import Float

@@ -11,14 +11,12 @@ class PlainSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    samples: int = Field(
-        default=250_000, ge=500, le=4_000_000, description="surface samples asked for on the finest level"
-    )
+    samples: int = Field(default=250_000, ge=500, le=4_000_000, description="surface samples of the finest level")
     stroke_scale: float = Field(
         default=1.0,
         ge=0.1,
         le=10.0,
-        description="stroke size: 2 paints with strokes twice as wide, whatever `samples` says",
+        description="stroke size: 2 paints strokes twice as wide, for any `samples`",
     )
     relief: float = Field(
         default=1.7,
@@ -66,7 +64,7 @@ class PlainSettings(BaseModel):
     )
     direction: Literal["curvature", "up", "around"] = Field(
         default="curvature",
-        description="what strokes follow: the form, the vertical, or level lines around the object",
+        description="direction of strokes: the form, the vertical, or level lines around the object",
     )
     form: float = Field(
         default=0.0,
@@ -122,7 +120,7 @@ class SurfaceSettings(PlainSettings):
     )
     modelling: Modelling | None = Field(
         default=None,
-        description="how much every hollow and bump asks for dark and light strokes, beside creases and ridges; unset: "
+        description="how much every hollow and bump attracts dark and light strokes, beside creases and ridges; unset: "
         "from the painting (1 for brushwork, down to 0 for graphic ones)",
     )
     look_up: LookUp | None = Field(
