@@ -66,8 +66,11 @@ def gallery(rows: Mapping[str, Any], size: int = 160, *, names: Sequence[str] = 
         for row, width in zip(made, widths, strict=True)
     ]
     sheet = compose(Sheet("", (), tuple(full)), max(widths), scale)
-    head = measures(scale)["margin"] + round(measures(scale)["title"] * 1.35)
-    return Gallery(np.round(srgb_from_linear(np.clip(sheet[head:], 0, 1)) * 255).astype(np.uint8))
+    m = measures(scale)
+    # The sheet's title and foot, which are empty.
+    head = m["margin"] + round(m["title"] * 1.35) + m["row_gap"] - m["gutter"]
+    foot = round(m["line"] * 1.2) + m["row_gap"]
+    return Gallery(np.round(srgb_from_linear(np.clip(sheet[head:-foot], 0, 1)) * 255).astype(np.uint8))
 
 
 def _blank(row: Any, missing: int, gutter: int) -> tuple[Any, ...]:

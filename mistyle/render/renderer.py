@@ -58,7 +58,7 @@ class Renderer:
     def __init__(
         self,
         mesh: Mesh,
-        cameras: Sequence[Camera],
+        cameras: Camera | Sequence[Camera],
         lights: Light | Sequence[Light] | Sequence[Lights],
         *,
         shadows: bool = True,
@@ -72,7 +72,7 @@ class Renderer:
 
         Raises UsageError for other kinds of light.
         """
-        self.mesh, self.cameras = mesh, tuple(cameras)
+        self.mesh, self.cameras = mesh, (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
         self.lights = lights_of_cameras(lights, len(self.cameras))
         other = {
             type(x).__name__ for rig in self.lights for x in rig if not isinstance(x, Directional | Point | Ambient)
