@@ -27,8 +27,8 @@ from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
 
 KEY = mistyle.Directional((-0.5, -0.5, -0.7071), (2.0, 1.5, 1.0), "camera")
-LAMP = mistyle.Point((1.5, 2.0, 2.5), (12.0, 9.0, 6.0))
-FLASH = mistyle.Point((0.2, 0.0, 0.0), (12.0, 9.0, 6.0), "camera")
+LAMP = mistyle.Point((-2.5, 1.5, 2.0), (12.0, 9.0, 6.0))
+BESIDE = mistyle.Point((-3.0, 0.5, 3.0), (12.0, 9.0, 6.0), "camera")
 MAPS = ("albedo", "normal", "roughness", "metallic")
 NOTEBOOK = ROOT / "scenes" / "fit_a_material.ipynb"
 
@@ -90,7 +90,7 @@ def leaves(maps) -> list[dict[str, torch.Tensor]]:
     return [{n: torch.tensor(getattr(m, n), requires_grad=True) for n in MAPS} for m in maps]
 
 
-@pytest.mark.parametrize("light", [KEY, LAMP, FLASH])
+@pytest.mark.parametrize("light", [KEY, LAMP, BESIDE])
 def test_the_renderer_draws_what_mitsuba_draws(rng, light):
     """The same picture from records, torch tensors and Dr.Jit tensors, of two texture sets, shadows included."""
     device.use()
@@ -218,11 +218,11 @@ def fitted():
 
 def test_a_material_is_recovered_in_memory(fitted):
     truth, _, fit = fitted
-    sure = fit.texels[0].covered & (fit.confidence[0] > 0.5)
+    sure = fit.texels[0].covered & (fit.confidence[0] > 0.5) & (fit.seen[0] >= 3)
     assert fit.figures["seen_share"] > 0.8 and sure.sum() > 0.5 * fit.texels[0].covered.sum()
     assert fit.figures["residual"] < 0.03 and len(fit.residuals) == 20
     grey = mistyle.flat_maps(64)
-    for name, share in (("albedo", 0.1), ("normal", 0.15), ("roughness", 0.35)):
+    for name, share in (("albedo", 0.2), ("normal", 0.25), ("roughness", 0.4)):
         wanted = getattr(truth, name)
         apart = [mistyle.compare(wanted, getattr(m, name), sure, kind="data")["rmse"] for m in (fit.maps[0], grey)]
         assert apart[0] < share * apart[1], (name, apart)
