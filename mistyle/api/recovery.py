@@ -106,9 +106,6 @@ def recover(
         progress or (lambda share: None),
         start=[start] if isinstance(start, Maps) else start,
     )
-    averaged = sum(times > 1 for times in by)
-    notes = (f"Blocks of up to {max(by)} x {max(by)} pixels were averaged in {averaged} of {len(by)} pictures, which"
-             " are much finer than the texels.",) if averaged else ()  # fmt: skip
     return MaterialFit(
         maps=done.maps,
         confidence=done.confidence,
@@ -118,8 +115,15 @@ def recover(
         parts=tuple(shape.parts),
         figures=_figures(texels, done.seen, done.confidence, done.residuals),
         residuals=done.residuals,
-        notes=(*notes, *done.notes),
+        notes=(*_averaged(by), *done.notes),
     )
+
+
+def _averaged(by: Sequence[int]) -> tuple[str, ...]:
+    """A note where pictures were averaged in blocks of `by` pixels a side."""
+    count = sum(times > 1 for times in by)
+    said = f"Blocks of up to {max(by, default=1)} x {max(by, default=1)} pixels were averaged in {count} of {len(by)} pictures, which are much"
+    return (f"{said} finer than the texels.",) if count else ()
 
 
 def _figures(

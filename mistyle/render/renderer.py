@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera
 from mistyle.core.errors import UsageError
 from mistyle.core.lanes import LANES, aligned
@@ -57,14 +58,14 @@ class Renderer:
 
     def __init__(
         self,
-        mesh: Mesh,
+        mesh: Mesh | Asset,
         cameras: Camera | Sequence[Camera],
         lights: Light | Sequence[Light] | Sequence[Lights],
         *,
         shadows: bool = True,
         frame: FrameKind = "mikkt",
     ) -> None:
-        """Trace `mesh` from every camera; the cameras may differ in size.
+        """Trace `mesh` (with UVs, in working space) from every camera; the cameras may differ in size.
 
         lights   directional, point and ambient lights: one rig for all cameras, or one for each
         shadows  whether the mesh shadows itself
@@ -72,7 +73,8 @@ class Renderer:
 
         Raises UsageError for other kinds of light.
         """
-        self.mesh, self.cameras = mesh, (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
+        self.mesh = mesh.mesh if isinstance(mesh, Asset) else mesh
+        self.cameras = (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
         self.lights = lights_of_cameras(lights, len(self.cameras))
         other = {
             type(x).__name__ for rig in self.lights for x in rig if not isinstance(x, Directional | Point | Ambient)
@@ -82,7 +84,7 @@ class Renderer:
                 f"Renderer: found {', '.join(sorted(other))}; expected Directional, Point and Ambient lights. "
                 "render_views draws the others, without gradients."
             )
-        traced, tangents = tracer(mesh), tangents_of(mesh, frame)
+        traced, tangents = tracer(self.mesh), tangents_of(self.mesh, frame)
         self._surfaces = [deferred.trace(traced, [camera], tangents) for camera in self.cameras]
         self._lit = [
             deferred.light(traced, surface, rig, shadows=shadows)
