@@ -121,9 +121,9 @@ def recover(
 
 def _averaged(by: Sequence[int]) -> tuple[str, ...]:
     """A note where pictures were averaged in blocks of `by` pixels a side."""
-    count = sum(times > 1 for times in by)
-    said = f"Blocks of up to {max(by, default=1)} x {max(by, default=1)} pixels were averaged in {count} of {len(by)} pictures, which are much"
-    return (f"{said} finer than the texels.",) if count else ()
+    count, most = sum(times > 1 for times in by), max(by, default=1)
+    where = f"in {count} of {len(by)} pictures, which are much finer than the texels"
+    return (f"Blocks of up to {most} x {most} pixels were averaged {where}.",) if count else ()
 
 
 def _figures(
