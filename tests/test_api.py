@@ -16,6 +16,7 @@ from notebooks import execute
 from test_recover import DIRECT, QUICK, strong_maps
 from test_scene_fit import CAMERAS, COLOUR, flat, references
 from test_seam import SIZES, crop, random_maps, sphere, torus
+from verbs import SQUARE
 
 import mistyle
 from mistyle import api
@@ -73,6 +74,20 @@ def test_the_settings_of_the_verbs_are_those_that_there_are():
 
     for typed, model in ((StylizeSettings, Settings), (FitSettings, MaterialSettings), (LookdevSettings, LookSettings)):
         assert set(typed.__annotations__) == set(model.model_fields), typed
+
+
+@pytest.fixture(scope="module")
+def square(tmp_path_factory) -> Path:
+    """A folder with square.obj and, in shots/, two lit views of it with their cameras and light."""
+    from mistyle.files.views import write_views
+
+    folder = tmp_path_factory.mktemp("square")
+    (folder / "square.obj").write_text(SQUARE)
+    cameras = [mistyle.orbit(a, 60, distance=4, fov=30, size=(24, 24)) for a in (0, 90)]
+    light = mistyle.Ambient((1.0, 1.0, 1.0))
+    views = mistyle.render_views(mistyle.read_mesh(folder / "square.obj"), None, cameras, light, spp=4)
+    write_views(folder / "shots", views.views, (light,))
+    return folder
 
 
 def plain_picture(mesh, maps, camera, light):
@@ -189,8 +204,8 @@ def test_the_renderer_and_rendered_views_show_one_material():
     assert inside.sum() > 500 and apart["psnr"] > 36 and apart.pixels == inside.sum()
 
 
-def test_views_of_an_asset_are_captures(tmp_path, verb_inputs):
-    asset = mistyle.read_mesh(verb_inputs / "square.obj")
+def test_views_of_an_asset_are_captures(square):
+    asset = mistyle.read_mesh(square / "square.obj")
     cameras = [mistyle.orbit(a, 60, distance=4, fov=30, size=(24, 24)) for a in (0, 90)]
     views = mistyle.render_views(asset, None, cameras, mistyle.Ambient((1.0, 1.0, 1.0)), spp=4)
     assert len(views) == 2 and views[1].camera is cameras[1] and len(views[:1]) == 1
@@ -247,15 +262,15 @@ def test_what_recover_refuses(fitted):
         mistyle.recover(sphere(), views.captures, 16, settings={"iteration": 3})
 
 
-def test_captures_come_from_folders_and_move_into_the_meshs_space(verb_inputs):
-    asset = mistyle.read_mesh(verb_inputs / "square.obj")
-    captures = mistyle.read_captures(verb_inputs / "shots", asset)
+def test_captures_come_from_folders_and_move_into_the_meshs_space(square):
+    asset = mistyle.read_mesh(square / "square.obj")
+    captures = mistyle.read_captures(square / "shots", asset)
     assert [c.name for c in captures.cameras] == [
-        c.name for c in mistyle.read_cameras(verb_inputs / "shots" / "camera.json")
+        c.name for c in mistyle.read_cameras(square / "shots" / "camera.json")
     ]
-    assert captures.lights[0] == mistyle.read_lights(verb_inputs / "shots")
+    assert captures.lights[0] == mistyle.read_lights(square / "shots")
     assert captures.load(0)[0].shape == (*captures.cameras[0].size, 3)
-    views = mistyle.read_views(verb_inputs / "shots")
+    views = mistyle.read_views(square / "shots")
     assert [v.camera.name for v in views] == [c.name for c in captures.cameras]
 
 
@@ -318,13 +333,11 @@ def test_what_compare_refuses():
         mistyle.compare(grey[..., 0], grey)
 
 
-def test_bake_and_lookdev_write_and_show_themselves(verb_inputs, tmp_path):
-    baked = mistyle.bake(
-        verb_inputs / "square.obj", verb_inputs / "shots", tmp_path / "baked", name="tile", atlas={"size": 32}
-    )
+def test_bake_and_lookdev_write_and_show_themselves(square, tmp_path):
+    baked = mistyle.bake(square / "square.obj", square / "shots", tmp_path / "baked", name="tile", atlas={"size": 32})
     assert baked.asset == tmp_path / "baked" / "tile.glb" and baked.asset.is_file() and json.dumps(baked)
     with pytest.raises(UsageError, match="size"):
-        mistyle.bake(verb_inputs / "square.obj", verb_inputs / "shots", tmp_path, atlas={"size": 3})
+        mistyle.bake(square / "square.obj", square / "shots", tmp_path, atlas={"size": 3})
     sheet = mistyle.lookdev(baked.asset, tmp_path / "sheet", size=64, spp=1, date="today")
     assert isinstance(sheet, dict) and Path(sheet["sheet"]).is_file() and sheet.figures == {}
     assert "data:image/webp" in sheet._repr_html_() and "tile.glb" in baked._repr_html_()
@@ -357,7 +370,7 @@ def test_a_gallery_is_one_png(tmp_path, rng):
     assert wide.shape[1] == made.pixels.shape[1] and len(wide) < len(made.pixels)
 
 
-@pytest.mark.timeout(300)
+@pytest.mark.timeout(900)
 def test_the_notebook_runs_and_its_stored_outputs_are_those(tmp_path):
     """What it shows has the same kinds of output as what is stored; the fit is as good as its text says."""
     stored = json.loads(NOTEBOOK.read_text("utf-8"))

@@ -45,7 +45,8 @@ class Comparison(Mapping[str, float]):
         from mistyle.measure.compare_metrics import METRICS
 
         rows = [(n, v, METRICS[n].unit, METRICS[n].better) for n, v in self.items()]
-        shown = {name: np.clip(m / (m.max() or 1), 0, 1) for name, m in self.maps.items()}
+        most = {name: float(m.max()) or 1.0 for name, m in self.maps.items()}
+        shown = {f"{name}, white: {most[name]:.2g}": np.clip(m / most[name], 0, 1) for name, m in self.maps.items()}
         notes = [f"{count} pixels left out: {name}" for name, count in self.bad.items() if count]
         head = ("metric", "value", "unit", "better")
         return html.page(f"{self.pixels:,} pixels", html.table(head, rows), html.thumbnails(shown), notes=notes)
