@@ -61,7 +61,7 @@ def render_views(
     mesh: Mesh | Asset,
     maps: Maps | Sequence[Maps] | None,
     cameras: Camera | Sequence[Camera],
-    lights: Light | Sequence[Light] | Sequence[Lights],
+    lights: Light | Sequence[Light] | Sequence[Sequence[Light]],
     spp: int = 64,
     *,
     seed: int = 0,

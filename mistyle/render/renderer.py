@@ -30,7 +30,7 @@ NEUTRAL = {"albedo": (0.5, 0.5, 0.5), "normal": (0.0, 0.0, 1.0), "roughness": (0
 MapSet = Maps | Mapping[str, Any]
 
 
-def lights_of_cameras(lights: Light | Sequence[Light] | Sequence[Lights], count: int) -> tuple[Lights, ...]:
+def lights_of_cameras(lights: Light | Sequence[Light] | Sequence[Sequence[Light]], count: int) -> tuple[Lights, ...]:
     """One rig for each of `count` cameras, from a light, from a rig for all of them, or from a rig for each."""
     if isinstance(lights, Light):
         lights = (lights,)
@@ -60,7 +60,7 @@ class Renderer:
         self,
         mesh: Mesh | Asset,
         cameras: Camera | Sequence[Camera],
-        lights: Light | Sequence[Light] | Sequence[Lights],
+        lights: Light | Sequence[Light] | Sequence[Sequence[Light]],
         *,
         shadows: bool = True,
         frame: FrameKind = "mikkt",
