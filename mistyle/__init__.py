@@ -1,190 +1,110 @@
-"""mistyle: one mesh and one style image in, the same mesh with stylized, physically based textures out."""
+"""mistyle: one mesh and one style image in, the same mesh with stylized, physically based textures out.
+
+The names of `__all__` are found in `mistyle.api` when they are first used: importing mistyle itself loads nothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from os import PathLike
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mistyle.render.scene_result import FittedScene
+    from mistyle.api import (
+        Ambient,
+        Asset,
+        Camera,
+        Captures,
+        Comparison,
+        Directional,
+        Environment,
+        Gallery,
+        JobResult,
+        Maps,
+        MaterialFit,
+        Mesh,
+        MistyleError,
+        Point,
+        RecoverSettings,
+        Renderer,
+        SceneFit,
+        SphericalGaussian,
+        View,
+        Views,
+        bake,
+        captures_of,
+        compare,
+        fit,
+        fit_scene,
+        flat_maps,
+        gallery,
+        look_at,
+        lookdev,
+        orbit,
+        read_cameras,
+        read_captures,
+        read_lights,
+        read_mesh,
+        read_picture,
+        read_views,
+        recover,
+        render_views,
+        stylize,
+        subset_of,
+    )
 
 __version__ = "0.1.0"
-__all__ = ["__version__", "fit", "fit_scene", "stylize"]
+__all__ = [
+    "__version__",
+    "Ambient",
+    "Asset",
+    "Camera",
+    "Captures",
+    "Comparison",
+    "Directional",
+    "Environment",
+    "Gallery",
+    "JobResult",
+    "Maps",
+    "MaterialFit",
+    "Mesh",
+    "MistyleError",
+    "Point",
+    "RecoverSettings",
+    "Renderer",
+    "SceneFit",
+    "SphericalGaussian",
+    "View",
+    "Views",
+    "bake",
+    "captures_of",
+    "compare",
+    "fit",
+    "fit_scene",
+    "flat_maps",
+    "gallery",
+    "look_at",
+    "lookdev",
+    "orbit",
+    "read_cameras",
+    "read_captures",
+    "read_lights",
+    "read_mesh",
+    "read_picture",
+    "read_views",
+    "recover",
+    "render_views",
+    "stylize",
+    "subset_of",
+]
 
 
-def stylize(
-    mesh: str | PathLike,
-    style: str | PathLike,
-    out: str | PathLike,
-    *,
-    preset: str = "standard",
-    name: str | None = None,
-    **settings: Any,
-) -> dict[str, Any]:
-    """Mesh + one style picture -> stylized asset, textures and report in the folder `out` (the paper's section 4).
+def __getattr__(name: str) -> Any:
+    """What `mistyle.api` has under this name (PEP 562)."""
+    if name not in __all__:
+        raise AttributeError(f"module 'mistyle' has no attribute {name!r}")
+    from mistyle import api
 
-    `settings` are nested as `mistyle stylize --print-config` prints them, for example `fit={"refine": "off"}`.
-    Returns the paths of the written files and the figures of `run.json`; resumes if `out` holds an earlier run of the
-    same job. Raises `mistyle.core.errors.MistyleError`.
-    """
-    from pathlib import Path
-
-    from mistyle.core.names import asset_name
-    from mistyle.run.pipeline import stylize as run
-    from mistyle.run.progress import Progress
-    from mistyle.run.stylize_job import Job
-    from mistyle.run.stylize_settings import resolve
-
-    mesh, style = Path(mesh), Path(style)
-    job = Job(mesh, style, Path(out), resolve(preset, None, settings), asset_name(name, mesh.stem, style.stem))
-    return run(job, Progress(quiet=True))
+    return getattr(api, name)
 
 
-def fit(
-    mesh: str | PathLike,
-    pictures: str | PathLike,
-    out: str | PathLike,
-    *,
-    lights: str | PathLike | None = None,
-    masks: str | PathLike | None = None,
-    preset: str = "standard",
-    name: str | None = None,
-    **settings: Any,
-) -> dict[str, Any]:
-    """Albedo, normal, roughness (and metallic) of a mesh from pictures of known cameras under known light.
-
-    `pictures` is a folder with camera.json, transforms.json or a COLMAP model, and the pictures; `lights` a
-    lights.json (None: the one in the folder; "unknown": solved for). `settings` are nested as `mistyle fit
-    --print-config` prints them, for example `recover={"metallic": True}` or `references={"hold_out": 2}`.
-    Returns the paths of the written files and the figures of `run.json`. Raises `mistyle.core.errors.MistyleError`.
-    """
-    from pathlib import Path
-
-    from mistyle.core.names import asset_name
-    from mistyle.run.material import fit_material
-    from mistyle.run.material_job import MaterialJob
-    from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
-    from mistyle.run.progress import Progress
-    from mistyle.run.settings import resolve
-
-    mesh = Path(mesh)
-    job = MaterialJob(
-        mesh,
-        Path(pictures),
-        Path(out),
-        resolve(preset, None, settings, root=MaterialSettings, presets=MATERIAL_PRESETS),
-        asset_name(name, mesh.stem),
-        lights="unknown" if lights == "unknown" else None if lights is None else Path(lights),
-        masks=None if masks is None else Path(masks),
-    )
-    return fit_material(job, Progress(quiet=True))
-
-
-def fit_scene(
-    scene: Any,
-    keys: str | Sequence[str],
-    sensors: Sequence[Any] | None = None,
-    references: Sequence[Any] = (),
-    *,
-    loss: str | Callable[[Any, Any], Any] | None = None,
-    regularizers: Sequence[Callable[[Mapping[str, Any]], Any]] = (),
-    callback: Callable[[int, float, Mapping[str, Any]], Any] | None = None,
-    iterations: int = 128,
-    spp: int = 16,
-    spp_grad: int | None = None,
-    rate: float = 0.02,
-    pyramid: bool = True,
-    sensors_per_step: int = 1,
-    seed: int = 0,
-    solver: str = "auto",
-    integrator: Any = None,
-    fast: bool = True,
-    masks: Sequence[Any] | None = None,
-    only: Mapping[str, Any] | None = None,
-    channels: str = "",
-    save: Callable[[dict[str, Any]], None] | None = None,
-    save_every: float = 60.0,
-    resume: Mapping[str, Any] | None = None,
-    progress: Callable[[float], None] | None = None,
-) -> FittedScene:
-    """Fit parameters of a live `mi.Scene`, so that its renders look like pictures of known cameras.
-
-    scene             a live `mi.Scene`; it is changed, and holds the result afterwards
-    keys              of `mi.traverse`, or globs: "wall.bsdf.*"; `mistyle fit --scene FILE --list` shows them
-    sensors           `mi.Sensor`s or indices into the scene's; None takes all of the scene's
-    references        one a sensor, of the film's size: linear Rec.709 radiance (h, w, 3), or paths of pictures
-    loss              None: "relative", or "log_srgb_l1" where gradients come without Monte Carlo.
-                      "relative": (I - R)² over the reference's mean square around the pixel; "l2": (I - R)². Render
-                      noise does not move the minimum of these two. "log_srgb_l1": |s(I) - s(R)| with s(x) =
-                      sRGB(log(1 + x)); noise moves its minimum by percents. Or a function (picture, reference) ->
-                      number on Mitsuba tensors (h, w, 3); pixels that do not count are equal in both
-    regularizers      functions ({key: value}) -> number on Mitsuba tensors and arrays, added to the loss (Adam only)
-    callback          (iteration, loss, values) after each step of Adam or round of Gauss–Newton; a true answer ends it
-    iterations        steps; each renders `sensors_per_step` cameras, every one once before any comes again
-    spp, spp_grad     samples a pixel of the picture and of its derivative, which are independent; spp_grad None takes 8
-                      for Gauss–Newton and 1 for Adam
-    rate              of Adam, for values in 0..1; what has no range is scaled by its first root mean square
-    pyramid           False: plain Adam on the texels
-    seed              every random choice follows from it
-    solver            "auto": Gauss–Newton for up to 32 numbers of literals and colours under a squared loss, else Adam;
-                      "adam"; "gauss-newton"
-    integrator        an `mi.Integrator`, a plugin's name or a dictionary; None: the scene's own where it has gradients,
-                      else `prb` (`prbvolpath` in a scene with media) with the depth of the scene's own
-    fast              take gradients without Monte Carlo where that gives the scene's own pictures; a note says whether
-    masks             pixels that count, bool (h, w), one a sensor (None: all)
-    only              by key (or name): bool, which numbers of a value may change; all others keep their bytes
-    channels          of EXR references by path: a prefix ("image"), or three names with commas
-    save, resume      `save` receives a dictionary of arrays every `save_every` seconds, and when the callback ends or
-                      breaks off the fit; given back as `resume`, with all else as it was, the fit continues to the same
-                      result (the same bytes with one thread)
-    progress          receives the share that is done, 0..1
-
-    Returns a `FittedScene`: values before and after by key, their standard errors, residuals with the share that is
-    render noise, what has not converged, and notes. A result worse than its start is undone, with a note. A texel
-    whose gradient is not a number keeps its last good value, and is reported. Raises UsageError for keys or
-    settings that cannot be, InputRefused for references and for what Mitsuba cannot render.
-    """
-    from dataclasses import replace
-    from pathlib import Path
-
-    from mistyle.render.scene_fit import fit_scene as run
-    from mistyle.render.scene_keys import merged
-    from mistyle.run.scene_references import read_reference
-
-    notes: list[str] = []
-    pictures: list[Any] = []
-    counts: list[Any] = [None] * len(references) if masks is None else list(masks)
-    for k, picture in enumerate(references):
-        if isinstance(picture, (str, PathLike)):
-            picture, usable, said = read_reference(Path(picture), channels)
-            notes += said
-            if k < len(counts):
-                counts[k] = usable if counts[k] is None else counts[k] & usable
-        pictures.append(picture)
-    fitted = run(
-        scene,
-        [keys] if isinstance(keys, str) else keys,
-        sensors,
-        pictures,
-        loss=loss,
-        regularizers=regularizers,
-        callback=callback,
-        iterations=iterations,
-        spp=spp,
-        spp_grad=spp_grad,
-        rate=rate,
-        pyramid=pyramid,
-        sensors_per_step=sensors_per_step,
-        seed=seed,
-        solver=solver,
-        integrator=integrator,
-        fast=fast,
-        masks=counts,
-        only=only,
-        save=save,
-        save_every=save_every,
-        resume=resume,
-        progress=progress or (lambda done: None),
-    )
-    return replace(fitted, notes=(*notes, *fitted.notes, *merged(fitted.parameters)))
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -7,6 +7,7 @@ mesh             demo.obj: a young elephant with a bird on its back: distance fu
                  decimation, Newton steps back onto the surface, normals from the distance function's gradient, xatlas
                  charts turned right-handed
 robot            robot.obj: a tin toy robot of closed shells (robot.py), xatlas charts turned right-handed
+vase             vase.obj: a vase for the notebook, a profile turned about an axis (vase.py)
 style            demo_style.png: an evening over the sea, painted stroke by stroke (sunset.py composes, paint.py paints)
 mosaic           demo_mosaic.jpg: two fish in stone and glass (mosaic.py)
 hatched          demo_hatched.png: a still life drawn with a pen (hatched.py)
@@ -30,11 +31,12 @@ import pixels  # noqa: E402
 import robot  # noqa: E402
 import sculpt  # noqa: E402
 import sunset  # noqa: E402
+import vase  # noqa: E402
 
 FACES = 15_000
 CELL = 0.011
 SOFTEN = 0.6
-TITLES = {"demo": "a young elephant with a bird on its back", "robot": "a tin toy robot that waves"}
+TITLES = {"demo": "a young elephant with a bird on its back", "robot": "a tin toy robot that waves", "vase": "a vase"}
 
 
 def largest_part(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -156,11 +158,14 @@ def obj_text(mesh: tuple[np.ndarray, np.ndarray, np.ndarray], corner_uvs: np.nda
     return "\n".join(lines) + "\n"
 
 
-def write_mesh(stem: str, material: str, mesh: tuple[np.ndarray, np.ndarray, np.ndarray]) -> None:
-    """Unwrap a mesh; write `stem`.obj and `stem`.mtl."""
+def write_mesh(
+    stem: str, material: str, mesh: tuple[np.ndarray, np.ndarray, np.ndarray], uvs: np.ndarray | None = None
+) -> None:
+    """Write `stem`.obj and `stem`.mtl; a mesh without corner UVs is unwrapped."""
     from mistyle.core.unwrap import unwrap
 
-    (uvs,) = unwrap([(mesh[0], mesh[1])])
+    if uvs is None:
+        (uvs,) = unwrap([(mesh[0], mesh[1])])
     (HERE / f"{stem}.obj").write_text(obj_text(mesh, uvs, (stem, material)), encoding="ascii", newline="\n")
     (HERE / f"{stem}.mtl").write_text(f"newmtl {material}\nKd 0.5 0.5 0.5\n", encoding="ascii", newline="\n")
 
@@ -206,6 +211,7 @@ def make_overview() -> None:
 MAKERS = {
     "mesh": lambda: write_mesh("demo", "elephant", sculpture()),
     "robot": lambda: write_mesh("robot", "robot", robot.robot()),
+    "vase": lambda: write_mesh("vase", "vase", *vase.vase()),
     "style": make_style,
     "mosaic": make_mosaic,
     "hatched": make_hatched,

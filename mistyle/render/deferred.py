@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.camera import Camera
 from mistyle.core.lanes import aligned
-from mistyle.core.light import Ambient, Directional, Lights, direction_in_world
+from mistyle.core.light import Ambient, Directional, Lights, Point, direction_in_world, position_in_world
 from mistyle.render import device
 from mistyle.render.draw import Tracer
 
@@ -113,19 +113,22 @@ def intersect(traced: Tracer, ray: Any, tangents: Float[np.ndarray, "f 3 4"] | N
 
 
 def light(traced: Tracer, surface: Surface, lights: Lights, *, shadows: bool = True) -> Lit:
-    """Light that all cameras share: directional lights, one shadow ray each (`shadows`), and unoccluded ambient light.
+    """Light that all cameras share: directional and point lights, one shadow ray each (`shadows`), and unoccluded
+    ambient light.
 
     Ambient light knows no occlusion, so that an albedo fitted under it does not turn bright in cavities; its radiance
     is summed over AMBIENT_DIRECTIONS fixed directions per pixel. Other kinds of light raise ValueError.
     """
     beams, ambient = [], np.zeros(3)
     for source in lights:
-        if isinstance(source, Directional):
+        if isinstance(source, (Directional, Point)):
             beams.append([source] * len(surface.cameras))
         elif isinstance(source, Ambient):
             ambient += source.radiance
         else:
-            raise ValueError(f"{type(source).__name__} cannot be summed exactly; give directional or ambient light")
+            raise ValueError(
+                f"{type(source).__name__} cannot be summed exactly; give directional, point or ambient light"
+            )
     glow = (float(ambient[0]), float(ambient[1]), float(ambient[2])) if ambient.any() else None
     return _lit(traced, surface, beams, glow, shadows)
 
@@ -138,7 +141,7 @@ def light_each(traced: Tracer, surface: Surface, beams: Sequence[Directional], *
 def _lit(
     traced: Tracer,
     surface: Surface,
-    beams: Sequence[Sequence[Directional]],
+    beams: Sequence[Sequence[Directional] | Sequence[Point]],
     ambient: tuple[float, float, float] | None,
     shadows: bool,
 ) -> Lit:
@@ -152,15 +155,32 @@ def _lit(
     wi = surface.frame.to_local(surface.towards)
     directional = []
     for row in beams:
-        towards = [direction_in_world(beam, camera) for beam, camera in zip(row, surface.cameras, strict=True)]
-        world = _each(mi.Vector3f, np.stack(towards), camera_of)
-        strength = _each(mi.Color3f, np.array([beam.irradiance for beam in row]), camera_of)
+        world, strength, ray = _beam(surface, row, camera_of)
         seen = mi.Bool(valid)
         if shadows:
-            seen &= ~traced.scene.ray_test(surface.point.spawn_ray(world), active=valid)
+            seen &= ~traced.scene.ray_test(ray, active=valid)
         directional.append((surface.frame.to_local(world), dr.select(seen, strength, 0)))
     dr.eval(wi, directional, valid)
     return Lit((height * len(surface.cameras), width), wi, valid, tuple(directional), ambient)
+
+
+def _beam(surface: Surface, row: Sequence[Directional] | Sequence[Point], camera_of: Any) -> tuple[Any, Any, Any]:
+    """Of one light for each camera: unit directions towards it, irradiance of what faces it, and shadow rays."""
+    import drjit as dr
+    import mitsuba as mi
+
+    both = list(zip(row, surface.cameras, strict=True))
+    if isinstance(row[0], Directional):
+        towards = [direction_in_world(beam, camera) for beam, camera in both if isinstance(beam, Directional)]
+        world = _each(mi.Vector3f, np.stack(towards), camera_of)
+        strength = [beam.irradiance for beam in row if isinstance(beam, Directional)]
+        return world, _each(mi.Color3f, np.array(strength), camera_of), surface.point.spawn_ray(world)
+    places = [position_in_world(point, camera) for point, camera in both if isinstance(point, Point)]
+    place = _each(mi.Point3f, np.stack(places), camera_of)
+    intensity = _each(mi.Color3f, np.array([point.intensity for point in row if isinstance(point, Point)]), camera_of)
+    way = place - surface.point.p
+    squared = dr.squared_norm(way)
+    return way * dr.rsqrt(squared), intensity / squared, surface.point.spawn_ray_to(place)
 
 
 def ambient_directions(wi: Any, count: int = AMBIENT_DIRECTIONS) -> list[tuple[Any, Any]]:

@@ -127,20 +127,24 @@ def draw_views(
     pictures = _pictures(mesh, maps, cameras, Staging(template, spp, seed, backdrop=False))
     views = []
     for k, (camera, picture) in enumerate(zip(cameras, pictures, strict=True)):
-        hits = gbuffer(traced, camera)
-        view = View(
-            camera=camera,
-            rgb=np.ascontiguousarray(picture[..., :3]),
-            depth=hits.depth,
-            normal=hits.normal,
-            uv=hits.uv,
-            part=hits.part,
-            mask=hits.mask,
-            coverage=np.ascontiguousarray(picture[..., 3]),
-        )
-        views.append(memory.away(view))
+        views.append(memory.away(view_of(traced, camera, picture)))
         progress((k + 1) / len(cameras))
     return views
+
+
+def view_of(traced: Tracer, camera: Camera, picture: Float[np.ndarray, "h w 4"]) -> View:
+    """A premultiplied linear picture of `camera` with its alpha as coverage, and the geometry at pixel centres."""
+    hits = gbuffer(traced, camera)
+    return View(
+        camera=camera,
+        rgb=np.ascontiguousarray(picture[..., :3]),
+        depth=hits.depth,
+        normal=hits.normal,
+        uv=hits.uv,
+        part=hits.part,
+        mask=hits.mask,
+        coverage=np.ascontiguousarray(picture[..., 3]),
+    )
 
 
 def as_fine_as(maps: Maps, pixels: int) -> Maps:
@@ -228,11 +232,18 @@ def _pictures(mesh, maps, cameras, staging):
         # A function, so that its scene goes before the next comes: where two live, other kernels have to be compiled.
         scene = loaded(camera) if standing is None else standing
         sensor = scene.sensors()[0] if standing is None else mi.load_dict(scenery.sensor_dict(camera, spp, seed))
-        times, each = scenery.passes(spp)
-        total = np.zeros((*camera.size, 4), np.float32)
-        for k in range(times):
-            step = (seed + k * SEED_STEP) % 2**32
-            total += np.array(mi.render(scene, sensor=sensor, spp=each, seed=step), dtype=np.float32)
-        return total / np.float32(times)
+        return mean_of_passes(scene, sensor, camera.size, spp, seed)
 
     yield from map(drawn, cameras)
+
+
+def mean_of_passes(scene: Any, sensor: Any, size: tuple[int, int], spp: int, seed: int) -> Float[np.ndarray, "h w 4"]:
+    """A picture of a loaded scene by at least `spp` samples a pixel, in passes of independent seeds."""
+    import mitsuba as mi
+
+    times, each = scenery.passes(spp)
+    total = np.zeros((*size, 4), np.float32)
+    for k in range(times):
+        step = (seed + k * SEED_STEP) % 2**32
+        total += np.array(mi.render(scene, sensor=sensor, spp=each, seed=step), dtype=np.float32)
+    return total / np.float32(times)

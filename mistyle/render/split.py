@@ -63,14 +63,27 @@ class Split:
         return self._frozen[key]
 
 
+def radiance(lit: deferred.Lit, packed: Any) -> Any:
+    """`Split.image` traced anew, for Dr.Jit's own gradients: packed materials (8n floats) to radiance (3n floats).
+
+    Both are Dr.Jit arrays, pixel after pixel. Each pixel reads its own material: the gradient adds nothing up.
+    """
+    return _image(partial(bsdf.terms, "principled", specular=0.5), *_lights_of(lit), packed)
+
+
 def _arrays(lit: deferred.Lit, materials: Float[np.ndarray, "n 8"]) -> tuple[Any, ...]:
+    import mitsuba as mi
+
+    return *_lights_of(lit), own(mi.Float, np.ascontiguousarray(materials, np.float32).ravel())
+
+
+def _lights_of(lit: deferred.Lit) -> tuple[Any, Any, Any, Any]:
     import drjit as dr
     import mitsuba as mi
 
     # Opaque, for a literal would be a constant of the recording.
     ambient = None if lit.ambient is None else mi.Color3f(*(dr.opaque(mi.Float, c) for c in lit.ambient))
-    packed = own(mi.Float, np.ascontiguousarray(materials, np.float32).ravel())
-    return lit.wi, lit.mask, list(lit.directional), ambient, packed
+    return lit.wi, lit.mask, list(lit.directional), ambient
 
 
 def _lights(wi: Any, directional: list[Any], ambient: Any) -> Iterator[tuple[Any, Any]]:

@@ -1,0 +1,147 @@
+"""A material from pictures under known light, in memory."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.api import html
+from mistyle.core.asset import Asset
+from mistyle.core.capture import Captures, shrunk
+from mistyle.core.errors import InputRefused
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import Mesh
+from mistyle.stages.recover_settings import RecoverSettings
+
+SURE = 0.5  # confidence above which a texel counts as determined
+
+
+@dataclass(frozen=True)
+class MaterialFit:
+    """A fitted material, per texture set.
+
+    maps        albedo linear Rec.709, normal in tangent space (+Y, MikkTSpace), roughness, metallic; `known` where a
+                picture saw the texel in the light. Texels beside the UV islands hold no meaning
+    confidence  0..1: 1 sure, 0 nothing seen. What the pictures leave open is low here
+    spread      standard deviations of albedo, normal (radians of tilt), roughness and metallic, (h, w) by name
+    seen        how many pictures saw the texel in the light
+    texels      where on the surface each texel lies, and which are covered
+    figures     seen_share and confident_share of the covered texels; residual and worst_residual: root mean square of
+                reference - render, relative to the reference's, mean and largest over the pictures
+    residuals   the same of each picture, by its name
+    notes       what was left out, averaged or not determined
+    """
+
+    maps: tuple[Maps, ...]
+    confidence: tuple[Float[np.ndarray, "_ _"], ...]
+    spread: tuple[dict[str, Float[np.ndarray, "_ _"]], ...]
+    seen: tuple[Int[np.ndarray, "_ _"], ...]
+    texels: tuple[Texels, ...]
+    parts: tuple[str, ...]
+    figures: dict[str, float]
+    residuals: dict[str, float]
+    notes: tuple[str, ...]
+
+    def _repr_html_(self) -> str:
+        rows = []
+        for part, maps, sure, texels in zip(self.parts, self.maps, self.confidence, self.texels, strict=True):
+            shown = html.map_pictures(maps) | {"confidence": np.where(texels.covered, sure, 0)}
+            on = {name: np.where(_like(texels.covered, p), p, 1).astype(np.float32) for name, p in shown.items()}
+            rows.append(html.page(part, html.thumbnails(on)))
+        return html.page("Fitted material", html.table(("figure", "value"), self.figures.items()), *rows,
+                         notes=self.notes)  # fmt: skip
+
+
+def _like(mask: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    return mask if picture.ndim == 2 else mask[..., None]
+
+
+def recover(
+    mesh: Mesh | Asset,
+    captures: Captures,
+    size: int = 512,
+    *,
+    settings: RecoverSettings | Mapping[str, Any] | None = None,
+    seed: int = 0,
+    start: Maps | Sequence[Maps] | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> MaterialFit:
+    """Albedo, normal, roughness and metallic of a mesh from pictures of known cameras under known light.
+
+    mesh      in working space with UVs, as `read_mesh` gives it
+    captures  of `read_captures`, of `render_views(...).captures`, or of `captures_of(cameras, lights, pictures)`
+    size      texels along each side of every texture set
+    settings  a `RecoverSettings` record or some of its fields, for example `{"metallic": True}`
+    seed      equal inputs, settings, seed and threads give equal bytes
+    start     maps to begin from, `size` texels a side; their metallic stays where metallic is not fitted
+    progress  receives the share that is done, 0..1
+
+    It is the solver of `mistyle fit`, with no folder, no checkpoints and nothing held out. Pictures much finer than
+    the texels are averaged in blocks first, and a note says so. Cameras and lights are taken as given; a common factor
+    of light and albedo cannot be told apart. Raises InputRefused where no picture can be used, UsageError for settings
+    that do not exist.
+    """
+    from mistyle.run.settings import validate
+    from mistyle.stages.recover import recover as solve
+    from mistyle.stages.recover_check import blocks
+    from mistyle.stages.texels import rasterise
+
+    shape = mesh.mesh if isinstance(mesh, Asset) else mesh
+    given = {} if settings is None else settings
+    chosen = given if isinstance(given, RecoverSettings) else validate(given, "recover", RecoverSettings)
+    unlit = [camera.name for camera, rig in zip(captures.cameras, captures.lights, strict=True) if not rig]
+    if unlit:
+        raise InputRefused(f"recover: found no light for the picture '{unlit[0]}', expected one for each. mistyle.fit"
+                           '(..., lights="unknown") solves for an unknown light.')  # fmt: skip
+    texels = tuple(rasterise(shape, part, size) for part in range(len(shape.parts)))
+    by = blocks(texels, captures.cameras)
+    done = solve(
+        shape,
+        texels,
+        shrunk(captures, by),
+        chosen,
+        seed,
+        progress or (lambda share: None),
+        start=[start] if isinstance(start, Maps) else start,
+    )
+    return MaterialFit(
+        maps=done.maps,
+        confidence=done.confidence,
+        spread=done.spread,
+        seen=done.seen,
+        texels=texels,
+        parts=tuple(shape.parts),
+        figures=_figures(texels, done.seen, done.confidence, done.residuals),
+        residuals=done.residuals,
+        notes=(*_averaged(by), *done.notes),
+    )
+
+
+def _averaged(by: Sequence[int]) -> tuple[str, ...]:
+    """A note where pictures were averaged in blocks of `by` pixels a side."""
+    count, most = sum(times > 1 for times in by), max(by, default=1)
+    where = f"in {count} of {len(by)} pictures, which are much finer than the texels"
+    return (f"Blocks of up to {most} x {most} pixels were averaged {where}.",) if count else ()
+
+
+def _figures(
+    texels: Sequence[Texels],
+    seen: Sequence[np.ndarray],
+    confidence: Sequence[np.ndarray],
+    residuals: Mapping[str, float],
+) -> dict[str, float]:
+    covered = [t.covered for t in texels]
+    total = max(sum(int(c.sum()) for c in covered), 1)
+
+    def share(masks: Sequence[np.ndarray]) -> float:
+        return sum(int((m & c).sum()) for m, c in zip(masks, covered, strict=True)) / total
+
+    left = list(residuals.values())
+    return {
+        "seen_share": share([s > 0 for s in seen]),
+        "confident_share": share([c > SURE for c in confidence]),
+        "residual": float(np.mean(left)),
+        "worst_residual": float(np.max(left)),
+    }

@@ -1,0 +1,66 @@
+"""The keyword settings of the verbs, by name: one mapping per stage, as `--print-config` prints them."""
+
+from collections.abc import Mapping
+from typing import Any, Literal, TypedDict
+
+Stage = Mapping[str, Any]
+Variant = Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"]
+
+
+class StylizeSettings(TypedDict, total=False):
+    """Settings of `stylize` and `bake`; `mistyle stylize --print-config` lists what each stage takes."""
+
+    seed: int
+    threads: int
+    memory: float
+    variant: Variant
+    stylizer: Literal["embedded", "embedded-view", "diffusion"]
+    inpainter: Literal["fill", "paint3d"]
+    read: Stage
+    rig: Stage
+    draw: Stage
+    surface: Stage
+    coat: Stage
+    sweep: Stage
+    atlas: Stage
+    bake: Stage
+    finish: Stage
+    fit: Stage
+    repair: Stage
+    report: Stage
+    deliver: Stage
+    colour: Stage
+    models: Stage
+    train: Stage
+    diffusion: Stage
+    paint3d: Stage
+
+
+class FitSettings(TypedDict, total=False):
+    """Settings of `fit`; `mistyle fit --print-config` lists what each stage takes."""
+
+    seed: int
+    threads: int
+    memory: float
+    variant: Variant
+    start: Literal["nothing", "own"]
+    read: Stage
+    references: Stage
+    atlas: Stage
+    recover: Stage
+    report: Stage
+    deliver: Stage
+    colour: Stage
+
+
+class LookdevSettings(TypedDict, total=False):
+    """Settings of `lookdev`: pixels and samples of its pictures, and how many frames of each turntable."""
+
+    size: int
+    spp: int
+    seed: int
+    turntable: int
+    hdri_turn: int
+    frame: int
+    threads: int
+    variant: str
