@@ -22,7 +22,7 @@ from mistyle.render.texel_views import Look, look
 from mistyle.stages import recover_observe, recover_pictures
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.neighbours import of_islands
-from mistyle.stages.recover import recover
+from mistyle.stages.recover import Checkpoints, recover
 from mistyle.stages.recover_check import usable
 from mistyle.stages.recover_observe import Gathered, gather
 from mistyle.stages.recover_pictures import SHORTEST
@@ -262,11 +262,11 @@ def test_the_same_bytes_again_and_after_an_interruption(world):
     update = {"iterations": 36, "rounds": 1, "bounces": 2, "bounce_samples": 8, "checkpoint": 1e-9}
     settings = QUICK.model_copy(update=update)
     states = []
-    whole = recover(mesh, [texels], some, settings, 5, save=states.append)
+    whole = recover(mesh, [texels], some, settings, 5, checkpoints=Checkpoints(save=states.append))
     assert [int(s["iteration"]) for s in states] == [6, 18, 24, 30]
     assert all(isinstance(v, np.ndarray) and v.dtype != object for s in states for v in s.values())
     for state in states:
-        resumed = recover(mesh, [texels], some, settings, 5, resume=state)
+        resumed = recover(mesh, [texels], some, settings, 5, checkpoints=Checkpoints(resume=state))
         for name in ("albedo", "normal", "roughness", "metallic"):
             assert getattr(whole.maps[0], name).tobytes() == getattr(resumed.maps[0], name).tobytes(), name
         assert whole.trace == resumed.trace

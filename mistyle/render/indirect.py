@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera, binned
 from mistyle.core.image import gaussian, nearest_fill, resize
-from mistyle.core.lanes import aligned
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
@@ -302,15 +301,3 @@ def _around(
 def _overlap(size: int, step: int) -> tuple[slice, slice]:
     """Rows that have another one `step` further on, and those others."""
     return slice(max(0, -step), size - max(0, step)), slice(max(0, step), size + min(0, step))
-
-
-def retarget(shade: Any, picture: int, rgb: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"]) -> None:
-    """Give a picture of a `Shade` another reference and other weights; pictures it does not keep load theirs again."""
-    import mitsuba
-
-    mi: Any = mitsuba
-    for block in shade.kept(picture):
-        target = np.array(block.target).reshape(-1, 4)
-        target[: len(block.pixel), :3] = rgb.reshape(-1, 3)[block.pixel]
-        target[: len(block.pixel), 3] = weight.ravel()[block.pixel]
-        block.target = mi.Float(aligned(target.ravel()))

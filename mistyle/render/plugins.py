@@ -93,8 +93,8 @@ def _gltf_class(mi: Any) -> type:
             sampled = dr.zeros(mi.BSDFSample3f)
             sampled.wo = dr.detach(wo)
             sampled.eta = mi.Float(1)
-            diffuse, gloss = mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
-            sampled.sampled_type = dr.select(glossy, gloss, diffuse)
+            diffuse, constant = mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+            sampled.sampled_type = dr.select(glossy, constant, diffuse)
             sampled.sampled_component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
             sampled.pdf = self._pdf(si, sampled.wo, active, metallic, roughness)
             value = self._eval(si, sampled.wo, active, metallic, roughness)
@@ -111,8 +111,8 @@ def _gltf_class(mi: Any) -> type:
         def _eval(self, si, wo, active, metallic, roughness):
             albedo = self.base_color.eval(si, active)
             angles = bsdf.upright(si.wi, wo)
-            paint, gloss = bsdf.MODELS["gltf"](angles, roughness, metallic, self.specular)
-            return dr.select(active & angles.valid, dr.fma(albedo, paint, gloss), 0)
+            linear, constant = bsdf.MODELS["gltf"](angles, roughness, metallic, self.specular)
+            return dr.select(active & angles.valid, dr.fma(albedo, linear, constant), 0)
 
         def _strategy(self, metallic, roughness):
             """The share of samples that follow GGX's visible normals, and that distribution; the rest is cosine."""

@@ -13,14 +13,14 @@ from mistyle.core.light import SOFT, Directional, Light, Lights, Point, directio
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
 from mistyle.render.hits import BLOCK_RAYS
-from mistyle.render.sky import even_directions, gathered_in
+from mistyle.render.sky import bin_environment, even_directions
 from mistyle.render.texel_lm import Rig
 
 SKY_CELLS = 128
 
 
 @dataclass(frozen=True)
-class Look:
+class GBuffer:
     """Surface points through the pixel centres of a camera, world; zero beside the mesh.
 
     normal  interpolated shading normal, unit, not turned towards the camera
@@ -33,7 +33,7 @@ class Look:
     lit: tuple[Bool[np.ndarray, "h w"], ...]
 
 
-def look(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> Look:
+def trace_gbuffer(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> GBuffer:
     """One exact ray through every pixel centre, and from where it ends one shadow ray to every delta light.
 
     Lights are Directional or Point; their frame "camera" is that of `camera`. Shadow rays start where Mitsuba's do.
@@ -63,7 +63,7 @@ def look(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> Look:
         for k, each in enumerate(reached):
             lit[k, part] = np.array(each)
     shape = camera.size
-    return Look(
+    return GBuffer(
         position.reshape(*shape, 3),
         normal.reshape(*shape, 3),
         mask.reshape(shape),
@@ -94,7 +94,7 @@ def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
         if soft:
             key = tuple(map(id, soft))
             if key not in known:
-                known[key] = gathered_in(soft, even_directions(SKY_CELLS))
+                known[key] = bin_environment(soft, even_directions(SKY_CELLS))
             sky = known[key]
             vector.extend(sky.direction)
             irradiance.extend(sky.irradiance)

@@ -164,18 +164,20 @@ def _explained(
 ) -> tuple[tuple[float, float], list[View]]:
     """The residuals of two solutions, and the views without their light by the second one."""
     from mistyle.render.draw import tracer
-    from mistyle.render.shade import Shade, pack
+    from mistyle.render.material_table import pack
+    from mistyle.render.shade import MaterialRenderer, RenderOptions
     from mistyle.render.unlit import unlit
 
     traced, sizes = tracer(mesh), [m.roughness.shape for m in both[0]]
-    shade = Shade(traced, captures, sizes, subsamples=SUBSAMPLES, gradients=False)
+    options = RenderOptions(subsamples=SUBSAMPLES, gradients=False)
+    renderer = MaterialRenderer(traced, captures, sizes, options)
     lost = np.zeros((2, 2))
     plain = [rgb for rgb, _ in unlit(traced, both[1], captures.cameras)]
     result = []
     for j, maps in enumerate(both):
-        shade.table = pack(maps)
+        table = renderer.upload(pack(maps))
         for k, view in enumerate(targets):
-            mask, lit = captures.load(k)[1], shade.image(k)
+            mask, lit = captures.load(k)[1], renderer.image(table, k)
             lost[j] += [float(((view.rgb - lit)[mask] ** 2).sum()), float((view.rgb[mask] ** 2).sum())]
             if j == 1:
                 result.append(replace(view, rgb=without_light(view, lit, plain[k], mask)))

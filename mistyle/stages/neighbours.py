@@ -2,7 +2,7 @@
 
 A chart's border is no border of the surface. Where a texel has no neighbour of its island on one side, the surface is
 followed by one texel's width in that direction, and the texel whose middle lies nearest to there takes that place.
-Charts often end where the material does, too: `believed` finds out where, as far as values are known.
+Charts often end where the material does, too: `weighted_seams` finds out where, as far as values are known.
 """
 
 from collections.abc import Iterable
@@ -63,7 +63,7 @@ def within(among: Links) -> Links:
     return replace(among, seams=(NONE, NONE, NONE, NONE))
 
 
-def believed(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
+def weighted_seams(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
     """The same with seams believed as far as the surface seems to go on there: half where any of `fields` (values and
     their standard deviations) jumps by twice what these and the mean difference of neighbours in the grid let expect.
     """

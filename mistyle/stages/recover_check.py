@@ -1,26 +1,23 @@
-"""Which reference pictures say something, and what is taken off them."""
+"""Which reference pictures say something, and how far they may be downsampled."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from mistyle.core.camera import Camera, in_frame, px_from_world
-from mistyle.core.capture import Captures, Loaded, subset
+from mistyle.core.capture import Captures, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.render.indirect import enlarged
 
 LEAST_VIEWS = 3
 FINE = 0.25  # share of the texels that may be narrower than ACROSS blocks of averaged pixels
 ACROSS = 2
 LEAST_PIXELS = 32  # along the shorter side of a picture that is left
-DISTRUST = 10.0  # of indirect light: what a pixel counts is halved by one tenth of the direct light
 
 
-def usable(mesh: Mesh, captures: Captures, notes: list[str]) -> Captures:
+def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captures:
     """The pictures that say something. A picture of another size than its camera is refused, as are captures of which
     nothing is left."""
     if len(captures) == 0:
@@ -64,7 +61,7 @@ def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: 
     return ""
 
 
-def blocks(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
+def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
     """How many pixels of each camera's picture, along a side, can be averaged and leave texels ACROSS blocks wide.
 
     Of the texels that face the camera, hidden ones too, three in four are at least that wide. With texels as wide as
@@ -87,29 +84,3 @@ def blocks(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
         most = max(1, min(camera.size) // LEAST_PIXELS)
         result.append(int(np.clip(np.quantile(wide, FINE), 1, most)) if len(wide) else 1)
     return result
-
-
-def without(captures: Captures, indirect: dict[int, np.ndarray]) -> Captures:
-    """The pictures less their indirect light, which may still come, in pictures that may be coarser."""
-
-    def load(k: int) -> Loaded:
-        rgb, mask = captures.load(k)
-        if k in indirect:
-            rgb = rgb - enlarged(indirect[k], captures.cameras[k].size)
-        return rgb, mask
-
-    return Captures(captures.cameras, captures.lights, load)
-
-
-def trust(captures: Captures, indirect: dict[int, np.ndarray]) -> Callable[[int], np.ndarray]:
-    """Weights of a picture's pixels, 0..1: a half where a tenth of what came directly was taken off as indirect."""
-
-    def weights(k: int) -> Float[np.ndarray, "h w"]:
-        size = captures.cameras[k].size
-        if k not in indirect:
-            return np.ones(size, np.float32)
-        taken = enlarged(indirect[k], size).max(axis=-1)
-        direct = np.maximum(np.nan_to_num(captures.load(k)[0]).max(axis=-1), 0)
-        return (direct / np.maximum(direct + DISTRUST * taken, 1e-9)).astype(np.float32)
-
-    return weights
