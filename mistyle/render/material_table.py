@@ -22,7 +22,7 @@ FETCHED_ROUGHNESS, FETCHED_METALLIC = 6, 7
 # A tilt longer than sqrt(1 - this²) has no gradient along its length any more.
 LEAST_Z = 0.05
 
-MaterialTable = Float[np.ndarray, "t 8"]
+MaterialTable = Float[np.ndarray, "a 8"]
 
 
 def pack(maps: Sequence[Maps]) -> MaterialTable:
