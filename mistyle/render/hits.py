@@ -272,7 +272,9 @@ def _block(
     if len(chosen) == 0:
         return None
     pixel, offset = np.repeat(chosen.astype(np.uint32), subsamples), np.tile(grid(subsamples), (len(chosen), 1))
-    rays = _trace(surface, camera, lights, _rays(camera, pixel, offset), sampling.shadows, soft is not None)
+    places = (mi.Float(aligned(offset[:, axis])) for axis in (0, 1))
+    ray = camera_rays(camera, mi.UInt32(aligned(pixel, np.uint32)), *places)
+    rays = _trace(surface, camera, lights, ray, sampling.shadows, soft is not None)
     point = rays.point
     face = mi.UInt32(point.prim_index)
     dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv)
@@ -402,14 +404,15 @@ def _pad(values: np.ndarray, size: int) -> np.ndarray:
     return result
 
 
-def _rays(camera: Camera, pixel: Integer[np.ndarray, " n"], offset: Float[np.ndarray, "n 2"]) -> Any:
+def camera_rays(camera: Camera, pixel: Any, x: Any, y: Any) -> Any:
+    """Rays through the places (x, y), 0..1, in the pixels (UInt32, row · width + column); unit directions."""
     import drjit as dr
     import mitsuba as mi
 
-    index = mi.UInt32(aligned(pixel, np.uint32))
     width = camera.size[1]
-    x = (mi.Float(index % width) + mi.Float(aligned(offset[:, 0])) - camera.centre[0]) / camera.focal
-    y = (mi.Float(index // width) + mi.Float(aligned(offset[:, 1])) - camera.centre[1]) / camera.focal
+    x = (mi.Float(pixel % width) + x - camera.centre[0]) / camera.focal
+    y = (mi.Float(pixel // width) + y - camera.centre[1]) / camera.focal
+    # Made for every call: a product with a literal zero, as upright cameras have one, resizes that zero.
     axes: list[Any] = [mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T]
     right, down, forward = axes
     return mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))

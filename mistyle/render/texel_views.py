@@ -12,7 +12,7 @@ from mistyle.core.lanes import aligned
 from mistyle.core.light import SOFT, Directional, Light, Lights, Point, direction_in_world, position_in_world
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
-from mistyle.render.hits import BLOCK_RAYS
+from mistyle.render.hits import BLOCK_RAYS, camera_rays
 from mistyle.render.sky import bin_environment, even_directions
 from mistyle.render.texel_lm import Rig
 
@@ -48,13 +48,8 @@ def trace_gbuffer(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> GB
     mask, lit = np.zeros(height * width, bool), np.zeros((len(lights), height * width), bool)
     for low in range(0, height * width, BLOCK_RAYS):
         part = slice(low, min(low + BLOCK_RAYS, height * width))
-        # Made for every block: a product with a literal zero, as upright cameras have one, resizes that zero.
-        right, down, forward = (mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T)
         index = dr.arange(mi.UInt32, part.start, part.stop)
-        x = (mi.Float(index % width) + 0.5 - camera.centre[0]) / camera.focal
-        y = (mi.Float(index // width) + 0.5 - camera.centre[1]) / camera.focal
-        ray = mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))
-        point, _ = deferred.intersect(traced, ray, None)
+        point, _ = deferred.intersect(traced, camera_rays(camera, index, 0.5, 0.5), None)
         valid = point.is_valid()
         reached = [valid & ~traced.scene.ray_test(_shadow(point, light, camera), active=valid) for light in lights]
         where, facing = point.p & valid, point.sh_frame.n & valid

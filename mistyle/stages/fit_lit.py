@@ -36,6 +36,23 @@ DESCRIBED = ("normal", "roughness", "albedo", "metallic")
 
 
 @dataclass(frozen=True)
+class LitViews:
+    """Views (linear rgb) that show the object under known lights."""
+
+    views: Sequence[View]
+    lights: Lights
+
+    def captures(self) -> Captures:
+        """The same as references of a recovery."""
+        return in_memory(
+            [view.camera for view in self.views],
+            [self.lights] * len(self.views),
+            [np.nan_to_num(view.rgb) for view in self.views],
+            [view_mask(view) for view in self.views],
+        )
+
+
+@dataclass(frozen=True)
 class Solved:
     """The solution at the fit's resolution, one set of maps per texture set, and the views without their light.
 
@@ -67,7 +84,8 @@ def lit_phases(
 
     `style` as in `two_phase`. The same inputs, settings, seed and thread count give the same bytes.
     """
-    solved = solve(mesh, maps, targets, texels, lights, settings, seed, lambda done: progress(SOLVED_SHARE * done))
+    lit = LitViews(targets, lights)
+    solved = solve(mesh, maps, lit, texels, settings, seed, lambda done: progress(SOLVED_SHARE * done))
     better = solved.residual[1] < solved.residual[0]
     begun = laid(maps, solved.start, solved.maps) if better else list(maps)
     only_albedo = settings.model_copy(update={"iterations1": 0})
@@ -89,23 +107,17 @@ def lit_phases(
 def solve(
     mesh: Mesh,
     maps: Sequence[Maps],
-    targets: Sequence[View],
+    lit: LitViews,
     texels: Sequence[Texels],
-    lights: Lights,
     settings: FitSettings,
     seed: int,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Solved:
     """Normal, roughness and albedo from the views, as fine as the views can tell texels apart."""
-    by = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
+    by = shrinkage(mesh, texels, lit.views, settings.texels_per_pixel)
     coarse = [t if by == 1 else rasterise(mesh, k, len(t.covered) // by) for k, t in enumerate(texels)]
     start = [_shrunk(m, t.covered.shape) for m, t in zip(maps, coarse, strict=True)]
-    captures = in_memory(
-        [view.camera for view in targets],
-        [lights] * len(targets),
-        [np.nan_to_num(view.rgb) for view in targets],
-        [view_mask(view) for view in targets],
-    )
+    targets, captures = lit.views, lit.captures()
     # Under soft light steps on whole pictures took as long as the texels and were undone.
     chosen = RecoverSettings(
         solver="texels" if has_soft(captures.lights) else "both",
@@ -113,11 +125,11 @@ def solve(
         joint_subsamples=JOINT_SAMPLES,
     )  # fmt: skip
     found = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
-    made = tuple(_where_seen(found, start, coarse, k) for k in range(len(start)))
-    residual, unlit = _explained(mesh, captures, (start, made), targets)
+    fitted = tuple(_where_seen(found, start, coarse, k) for k in range(len(start)))
+    residual, unlit = _explained(mesh, captures, (start, fitted), targets)
     progress(1.0)
     trace = {f"phase1.{name}": values for name, values in found.trace.items()}
-    return Solved(tuple(start), made, tuple(unlit), residual, trace, found.notes)
+    return Solved(tuple(start), fitted, tuple(unlit), residual, trace, found.notes)
 
 
 def laid(
