@@ -146,7 +146,7 @@ class Descent:
                 first.append(new1)
                 second.append(new2)
                 age.append(new_age)
-                total = step if total is None else total + _spread(step, shape, size)
+                total = step if total is None else total + _upsample(step, shape, size)
                 k += 1
             moved.append(total)
             start += count
@@ -220,7 +220,7 @@ def _halved(fine: Any, size: tuple[int, int], half: tuple[int, int]) -> Any:
     return total
 
 
-def _spread(coarse: Any, shape: tuple[int, int], size: tuple[int, int]) -> Any:
+def _upsample(coarse: Any, shape: tuple[int, int], size: tuple[int, int]) -> Any:
     """Bilinear interpolation of a level's texels at those of the texture."""
     import drjit as dr
     import mitsuba

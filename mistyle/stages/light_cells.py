@@ -91,8 +91,8 @@ def _within(cells: EnvironmentCells, k: int, count: int) -> Float[np.ndarray, "n
     number = np.arange(count) + 0.5
     away, turn = np.sqrt(cells.angle[k] / np.pi * number / count), np.pi * (1 + 5**0.5) * number
     offset = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * np.cross(middle, across)
-    found = middle + away[:, None] * offset
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    towards = middle + away[:, None] * offset
+    return towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
 @cache

@@ -99,13 +99,13 @@ def texels_under(bundled: Bundle, radiance: Radiance, start: Values, steps: int)
     """The texels' best answer to a light."""
     _relight(bundled, radiance)
     mean, prior = first_values(bundled), _prior(len(start))
-    found = bundled.problem.solve(start, mean, prior, steps)
-    cost = found.cost + ((found.values - mean) ** 2 * prior).sum(axis=1)
+    solution = bundled.problem.solve(start, mean, prior, steps)
+    cost = solution.cost + ((solution.values - mean) ** 2 * prior).sum(axis=1)
     seen = bundled.observed.observations.rgb
-    residual = (seen - bundled.problem.predict(found.values))[bundled.used]
+    residual = (seen - bundled.problem.predict(solution.values))[bundled.used]
     residual = np.sqrt((residual.astype(float) ** 2).sum() / max(float((seen[bundled.used] ** 2).sum()), 1e-30))
-    told = bundled.observed.seen >= LEAST_SEEN
-    return State(radiance, found.values, float(cost[told].sum()), float(residual))
+    often = bundled.observed.seen >= LEAST_SEEN
+    return State(radiance, solution.values, float(cost[often].sum()), float(residual))
 
 
 def light_over(bundled: Bundle, radiance: Radiance, values: Values) -> Radiance:
@@ -258,10 +258,10 @@ def _smoothness(cells: EnvironmentCells, radiance: Radiance) -> Float[np.ndarray
     return np.kron(np.eye(3), one)
 
 
-def _means(cells: EnvironmentCells, wanted: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 n"]:
-    """Rows that give each channel's mean radiance relative to the wanted one."""
+def _means(cells: EnvironmentCells, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 n"]:
+    """Rows that give each channel's mean radiance relative to `target`."""
     share = cells.angle / cells.angle.sum()
-    return np.kron(np.diag(1 / np.maximum(wanted, 1e-12)), share)
+    return np.kron(np.diag(1 / np.maximum(target, 1e-12)), share)
 
 
 def _least_squares(matrix: np.ndarray, right: np.ndarray) -> Radiance:

@@ -107,8 +107,8 @@ def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
         good &= np.einsum("nd,nkd->nk", normal[alone], normal[near]) > OTHER_SIDE
         away = np.maximum(np.abs(row[near] - row[alone, None]), np.abs(column[near] - column[alone, None]))
         good &= (away > BESIDE) | (own[near] != own[alone, None])
-        first, found = good.argmax(axis=1), good.any(axis=1)
-        return _seam(at[alone[found]], at[near[found, first[found]]])
+        first, sewn = good.argmax(axis=1), good.any(axis=1)
+        return _seam(at[alone[sewn]], at[near[sewn, first[sewn]]])
 
     right, left, below, above = (across(*step) for step in STEPS)
     return right, left, below, above

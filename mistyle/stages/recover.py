@@ -1,13 +1,14 @@
 """Recovering materials: albedo, normal, roughness and metallic from pictures of known cameras under known light.
 
-First texel by texel (`recover_solve.py`): with geometry, cameras and lights known nothing has to be rendered to
-solve for one texel, and Levenberg-Marquardt gets in twenty steps where gradient descent on pictures does not get in
-hundreds. Then on whole pictures (`recover_pictures.py`), by Adam through `render/shade.py`, which models pixels and
-interpolation exactly. Before, in between and after that neighbours have a word about what pictures leave open
-(`recover_smooth.py`). Under delta lights texels, pictures and neighbours are at last solved for together
-(`recover_joint.py`). Light that reaches the surface by way of other surfaces is estimated with the maps found so far
-and taken off the pictures, in all parts (`bounces`). Lights and cameras are taken as they are given; a common factor
-of light and albedo cannot be told apart, so albedo is as right as the lights' units are.
+1. `recover_texels.py` solves each texel alone by Levenberg-Marquardt. It renders nothing: cameras and lights are known.
+   Twenty such steps reach what hundreds of gradient steps on pictures do not.
+2. `recover_pictures.py` minimises the loss of whole pictures by Adam, through `render/shade.py`, which models pixels
+   and interpolation exactly.
+3. `recover_joint.py` ends with a joint Gauss-Newton over all texels and pictures, under delta lights only.
+
+Smoothness priors (`recover_smooth.py`) act before, between and after the passes of Adam. All parts fit to direct light:
+light between surfaces is estimated with the current maps and taken off the pictures (`bounces`). Lights and cameras are
+taken as given. A common factor of light and albedo is not identifiable: albedo is as right as the lights' units.
 """
 
 from collections.abc import Callable, Sequence
@@ -45,7 +46,7 @@ NO_CHECKPOINTS = Checkpoints()
 
 @dataclass(frozen=True)
 class Recovered:
-    """What was found, per texture set.
+    """The fitted maps and their uncertainty, per texture set.
 
     maps        `known` is True where at least one picture observed the texel in the light
     confidence  0..1, 1 sure, 0 nothing seen: 1 / (1 + mean of (standard deviation / HALF_SURE)²)

@@ -22,29 +22,29 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
     nothing is left."""
     if len(captures) == 0:
         raise InputRefused("No reference pictures came; give at least three views of the object.")
-    kept, silent = [], []
+    usable, silent = [], []
     for k, camera in enumerate(captures.cameras):
         rgb, mask = captures.load(k)
         if rgb.shape[:2] != camera.size or mask.shape != camera.size:
-            found, wanted = "x".join(map(str, rgb.shape[1::-1])), "x".join(map(str, camera.size[::-1]))
+            size, expected = "x".join(map(str, rgb.shape[1::-1])), "x".join(map(str, camera.size[::-1]))
             raise InputRefused(
-                f"Picture '{camera.name}' has {found} pixels, its camera {wanted}. Resize one to the other's size."
+                f"Picture '{camera.name}' has {size} pixels, its camera {expected}. Resize one to the other's size."
             )
         reason = _why_not(mesh, camera, captures.lights[k], rgb, mask)
-        (silent if reason else kept).append((k, reason))
+        (silent if reason else usable).append((k, reason))
     for k, reason in silent:
         notes.append(f"Picture '{captures.cameras[k].name}' is left out: {reason}.")
-    if not kept:
+    if not usable:
         reasons = "; ".join(sorted({reason for _, reason in silent}))
         raise InputRefused(f"None of {len(captures)} reference pictures can be used ({reasons}). Check cameras, masks"
                            " and exposure.")  # fmt: skip
-    views = {captures.cameras[k].world_from_cam.tobytes() for k, _ in kept}
+    views = {captures.cameras[k].world_from_cam.tobytes() for k, _ in usable}
     if len(views) < LEAST_VIEWS:
         notes.append(
             f"Only {len(views)} different view(s) can be used: the fit is singular, normals and roughness are guesses."
             f" Give at least {LEAST_VIEWS} views, better 16 around the object."
         )
-    return subset(captures, [k for k, _ in kept])
+    return subset(captures, [k for k, _ in usable])
 
 
 def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: np.ndarray) -> str:

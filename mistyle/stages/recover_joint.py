@@ -1,24 +1,23 @@
 """The last part of a recovery: a joint Gauss-Newton over all texels and pictures, with the smoothness prior.
 
-Steps of gradient descent on pictures move every unknown by itself and neighbours are asked in between. Where few
-pictures show a texel, albedo, roughness and tilt can nearly stand for each other, and it takes such steps very long to
-get to the end of that valley. Gauss-Newton steps follow it: around the maps x that were found a pixel is
+Where few pictures show a texel, albedo, roughness and tilt are nearly interchangeable, and gradient descent follows
+that valley slowly. Gauss-Newton steps follow it at once. Around the current maps x a pixel is
 
     I_p(x + d) = I_p(x) + D_p sum_t b_pt d_t
 
 with b the bilinear weights, averaged over the pixel's lit samples, and D its derivative by a change that all its texels
-share, from central differences of whole pictures. (Samples of a pixel are so taken to answer alike; the pictures
-themselves are exact, so where the steps end the pictures agree, up to that.) With R the references and P the
-priors of `recover_smooth.py`, of variances that are measured alike, each step solves
+share, from central differences of whole pictures. (D takes the samples of a pixel as equal. The pictures themselves are
+exact, so the fixed point of the steps is, up to that.) With R the references and P the priors of `recover_smooth.py`,
+whose variances are measured alike, each step solves
 
     (B' D' W D B + P) d = B' D' W (R - I(x)) - P x
 
 by conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, sections 10.3 and 5.1), preconditioned by the
 texels' own blocks. W are Cauchy's weights (Huber, Robust Statistics, 1981, section 7.8) of residuals r of standard
-deviation s, 1 / (s² (1 + (r / (WRONG s))²)): of edges of shadows and outlines some pixels are always wrong. Light
-between surfaces is taken off R as it was estimated; what it changes by with the texels that reflect it to the camera is
-in D and in I (`joint_pixels.py`), so places that no light reaches have a say too. Metallic stays; soft light, whose
-pictures take long to draw, has no such steps.
+deviation s, 1 / (s² (1 + (r / (CAUCHY_SCALE s))²)): some pixels at edges of shadows and outlines are outliers. R is
+without the estimated light between surfaces. Its change with the texels that reflect it to the camera is in D and in I
+(`joint_pixels.py`), so places without direct light count too. Metallic stays. Soft light, whose pictures take long to
+draw, has no such steps.
 """
 
 from collections.abc import Callable, Sequence
@@ -59,7 +58,7 @@ MOVES = (((0, 1, 2), 0.02), ((TILT_X,), 0.003), ((TILT_Y,), 0.003), ((ROUGHNESS,
 # residual proves, since there are about as many unknowns as pixels and most fit better than they tell; FIT at least.
 LOOSE, FIT = 1.4, 0.1
 JUMP = 3.0  # times a change to one side is larger than to the other where it is none of a smooth function
-WRONG = 1.4  # standard deviations from which on a residual counts for less
+CAUCHY_SCALE = 1.4  # standard deviations from which on a residual counts for less
 EDGE = 0.1  # standard deviation where only some of a pixel's samples are lit, relative to those that are
 BETWEEN = 0.15  # that of light between surfaces, relative to it
 FREE = 0.5  # standard deviation that what no picture tells is left
@@ -227,14 +226,14 @@ def _cost(residuals: Sequence[np.ndarray], errors: Sequence[ResidualStd]) -> flo
     """Cauchy's, the mean over the channels of all pixels that count."""
     total, count = 0.0, 0.0
     for w, e in zip(residuals, errors, strict=True):
-        units = np.nan_to_num(w / (WRONG * e.std[:, None]))
+        units = np.nan_to_num(w / (CAUCHY_SCALE * e.std[:, None]))
         total += float((np.log1p(units**2).sum(axis=1) * e.counts).sum(dtype=np.float64))
         count += 3 * float(e.counts.sum())
-    return WRONG**2 * total / max(count, 1)
+    return CAUCHY_SCALE**2 * total / max(count, 1)
 
 
 def _weights(residuals: np.ndarray, derivative: np.ndarray, errors: ResidualStd) -> Float[np.ndarray, "p 3"]:
-    units = residuals / (WRONG * errors.std[:, None])
+    units = residuals / (CAUCHY_SCALE * errors.std[:, None])
     weight = (errors.counts / errors.std**2)[:, None] / (1 + units**2)
     sound = np.isfinite(weight) & np.isfinite(derivative).all(axis=2)
     derivative[~sound] = 0

@@ -1,8 +1,8 @@
-"""The pictures' part of a recovery: Adam on whole pictures, one a step, in an order that is shuffled anew each time.
+"""Adam on whole pictures: one picture a step, in an order that is shuffled anew for each round of all pictures.
 
-It goes in passes. After each neighbours have a word (`recover_smooth.py`), and before the last ones the light between
-surfaces is estimated with the better maps: both draw the texels that few pictures show, or hardly light, towards what
-is known around them, and the next pass asks the pictures again.
+The steps form passes. Smoothing (`recover_smooth.py`) follows each pass, and an estimate of the light between surfaces
+precedes the last ones. Both draw texels that few pictures show, or hardly light, towards their surroundings. The next
+pass corrects them by the pictures.
 """
 
 import time

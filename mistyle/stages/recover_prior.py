@@ -1,4 +1,4 @@
-"""What is believed of a texel besides what its own pictures tell, and how much those tell."""
+"""Priors of the per-texel solver, and the uncertainty that a texel's own observations leave."""
 
 from typing import Any
 
@@ -30,7 +30,7 @@ LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean o
 LEAST_SEEN = 3  # times that a texel was seen, for what was seen to decide anything
 BEST_FIT = 0.02  # of what `noise` and `relative` say, as variance: observations are never thought better than that
 MARGIN = 1.5  # on the variance of what observations tell, since they err together
-NOTHING = 1.0  # standard deviation of what nothing was told about
+NOTHING = 1.0  # standard deviation of texels without observations
 
 
 def penalty(values: Values, mean: Values, prior: Values) -> Float[np.ndarray, " t"]:
@@ -110,8 +110,8 @@ def neighbour_weight(solution: Solution, observed: TexelObservations) -> Values:
     """What a texel counts in its neighbours' means: by its spread, and less where its observations do not fit."""
     sure = 1 / np.maximum(solution.spread, 1e-4) ** 2
     sure = np.minimum(sure, np.quantile(sure, 0.9, axis=0))
-    wrong = solution.cost / np.maximum(observed.seen, 1) / MISFIT
-    sure = (sure / (1 + wrong[:, None]) ** 2).astype(np.float32)
+    misfits = solution.cost / np.maximum(observed.seen, 1) / MISFIT
+    sure = (sure / (1 + misfits[:, None]) ** 2).astype(np.float32)
     sure[observed.seen == 0] = 1e-6
     return sure
 
@@ -156,9 +156,9 @@ def unconstrained_std(
     solution: Solution, observed: TexelObservations, scale: float | Float[np.ndarray, " t"] = 1.0
 ) -> Values:
     """Standard deviations of what the texels' observations tell, `scale` on their variance; NOTHING without any."""
-    found = np.minimum(likelihood(solution)[0] * np.sqrt(np.reshape(scale, (-1, 1))), NOTHING)
-    found[observed.seen == 0] = NOTHING
-    return found.astype(np.float32)
+    std = np.minimum(likelihood(solution)[0] * np.sqrt(np.reshape(scale, (-1, 1))), NOTHING)
+    std[observed.seen == 0] = NOTHING
+    return std.astype(np.float32)
 
 
 def combine_class_prior(

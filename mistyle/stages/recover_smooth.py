@@ -1,15 +1,15 @@
-"""The neighbours' last word: maps as smooth as the surface is, as far as the pictures leave them open.
+"""Empirical-Bayes smoothing of the maps; its strength is estimated locally.
 
 A texel's own pictures tell its albedo, tilt and roughness with an error that is known roughly
 (`TexelEstimate.unconstrained`). What texels in a row differ by from a straight line through their neighbours has a
 variance that is the surface's own plus that of these errors; so the surface's own is measured around every texel
 (empirical Bayes), and the most likely values under both minimise
 
-    sum (x - found)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance  +  SHARE sum x² / spread²
+    sum (x - estimate)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance  +  SHARE sum x² / spread²
 
 over rows and columns of each island, of albedo and roughness also across seams (a Gaussian field of second
 differences: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.4). Where the surface is rough the variance is
-large, and what was found stays. The last sum is of tilts alone: where little was seen, one that a few texels began
+large, and the estimate stays. The last sum is of tilts alone: where little was seen, one that a few texels began
 would else go on along its slope, farther than any that is known. `spread` is measured around every texel too.
 """
 
@@ -47,11 +47,11 @@ Both = tuple[np.ndarray, np.ndarray]  # along rows, and along columns (transpose
 
 @dataclass(frozen=True)
 class Field:
-    """One channel in one texture set: its rows of the table, what was found and its errors, the variance of its second
+    """One channel in one texture set: its rows of the table, the estimate and its errors, the variance of its second
     differences, the weight of x², and which texels are neighbours."""
 
     part: slice
-    found: Grid
+    estimate: Grid
     error: Grid
     variance: Grid
     ridge: Grid
@@ -74,7 +74,7 @@ def map_smoothing(
     moved, atlas = np.zeros_like(table), with_seam_weights(atlas, table[:, SOLVED], noise)
     for c in LEAST:
         for one in _fields(table, noise, atlas, c):
-            moved[one.part, c] = (_likely(one) - one.found).ravel()
+            moved[one.part, c] = (_likely(one) - one.estimate).ravel()
     result = table + fill(moved, atlas)
     if metallic:
         result = binarise_metallic(result, noise)
@@ -97,11 +97,11 @@ def _fields(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: int) ->
     """The channel in every texture set."""
     ridge = ridge_weight(table, noise, atlas, channel) if channel in TILTS else np.zeros(len(table), np.float32)
     for part, size, links in zip(atlas.parts, atlas.sizes, atlas.links, strict=True):
-        found = table[part, channel].reshape(size)
+        estimate = table[part, channel].reshape(size)
         error = np.minimum(noise[part, channel].reshape(size), OPEN)
         among = links if OVER_SEAMS[channel] else within(links)
-        error, variance = _measured(found, error, among, LEAST[channel])
-        yield Field(part, found, error, variance, ridge[part].reshape(size), among)
+        error, variance = _measured(estimate, error, among, LEAST[channel])
+        yield Field(part, estimate, error, variance, ridge[part].reshape(size), among)
 
 
 def ridge_weight(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: int) -> Float[np.ndarray, " a"]:
@@ -145,15 +145,15 @@ def _second(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
     return np.where(links, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
 
 
-def _measured(found: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
+def _measured(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
     """Of what second differences vary by around every texel: how much is error, and the surface's own variance of them.
 
     Where values vary less than their errors say, the errors are shared with the neighbours (the solver's prior made
     them so): then only as much error is taken as the variation shows, since no smoothing could remove the rest.
     """
-    total = np.zeros((3, *found.shape, 1), np.float32)
+    total = np.zeros((3, *estimate.shape, 1), np.float32)
     for turned, link in enumerate(_lines(among)):
-        x, e = (found.T, error.T) if turned else (found, error)
+        x, e = (estimate.T, error.T) if turned else (estimate, error)
         noise = 0.25 * (e[:, :-2] ** 2 + e[:, 2:] ** 2) + e[:, 1:-1] ** 2
         weight = np.where(link, 1 / (noise + SURE**2) ** 2, 0)
         sums = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
@@ -221,6 +221,6 @@ def _likely(one: Field) -> Float[np.ndarray, "h w"]:
     sure = (1 / np.maximum(one.error, 1e-4) ** 2).astype(np.float32).ravel()
     matrix = prior + dia_array((sure[None], 0), shape=prior.shape)
     inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=prior.shape)
-    # From what was found: the change is solved for, so that little of it is lost to rounding.
-    change, _ = cg(matrix, -(prior @ one.found.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
-    return one.found + change.reshape(one.found.shape).astype(np.float32)
+    # From the estimate: the change is solved for, so that little of it is lost to rounding.
+    change, _ = cg(matrix, -(prior @ one.estimate.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
+    return one.estimate + change.reshape(one.estimate.shape).astype(np.float32)

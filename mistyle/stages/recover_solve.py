@@ -1,4 +1,4 @@
-"""Rounds of the per-texel solver: neighbours help those that saw little, and the pictures correct what they model not.
+"""Rounds of the per-texel solver, with priors from neighbours, and defect correction by rendered pictures.
 
 The solver takes a texel's radiance for that of the picture at one place, but a pixel is a mean over its area of
 interpolated texels. So after each solve the pictures are rendered as they are really made (`render/shade.py`), and

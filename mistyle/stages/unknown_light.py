@@ -152,8 +152,8 @@ def _maps(state: State, observed: TexelObservations, texels: Sequence[Texels]) -
 
     atlas = atlas_of(texels)
     known = scatter(observed.seen > 0, observed, atlas, False)
-    found = unpack(scatter_to_atlas(state.values, observed, atlas), atlas.sizes)
-    return tuple(replace(m, known=known[p].reshape(m.known.shape)) for m, p in zip(found, atlas.parts, strict=True))
+    maps = unpack(scatter_to_atlas(state.values, observed, atlas), atlas.sizes)
+    return tuple(replace(m, known=known[p].reshape(m.known.shape)) for m, p in zip(maps, atlas.parts, strict=True))
 
 
 def _small(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
