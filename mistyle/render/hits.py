@@ -286,7 +286,6 @@ def _block(
     uv = np.array(point.uv).T[kept]
     uv = np.stack([uv[:, 0], 1 - uv[:, 1].astype(np.float64)], axis=1)
     texel, step, place = bilinear_footprint(uv, part, surface.sizes)
-
     size = padded(len(kept))
     # Samples come pixel after pixel.
     begins = np.concatenate([[True], np.diff(pixel[kept]) > 0])[: len(kept)]
