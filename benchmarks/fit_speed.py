@@ -32,8 +32,10 @@ from mistyle.core.capture import Captures, in_memory
 from mistyle.core.light import Directional, direction_in_world, lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.render import device, draw, shade
+from mistyle.render import device, draw
 from mistyle.render import scene as scenery
+from mistyle.render.material_table import pack
+from mistyle.render.shade import MaterialRenderer, RenderOptions
 from mistyle.stages.recover_settings import RecoverSettings
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
@@ -50,12 +52,14 @@ class Problem:
     captures: Captures
     maps: list[Maps]
 
-    def shade(self, subsamples: int, **options: Any) -> shade.Shade:
+    def renderer(self, subsamples: int, **options: Any) -> MaterialRenderer:
         """Ours, in the frame that mi.render knows."""
-        sizes = [m.roughness.shape for m in self.maps]
-        made = shade.Shade(self.traced, self.captures, sizes, frame="mitsuba", subsamples=subsamples, **options)
-        made.table = shade.pack(self.maps)
-        return made
+        chosen = RenderOptions(frame="mitsuba", subsamples=subsamples, **options)
+        return MaterialRenderer(self.traced, self.captures, [m.roughness.shape for m in self.maps], chosen)
+
+    def table(self, renderer: MaterialRenderer) -> Any:
+        """Where the maps stand, on the device."""
+        return renderer.upload(pack(self.maps))
 
 
 def random_maps(size: int, seed: int) -> Maps:
@@ -76,8 +80,10 @@ def problem(mesh: Mesh, resolution: int, texture: int, views: int = 1) -> Proble
     traced, rig = draw.tracer(mesh), [lights("phase1")] * views
     empty = in_memory(cameras, rig, [np.zeros((resolution, resolution, 3), np.float32)] * views)
     parts = range(len(mesh.parts))
-    target = Problem(mesh, traced, empty, [random_maps(texture, 100 + p) for p in parts]).shade(1)
-    captures = in_memory(cameras, rig, [target.image(k) for k in range(views)])
+    target = Problem(mesh, traced, empty, [random_maps(texture, 100 + p) for p in parts])
+    renderer = target.renderer(1)
+    table = target.table(renderer)
+    captures = in_memory(cameras, rig, [renderer.image(table, k) for k in range(views)])
     return Problem(mesh, traced, captures, [random_maps(texture, p) for p in parts])
 
 
@@ -194,14 +200,16 @@ def steps(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     speedups, at_equal_error, repeats = [], [], 5 if quick else 15
     for size in (128, 256) if quick else (512, 1024):
         where = problem(mesh, size, size)
-        one, usual = where.shade(1), where.shade(RecoverSettings().subsamples)
-        ours_1 = figures[f"ours_1spp_{size}_seconds"] = seconds(lambda s=one: s.step([0], "l2"), repeats)
-        ours_usual = figures[f"ours_default_{size}_seconds"] = seconds(lambda s=usual: s.step([0], "l2"), repeats)
+        one, usual = where.renderer(1), where.renderer(RecoverSettings().subsamples)
+        table = where.table(one)
+        ours_1 = seconds(lambda s=one, t=table: s.step(t, [0], "l2"), repeats)
+        ours_usual = seconds(lambda s=usual, t=table: s.step(t, [0], "l2"), repeats)
+        figures |= {f"ours_1spp_{size}_seconds": ours_1, f"ours_default_{size}_seconds": ours_usual}
         figures[f"ours_1spp_{size}_floor_ratio"] = ours_1 / floor(one)
         figures[f"ours_default_{size}_floor_ratio"] = ours_usual / floor(usual)
         grid = 256 if quick else 1024
-        exact = np.array(where.shade(grid, memory=0).step([0], "l2")[1], np.float64)[:, :6]
-        mine = errors(np.array(usual.step([0], "l2")[1], np.float64)[:, :6], exact)
+        exact = np.array(where.renderer(grid, memory=0).step(table, [0], "l2")[1], np.float64)[:, :6]
+        mine = errors(np.array(usual.step(table, [0], "l2")[1], np.float64)[:, :6], exact)
         figures |= {f"ours_default_{size}_error_{name}": e for name, e in zip(MAPS, mine, strict=True)}
         figures[f"ours_{size}_peak_gb"] = peak_gb()
         for name, integrator in INTEGRATORS.items():
@@ -221,7 +229,7 @@ def steps(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     figures["step_speedup_equal_error"] = min(at_equal_error)
 
 
-def floor(ours: shade.Shade) -> float:
+def floor(ours: MaterialRenderer) -> float:
     """Seconds to move what a step must move once: hits, references, the texels seen, and the whole gradient."""
     blocks = list(ours.blocks(0))
     texels = sum(b.hits.counts[2] for b in blocks)
@@ -258,8 +266,9 @@ def growth(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     for name, points in series.items():
         counts, taken = [], []
         for count, where, chosen in points:
-            ours = where.shade(RecoverSettings().subsamples)
-            taken.append(seconds(lambda s=ours, c=chosen: s.step(c, "l2"), repeats))
+            ours = where.renderer(RecoverSettings().subsamples)
+            table = where.table(ours)
+            taken.append(seconds(lambda s=ours, t=table, c=chosen: s.step(t, c, "l2"), repeats))
             counts.append(count)
             figures[f"ours_{name}_{count}_seconds"] = taken[-1]
         figures[f"exponent_{name}"] = float(np.polyfit(np.log(counts), np.log(taken), 1)[0])
@@ -283,7 +292,9 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
 
     device.use()
     size, repeats = (128, 5) if quick else (512, 15)
-    ours = problem(mesh, size, size).shade(1)
+    where = problem(mesh, size, size)
+    ours = where.renderer(1)
+    table = where.table(ours)
     (block,) = ours.blocks(0)
     h = block.hits
     samples, n = h.samples, h.counts[0]
@@ -323,7 +334,7 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
 
     def by_texel():
         gradient = empty()
-        shading.add_rows(gradient, frozen(ours._table, packed, h.transpose), h.transpose)
+        shading.add_rows(gradient, frozen(table, packed, h.transpose), h.transpose)
         return gradient
 
     figures["transpose_gather_seconds"] = seconds(by_texel, repeats)
@@ -340,7 +351,8 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     shaded = device.Frozen(alone)
     at = dr.gather(mi.Vector4f, mi.Float(adjoint.array), samples.slot)
     dr.eval(at)
-    figures["transpose_shading_seconds"] = seconds(lambda: shaded(ours._textures, samples, block.lights, at), repeats)
+    textures = ours._textures(table)
+    figures["transpose_shading_seconds"] = seconds(lambda: shaded(textures, samples, block.lights, at), repeats)
     figures["transpose_texel_space_seconds"] = figures["transpose_shading_seconds"] * h.counts[2] / n
 
 

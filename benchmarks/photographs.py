@@ -37,15 +37,18 @@ from mistyle.core.capture import Captures, in_memory, shrunk
 from mistyle.core.distortion import Lens, distort
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, to_json
+from mistyle.core.maps import flat_maps
 from mistyle.files.cameras import transforms
 from mistyle.files.captures import read_captures
 from mistyle.files.read_mesh import read_mesh
 from mistyle.render.draw import tracer
-from mistyle.render.shade import Shade, pack
+from mistyle.render.shade import MaterialRenderer
+from mistyle.render.shade import RenderOptions
 from mistyle.run.material_budget import material_gb
+from mistyle.render.material_table import pack
 from mistyle.run.material_settings import MaterialSettings
 from mistyle.stages.recover import recover
-from mistyle.stages.recover_check import blocks
+from mistyle.stages.recover_check import downsampling_factors
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise, start_maps
 
@@ -77,7 +80,7 @@ def large(place: Path, views: int, side: int) -> dict[str, float]:
     count = photograph(mesh, folder, views, side)
     captures = read_captures(folder, saturation=0.99)
     asset = read_mesh(mesh)
-    by = blocks([rasterise(asset.mesh, 0, ATLAS)], captures.cameras)
+    by = downsampling_factors([rasterise(asset.mesh, 0, ATLAS)], captures.cameras)
     figures = {"large.pictures": float(count), "large.megapixels": side * side / 1e6, "large.block": float(by[0])}
     figures["large.read_seconds"] = _seconds(lambda: captures.load(0))
     for name, seen in (("large", captures), ("large.averaged", shrunk(captures, by))):
@@ -131,10 +134,8 @@ def _pictures(asset, shots) -> Iterator[np.ndarray]:
     traced, table = tracer(asset.mesh), pack(maps)
     for shot in shots:
         empty = np.zeros((*shot.camera.size, 3), np.float32)
-        shade = Shade(traced, in_memory([shot.camera], [shot.lights], [empty]), [m.roughness.shape for m in maps],
-                      subsamples=1, memory=0)  # fmt: skip
-        shade.table = table
-        yield shade.image(0)
+        one, options = in_memory([shot.camera], [shot.lights], [empty]), RenderOptions(subsamples=1, memory=0)
+        yield MaterialRenderer(traced, one, [m.roughness.shape for m in maps], options).image(table, 0)
 
 
 def undistort(lens: Lens, sent: Float[np.ndarray, "*n 2"], steps: int = 20) -> Float[np.ndarray, "*n 2"]:
@@ -171,9 +172,10 @@ def _bent(lens: Lens, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
 
 def _prediction(mesh, captures: Captures) -> float:
     """Seconds that the picture takes which is too large to be kept, after everything was compiled."""
-    shade = Shade(tracer(mesh), captures, [(ATLAS, ATLAS)] * len(mesh.parts), subsamples=9, memory=0)
-    shade.image(0)
-    return _seconds(lambda: shade.image(0))
+    sizes, options = [(ATLAS, ATLAS)] * len(mesh.parts), RenderOptions(subsamples=9, memory=0)
+    renderer, table = MaterialRenderer(tracer(mesh), captures, sizes, options), pack([flat_maps(ATLAS)] * len(sizes))
+    renderer.image(table, 0)
+    return _seconds(lambda: renderer.image(table, 0))
 
 
 def strong(size: int) -> dict[str, float]:

@@ -216,8 +216,9 @@ def photographs(mesh: Any, size: int) -> tuple[Any, Any]:
     from mistyle.core.capture import in_memory
     from mistyle.core.light import Directional
     from mistyle.core.maps import Maps
-    from mistyle.render import shade
     from mistyle.render.draw import tracer
+    from mistyle.render.material_table import pack
+    from mistyle.render.shade import MaterialRenderer, RenderOptions
     from mistyle.stages.texels import rasterise
 
     texels = rasterise(mesh, 0, size)
@@ -229,9 +230,8 @@ def photographs(mesh: Any, size: int) -> tuple[Any, Any]:
     cameras = [look_at(list(eye), fov=30, size=(48, 48), name=f"v{k}") for k, eye in enumerate(eyes)]
     lamps = [(Directional((0.3, -0.5, -0.8), (2.0, 2.0, 2.0), "camera"),)] * len(eyes)
     blank = in_memory(cameras, lamps, [np.zeros((48, 48, 3), np.float32)] * len(eyes))
-    drawn = shade.Shade(tracer(mesh), blank, [(size, size)], model="principled", frame="mikkt", subsamples=4)
-    drawn.table = shade.pack([maps])
-    return texels, in_memory(cameras, lamps, [drawn.image(k) for k in range(len(eyes))])
+    renderer, table = MaterialRenderer(tracer(mesh), blank, [(size, size)], RenderOptions(subsamples=4)), pack([maps])
+    return texels, in_memory(cameras, lamps, [renderer.image(table, k) for k in range(len(eyes))])
 
 
 def recovered(made: Stages) -> None:

@@ -150,7 +150,7 @@ def relative(got, expected):
 
 
 def ours(model, given, **options):
-    return np.array(bsdf.evaluate(model, **loaded(given), **options)).T
+    return np.array(bsdf.evaluate(bsdf.Reflectance(model, **options), **loaded(given))).T
 
 
 @pytest.mark.parametrize("flip", [False, True])
@@ -221,7 +221,7 @@ def gradients(model, given, **options):
     arrays = loaded(given)
     for name in ("normal", "albedo", "roughness", "metallic"):
         dr.enable_grad(arrays[name])
-    dr.backward(dr.sum(dr.sum(bsdf.evaluate(model, **arrays, **options))))
+    dr.backward(dr.sum(dr.sum(bsdf.evaluate(bsdf.Reflectance(model, **options), **arrays))))
     rows = [dr.grad(arrays["normal"])[:2], dr.grad(arrays["albedo"]), dr.grad(arrays["roughness"])]
     rows.append(dr.grad(arrays["metallic"]))
     return np.concatenate([np.array(row).reshape(-1, len(given["wi"])) for row in rows]).T.astype(np.float64)

@@ -10,6 +10,7 @@ from mistyle.core.light import Ambient, Directional, Environment, Point, SceneLi
 from mistyle.render import device, draw, hits, shade
 from mistyle.render import scene as scenery
 from mistyle.render import sky as skies
+from mistyle.render.material_table import pack
 
 
 @pytest.fixture(scope="module")
@@ -18,9 +19,10 @@ def traced():
     return draw.tracer(torus())
 
 
-def collected(traced, camera, lights, mask=None, **options) -> list[hits.Hits]:
+def collected(traced, camera, lights, mask=None, **options) -> list[hits.SampleBlock]:
     mask = np.ones(camera.size, bool) if mask is None else mask
-    return list(hits.collect(traced, camera, lights, mask, SIZES, **options))
+    soft, sampling = options.pop("soft", None), hits.Sampling(**options)
+    return list(hits.collect(hits.TexturedMesh(traced, SIZES), camera, lights, mask, sampling, soft))
 
 
 def test_only_samples_on_the_mesh_inside_the_mask_and_lit_are_kept(traced, rng):
@@ -61,7 +63,7 @@ def test_the_transpose_lists_every_fetch_once(traced):
 
 def test_cells_repeat_at_the_borders():
     uv = np.array([[0.0, 1.0], [0.999, 0.001], [1.25, -0.3]], np.float32)
-    texel, step, place = hits.cells(uv, np.array([1, 1, 0]), [(4, 8), (2, 3)])
+    texel, step, place = hits.bilinear_footprint(uv, np.array([1, 1, 0]), [(4, 8), (2, 3)])
     # In the first texel's own corner the fetch begins at the last texel of the set, which has 2 rows of 3.
     assert texel[0] == 32 + 5 and hits.steps([(4, 8), (2, 3)])[step[0]].tolist() == [-2, -3]
     assert texel[1] == 32 + 5 and texel[2] == 1
@@ -101,8 +103,8 @@ def test_delta_lights_arrive_as_mitsubas_do(traced, rng, light):
 
     camera, maps = crop(), random_maps(rng, SIZES)
     captures = in_memory([camera], [(light,)], [np.zeros((*camera.size, 3), np.float32)])
-    ours = shade.Shade(traced, captures, SIZES, frame="mitsuba", subsamples=1)
-    ours.table = shade.pack(maps)
+    options = shade.RenderOptions(frame="mitsuba", subsamples=1)
+    ours = shade.MaterialRenderer(traced, captures, SIZES, options)
     sensor = scenery.sensor_dict(camera)
     sensor["film"]["pixel_format"] = "rgb"
     sensor["sampler"] = {"type": "stratified", "sample_count": 1, "jitter": False}
@@ -121,7 +123,7 @@ def test_delta_lights_arrive_as_mitsubas_do(traced, rng, light):
     lit = (twin > 0).any(axis=-1).mean()
     assert 0.1 < lit < 0.97
     # At a shadow's edge the two rays may fall on different sides.
-    assert (np.abs(ours.image(0) - twin).max(axis=-1) > 2e-4 * twin.max()).mean() < 2e-3
+    assert (np.abs(ours.image(pack(maps), 0) - twin).max(axis=-1) > 2e-4 * twin.max()).mean() < 2e-3
 
 
 def test_a_grid_of_samples_is_square():

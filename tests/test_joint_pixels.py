@@ -13,10 +13,10 @@ from mistyle.core.image import gaussian
 from mistyle.render import device, draw
 from mistyle.render import hits as collecting
 from mistyle.render.indirect import Indirect
-from mistyle.render.shade import Shade, pack, unpack
+from mistyle.render.material_table import pack, unpack
 from mistyle.stages import joint_pixels
+from mistyle.stages.fit_context import FitContext
 from mistyle.stages.recover_table import linked
-from mistyle.stages.recover_texels import Work
 from mistyle.stages.texels import rasterise
 
 SAMPLES = 1024
@@ -34,22 +34,21 @@ def bowl():
     lights = [(directional(*LIGHTS[k]),) for k in range(3)]
     captures = in_memory(cameras, lights, [np.zeros((48, 48, 3), np.float32)] * 3)
     texels = [rasterise(mesh, 0, SIZE)]
-    shade = Shade(draw.tracer(mesh), captures, ((SIZE, SIZE),), subsamples=9)
     settings = QUICK.model_copy(update={"bounces": 1})
     tangents = collecting.tangents_of(mesh, "mikkt")
-    work = Work(shade.traced, tangents, texels, linked(mesh, texels), captures, settings, [])
-    return work, shade, pack([maps])
+    context = FitContext(draw.tracer(mesh), tangents, texels, linked(mesh, texels), captures, settings)
+    return context, context.renderer(subsamples=9), pack([maps])
 
 
 def test_every_pixel_that_shows_the_mesh_is_there_once(bowl):
     """Where light between surfaces is looked for; the lit ones are the same as without."""
-    work, shade, _ = bowl
-    pictures, unknown, left = joint_pixels.all_pixels(shade, work)
-    alone = replace(work, settings=work.settings.model_copy(update={"bounces": 0}))
-    lit, fewer, more_left = joint_pixels.all_pixels(shade, alone)
+    context, renderer, table = bowl
+    pictures, unknown, left = joint_pixels.image_footprints(context, renderer)
+    alone = replace(context, settings=context.settings.model_copy(update={"bounces": 0}))
+    lit, fewer, more_left = joint_pixels.image_footprints(alone, renderer)
     assert left < more_left and len(fewer.rows) <= len(unknown.rows)
     for k, (pixels, only) in enumerate(zip(pictures, lit, strict=True)):
-        shown = shade.image_and_coverage(k)[1].ravel() > 0
+        shown = renderer.image_and_coverage(table, k)[1].ravel() > 0
         dark = pixels.lit == 0
         assert 0.02 * shown.sum() < dark.sum() < 0.98 * shown.sum()
         # A flash shows less than a camera where the surface is seen from its very edge.
@@ -66,17 +65,21 @@ def test_every_pixel_that_shows_the_mesh_is_there_once(bowl):
 )
 def test_light_between_surfaces_follows_what_reflects_it(bowl, columns, far, metallic):
     """By tilt and albedo: against estimates of maps that are moved in a patch, which hardly lights itself."""
-    work, shade, table = bowl
+    context, renderer, table = bowl
     table = table.copy()
     table[:, 6] = metallic
-    pictures, unknown, _ = joint_pixels.all_pixels(shade, work)
-    axes, camera, many = joint_pixels.frames(work, unknown), work.captures.cameras[0], [work.captures.lights[0]]
-    mesh, sizes = shade.traced.mesh, work.where.sizes
+    pictures, unknown, _ = joint_pixels.image_footprints(context, renderer)
+    axes, camera, many = (
+        joint_pixels.unknown_frames(context, unknown),
+        context.captures.cameras[0],
+        [context.captures.lights[0]],
+    )
+    mesh, sizes = context.traced.mesh, context.atlas.sizes
     (light, vectors), *_ = Indirect(mesh, unpack(table, sizes)).pictures_and_vectors(camera, many, SAMPLES, 3)
-    derivative = joint_pixels.between(pictures[0], light, vectors, camera.size, table[unknown.rows], axes)
-    place = work.texels[0].position.reshape(-1, 3)
-    lowest = work.texels[0].covered.ravel() & (place[:, 2] < -0.7)
-    assert 0.03 < lowest.sum() / work.texels[0].covered.sum() < 0.3
+    derivative = joint_pixels.indirect_jacobian(pictures[0], light, vectors, camera.size, table[unknown.rows], axes)
+    place = context.texels[0].position.reshape(-1, 3)
+    lowest = context.texels[0].covered.ravel() & (place[:, 2] < -0.7)
+    assert 0.03 < lowest.sum() / context.texels[0].covered.sum() < 0.3
     moves = np.zeros_like(table)
     moves[np.ix_(lowest, columns)] = far
     real = []
@@ -84,7 +87,7 @@ def test_light_between_surfaces_follows_what_reflects_it(bowl, columns, far, met
         real.append(Indirect(mesh, unpack(moved, sizes)).pictures(camera, many, SAMPLES, 3)[0])
     real = ((real[0] - real[1]) / 2).reshape(-1, 3)
     told = np.zeros_like(real)
-    told[pictures[0].index] = joint_pixels.change(pictures[0], derivative, moves[unknown.rows])
+    told[pictures[0].index] = joint_pixels.indirect_delta(pictures[0], derivative, moves[unknown.rows])
     inside = np.zeros(len(real), bool)
     inside[pictures[0].index] = pictures[0].fetch @ lowest[unknown.rows].astype(np.float32) > 0.999
     assert inside.sum() > 50

@@ -19,7 +19,9 @@ from mistyle.core.view import View
 from mistyle.files.images import write_png
 from mistyle.files.read_mesh import read_mesh
 from mistyle.files.views import read_views, write_views
-from mistyle.render import draw, shade
+from mistyle.render import draw
+from mistyle.render.material_table import pack
+from mistyle.render.shade import MaterialRenderer
 from mistyle.run.charts import Chart, svg
 from mistyle.run.cli import main
 from mistyle.run.material import hold_out, lights_in_order, place, references_of
@@ -85,12 +87,11 @@ def photographed(mesh: Mesh, cameras: list[Camera], rigs: list[Lights]) -> list[
     """The true material from every camera under its lights."""
     blank = [np.zeros((*camera.size, 3), np.float32) for camera in cameras]
     traced = draw.tracer(mesh)
-    shader = shade.Shade(traced, in_memory(cameras, rigs, blank), [(SIZE, SIZE)], subsamples=4)
-    shader.table = shade.pack([truth()])
+    renderer, table = MaterialRenderer(traced, in_memory(cameras, rigs, blank), [(SIZE, SIZE)]), pack([truth()])
     views = []
     for k, camera in enumerate(cameras):
         hits = draw.gbuffer(traced, camera)
-        image, coverage = shader.image_and_coverage(k)
+        image, coverage = renderer.image_and_coverage(table, k)
         fields = (image, hits.depth, hits.normal, hits.uv, hits.part, hits.mask, coverage)
         views.append(View(camera, *fields))
     return views

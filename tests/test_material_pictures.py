@@ -13,8 +13,9 @@ from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
 from mistyle.files.read_mesh import read_mesh
 from mistyle.render import draw, hits, shade, texel_views
+from mistyle.render.material_table import pack
 from mistyle.run.material_pictures import look_through, looked
-from mistyle.stages.recover_check import LEAST_PIXELS, blocks
+from mistyle.stages.recover_check import LEAST_PIXELS, downsampling_factors
 from mistyle.stages.texels import rasterise
 
 
@@ -34,14 +35,14 @@ def test_texels_are_left_two_blocks_wide(bowls):
     cameras = [above(side) for side in (48, 256, 512)] + [look_at((0, 0, -4), fov=30, size=(512, 512))]
     for size in (32, 128):
         texels = [rasterise(mesh, 0, size)]
-        found = blocks(texels, cameras)
+        found = downsampling_factors(texels, cameras)
         # The bowl is flat enough, and all but the four units away: 0.96 of the texture's side is its width.
         wide = np.ptp(mesh.positions[:, 0]) / (0.96 * size) * cameras[2].focal / 4
         assert found[2] == pytest.approx(wide / 2, abs=1) and found[2] <= max(1, 1.1 * wide / 2)
         assert found[1] == pytest.approx(found[2] / 2, abs=1)
         assert found[0] == 1  # 48 pixels are few enough
         assert found[3] == 1  # from below nothing faces the camera
-    assert blocks([rasterise(mesh, 0, 2)], cameras[:3]) == [1, 256 // LEAST_PIXELS, 512 // LEAST_PIXELS]
+    assert downsampling_factors([rasterise(mesh, 0, 2)], cameras[:3]) == [1, 256 // LEAST_PIXELS, 512 // LEAST_PIXELS]
 
 
 def test_averages_are_kept_with_what_counts(bowls, tmp_path, rng):
@@ -51,7 +52,7 @@ def test_averages_are_kept_with_what_counts(bowls, tmp_path, rng):
     captures = in_memory([above(256)] * 2, [()] * 2, pictures, counts)
     look_through(tmp_path, texels, captures, 0, lambda done: None)
     found, notes = looked(tmp_path, captures)
-    (by, _) = blocks(texels, captures.cameras)
+    (by, _) = downsampling_factors(texels, captures.cameras)
     small = shrunk(captures, [by, by])
     assert by > 1 and found.cameras == small.cameras and found.cameras[0].size == (256 // by, 256 // by)
     for k in range(2):
@@ -90,14 +91,16 @@ def test_a_picture_that_is_not_kept_is_the_same_picture(rng, memory):
     """Collected without what gradients need, at once or the second time."""
     camera = crop(48)
     captures = in_memory([camera], [(KEY,)], [np.zeros((*camera.size, 3), np.float32)])
-    table = shade.pack(random_maps(rng, SIZES))
+    table = pack(random_maps(rng, SIZES))
     traced = draw.tracer(torus())
-    kept, lost = (shade.Shade(traced, captures, SIZES, subsamples=4, memory=m) for m in (1e9, memory))
-    kept.table = lost.table = table
-    first = kept.image(0)
+    kept, lost = (
+        shade.MaterialRenderer(traced, captures, SIZES, shade.RenderOptions(subsamples=4, memory=m))
+        for m in (1e9, memory)
+    )
+    first = kept.image(table, 0)
     for _ in range(2):
-        assert np.array_equal(lost.image(0), first)
-        assert np.array_equal(np.array(lost.step([0])[1].array), np.array(kept.step([0])[1].array))
+        assert np.array_equal(lost.image(table, 0), first)
+        assert np.array_equal(np.array(lost.step(table, [0])[1].array), np.array(kept.step(table, [0])[1].array))
     blocks = list(lost.blocks(0, gradients=False))
     assert all(block.hits.transpose is None for block in blocks)
     assert blocks[0].hits.bytes < next(iter(kept.blocks(0))).hits.bytes
@@ -114,17 +117,18 @@ def test_rays_beside_the_mesh_are_not_traced():
     near = look_at((0.5, 0.3, 0.2), fov=120, size=(60, 90))
     assert hits.window(traced.mesh, near) == (slice(0, 60), slice(0, 90))
     away = look_at((0, 0, 9), target=(0, 0, 20), fov=20, size=(60, 90))
-    mask = np.ones(away.size, bool)
-    assert not list(hits.collect(traced, away, (KEY,), mask, SIZES))
-    assert sum(b.covered.sum() for b in hits.collect(traced, camera, (KEY,), mask, SIZES, subsamples=1)) == seen.sum()
+    mask, surface = np.ones(away.size, bool), hits.TexturedMesh(traced, SIZES)
+    assert not list(hits.collect(surface, away, (KEY,), mask))
+    blocks = hits.collect(surface, camera, (KEY,), mask, hits.Sampling(subsamples=1))
+    assert sum(b.covered.sum() for b in blocks) == seen.sum()
 
 
 def test_what_pixels_see_does_not_hang_on_blocks(monkeypatch):
     """An upright camera's right axis has a zero, with which Dr.Jit multiplies in its own way."""
     traced, camera = draw.tracer(torus()), look_at((0, 1, 4), fov=40, size=(60, 50))
-    whole = texel_views.look(traced, camera, (KEY,))
+    whole = texel_views.trace_gbuffer(traced, camera, (KEY,))
     monkeypatch.setattr(texel_views, "BLOCK_RAYS", 2000)
-    parts = texel_views.look(traced, camera, (KEY,))
+    parts = texel_views.trace_gbuffer(traced, camera, (KEY,))
     assert camera.world_from_cam[1, 0] == 0
     for name in ("position", "normal", "mask"):
         assert np.array_equal(getattr(whole, name), getattr(parts, name))

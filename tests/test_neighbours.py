@@ -7,7 +7,7 @@ import pytest
 
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.stages.neighbours import STEPS, Links, believed, links, within
+from mistyle.stages.neighbours import STEPS, Links, links, weighted_seams, within
 from mistyle.stages.texels import rasterise
 
 Strip = tuple[list[tuple[float, float, float]], list[tuple[float, float]]]
@@ -105,7 +105,7 @@ def test_a_seam_is_believed_unless_values_that_are_known_jump_there(rng, jump, s
     values = 0.5 + 0.02 * texels.position + jump * (texels.island == 1)[..., None]
     values += rng.normal(0, 0.01, values.shape)
     open_ = np.full(values.shape[:2], spread, np.float32)
-    found = believed(every, [(values[..., c].astype(np.float32), open_) for c in range(3)])
+    found = weighted_seams(every, [(values[..., c].astype(np.float32), open_) for c in range(3)])
     shares = np.concatenate([seam.share for seam in found.seams])
     assert len(shares) == 32 and least <= np.median(shares) <= most
     assert all(np.array_equal(a.here, b.here) for a, b in zip(found.seams, every.seams, strict=True))

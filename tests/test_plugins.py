@@ -186,7 +186,7 @@ def shaded(mesh, maps, camera, tangents):
     )
     rest = (mi.Float(fetched[name].ravel()) for name in ("roughness", "metallic"))
     ((wo, irradiance),) = ours.lit.directional
-    value = bsdf.evaluate("gltf", ours.lit.wi, wo, normal, albedo, *rest) * irradiance
+    value = bsdf.evaluate(bsdf.Reflectance("gltf"), ours.lit.wi, wo, normal, albedo, *rest) * irradiance
     return np.array(value).T.reshape(*ours.lit.size, 3)
 
 

@@ -137,20 +137,19 @@ def test_what_is_not_fitted_stays_and_a_worse_result_is_dropped(room):
 def test_emitters_light_a_surface_as_the_records_say(lights):
     """The same picture as the deferred renderer, which sums the records themselves."""
     from mistyle.render.draw import tracer
-    from mistyle.render.shade import Shade, pack
+    from mistyle.render.material_table import pack
+    from mistyle.render.shade import MaterialRenderer, RenderOptions
 
     device.use()
     mesh, maps = corner(), coloured()
     camera = look_at((2.5, 2, 2.2), fov=22, size=(RESOLUTION, RESOLUTION), name="v")
     shown = picture(mesh, maps, camera, lights, spp=1024, depth=2)
     captures = in_memory([camera], [lights], [shown])
-    shade = Shade(tracer(mesh), captures, [(SIZE, SIZE)], subsamples=4, directions=512)
-    shade.table = pack([maps])
-    inside = shade.image_and_coverage(0)[1] > 0.999
+    renderer = MaterialRenderer(tracer(mesh), captures, [(SIZE, SIZE)], RenderOptions(directions=512))
+    image, coverage = renderer.image_and_coverage(pack([maps]), 0)
+    inside = coverage > 0.999
     # Each pixel sees a few of the soft light's directions, its neighbours others: their mean is what has to agree.
-    blurred = [
-        gaussian(np.where(inside[..., None], p, 0).astype(np.float32), 2.0)[inside] for p in (shade.image(0), shown)
-    ]
+    blurred = [gaussian(np.where(inside[..., None], p, 0).astype(np.float32), 2.0)[inside] for p in (image, shown)]
     wrong = np.sqrt(((blurred[0] - blurred[1]) ** 2).mean() / (blurred[1] ** 2).mean())
     assert wrong < 0.01
     # A light that is turned the wrong way, or counted twice, is another picture altogether.

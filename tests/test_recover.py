@@ -18,18 +18,18 @@ from mistyle.render import hits as collecting
 from mistyle.render import scene as scenery
 from mistyle.render.emitters import emitters
 from mistyle.render.indirect import FIREFLY, MOST, Indirect, averaged, enlarged, in_proportion
-from mistyle.render.texel_views import Look, look
+from mistyle.render.texel_views import GBuffer, trace_gbuffer
 from mistyle.stages import recover_observe, recover_pictures
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.neighbours import of_islands
-from mistyle.stages.recover import recover
-from mistyle.stages.recover_check import usable
-from mistyle.stages.recover_observe import Gathered, gather
+from mistyle.stages.recover import Checkpoints, recover
+from mistyle.stages.recover_check import validate_captures
+from mistyle.stages.recover_observe import ObservationOptions, TexelObservations, VisibleTexels, collect_observations
 from mistyle.stages.recover_pictures import SHORTEST
 from mistyle.stages.recover_prior import NOTHING
 from mistyle.stages.recover_settings import RecoverSettings, estimates, passes
 from mistyle.stages.recover_table import Atlas
-from mistyle.stages.recover_texels import Found
+from mistyle.stages.recover_texels import TexelEstimate
 from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
@@ -153,7 +153,11 @@ def found_texels(values: np.ndarray, noise: float, prior: float, seen: np.ndarra
     observations = Observations(start, zeros.astype(np.int32), rgb, zeros, zeros.astype(np.int32))
     points = Points(np.zeros((count, 3), np.float32), np.zeros((count, 3, 3), np.float32))
     rig = Rig(none, np.zeros(1, np.int32), none, none[:, 0], none)
-    return solution, Gathered(np.arange(count), points, rig, observations, (), np.zeros(count, np.int32)), where
+    return (
+        solution,
+        TexelObservations(np.arange(count), points, rig, observations, (), np.zeros(count, np.int32)),
+        where,
+    )
 
 
 @pytest.mark.parametrize(("variation", "noise"), [(0.0, 0.01), (0.01, 0.01), (0.02, 0.005), (0.2, 0.01)])
@@ -166,11 +170,11 @@ def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
     found = truth + noise * rng.standard_normal(mean.shape)
     prior, alone = 0.03**-2, noise**-2
     values = (found * alone + mean * prior) / (alone + prior)
-    solution, gathered, where = found_texels(values, noise, 0.03, np.full(SIDE * SIDE, 9))
+    solution, observed, where = found_texels(values, noise, 0.03, np.full(SIDE * SIDE, 9))
     np.testing.assert_allclose(recover_prior.likelihood(solution)[0], noise, rtol=1e-2)
     own = noise**-2 / (noise**-2 + 0.03**-2)
-    np.testing.assert_allclose(recover_prior.decided(solution, gathered), own, rtol=1e-2)
-    firm = 1 / np.sqrt(recover_prior.belief(solution, mean, gathered, where, 0.03))
+    np.testing.assert_allclose(recover_prior.data_weight(solution, observed), own, rtol=1e-2)
+    firm = 1 / np.sqrt(recover_prior.prior_precision(solution, mean, observed, where, 0.03))
     wanted = np.clip(variation, recover_prior.LEAST, 0.03)
     if variation > 0:
         np.testing.assert_allclose(np.median(firm[:, 3:5]), wanted, rtol=0.1)
@@ -189,22 +193,22 @@ def test_where_nothing_is_known_a_surface_is_level(rng, tilt):
     values[:, 3:5] = np.hypot(tilt, 0.01) * rng.standard_normal((SIDE * SIDE, 2))
     half = np.arange(SIDE * SIDE) < SIDE * SIDE // 2
     values[~half, 3:5] = 0.4
-    solution, gathered, where = found_texels(values, 0.01, 0.6, np.where(half, 9, 0))
-    np.testing.assert_allclose(recover_prior.varied(solution, gathered), tilt**2, rtol=0.15)
+    solution, observed, where = found_texels(values, 0.01, 0.6, np.where(half, 9, 0))
+    np.testing.assert_allclose(recover_prior.tilt_variance(solution, observed), tilt**2, rtol=0.15)
     mean, firm = values.copy(), np.full(values.shape, 1 / 0.01**2, np.float32)
     mean[:, 3:5] = np.where(half[:, None], 0.1, 0.4)
-    level, prior = recover_prior.levelled(solution, mean, firm, gathered, where)
+    level, prior = recover_prior.shrink_normals(solution, mean, firm, observed, where)
     far = recover_prior.BLUR * SIDE  # rows next to the border have neighbours from both halves
     np.testing.assert_allclose(level[: SIDE * SIDE // 2 - far, 3:5], 0.1, rtol=0.05)
     assert (np.abs(level[SIDE * SIDE // 2 + far :, 3:5]) < 1e-3).all()
     np.testing.assert_allclose(prior[-1, 3:5] ** -0.5, np.hypot(0.01, tilt), rtol=0.1)
     np.testing.assert_array_equal(level[:, [0, 1, 2, 5, 6]], mean[:, [0, 1, 2, 5, 6]])
     solution.cost[:] = 3 * (9 - 7 / 3)  # what does not fit, here 3 times what it should, holds them more firmly
-    again = recover_prior.levelled(solution, mean, firm, gathered, where)[1]
+    again = recover_prior.shrink_normals(solution, mean, firm, observed, where)[1]
     np.testing.assert_allclose((again / prior)[: SIDE * SIDE // 2 - far, 3:5], 2, rtol=0.15)
     solution.cost[:] = 0
     # Seen in parts only, it is for the pictures to say what tilts there are, where there are any.
-    share = recover_prior.decided(solution, gathered)
+    share = recover_prior.data_weight(solution, observed)
     assert (share[half] > 0.9).all()
     np.testing.assert_allclose(share[~half], tilt**2 / (tilt**2 + recover_prior.KNOWN**2), rtol=0.1)
 
@@ -215,11 +219,11 @@ def test_misfit_is_of_those_that_could_contradict_themselves():
 
     seen = np.where(np.arange(SIDE * SIDE) % 2 == 0, 1, 9)
     values = np.full((SIDE * SIDE, 7), 0.5, np.float32)
-    solution, gathered, where = found_texels(values, 0.01, 0.6, seen)
+    solution, observed, where = found_texels(values, 0.01, 0.6, seen)
     solution.cost[seen == 9] = 20.0
-    np.testing.assert_allclose(recover_prior.misfit(solution, gathered, where), 20 / (9 - 7 / 3), rtol=1e-4)
-    solution, gathered, where = found_texels(values, 0.01, 0.6, np.ones_like(seen))
-    assert (recover_prior.misfit(solution, gathered, where) == 0).all()
+    np.testing.assert_allclose(recover_prior.misfit(solution, observed, where), 20 / (9 - 7 / 3), rtol=1e-4)
+    solution, observed, where = found_texels(values, 0.01, 0.6, np.ones_like(seen))
+    assert (recover_prior.misfit(solution, observed, where) == 0).all()
 
 
 def test_what_observations_tell_is_measured_by_how_well_they_fit():
@@ -227,10 +231,10 @@ def test_what_observations_tell_is_measured_by_how_well_they_fit():
     from mistyle.stages import recover_prior
 
     seen = np.where(np.arange(SIDE * SIDE) < SIDE, 0, 9)
-    solution, gathered, where = found_texels(np.full((SIDE * SIDE, 7), 0.5, np.float32), 0.01, 0.6, seen)
+    solution, observed, where = found_texels(np.full((SIDE * SIDE, 7), 0.5, np.float32), 0.01, 0.6, seen)
     for cost, wanted in ((0, recover_prior.BEST_FIT), (1, 1), (4, 4)):
         solution.cost[:] = np.where(seen > 0, 3 * cost * (9 - 7 / 3), 0)
-        told = recover_prior.told(solution, gathered, where)
+        told = recover_prior.observation_std(solution, observed, where)
         assert (told[seen == 0] == recover_prior.NOTHING).all()
         np.testing.assert_allclose(told[seen > 0] / 0.01, np.sqrt(recover_prior.MARGIN * wanted), rtol=0.02)
 
@@ -262,11 +266,11 @@ def test_the_same_bytes_again_and_after_an_interruption(world):
     update = {"iterations": 36, "rounds": 1, "bounces": 2, "bounce_samples": 8, "checkpoint": 1e-9}
     settings = QUICK.model_copy(update=update)
     states = []
-    whole = recover(mesh, [texels], some, settings, 5, save=states.append)
+    whole = recover(mesh, [texels], some, settings, 5, checkpoints=Checkpoints(save=states.append))
     assert [int(s["iteration"]) for s in states] == [6, 18, 24, 30]
     assert all(isinstance(v, np.ndarray) and v.dtype != object for s in states for v in s.values())
     for state in states:
-        resumed = recover(mesh, [texels], some, settings, 5, resume=state)
+        resumed = recover(mesh, [texels], some, settings, 5, checkpoints=Checkpoints(resume=state))
         for name in ("albedo", "normal", "roughness", "metallic"):
             assert getattr(whole.maps[0], name).tobytes() == getattr(resumed.maps[0], name).tobytes(), name
         assert whole.trace == resumed.trace
@@ -375,7 +379,7 @@ def test_what_mirrors_show_of_other_surfaces_is_in_the_estimate():
         photographs(mesh, [maps], [camera], many, "mikkt", path | {"max_depth": depth}, 1024)[0] for depth in (2, 5)
     )
     estimate = Indirect(mesh, [maps]).pictures(camera, many, 256, 3)[0]
-    shown = look(draw.tracer(mesh), camera, []).position[..., 2] < -0.85
+    shown = trace_gbuffer(draw.tracer(mesh), camera, []).position[..., 2] < -0.85
     difference = gaussian((whole - direct - estimate) * shown[..., None], 1.0)[shown]
     assert shown.sum() > 50
     assert np.sqrt((difference**2).mean()) < 0.1 * np.sqrt(((whole - direct)[shown] ** 2).mean())
@@ -420,29 +424,32 @@ def test_with_light_between_surfaces_known_the_solver_begins_anew(world, monkeyp
     events, targets, light = [], [], 0.01
     solve, retarget = recover_solve.first_solve, Problem.retarget
 
-    def spied(problem, start, *rest):
-        events.append(("solve", start.tobytes()))
-        return solve(problem, start, *rest)
+    def spied(problem, begin, *rest):
+        events.append(("solve", begin[0].tobytes()))
+        return solve(problem, begin, *rest)
 
     def heard(problem, rgb):
         events.append(("target",))
         targets.append(rgb.copy())
         retarget(problem, rgb)
 
-    def estimated(work, shade, table, indirect, samples, seed, progress):
-        events.append(("estimate", samples))
-        indirect.update({k: np.full((*c.size, 3), light, np.float32) for k, c in enumerate(work.captures.cameras)})
+    def estimated(context, renderer, table, sampling, progress):
+        events.append(("estimate", sampling[0]))
+        for k, camera in enumerate(context.captures.cameras):
+            yield k, np.full((*camera.size, 3), light, np.float32), None
 
     monkeypatch.setattr(recover_solve, "first_solve", spied)
     monkeypatch.setattr(Problem, "retarget", heard)
-    monkeypatch.setattr(recover_texels, "take_off_indirect", estimated)
+    monkeypatch.setattr(recover_texels, "estimate_indirect", estimated)
     settings = QUICK.model_copy(update={"iterations": 0, "rounds": 1, "bounces": 2, "bounce_samples": 16})
     recover(mesh, [texels], some, settings, 0)
     begun = next(e for e in events if e[0] == "solve")
     one = ("target",)
     assert events == [begun, one, ("estimate", 2), one, begun, one, ("estimate", 16), one, begun, one, one, one]
     tangents = collecting.tangents_of(mesh, settings.frame)
-    first = gather(draw.tracer(mesh), [texels], some, tangents, facing=settings.facing).observations.rgb
+    first = collect_observations(
+        draw.tracer(mesh), [texels], some, tangents, ObservationOptions(facing=settings.facing)
+    ).observations.rgb
     for target in (targets[1], targets[3]):
         np.testing.assert_allclose(target, first - light, atol=1e-6)
 
@@ -465,8 +472,8 @@ def test_whole_pictures_leave_no_texel_as_open_as_the_solver_did():
     noise = np.full((6, 7), 0.002, np.float32)
     noise[4], noise[5] = 0.06, NOTHING
     seen = np.array([9, 9, 9, 9, 3, 0])
-    found = Found(np.zeros((6, 8), np.float32), noise, np.ones(6, np.float32), noise, seen, seen, True)
-    left = recover_pictures._left(found)
+    found = TexelEstimate(np.zeros((6, 8), np.float32), noise, np.ones(6, np.float32), noise, seen, seen, True)
+    left = recover_pictures._unconstrained_std(found)
     np.testing.assert_allclose(left[:4, :6], 0.002, rtol=0.03)
     bound = recover_pictures.LEFT[:6] * 0.002
     assert (left[4:, :6] < bound).all() and (left[4:, :6] > 0.95 * bound).all()
@@ -479,7 +486,7 @@ def test_what_is_believed_of_metals_is_one_prior(rng: np.random.Generator):
 
     x, mean, prior = (rng.uniform(0.1, 2, (20, 7)).astype(np.float32) for _ in range(3))
     metal = np.repeat([0, 1], 10).astype(np.float32)
-    around, weight, constant = recover_prior.both(mean, prior, metal)
+    around, weight, constant = recover_prior.combine_class_prior(mean, prior, metal)
     wanted = ((x - mean) ** 2 * prior).sum(axis=1) + (x[:, 6] - metal) ** 2 / recover_prior.METAL_SPREAD**2
     wanted += metal * ((x[:, :3] - recover_prior.METAL_ALBEDO) ** 2).sum(axis=1) / recover_prior.METAL_ALBEDOS**2
     np.testing.assert_allclose(((x - around) ** 2 * weight).sum(axis=1) + constant, wanted, rtol=1e-4)
@@ -487,12 +494,12 @@ def test_what_is_believed_of_metals_is_one_prior(rng: np.random.Generator):
 
 def test_black_that_no_gloss_shows_on_is_rather_a_mirror():
     """Black paint costs more than a metal where it is smooth and seen often, and nothing where its gloss shows."""
-    from mistyle.stages.recover_prior import OFTEN, unlikely
+    from mistyle.stages.recover_prior import OFTEN, log_prior_penalty
 
     values = np.zeros((4, 7), np.float32)
     values[:, 5] = 0.1, 0.8, 0.1, 0.1
     values[2, 6], seen = 1, np.array([OFTEN, OFTEN, OFTEN, 1])
-    smooth, matt, metal, once = unlikely(values, seen)
+    smooth, matt, metal, once = log_prior_penalty(values, seen)
     assert matt == 0 < once < metal < smooth
 
 
@@ -510,7 +517,9 @@ def test_where_texels_and_pictures_differ_observations_count_for_less(world, mon
         monkeypatch.setattr(Problem, name, lambda own, x, f=real, kept=kept: (heard[kept].append(x), f(own, x))[1])
     monkeypatch.setattr(recover_solve, "UNLIKE", unlike)
     recover(mesh, [texels], few, QUICK.model_copy(update={"iterations": 0, "rounds": 1}), 0)
-    seen = gather(draw.tracer(mesh), [texels], few, tangents, facing=QUICK.facing).observations
+    seen = collect_observations(
+        draw.tracer(mesh), [texels], few, tangents, ObservationOptions(facing=QUICK.facing)
+    ).observations
     apart = np.abs(heard["targets"][0] - seen.rgb).max(axis=1)
     assert np.quantile(apart * seen.weight, 0.9) > 1
     np.testing.assert_allclose(1 / heard["weights"][0], 1 / seen.weight + unlike * apart, rtol=1e-4)
@@ -522,9 +531,9 @@ def test_steps_are_as_long_as_the_noise():
     noise = np.full((6, 7), 0.02, np.float32)
     noise[1], noise[2], noise[3], noise[5] = 0.04, 0.0001, NOTHING, NOTHING
     seen, decided = np.array([9, 9, 9, 0, 9, 0]), np.array([1, 1, 1, 1, 0.25, 1], np.float32)
-    found = Found(np.zeros((6, 8), np.float32), noise, decided, noise, seen, seen, True)
+    found = TexelEstimate(np.zeros((6, 8), np.float32), noise, decided, noise, seen, seen, True)
     where = Atlas(((1, 6),), (np.arange(6)[None] < 5,), (np.array([0, 1, 2, 3, 4, 4]),))
-    shares = recover_pictures._shares(found, where)
+    shares = recover_pictures._rate_factors(found, where)
     np.testing.assert_array_equal(shares[5], shares[4])
     np.testing.assert_allclose(shares[:4, 0], [1, 2, SHORTEST, 3], rtol=1e-6)
     np.testing.assert_allclose(shares[:5, 3], [1, 2, SHORTEST, 3, 0.5], rtol=1e-6)
@@ -595,18 +604,18 @@ def test_texel_frames_are_those_of_the_rays(world, frame):
 
 
 def test_observations_are_the_pictures_at_the_texels(world):
-    """What is gathered is what the model of the true material predicts, up to the pixels' size."""
+    """What is observed is what the model of the true material predicts, up to the pixels' size."""
     from mistyle.render.texel_lm import Options, Problem
 
     mesh, maps, texels, captures = world
-    gathered = gather(draw.tracer(mesh), [texels], captures, collecting.tangents_of(mesh, "mikkt"))
-    problem = Problem(gathered.points, gathered.rig, gathered.observations, Options())
+    observed = collect_observations(draw.tracer(mesh), [texels], captures, collecting.tangents_of(mesh, "mikkt"))
+    problem = Problem(observed.points, observed.rig, observed.observations, Options())
     parts = [maps.albedo.reshape(-1, 3), maps.normal.reshape(-1, 3)[:, :2], maps.roughness.reshape(-1, 1)]
-    true = np.concatenate([*parts, maps.metallic.reshape(-1, 1)], axis=1)[gathered.texel]
-    wrong = problem.predict(true) - gathered.observations.rgb
-    assert len(wrong) > 5 * len(gathered.texel)
-    assert np.median(np.abs(wrong)) < 0.01 * np.abs(gathered.observations.rgb).max()
-    assert (gathered.views <= gathered.seen).all() and (gathered.views * 3 >= gathered.seen).all()
+    true = np.concatenate([*parts, maps.metallic.reshape(-1, 1)], axis=1)[observed.texel]
+    wrong = problem.predict(true) - observed.observations.rgb
+    assert len(wrong) > 5 * len(observed.texel)
+    assert np.median(np.abs(wrong)) < 0.01 * np.abs(observed.observations.rgb).max()
+    assert (observed.views <= observed.seen).all() and (observed.views * 3 >= observed.seen).all()
 
 
 def test_a_look_up_moves_to_the_pixels_that_count():
@@ -617,9 +626,10 @@ def test_a_look_up_moves_to_the_pixels_that_count():
     edge = np.where(np.arange(8) == 3, -1, 1).astype(np.int8) * np.ones((8, 1), np.int8)
 
     def seen(own, lit=(), usable=None, soft=True, move=1.5):
-        one = np.array([3 * 8 + 3]), np.float32([0.2]), np.float32([0.3]), np.array(own, bool)[:, None]
+        place = np.array([3 * 8 + 3]), np.float32([0.2]), np.float32([0.3])
+        visible = VisibleTexels(np.array([7]), *place, np.array(own, bool)[:, None], np.ones(1, np.float32))
         usable = np.ones((8, 8), bool) if usable is None else usable
-        return recover_observe._observe(ramp, usable, lit, soft, np.array([7]), *one, move)
+        return recover_observe._observe(ramp, usable, lit, soft, visible, move)
 
     whole, left, top = (1, 1, 1, 1), (1, 0, 1, 0), (1, 1, 0, 0)
     for own, place in (
@@ -655,7 +665,7 @@ def test_pixels_with_an_edge_in_them_do_not_count():
         position = world_from_px(at, pixel_centres(at.size).reshape(-1, 2), depth).reshape(*at.size, 3)
         normal = np.broadcast_to(np.float32([0, 0, 1]), position.shape)
         lit = pixel_centres(at.size)[..., 1] > step - 2
-        return Look(position.astype(np.float32), normal, np.ones(at.size, bool), (lit,))
+        return GBuffer(position.astype(np.float32), normal, np.ones(at.size, bool), (lit,))
 
     # The picture of the corners begins half a pixel further out.
     seen, corners = plane(camera, 4.3), plane(of_corners(camera), 4.8)
@@ -679,20 +689,20 @@ def test_pictures_that_say_nothing(world):
     pictures[1] = np.zeros_like(pictures[1])
     masks[2] = np.zeros_like(masks[2])
     notes: list[str] = []
-    kept = usable(mesh, in_memory(cameras, captures.lights[:10], pictures, masks), notes)
+    kept = validate_captures(mesh, in_memory(cameras, captures.lights[:10], pictures, masks), notes)
     assert len(kept) == 7
     assert any("'view0.1'" in n and "all black" in n for n in notes)
     assert any("'view0.2'" in n and "saturated" in n for n in notes)
     assert any("'away'" in n and "cannot see the mesh" in n for n in notes)
     few: list[str] = []
-    usable(mesh, subset(captures, [0, 1, 3]), few)
+    validate_captures(mesh, subset(captures, [0, 1, 3]), few)
     assert any("2 different view(s)" in n and "singular" in n for n in few)
     with pytest.raises(InputRefused, match="None of 2"):
-        usable(mesh, in_memory([away, away], captures.lights[:2], pictures[:2]), [])
+        validate_captures(mesh, in_memory([away, away], captures.lights[:2], pictures[:2]), [])
     with pytest.raises(InputRefused, match="80x80"):
-        usable(mesh, in_memory(cameras[:1], captures.lights[:1], [np.ones((40, 30, 3), np.float32)]), [])
+        validate_captures(mesh, in_memory(cameras[:1], captures.lights[:1], [np.ones((40, 30, 3), np.float32)]), [])
     with pytest.raises(InputRefused, match="three views"):
-        usable(mesh, subset(captures, []), [])
+        validate_captures(mesh, subset(captures, []), [])
 
 
 def test_a_gradient_that_is_no_number_stops_at_its_texel():
@@ -724,12 +734,12 @@ def test_descent_is_adam_with_masked_updates(rng, levels):
     import mitsuba as mi
 
     from mistyle.core.image import resize
-    from mistyle.render.descent import Descent, table_on_device
+    from mistyle.render.descent import AdamOptions, Descent, table_on_device
 
     device.use()
     size = (32, 32)
     shares = rng.random((32 * 32, 8)).astype(np.float32)
-    descent = Descent([size], (1, 1, 1, 1, 1, 1, 1, 0), levels=levels, shares=shares)
+    descent = Descent([size], (1, 1, 1, 1, 1, 1, 1, 0), AdamOptions(levels=levels), shares=shares)
     table = np.full((32 * 32, 8), 0.5, np.float32)
     x, wanted = table_on_device(table), table[:, :7].reshape(*size, 7).astype(np.float64)
     first, second, age = ([np.zeros((32 >> k, 32 >> k, c)) for k in range(levels)] for c in (7, 7, 1))

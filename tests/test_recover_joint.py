@@ -13,31 +13,32 @@ from mistyle.core.image import gaussian
 from mistyle.core.light import Ambient
 from mistyle.render import draw
 from mistyle.render import hits as collecting
-from mistyle.render.shade import Shade, pack
+from mistyle.render.material_table import pack
+from mistyle.render.shade import MaterialRenderer
 from mistyle.stages import joint_algebra as algebra
 from mistyle.stages import recover_joint as joint
-from mistyle.stages.joint_pixels import Unknown, all_pixels
+from mistyle.stages.fit_context import DirectCaptures, FitContext
+from mistyle.stages.joint_pixels import UnknownTexels, image_footprints
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_prior import NOTHING
 from mistyle.stages.recover_table import linked
-from mistyle.stages.recover_texels import Work
 
 FEW = QUICK.model_copy(update={"iterations": 60, "rounds": 1})
 
 
-def random_linear(rng: np.random.Generator, pixels: int, texels: int) -> algebra.Linear:
+def random_linear(rng: np.random.Generator, pixels: int, texels: int) -> algebra.LinearisedImage:
     weights = rng.uniform(0, 1, (pixels, texels)) * (rng.random((pixels, texels)) < 0.4)
     derivative, weight, wrong = (
         rng.normal(size=(pixels, 3, 4)),
         rng.uniform(0.5, 2, (pixels, 3)),
         rng.normal(size=(pixels, 3)),
     )
-    return algebra.Linear(
+    return algebra.LinearisedImage(
         csr_array(weights.astype(np.float32)), *(a.astype(np.float32) for a in (derivative, weight, wrong))
     )
 
 
-def dense(each: algebra.Linear) -> np.ndarray:
+def dense(each: algebra.LinearisedImage) -> np.ndarray:
     """D B as a matrix, channels of pixels x unknowns of texels."""
     fetch, d = each.fetch.toarray().astype(np.float64), each.derivative.astype(np.float64)
     by = np.zeros((*d.shape[:2], 6))
@@ -49,16 +50,16 @@ def test_the_equations_are_those_of_dense_matrices(rng):
     texels = 5
     linear = [random_linear(rng, pixels, texels) for pixels in (7, 4)]
     matrix = sum(dense(each).T @ np.diag(each.weight.ravel()) @ dense(each) for each in linear)
-    right = sum(dense(each).T @ (each.weight * each.wrong).ravel() for each in linear)
+    right = sum(dense(each).T @ (each.weight * each.residual).ravel() for each in linear)
     v = rng.normal(size=(texels, 6)).astype(np.float32)
-    np.testing.assert_allclose(algebra.curved(linear, v).ravel(), matrix @ v.ravel(), rtol=1e-4, atol=1e-4)
-    np.testing.assert_allclose(algebra.right_side(linear, texels).ravel(), right, rtol=1e-4, atol=1e-4)
-    blocks = algebra.own_blocks(linear, texels)
+    np.testing.assert_allclose(algebra.normal_matvec(linear, v).ravel(), matrix @ v.ravel(), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(algebra.rhs(linear, texels).ravel(), right, rtol=1e-4, atol=1e-4)
+    blocks = algebra.diagonal_blocks(linear, texels)
     for t in range(texels):
         np.testing.assert_allclose(blocks[t], matrix[6 * t : 6 * t + 6, 6 * t : 6 * t + 6], rtol=1e-4, atol=1e-4)
     inverse = np.linalg.inv(blocks + np.eye(6, dtype=np.float32))
-    solved = algebra.conjugate(
-        lambda x: algebra.curved(linear, x) + x, right.reshape(texels, 6).astype(np.float32), inverse
+    solved = algebra.pcg(
+        lambda x: algebra.normal_matvec(linear, x) + x, right.reshape(texels, 6).astype(np.float32), inverse
     )
     exact = np.linalg.solve(matrix + np.eye(6 * texels), right)
     assert np.linalg.norm(solved.ravel() - exact) < 0.02 * np.linalg.norm(exact)
@@ -70,7 +71,7 @@ def test_weights_are_the_slope_of_the_cost(rng):
     wrong[0, 1] = np.nan
     derivative = rng.normal(size=(6, 3, 4)).astype(np.float32)
     derivative[1, 2, 3] = np.inf
-    own = joint.Errors(rng.uniform(0.5, 2, 6).astype(np.float32), np.array([1, 1, 0, 1, 1, 1], np.float32))
+    own = joint.ResidualStd(rng.uniform(0.5, 2, 6).astype(np.float32), np.array([1, 1, 0, 1, 1, 1], np.float32))
     weight = joint._weights(wrong, derivative, own)
     assert weight[0, 1] == weight[1, 2] == 0 and (weight[2] == 0).all() and np.isfinite(derivative).all()
     count = 3 * own.counts.sum()
@@ -87,7 +88,7 @@ def test_a_step_keeps_within_bounds():
     table[:, :6] = 0.5, 0.5, 0.5, 0.6, 0.6, 0.1
     change = np.full((3, 6), 9.0, np.float32)
     change[1], change[2, 5] = np.nan, -9
-    moved = joint._moved(table, Unknown(np.array([0, 1, 3]), np.ones(3, bool)), change, 0.04)
+    moved = joint._moved(table, UnknownTexels(np.array([0, 1, 3]), np.ones(3, bool)), change, 0.04)
     np.testing.assert_allclose(moved[0, :3], 0.7, atol=1e-6)
     np.testing.assert_allclose(np.hypot(*moved[0, 3:5]), joint.STEEPEST, atol=1e-6)
     np.testing.assert_array_equal(moved[1:3], table[1:3])
@@ -99,30 +100,34 @@ def drawn(world):  # noqa: F811
     """Six pictures, as the joint steps see them."""
     mesh, maps, texels, captures = world
     some = subset(captures, range(0, 30, 5))
-    shade = Shade(draw.tracer(mesh), some, ((64, 64),), subsamples=9)
-    work = Work(shade.traced, collecting.tangents_of(mesh, "mikkt"), [texels], linked(mesh, [texels]), some, QUICK, [])
-    found = all_pixels(shade, work)
-    assert found is not None
-    return work, shade, pack([maps]), *found
+    tangents = collecting.tangents_of(mesh, "mikkt")
+    context = FitContext(draw.tracer(mesh), tangents, [texels], linked(mesh, [texels]), some, QUICK)
+    renderer = context.renderer(subsamples=9)
+    footprints = image_footprints(context, renderer)
+    assert footprints is not None
+    pictures, unknown, _ = footprints
+    problem = joint.JointProblem(context, renderer, pictures, unknown, DirectCaptures(some), ())
+    return problem, pack([maps])
 
 
 def test_a_pixel_is_the_mean_of_its_texels(drawn, rng):
     """Changes that differ from texel to texel move the pictures as the model says, nearly, and equal ones nearer:
     where the camera is faced, since reflectance jumps where the mapped normal turns away."""
-    _, shade, table, pictures, unknown, _ = drawn
+    problem, table = drawn
+    pictures, unknown = problem.footprints, problem.unknown
     for pixels in pictures:
         np.testing.assert_allclose(pixels.fetch.sum(axis=1), 1, atol=1e-5)
         assert (pixels.lit > 0).all() and (pixels.lit <= 1).all()
-    faced = np.concatenate([facing(shade, k) > 0.6 for k in range(len(pictures))])
+    faced = np.concatenate([facing(problem.renderer, k) > 0.6 for k in range(len(pictures))])
     assert faced.mean() > 0.5
-    before = joint._images(shade, table, pictures)
-    derivatives = joint._derivatives(shade, table, before, pictures, unknown.rows, 0.04)
+    before = problem.images(table)
+    derivatives = joint._derivatives(problem, table, before)
     noise = rng.standard_normal((64, 64, 6)).astype(np.float32)
     smooth = np.stack([gaussian(noise[..., c], 2.0) for c in range(6)], axis=-1)
     for change, most in ((np.full((4096, 6), 2e-4, np.float32), 0.04), (2e-3 * smooth.reshape(-1, 6), 0.1)):
         moved = table.copy()
         moved[:, :6] += change
-        after = joint._images(shade, moved, pictures)
+        after = problem.images(moved)
         real = np.concatenate([b - a for a, b in zip(before, after, strict=True)])
         each = [p.fetch @ change[unknown.rows] for p in pictures]
         told = np.concatenate(
@@ -134,10 +139,10 @@ def test_a_pixel_is_the_mean_of_its_texels(drawn, rng):
         assert np.linalg.norm((told - real)[faced]) < most * np.linalg.norm(real[faced])
 
 
-def facing(shade: Shade, picture: int) -> np.ndarray:
+def facing(renderer: MaterialRenderer, picture: int) -> np.ndarray:
     """The least cosine between surface and camera of each lit pixel's samples."""
     least = []
-    for block in shade.blocks(picture):
+    for block in renderer.blocks(picture):
         count = block.hits.counts[0]
         of = np.full(len(block.pixel), np.inf, np.float32)
         np.minimum.at(of, np.array(block.hits.samples.slot)[:count], np.array(block.hits.samples.wi.z)[:count])

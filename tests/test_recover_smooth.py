@@ -77,7 +77,7 @@ def test_a_seam_is_a_border_of_tilts_but_not_of_roughness():
         noisy = true + np.random.default_rng(3).normal(0, noise, size)
         table, error = tables(noisy, noise)
         table[:, 5] = noisy.ravel()
-        result = smoothing.smoothed(table, error, replace(atlas(covered), links=(among,)), FLOOR, True)
+        result = smoothing.map_smoothing(table, error, replace(atlas(covered), links=(among,)), FLOOR, True)
         beside = (result[:, 5].reshape(size) - true)[:, column - 1 : column + 1]
         return float(np.sqrt((beside**2).mean())), result[:, 3]
 
@@ -90,7 +90,7 @@ def test_a_seam_is_a_border_of_tilts_but_not_of_roughness():
 def test_noise_on_a_smooth_surface_goes(rng: np.random.Generator):
     true, noise = waves(96, 40), 0.03
     table, error = tables(true + rng.normal(0, noise, true.shape), noise)
-    result = smoothing.smoothed(table, error, atlas(np.ones(true.shape, bool)), FLOOR, True)
+    result = smoothing.map_smoothing(table, error, atlas(np.ones(true.shape, bool)), FLOOR, True)
     left = result[:, 3].reshape(true.shape) - true
     assert np.sqrt((left**2).mean()) < 0.5 * noise
     assert np.abs(result[:, [0, 1, 2, 6]] - table[:, [0, 1, 2, 6]]).max() < 1e-6
@@ -102,7 +102,7 @@ def test_noise_of_the_albedo_goes_but_a_print_that_is_known_stays(rng: np.random
     for true, error, most in ((wavy, noise, 0.5), (printed, 0.005, 1.05)):
         table, errors = tables(np.zeros(true.shape), error)
         table[:, :3] = (true + rng.normal(0, error, true.shape)).reshape(-1, 1)
-        result = smoothing.smoothed(table, errors, atlas(np.ones(true.shape, bool)), FLOOR, True)
+        result = smoothing.map_smoothing(table, errors, atlas(np.ones(true.shape, bool)), FLOOR, True)
         assert np.sqrt(((result[:, :3] - true.reshape(-1, 1)) ** 2).mean()) < most * error
 
 
@@ -111,7 +111,7 @@ def test_metallic_that_is_left_open_is_none_or_all():
     table, noise = np.full((5, 8), 0.5, np.float32), np.full((5, 7), 0.5, np.float32)
     table[:, 6] = [0.1, 0.9, 0.1, 0.5, 1.0]
     noise[2, 6] = 0.001
-    result = smoothing._settled(table, noise)
+    result = smoothing.binarise_metallic(table, noise)
     assert result[0, 6] < 0.02 and result[1, 6] > 0.98 and result[4, 6] == 1
     np.testing.assert_allclose(result[2:4, 6], [0.1, 0.5], atol=1e-4)
     dielectric = [0, 2]
@@ -124,7 +124,7 @@ def test_metallic_that_is_left_open_is_none_or_all():
 def test_a_rough_surface_that_is_known_stays(rng: np.random.Generator):
     true, noise = rng.normal(0, 0.15, (64, 64)), 0.01
     table, error = tables(true + rng.normal(0, noise, true.shape), noise)
-    result = smoothing.smoothed(table, error, atlas(np.ones(true.shape, bool)), FLOOR, True)
+    result = smoothing.map_smoothing(table, error, atlas(np.ones(true.shape, bool)), FLOOR, True)
     assert np.sqrt(((result[:, 3] - true.ravel()) ** 2).mean()) < 1.1 * noise
 
 
@@ -134,7 +134,9 @@ def test_what_nothing_was_seen_of_follows_the_slope_around_it(rng: np.random.Gen
     error[30:33, 20:40] = np.inf
     wrong = np.where(np.isinf(error), 0, true)
     table, error = tables(wrong, error)
-    result = smoothing.smoothed(table, error, atlas(np.ones(true.shape, bool)), FLOOR, True)[:, 3].reshape(true.shape)
+    result = smoothing.map_smoothing(table, error, atlas(np.ones(true.shape, bool)), FLOOR, True)[:, 3].reshape(
+        true.shape
+    )
     hole = np.isinf(error[:, 3].reshape(true.shape))
     assert np.abs(result - true)[hole].mean() < 0.15 * np.abs(true)[hole].mean()
     assert np.abs(result - true)[~hole].max() < 0.01
@@ -146,7 +148,7 @@ def test_where_nothing_was_seen_tilts_do_not_lean_more_than_those_that_are_known
     found = np.where(known, rng.normal(0, 0.05, known.shape), 0.4)
     table, error = tables(found, np.where(known, 0.003, np.inf))
     table[:, 5] = 0.5 + table[:, 3]
-    result = smoothing.smoothed(table, error, atlas(np.ones(known.shape, bool)), FLOOR, True)
+    result = smoothing.map_smoothing(table, error, atlas(np.ones(known.shape, bool)), FLOOR, True)
     tilt, roughness = (result[:, c].reshape(known.shape) for c in (3, 5))
     assert np.abs(tilt[~known]).mean() < 0.06 and roughness[~known].mean() > 0.6
     assert np.abs(tilt - found)[known].max() < 0.005
@@ -159,12 +161,12 @@ def test_islands_do_not_mix_and_uncovered_texels_move_as_their_nearest(rng: np.r
     true = np.where(island == 0, 0.2, -0.2)
     table, error = tables(true + rng.normal(0, 0.02, true.shape), 0.02)
     where = atlas(island >= 0, island)
-    result = smoothing.smoothed(table, error, where, FLOOR, True)[:, 3].reshape(side, side)
+    result = smoothing.map_smoothing(table, error, where, FLOOR, True)[:, 3].reshape(side, side)
     assert np.abs(result - true)[island >= 0].mean() < 0.01
     links = where.links[0]
     one = replace(links, right=links.right & (island[:, 1:] == 0), below=links.below & (island[1:] == 0))
     alone = replace(where, links=(one,))
-    half = smoothing.smoothed(table, error, alone, FLOOR, True)[:, 3].reshape(side, side)
+    half = smoothing.map_smoothing(table, error, alone, FLOOR, True)[:, 3].reshape(side, side)
     assert np.allclose(half[:, :18], result[:, :18], atol=2e-4)
     moved = (result - table[:, 3].reshape(side, side)).ravel()
     uncovered = (island < 0).ravel()
@@ -175,5 +177,5 @@ def test_islands_do_not_mix_and_uncovered_texels_move_as_their_nearest(rng: np.r
 def test_roughness_stays_what_it_may_be(found: float):
     table, error = tables(np.zeros((16, 16)), 0.01)
     table[:, 5] = found
-    result = smoothing.smoothed(table, error, atlas(np.ones((16, 16), bool)), FLOOR, False)
+    result = smoothing.map_smoothing(table, error, atlas(np.ones((16, 16), bool)), FLOOR, False)
     assert result[:, 5].min() >= FLOOR and result[:, 5].max() <= 1

@@ -2,6 +2,8 @@
 
 import subprocess
 import sys
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from mistyle.core.capture import in_memory
 from mistyle.core.light import Ambient, Directional, Environment, Point
 from mistyle.render import device, draw, hits, shade
 from mistyle.render import scene as scenery
+from mistyle.render.material_table import pack, unpack
 
 RIM = Directional((0.8, 0.36, 0.48), (0.6, 1.2, 2.0))
 LAMP = Point((1.5, 1.0, 1.5), (3.0, 2.5, 2.0))
@@ -24,13 +27,33 @@ def traced():
     return draw.tracer(torus())
 
 
-def made(traced, rng, cameras, lights, subsamples=1, maps=None, **options) -> shade.Shade:
+@dataclass
+class Drawn:
+    """A renderer, and the table that it draws here."""
+
+    renderer: shade.MaterialRenderer
+    table: Any
+
+    def image(self, k):
+        return self.renderer.image(self.table, k)
+
+    def image_and_coverage(self, k):
+        return self.renderer.image_and_coverage(self.table, k)
+
+    def step(self, pictures, loss="log_srgb_l1"):
+        return self.renderer.step(self.table, pictures, loss)
+
+    def pull(self, k, adjoint):
+        return self.renderer.pull(self.table, k, adjoint)
+
+
+def made(traced, rng, cameras, lights, subsamples=1, maps=None, weights=None, **options) -> Drawn:
     """One picture per camera, all under the same lights, with random references."""
     pictures = [rng.uniform(0, 1, (*camera.size, 3)).astype(np.float32) for camera in cameras]
     captures = in_memory(cameras, [lights] * len(cameras), pictures)
-    result = shade.Shade(traced, captures, SIZES, **{"frame": "mitsuba", "subsamples": subsamples} | options)
-    result.table = shade.pack(maps or random_maps(rng, SIZES, tilt=0.2))
-    return result
+    chosen = shade.RenderOptions(**{"frame": "mitsuba", "subsamples": subsamples} | options)
+    renderer = shade.MaterialRenderer(traced, captures, SIZES, chosen, weights)
+    return Drawn(renderer, pack(maps or random_maps(rng, SIZES, tilt=0.2)))
 
 
 def scene_of(traced, maps, camera, lights, integrator):
@@ -123,8 +146,8 @@ def test_gradient_of_each_map_equals_finite_differences(traced, rng, loss, model
     if loss == "log_srgb_l1":  # which has a kink where picture and reference agree
         pictures = [ours.image(k) for k in (0, 1)]
         apart = [np.where(np.abs(r - p) < 0.05, p + 0.1, r) for p, r in zip(pictures, references(ours), strict=True)]
-        ours.captures = in_memory(cameras, ours.captures.lights, apart)
-        ours._kept.clear()
+        ours.renderer.captures = in_memory(cameras, ours.renderer.captures.lights, apart)
+        ours.renderer._kept.clear()
     start = ours.table.astype(np.float64)
     gradient = np.array(ours.step([0, 1], loss)[1]).astype(np.float64)
     assert (gradient[:, 7] == 0).all()
@@ -142,7 +165,7 @@ def test_gradient_of_each_map_equals_finite_differences(traced, rng, loss, model
 
 
 def references(ours) -> list[np.ndarray]:
-    return [ours.captures.load(k)[0] for k in range(len(ours.captures))]
+    return [ours.renderer.captures.load(k)[0] for k in range(len(ours.renderer.captures))]
 
 
 def facing_pixels(traced, camera) -> np.ndarray:
@@ -165,7 +188,7 @@ def loss_of(ours, loss, pictures, weights) -> float:
     for k in pictures:
         image, coverage = ours.image_and_coverage(k)
         image, covered = image.astype(np.float64), coverage > 0
-        reference = ours.captures.load(k)[0].astype(np.float64)
+        reference = ours.renderer.captures.load(k)[0].astype(np.float64)
         if loss == "l2":
             lost = (image - reference) ** 2
         else:
@@ -185,9 +208,9 @@ def test_loss_counts_covered_pixels_of_the_mask_with_their_weights(traced, rng, 
     assert dark > 0.02  # pixels in shadow count as well
     assert float(ours.step([0], loss)[0][0]) == pytest.approx(loss_of(ours, loss, [0], [weight]), rel=2e-5)
     mask = rng.random(camera.size) < 0.5
-    captures = in_memory([camera], [(KEY,)], [ours.captures.load(0)[0]], [mask])
-    half = shade.Shade(traced, captures, SIZES, frame="mitsuba", subsamples=subsamples)
-    half.table = ours.table
+    captures = in_memory([camera], [(KEY,)], [ours.renderer.captures.load(0)[0]], [mask])
+    options = shade.RenderOptions(frame="mitsuba", subsamples=subsamples)
+    half = Drawn(shade.MaterialRenderer(traced, captures, SIZES, options), ours.table)
     np.testing.assert_array_equal(half.image(0), np.where(mask[..., None], ours.image(0), 0))
     assert float(half.step([0], loss)[0][0]) == pytest.approx(loss_of(half, loss, [0], [1.0]), rel=2e-5)
 
@@ -195,7 +218,7 @@ def test_loss_counts_covered_pixels_of_the_mask_with_their_weights(traced, rng, 
 @pytest.mark.parametrize("lights, subsamples", [((KEY, LAMP), 1), ((KEY, LAMP), 4), ((Ambient((1, 1, 1)), KEY), 4)])
 def test_gradient_of_a_given_derivative_is_the_same_one(traced, rng, lights, subsamples):
     ours = made(traced, rng, [crop(24)], lights, subsamples, directions=32)
-    image, reference = ours.image(0), ours.captures.load(0)[0]
+    image, reference = ours.image(0), ours.renderer.captures.load(0)[0]
     adjoint = 2 * (image - reference) / image.size
     fused, pulled = np.array(ours.step([0], "l2")[1]), np.array(ours.pull(0, adjoint))
     assert np.abs(fused).max() > 0
@@ -257,7 +280,7 @@ def test_same_bytes_frozen_kept_recomputed_and_again(traced, lights, subsamples,
         adjoint = rng.normal(size=(40, 40, 3)).astype(np.float32)
         found = [value, gradient, ours.pull(1, adjoint), *ours.image_and_coverage(1)]
         results.append([np.array(v).tobytes() for v in found])
-        assert bool(ours._kept) == ("memory" not in options)
+        assert bool(ours.renderer._kept) == ("memory" not in options)
     assert all(result == results[0] for result in results[1:])
 
 
@@ -267,8 +290,8 @@ def test_without_gradients_pictures_are_the_same_and_take_less(traced, memory):
     for options in ({}, {"gradients": False}):
         ours = made(traced, np.random.default_rng(1), [crop(40)], (KEY, LAMP), 4, memory=memory, **options)
         pictures = [ours.image(0) for _ in range(2)]
-        list(ours.blocks(0))
-        found.append((ours.held(), *(p.tobytes() for p in pictures)))
+        list(ours.renderer.blocks(0))
+        found.append((ours.renderer.held(), *(p.tobytes() for p in pictures)))
     assert found[0][1:] == found[1][1:]
     assert found[1][0] <= 0.7 * found[0][0] and (found[1][0] > 0) == (memory > 0)
 
@@ -297,13 +320,15 @@ def test_the_loop_traces_nothing_waits_for_nothing_and_records_rarely(traced, rn
     adjoint = mi.TensorXf(rng.normal(size=(32, 32, 3)).astype(np.float32))
     collected = [ours.image(k) for k in range(6)]
     monkeypatch.setattr(hits, "collect", None)
-    counts, start = [], ours.recordings
+    counts, start, table = [], ours.renderer.recordings, ours.table
+    uploaded = ours.renderer.upload(table)
     with dr.scoped_set_flag(dr.JitFlag.ForbidSynchronization, True):
         for _ in range(4):
             value, gradient = ours.step(range(6), "log_srgb_l1")
             pulled = ours.pull(3, adjoint)
-            ours.table = mi.TensorXf(mi.Float(ours._table) - 0.01 * gradient.array, (ours.texels, 8))
-            counts.append(ours.recordings - start)
+            ours.table = mi.TensorXf(uploaded - 0.01 * gradient.array, (len(table), 8))
+            uploaded = ours.table.array
+            counts.append(ours.renderer.recordings - start)
     # At most two for each of six pictures' sizes and the one that is pulled, all of them at the beginning.
     assert len(collected) == 6 and counts[1] == counts[-1] <= 14
     assert np.isfinite(np.array(gradient)).all() and np.isfinite(np.array(pulled)).all() and float(value[0]) > 0
@@ -319,7 +344,7 @@ def test_one_step_along_the_gradient_is_downhill(traced, rng):
 
 def test_maps_survive_the_table(rng):
     maps = random_maps(rng, SIZES)
-    for before, after in zip(maps, shade.unpack(shade.pack(maps), SIZES), strict=True):
+    for before, after in zip(maps, unpack(pack(maps), SIZES), strict=True):
         for name in ("albedo", "normal", "roughness", "metallic"):
             np.testing.assert_allclose(getattr(after, name), getattr(before, name), atol=1e-6)
 
@@ -327,11 +352,11 @@ def test_maps_survive_the_table(rng):
 def test_misuse_is_refused(traced, rng):
     ours = made(traced, rng, [crop(8)], (KEY,))
     with pytest.raises(ValueError, match="a table of"):
-        ours.table = np.zeros((3, 8), np.float32)
+        ours.renderer.image(np.zeros((3, 8), np.float32), 0)
     with pytest.raises(ValueError, match="model is"):
         made(traced, rng, [crop(8)], (KEY,), model="phong")
     with pytest.raises(ValueError, match="texture sets"):
-        shade.Shade(traced, ours.captures, SIZES[:1])
+        shade.MaterialRenderer(traced, ours.renderer.captures, SIZES[:1])
 
 
 def test_arrays_let_go_while_a_function_is_recorded_do_no_harm():

@@ -25,14 +25,14 @@ EVEN = Ambient((0.5, 1.0, 2.0))
 def test_cells_hold_all_the_light():
     middles = sky.even_directions(SKY_CELLS)
     np.testing.assert_allclose(np.linalg.norm(middles, axis=1), 1, atol=1e-6)
-    even = sky.gathered_in((EVEN, Directional((0, 1, 0), (9, 9, 9))), middles)
+    even = sky.bin_environment((EVEN, Directional((0, 1, 0), (9, 9, 9))), middles)
     np.testing.assert_allclose(even.irradiance.sum(axis=0), 4 * np.pi * np.array(EVEN.radiance), rtol=1e-3)
     # Evenly lit cells have nearly one size: that of a disc of 1/128 of the sphere, and its spread.
     radius2 = 4 / SKY_CELLS
     assert np.abs(even.irradiance[:, 1] * SKY_CELLS / (4 * np.pi) - 1).max() < 0.15
     assert even.width2.mean() == pytest.approx(radius2 / 4, rel=0.1)
     assert (even.direction * middles).sum(axis=1).min() > 0.998
-    sun = sky.gathered_in((SUN,), middles)
+    sun = sky.bin_environment((SUN,), middles)
     brightest = sun.irradiance[:, 0].argmax()
     assert sun.irradiance[brightest, 0] > 0.3 * sun.irradiance[:, 0].sum()
     assert sun.direction[brightest] @ np.array(SUN.axis) > middles[brightest] @ np.array(SUN.axis) - 1e-6
@@ -112,12 +112,12 @@ def test_the_model_is_the_sum_over_cells(rng, model):
         tilt = x[texel, 3:5]
         normal = mi.Vector3f(float(tilt[0]), float(tilt[1]), float(np.sqrt(1 - (tilt**2).sum())))
         rough = (x[texel, 5] ** 4 + 0.5 * own.width2[lamps.start : lamps.stop]) ** 0.25
-        paint, gloss = bsdf.terms(
-            model, mi.Vector3f(*map(float, wi)), mi.Vector3f(*(mi.Float(c) for c in wo.T)), normal,
+        linear, constant = bsdf.terms(
+            bsdf.Reflectance(model), mi.Vector3f(*map(float, wi)), mi.Vector3f(*(mi.Float(c) for c in wo.T)), normal,
             mi.Float(rough.astype(np.float32)), mi.Float(float(x[texel, 6])),
         )  # fmt: skip
         light = own.irradiance[lamps.start : lamps.stop] * np.array(shines)[:, None]
-        parts = np.array(paint)[:, None] * x[texel, :3] + np.array(gloss)[:, None]
+        parts = np.array(linear)[:, None] * x[texel, :3] + np.array(constant)[:, None]
         expected[row] = (light * parts).sum(axis=0)
     np.testing.assert_allclose(found, expected, rtol=2e-4, atol=2e-5)
 

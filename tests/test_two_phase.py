@@ -17,7 +17,8 @@ from mistyle.core.maps import flat_maps
 from mistyle.core.paths import scenes
 from mistyle.render import device
 from mistyle.render.draw import tracer
-from mistyle.render.shade import Shade, pack
+from mistyle.render.material_table import pack
+from mistyle.render.shade import MaterialRenderer, RenderOptions
 from mistyle.run import pipeline
 from mistyle.run.generative import lights_of_views
 from mistyle.run.made import Atlas, Baked
@@ -80,11 +81,12 @@ def test_the_true_maps_redraw_the_views_and_flat_ones_do_not(scene, name):
     light, texels = lights(name), scene.atlas.texels[0]
     views = views_of(scene, light, count=2, spp=64)
     captures = in_memory([v.camera for v in views], [light] * 2, [v.rgb for v in views], [view_mask(v) for v in views])
-    shade = Shade(tracer(scene.asset.mesh), captures, [texels.covered.shape], subsamples=9, gradients=False)
+    options = RenderOptions(subsamples=9, gradients=False)
+    renderer = MaterialRenderer(tracer(scene.asset.mesh), captures, [texels.covered.shape], options)
 
     def wrong(maps):
-        shade.table = pack(maps)
-        pairs = [(v.rgb, shade.image(k), view_mask(v)) for k, v in enumerate(views)]
+        table = pack(maps)
+        pairs = [(v.rgb, renderer.image(table, k), view_mask(v)) for k, v in enumerate(views)]
         return float(np.mean([np.abs(a - b)[m].mean() / a[m].mean() for a, b, m in pairs]))
 
     assert wrong(scene.truth) < 0.03

@@ -14,10 +14,10 @@ from mistyle.core.light import Environment, environment_directions
 from mistyle.core.maps import flat_maps
 from mistyle.files.read_mesh import read_mesh
 from mistyle.render.draw import tracer
-from mistyle.render.sky import even_directions, gathered_in
+from mistyle.render.sky import bin_environment, even_directions
 from mistyle.render.texel_lm import Options
 from mistyle.stages import light_cells, light_solve, recover_prior, unknown_light
-from mistyle.stages.recover_observe import gather
+from mistyle.stages.recover_observe import ObservationOptions, collect_observations
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise
 
@@ -55,16 +55,16 @@ def found(mesh, captures):
 
 
 def total(light: Environment) -> np.ndarray:
-    return gathered_in((light,), even_directions(128)).irradiance.sum(axis=0)
+    return bin_environment((light,), even_directions(128)).irradiance.sum(axis=0)
 
 
 def test_the_light_is_found_where_it_is(found, sky):
     directions = even_directions(128)
     close = (directions @ directions.T > np.cos(0.35)).astype(float)
-    true, mine = (close @ luminance(gathered_in((e,), directions).irradiance) for e in (sky, found.light))
+    true, mine = (close @ luminance(bin_environment((e,), directions).irradiance) for e in (sky, found.light))
     assert np.corrcoef(true, mine)[0, 1] > 0.9
     assert directions[true.argmax()] @ directions[mine.argmax()] > np.cos(np.radians(20))
-    turned = close @ luminance(gathered_in((replace(found.light, turn=180.0),), directions).irradiance)
+    turned = close @ luminance(bin_environment((replace(found.light, turn=180.0),), directions).irradiance)
     assert np.corrcoef(true, turned)[0, 1] < 0.3
 
 
@@ -111,10 +111,10 @@ def bundled(mesh, captures):
     """The problem of the pictures on a very coarse atlas."""
     texels, traced = rasterise(mesh, 0, 32), tracer(mesh)
     lit = replace(captures, lights=tuple((Environment(np.ones((8, 16, 3), np.float32)),) for _ in captures.cameras))
-    gathered = gather(traced, [texels], lit, None, noise=0.01, relative=0.03)
+    observed = collect_observations(traced, [texels], lit, None, ObservationOptions(noise=0.01, relative=0.03))
     cells = light_cells.even_cells()
     options = Options("principled", False, floor=0.1)
-    return light_solve.bundle(traced, gathered, texels.normal[texels.covered], cells, options)
+    return light_solve.bundle(traced, observed, texels.normal[texels.covered], cells, options)
 
 
 def test_the_light_s_system_is_that_of_the_model(mesh, captures):
@@ -135,7 +135,7 @@ def test_the_light_s_system_is_that_of_the_model(mesh, captures):
 
 def test_texels_are_eliminated_as_from_the_whole_matrix(mesh, captures):
     own = bundled(mesh, captures)
-    rng, cells, count = np.random.default_rng(3), len(own.cells.angle), len(own.gathered.texel)
+    rng, cells, count = np.random.default_rng(3), len(own.cells.angle), len(own.observed.texel)
     rows = len(own.owner)
     by_texel = rng.normal(0, 1, (rows, 3, 7)).astype(np.float32) * own.used[:, None, None]
     by_texel[:, :, own.free :] = 0
@@ -143,7 +143,7 @@ def test_texels_are_eliminated_as_from_the_whole_matrix(mesh, captures):
     wrong = rng.normal(0, 1, (rows, 3)) * own.used[:, None]
     values = light_solve.first_values(own) + rng.normal(0, 0.1, (count, 7)).astype(np.float32)
     lost, slope = light_solve._followed(own, values, by_texel, by_light, wrong)
-    told = np.flatnonzero(own.gathered.seen >= recover_prior.LEAST_SEEN)
+    told = np.flatnonzero(own.observed.seen >= recover_prior.LEAST_SEEN)
     expected, pulled = np.zeros((3 * cells, 3 * cells)), np.zeros(3 * cells)
     prior = np.diag(np.array(light_solve.SPREAD) ** -2.0)
     for texel in told:
@@ -162,7 +162,7 @@ def test_texels_are_eliminated_as_from_the_whole_matrix(mesh, captures):
 
 
 def test_shares_add_up_to_the_prediction(mesh, captures):
-    from mistyle.render.texel_shares import shares
+    from mistyle.render.texel_shares import light_transport_matrix
 
     own = bundled(mesh, captures)
     rng = np.random.default_rng(1)
@@ -170,9 +170,9 @@ def test_shares_add_up_to_the_prediction(mesh, captures):
     values = light_solve.first_values(own)
     values[:, :3], values[:, 5] = rng.random((len(values), 3)), rng.uniform(0.2, 0.9, len(values))
     light_solve._relight(own, radiance)
-    paint, gloss = shares(own.problem, values, len(own.owner), len(own.cells.angle))
+    linear, constant = light_transport_matrix(own.problem, values, len(own.owner), len(own.cells.angle))
     energy = radiance * own.cells.angle[:, None]
-    expected = values[own.owner, :3] * (paint @ energy) + gloss @ energy
+    expected = values[own.owner, :3] * (linear @ energy) + constant @ energy
     np.testing.assert_allclose(own.problem.predict(values), expected, rtol=2e-4, atol=1e-5)
 
 

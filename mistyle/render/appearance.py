@@ -361,7 +361,7 @@ def _surface_class(mi: Any) -> type:
             angles = bsdf.upright(si.wi, wo)
             albedo, roughness, metallic, f0 = values
             coat = (self.coat, self.coat_roughness)
-            value = bsdf.layered(angles, albedo, roughness, metallic, f0, self.edge, *coat)
+            value = bsdf.layered(angles, albedo, roughness, metallic, f0, self.edge, coat)
             return dr.select(active & angles.valid, value, 0)
 
     return LayeredSurface

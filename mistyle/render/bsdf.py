@@ -1,13 +1,14 @@
 """The two reflectance models in closed form, over Dr.Jit arrays in the tangent frame of a surface point.
 
 Both are isotropic, so that a normal map enters through four cosines and no frame is built, and both are linear in the
-albedo: f cos(theta_o) = albedo · paint + gloss with two scalars (`terms`). Directions are unit vectors that point away
-from the surface, `wi` to the camera and `wo` to the light, as in Mitsuba. Everything is linear Rec.709; parameters are
-0..1 and not clamped here. All functions take any Dr.Jit float type, are differentiable by its AD, trace about
-150 operations and evaluate nothing. Where the result is 0 the gradient is 0, never NaN, for finite input.
+albedo: f cos(theta_o) = albedo · linear + constant with two scalars (`terms`). Directions are unit vectors that point
+away from the surface, `wi` to the camera and `wo` to the light, as in Mitsuba. Everything is linear Rec.709;
+parameters are 0..1 and not clamped here. All functions take any Dr.Jit float type, are differentiable by its AD, trace
+about 150 operations and evaluate nothing. Where the result is 0 the gradient is 0, never NaN, for finite input.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 # Mitsuba's floor of the GGX alpha; roughness² below it has no effect and no gradient, in both models.
@@ -16,6 +17,21 @@ ROUGHNESS_FLOOR = ALPHA_FLOOR**0.5
 
 # A dielectric of index 1.5, as glTF fixes it: (0.5 / 2.5)².
 GLTF_F0 = 0.04
+
+
+@dataclass(frozen=True)
+class Reflectance:
+    """A model ("principled" or "gltf") and its options.
+
+    flip_invalid  the perturbed normal turns to the camera's side, as Mitsuba's flip_invalid_normals
+    shadowing     the bump terminator, as Mitsuba's use_shadowing_function
+    specular      as in `principled` and `gltf`
+    """
+
+    model: str = "principled"
+    flip_invalid: bool = False
+    shadowing: bool = False
+    specular: float = 0.5
 
 
 class Angles(NamedTuple):
@@ -55,19 +71,9 @@ def gltf(wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, specul
 
 
 def evaluate(
-    model: str,
-    wi: Any,
-    wo: Any,
-    normal: Any,
-    albedo: Any,
-    roughness: Any,
-    metallic: Any,
-    *,
-    flip_invalid: bool = False,
-    shadowing: bool = False,
-    specular: float = 0.5,
+    reflectance: Reflectance, wi: Any, wo: Any, normal: Any, albedo: Any, roughness: Any, metallic: Any
 ) -> Any:
-    """f cos(theta_o) of `model` ("principled" or "gltf") under the tangent-space `normal` (-1..1, any length > 0).
+    """f cos(theta_o) under the tangent-space `normal` (-1..1, any length > 0).
 
     Equals `mi.BSDF.eval` of twosided(normalmap(principled)) with its options flip_invalid_normals and
     use_shadowing_function: light or camera below the perturbed horizon give 0. `wi`, `wo` in the unperturbed frame, on
@@ -75,39 +81,30 @@ def evaluate(
     """
     import drjit as dr
 
-    options = {"flip_invalid": flip_invalid, "shadowing": shadowing, "specular": specular}
-    paint, gloss = terms(model, wi, wo, normal, roughness, metallic, **options)
-    return dr.fma(albedo, paint, gloss)
+    linear, constant = terms(reflectance, wi, wo, normal, roughness, metallic)
+    return dr.fma(albedo, linear, constant)
 
 
-def terms(
-    model: str,
-    wi: Any,
-    wo: Any,
-    normal: Any,
-    roughness: Any,
-    metallic: Any,
-    *,
-    flip_invalid: bool = False,
-    shadowing: bool = False,
-    specular: float = 0.5,
-) -> tuple[Any, Any]:
-    """(paint, gloss): `evaluate` is albedo · paint + gloss. Several lights can be summed before the albedo comes in."""
+def terms(reflectance: Reflectance, wi: Any, wo: Any, normal: Any, roughness: Any, metallic: Any) -> tuple[Any, Any]:
+    """Albedo-linear and constant term: `evaluate` is albedo · linear + constant.
+
+    Several lights can be summed before the albedo comes in.
+    """
     import drjit as dr
 
     wo_z, wi_z = dr.mulsign(wo.z, wi.z), dr.abs(wi.z)
     x, y, z = normal.x, normal.y, normal.z
-    if flip_invalid:
+    if reflectance.flip_invalid:
         turn = dr.select(dr.fma(wi.x, x, dr.fma(wi.y, y, wi_z * z)) * wi_z <= 0, -1.0, 1.0)
         x, y = x * turn, y * turn
     scale = dr.rsqrt(dr.maximum(dr.fma(x, x, dr.fma(y, y, z * z)), 1e-20))
     n = (x * scale, y * scale, z * scale)
     angles = _angles(n, (wi.x, wi.y, wi_z), (wo.x, wo.y, wo_z), wo_z > 0)
-    paint, gloss = MODELS[model](angles, roughness, metallic, specular)
-    if shadowing:
+    linear, constant = MODELS[reflectance.model](angles, roughness, metallic, reflectance.specular)
+    if reflectance.shadowing:
         shade = _shadow_terminator(n[2], dr.select(angles.valid, wo_z, 1))
-        paint, gloss = paint * shade, gloss * shade
-    return dr.select(angles.valid, paint, 0), dr.select(angles.valid, gloss, 0)
+        linear, constant = linear * shade, constant * shade
+    return dr.select(angles.valid, linear, 0), dr.select(angles.valid, constant, 0)
 
 
 def upright(wi: Any, wo: Any) -> Angles:
@@ -119,8 +116,8 @@ def _reflected(lobes: Callable, wi, wo, albedo, roughness, metallic, specular: f
     import drjit as dr
 
     angles = upright(wi, wo)
-    paint, gloss = lobes(angles, roughness, metallic, specular)
-    return dr.fma(albedo, dr.select(angles.valid, paint, 0), dr.select(angles.valid, gloss, 0))
+    linear, constant = lobes(angles, roughness, metallic, specular)
+    return dr.fma(albedo, dr.select(angles.valid, linear, 0), dr.select(angles.valid, constant, 0))
 
 
 def _angles(n: tuple, wi: tuple, wo: tuple, valid: Any) -> Angles:
@@ -150,16 +147,16 @@ def _principled(a: Angles, roughness: Any, metallic: Any, specular: float) -> tu
     fi, fo = _schlick(a.cos_i), _schlick(a.cos_o)
     retro = 2 * dr.square(a.cos_d) * roughness
     burley = dr.fma(-0.5, fi, 1) * dr.fma(-0.5, fo, 1) + retro * (fi + fo + fi * fo * (retro - 1))
-    paint = dielectric * burley * (a.cos_o * (1 / dr.pi))
+    linear = dielectric * burley * (a.cos_o * (1 / dr.pi))
     if specular == 0:
-        return paint, dr.zeros(type(paint))
+        return linear, dr.zeros(type(linear))
     alpha2 = _alpha2(roughness)
     root_i, root_o = _smith_root(a.cos_i, alpha2), _smith_root(a.cos_o, alpha2)
     spread = dr.fma(alpha2, a.cos2_h, a.sin2_h)
     lobe = alpha2 * a.cos_o / (dr.pi * dr.square(spread) * ((a.cos_i + root_i) * (a.cos_o + root_o)))
     edge = _schlick(a.cos_d)
     tint, white = _metal(lobe, metallic, edge)
-    return paint + tint, dr.fma(lobe * dielectric, _fresnel(a.cos_d, specular), white)
+    return linear + tint, dr.fma(lobe * dielectric, _fresnel(a.cos_d, specular), white)
 
 
 def _gltf(a: Angles, roughness: Any, metallic: Any, specular: float) -> tuple[Any, Any]:
@@ -173,13 +170,14 @@ def _gltf(a: Angles, roughness: Any, metallic: Any, specular: float) -> tuple[An
 
 
 def layered(
-    a: Angles, albedo: Any, roughness: Any, metallic: Any, f0: Any, f90: float, coat: float, coat_roughness: float
+    a: Angles, albedo: Any, roughness: Any, metallic: Any, f0: Any, f90: float, coat: tuple[float, float]
 ) -> Any:
     """f cos(theta_o) of glTF's surface with KHR_materials_specular, KHR_materials_ior and KHR_materials_clearcoat.
 
     `albedo` and `f0` (of the dielectric) are colours; F(f0) = f0 + (f90 - f0)(1 - |wi·h|)^5, of which the largest
-    channel is what the diffuse lobe loses. The coat of index 1.5 covers the base by its Fresnel term at the normal.
-    With f0 = 0.04, f90 = 1 and no coat it is `gltf`. Safe numbers where `a.valid` is False.
+    channel is what the diffuse lobe loses. `coat` is (strength, roughness); of index 1.5, it
+    covers the base by its Fresnel term at the normal. With f0 = 0.04, f90 = 1 and no coat it is `gltf`.
+    Safe numbers where `a.valid` is False.
     """
     import drjit as dr
 
@@ -189,9 +187,10 @@ def layered(
     dielectric = (1 - dr.max(fresnel)) * albedo * (a.cos_o * (1 / dr.pi)) + fresnel * lobe
     metal = (albedo + (1 - albedo) * edge) * lobe
     base = dielectric * (1 - metallic) + metal * metallic
-    if coat == 0:
+    strength, coat_roughness = coat
+    if strength == 0:
         return base
-    share = coat * dr.fma(1 - GLTF_F0, _schlick(a.cos_i), GLTF_F0)
+    share = strength * dr.fma(1 - GLTF_F0, _schlick(a.cos_i), GLTF_F0)
     return base * (1 - share) + share * _lobe(a, max(coat_roughness**2, ALPHA_FLOOR) ** 2)
 
 

@@ -10,6 +10,7 @@ Everything runs in one frozen function per step; sums are gathers in a fixed ord
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,31 +18,46 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.lanes import aligned
 from mistyle.render import device
+from mistyle.render.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT_X, TILT_Y
 
 CHANNELS = ("albedo", "albedo", "albedo", "normal", "normal", "roughness", "metallic")
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12
 FINE = 0xFFFFFFFF  # nothing went wrong in this texel
 
 
+@dataclass(frozen=True)
+class AdamOptions:
+    """How a Descent steps.
+
+    levels   of the pyramid, 1: the texture alone
+    floor    least roughness
+    tilt     bounds |tilt|; all else stays within 0..1
+    damping  times the root mean square of a level's gradients in a channel joins Adam's denominator: without it a
+             number on which the pictures hardly depend moves as fast as all others, by nothing but chance
+    """
+
+    levels: int = 1
+    floor: float = 0.04
+    tilt: float = 0.95
+    damping: float = 0.0
+
+
+DEFAULT_OPTIONS = AdamOptions()
+
+
 class Descent:
     """Moments of every level of every texture set's pyramid, and the step.
 
     `rates` are factors of the rate per channel of the table (8 of them, 0: stands still), `shares` further ones by
-    texel and channel; `still` names texels that do not move at all; roughness stays within floor..1, |tilt| below
-    `tilt`, the rest within 0..1. `damping` times the root mean square of a level's gradients in a channel joins Adam's
-    denominator: without it a number on which the pictures hardly depend moves as fast as all others, by nothing but
-    chance.
+    texel and channel; `still` names texels that do not move at all.
     """
 
     def __init__(
         self,
         sizes: Sequence[tuple[int, int]],
         rates: Sequence[float],
+        options: AdamOptions = DEFAULT_OPTIONS,
         *,
-        levels: int = 1,
-        floor: float = 0.04,
-        tilt: float = 0.95,
-        damping: float = 0.0,
         still: Bool[np.ndarray, " t"] | None = None,
         shares: Float[np.ndarray, "t 8"] | None = None,
     ) -> None:
@@ -50,9 +66,9 @@ class Descent:
 
         mi: Any = mitsuba
         self.sizes = [(rows, columns) for rows, columns in sizes]
-        self.rates, self.floor, self.tilt, self.damping = tuple(rates), floor, tilt, damping
+        self.rates, self.options = tuple(rates), options
         self.texels = sum(rows * columns for rows, columns in sizes)
-        self.pyramids = [_levels(size, levels) for size in self.sizes]
+        self.pyramids = [_levels(size, options.levels) for size in self.sizes]
         widths = [rows * columns for pyramid in self.pyramids for rows, columns in pyramid]
         self.moments = [[mi.Float(aligned(np.zeros(8 * n))) for n in widths] for _ in range(2)]
         self.ages = [mi.Float(aligned(np.zeros(n))) for n in widths]
@@ -70,8 +86,8 @@ class Descent:
 
         mi: Any = mitsuba
         table, self.moments, self.ages, self.blame = self._run(
-            table, gradient, self.moments, self.ages, self.blame, self.shares,
-            dr.opaque(mi.Float, float(rate)), dr.opaque(mi.UInt32, 8 * picture),
+            table, gradient, (self.moments, self.ages, self.blame), self.shares,
+            dr.opaque(mi.Float, float(rate)), dr.opaque(mi.UInt32, COLUMNS * picture),
         )  # fmt: skip
         return table
 
@@ -99,13 +115,15 @@ class Descent:
         bad = np.flatnonzero(blame < FINE - 1)
         return [(int(k), CHANNELS[int(blame[k]) % 8], int(blame[k]) // 8) for k in bad]
 
-    def _step(self, table, gradient, moments, ages, blame, shares, rate, picture) -> Any:
+    def _step(self, table, gradient, state, shares, rate, picture) -> Any:
+        """New table, moments, ages and blame; `state` are the old ones."""
         import drjit as dr
         import mitsuba
 
         mi: Any = mitsuba
+        moments, ages, blame = state
         texel = dr.arange(mi.UInt32, self.texels)
-        rows = [dr.gather(mi.Float, gradient, texel * 8 + c) for c in range(7)]
+        rows = [dr.gather(mi.Float, gradient, texel * COLUMNS + c) for c in range(7)]
         finite = mi.Bool(True)
         channel = mi.UInt32(0)
         for c in reversed(range(7)):
@@ -115,7 +133,7 @@ class Descent:
         blame = dr.select((blame == FINE) & ~finite, picture + channel, blame)
         moves = blame == FINE
         packed = dr.ravel(mi.ArrayXf([dr.select(moves, r, 0) for r in rows] + [dr.zeros(mi.Float, self.texels)]))
-        old = [dr.gather(mi.Float, table, texel * 8 + c) for c in range(8)]
+        old = [dr.gather(mi.Float, table, texel * COLUMNS + c) for c in range(8)]
         first, second, age, moved, start, k = [], [], [], [], 0, 0
         for size, pyramid in zip(self.sizes, self.pyramids, strict=True):
             count = size[0] * size[1]
@@ -128,13 +146,13 @@ class Descent:
                 first.append(new1)
                 second.append(new2)
                 age.append(new_age)
-                total = step if total is None else total + _spread(step, shape, size)
+                total = step if total is None else total + _upsample(step, shape, size)
                 k += 1
             moved.append(total)
             start += count
         change = moved[0] if len(moved) == 1 else [dr.concat([m[c] for m in moved]) for c in range(8)]
         for share in shares:
-            change = [change[c] * dr.gather(mi.Float, share, texel * 8 + c) for c in range(8)]
+            change = [change[c] * dr.gather(mi.Float, share, texel * COLUMNS + c) for c in range(8)]
         new = [old[c] - rate * self.rates[c] * change[c] if self.rates[c] else old[c] for c in range(8)]
         new = [dr.select(moves, a, b) for a, b in zip(self._projected(new), old, strict=True)]
         table = dr.ravel(mi.ArrayXf(new))
@@ -157,19 +175,24 @@ class Descent:
         new1, new2 = BETA1 * old1 + (1 - BETA1) * g, BETA2 * old2 + (1 - BETA2) * dr.square(g)
         scale1, scale2 = 1 / (1 - BETA1**age), 1 / (1 - BETA2**age)
         least = mi.ArrayXf([dr.zeros(mi.Float, width) + EPSILON] * 8)
-        if self.damping:
+        if self.options.damping:
             share = dr.maximum(mi.Float(dr.mean(dr.select(on, mi.Float(1), mi.Float(0)))), mi.Float(1e-6))
             square = [dr.mean(dr.select(on, new2[c] * scale2, 0)) / share for c in range(8)]
-            least = mi.ArrayXf([dr.zeros(mi.Float, width) + self.damping * dr.sqrt(s) + EPSILON for s in square])
+            least = mi.ArrayXf(
+                [dr.zeros(mi.Float, width) + self.options.damping * dr.sqrt(s) + EPSILON for s in square]
+            )
         step = dr.select(on, new1 * scale1 / (dr.sqrt(new2 * scale2) + least), 0)
         return dr.ravel(dr.select(on, new1, old1)), dr.ravel(dr.select(on, new2, old2)), age, step
 
     def _projected(self, x: list) -> list:
         import drjit as dr
 
-        scale = dr.minimum(1, self.tilt / dr.maximum(dr.sqrt(dr.square(x[3]) + dr.square(x[4])), 1e-9))
-        colour = [dr.clip(v, 0, 1) for v in x[:3]]
-        return [*colour, x[3] * scale, x[4] * scale, dr.clip(x[5], self.floor, 1), dr.clip(x[6], 0, 1), x[7]]
+        scale = dr.minimum(
+            1, self.options.tilt / dr.maximum(dr.sqrt(dr.square(x[TILT_X]) + dr.square(x[TILT_Y])), 1e-9)
+        )
+        colour = [dr.clip(v, 0, 1) for v in x[ALBEDO]]
+        tilt = x[TILT_X] * scale, x[TILT_Y] * scale
+        return [*colour, *tilt, dr.clip(x[ROUGHNESS], self.options.floor, 1), dr.clip(x[METALLIC], 0, 1), x[-1]]
 
 
 def _levels(size: tuple[int, int], levels: int) -> list[tuple[int, int]]:
@@ -197,7 +220,7 @@ def _halved(fine: Any, size: tuple[int, int], half: tuple[int, int]) -> Any:
     return total
 
 
-def _spread(coarse: Any, shape: tuple[int, int], size: tuple[int, int]) -> Any:
+def _upsample(coarse: Any, shape: tuple[int, int], size: tuple[int, int]) -> Any:
     """Bilinear interpolation of a level's texels at those of the texture."""
     import drjit as dr
     import mitsuba

@@ -33,6 +33,33 @@ BLOCK_RAYS = 1 << 20
 
 
 @dataclass(frozen=True)
+class TexturedMesh:
+    """A mesh to trace, the sizes (rows, columns) of its texture sets, and the frames of its normal maps.
+
+    `tangents` as of `tangents_of`.
+    """
+
+    traced: Tracer
+    sizes: Sequence[tuple[int, int]]
+    tangents: Float[np.ndarray, "f 3 4"] | None = None
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How a picture is sampled: a square number of `subsamples` a pixel, whether the mesh throws `shadows` on itself.
+
+    Without `gradients` blocks have no transpose: they are good for pictures only, and are ready sooner.
+    """
+
+    subsamples: int = 4
+    shadows: bool = True
+    gradients: bool = True
+
+
+DEFAULT_SAMPLING = Sampling()
+
+
+@dataclass(frozen=True)
 class Samples:
     """n lit samples of a block, pixel after pixel, padded with samples of no strength (Dr.Jit arrays only).
 
@@ -90,7 +117,7 @@ class Transpose:
 
 
 @dataclass(frozen=True)
-class Hits:
+class SampleBlock:
     """One block of a picture. `counts` are the samples, pixels and texels without padding.
 
     transpose only where gradients were asked for
@@ -138,20 +165,20 @@ def steps(sizes: Sequence[tuple[int, int]]) -> Int[np.ndarray, "k 2"]:
     return np.array(table, np.int32)
 
 
-def corners(
+def bilinear_taps(
     texel: Int[np.ndarray, " n"],
     step: Int[np.ndarray, " n"],
     place: Float[np.ndarray, "n 2"],
     sizes: Sequence[tuple[int, int]],
 ) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
-    """The four texels, rows of the table, that each of the `cells` is fetched from, and their bilinear weights."""
+    """The four texels, rows of the table, that each footprint is fetched from, and their bilinear weights."""
     right, down = steps(sizes)[step].astype(np.int64).T
     index = texel[:, None] + np.stack([np.zeros_like(right), right, down, right + down], axis=1)
     x, y = place.T
     return index, np.stack([(1 - x) * (1 - y), x * (1 - y), (1 - x) * y, x * y], axis=1)
 
 
-def cells(
+def bilinear_footprint(
     uv: Float[np.ndarray, "n 2"], part: Int[np.ndarray, " n"], sizes: Sequence[tuple[int, int]]
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
     """Bilinear fetch from texture sets of `sizes` (rows, columns), all texels one after the other, row by row.
@@ -169,23 +196,17 @@ def cells(
 
 
 def collect(
-    traced: Tracer,
+    surface: TexturedMesh,
     camera: Camera,
     lights: Lights,
     mask: Bool[np.ndarray, "h w"],
-    sizes: Sequence[tuple[int, int]],
-    tangents: Float[np.ndarray, "f 3 4"] | None = None,
-    *,
-    subsamples: int = 4,
-    shadows: bool = True,
+    sampling: Sampling = DEFAULT_SAMPLING,
     soft: Sky | None = None,
-    gradients: bool = True,
-) -> Iterator[Hits]:
+) -> Iterator[SampleBlock]:
     """The blocks of one picture, top to bottom, without those that see nothing of the mesh.
 
-    `tangents` as of `tangents_of`; `sizes` (rows, columns) of the texture sets; `soft` is `sky.sky(lights)`, made here
-    if it is not given. Without `gradients` the blocks are good for pictures only, and sooner there. Shadow rays start
-    where Mitsuba's start. ValueError for lights that only a scene file describes.
+    `soft` is `sky.sky(lights)`, made here if it is not given. Shadow rays start where Mitsuba's start. ValueError for
+    lights that only a scene file describes.
     """
     device.use()
     if mask.shape != camera.size:
@@ -194,13 +215,13 @@ def collect(
     if any(isinstance(light, SceneLights) for light in lights):
         raise ValueError(f"{camera.name}: light that only a scene file describes cannot be collected")
     soft = soft or sky(lights)
-    down, across = window(traced.mesh, camera)
+    down, across = window(surface.traced.mesh, camera)
     near = np.zeros_like(mask)
     near[down, across] = mask[down, across]
-    rows = max(1, BLOCK_RAYS // (max(1, across.stop - across.start) * subsamples))
-    options = (sizes, tangents, subsamples, shadows, soft, gradients)
+    rows = max(1, BLOCK_RAYS // (max(1, across.stop - across.start) * sampling.subsamples))
     for row in range(down.start, down.stop, rows):
-        block = _block(traced, camera, known, near[row : min(row + rows, down.stop)], row, *options)
+        part = near[row : min(row + rows, down.stop)]
+        block = _block(surface, camera, known, part, row, sampling, soft)
         if block is not None:
             yield block
 
@@ -216,75 +237,70 @@ def window(mesh: Mesh, camera: Camera) -> tuple[slice, slice]:
     return slice(top, bottom), slice(left, right)
 
 
-def _block(traced, camera, lights, mask, row, sizes, tangents, subsamples, shadows, soft, gradients) -> Hits | None:
+@dataclass(frozen=True)
+class _Traced:
+    """What a block's rays found: Mitsuba's surface points and frames, and per ray (Dr.Jit) whether they count.
+
+    `side` is -1 where the surface's back is seen; `wo` and `strength` per delta light as in `Samples`.
+    """
+
+    point: Any
+    frame: Any
+    wi: Any
+    side: Any
+    valid: Any
+    lit: Any
+    wo: list[Any]
+    strength: list[Any]
+
+
+def _block(
+    surface: TexturedMesh,
+    camera: Camera,
+    lights: Sequence[Directional | Point],
+    mask: Bool[np.ndarray, "rows w"],
+    row: int,
+    sampling: Sampling,
+    soft: Sky | None,
+) -> SampleBlock | None:
+    """The rows of a picture from `row` on that `mask` has."""
     import drjit as dr
     import mitsuba as mi
 
-    width = camera.size[1]
-    wanted = np.flatnonzero(mask) + row * width
-    if len(wanted) == 0:
+    width, subsamples = camera.size[1], sampling.subsamples
+    chosen = np.flatnonzero(mask) + row * width
+    if len(chosen) == 0:
         return None
-    pixel, offset = np.repeat(wanted.astype(np.uint32), subsamples), np.tile(grid(subsamples), (len(wanted), 1))
-    ray = _rays(camera, pixel, offset)
-    point, frame = deferred.intersect(traced, ray, tangents)
-    wi = frame.to_local(-ray.d)
-    valid = point.is_valid() & (wi.z != 0)
-    side = dr.mulsign(mi.Float(1), wi.z)
-    lit, wo, strength = valid & (soft is not None), [], []
-    for light in lights:
-        direction, arriving = _arriving(traced, point, light, camera, valid, shadows)
-        local = frame.to_local(direction)
-        local.z *= side
-        arriving = dr.select(valid & (local.z > 0), arriving, 0)
-        lit |= arriving > 0
-        wo.append(local)
-        strength.append(arriving)
-    wi.z *= side
+    pixel, offset = np.repeat(chosen.astype(np.uint32), subsamples), np.tile(grid(subsamples), (len(chosen), 1))
+    places = (mi.Float(aligned(offset[:, axis])) for axis in (0, 1))
+    ray = camera_rays(camera, mi.UInt32(aligned(pixel, np.uint32)), *places)
+    rays = _trace(surface, camera, lights, ray, sampling.shadows, soft is not None)
+    point = rays.point
     face = mi.UInt32(point.prim_index)
-    dr.eval(valid, lit, wi, wo, strength, face, point.uv)
-    on, kept = np.array(valid), np.flatnonzero(np.array(lit)).astype(np.uint32)
+    dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv)
+    on, kept = np.array(rays.valid), np.flatnonzero(np.array(rays.lit)).astype(np.uint32)
     hit = np.bincount(pixel[on] - row * width, minlength=mask.size).reshape(mask.shape)
     if not on.any():
         return None
-    part = traced.mesh.part[np.array(face)[kept]]
+    part = surface.traced.mesh.part[np.array(face)[kept]]
     uv = np.array(point.uv).T[kept]
-    texel, step, place = cells(np.stack([uv[:, 0], 1 - uv[:, 1].astype(np.float64)], axis=1), part, sizes)
-
+    uv = np.stack([uv[:, 0], 1 - uv[:, 1].astype(np.float64)], axis=1)
+    texel, step, place = bilinear_footprint(uv, part, surface.sizes)
     size = padded(len(kept))
-    where = own(mi.UInt32, _pad(kept, size))
-    real = dr.arange(mi.UInt32, size) < len(kept)
     # Samples come pixel after pixel.
     begins = np.concatenate([[True], np.diff(pixel[kept]) > 0])[: len(kept)]
     first, slot = np.flatnonzero(begins), np.cumsum(begins) - 1
     lit_pixels, count = pixel[kept][first], np.diff(first, append=len(kept))
-    axes: Any = None
-    variant, visible = None, None
-    if soft is not None:
-        axes = tuple(dr.gather(mi.Vector3f, mi.Vector3f(a), where) for a in (frame.s, frame.t, frame.n * side))
-        position, normal = (dr.gather(mi.Vector3f, mi.Vector3f(a), where) for a in (point.p, point.n))
-        variant = own(mi.UInt8, _pad(_variants(pixel[kept], kept % subsamples, subsamples, width), size))
-        visible = _visible(traced, position, normal, axes[2], variant, soft, shadows)
-    samples = Samples(
-        slot=own(mi.UInt32, _pad(slot.astype(np.uint32), size)),
-        texel=own(mi.UInt32, _pad(texel.astype(np.uint32), size)),
-        step=own(mi.UInt8, _pad(step.astype(np.uint8), size)),
-        x=own(mi.Float, _pad(place[:, 0].astype(np.float32), size)),
-        y=own(mi.Float, _pad(place[:, 1].astype(np.float32), size)),
-        wi=dr.gather(mi.Vector3f, wi, where),
-        wo=tuple(dr.gather(mi.Vector3f, w, where) for w in wo),
-        strength=tuple(dr.select(real, dr.gather(mi.Float, s, where), 0) for s in strength),
-        frame=axes,
-        variant=variant,
-        visible=visible,
-    )
+    variant = _variants(pixel[kept], kept % subsamples, subsamples, width)
+    samples = _samples(surface, rays, kept, (slot, texel, step, place), variant, soft, sampling.shadows)
     p = padded(len(lit_pixels))
     pixels = Pixels(*(own(mi.UInt32, _pad(a.astype(np.uint32), p)) for a in (lit_pixels, first, count)))
-    transpose, touched = _transpose(texel, step, place, sizes, size) if gradients else (None, 0)
+    transpose, touched = _transpose(texel, step, place, surface.sizes, size) if sampling.gradients else (None, 0)
     dr.make_opaque(samples, pixels, transpose)
     dark = hit.ravel() > 0
     dark[lit_pixels - np.uint32(row * width)] = False
     soft_bytes = 37 + 4 * -(-len(soft.direction) // 32) if soft is not None else 0
-    return Hits(
+    return SampleBlock(
         samples=samples,
         pixels=pixels,
         transpose=transpose,
@@ -297,6 +313,74 @@ def _block(traced, camera, lights, mask, row, sizes, tangents, subsamples, shado
         bytes=size * (29 + 16 * len(lights) + soft_bytes)
         + 12 * p
         + (0 if transpose is None else 32 * size + 12 * padded(touched)),
+    )
+
+
+def _trace(
+    surface: TexturedMesh,
+    camera: Camera,
+    lights: Sequence[Directional | Point],
+    ray: Any,
+    shadows: bool,
+    soft: bool,
+) -> _Traced:
+    import drjit as dr
+    import mitsuba as mi
+
+    point, frame = deferred.intersect(surface.traced, ray, surface.tangents)
+    wi = frame.to_local(-ray.d)
+    valid = point.is_valid() & (wi.z != 0)
+    side = dr.mulsign(mi.Float(1), wi.z)
+    lit, wo, strength = valid & soft, [], []
+    for light in lights:
+        direction, arriving = _arriving(surface.traced, point, light, camera, valid, shadows)
+        local = frame.to_local(direction)
+        local.z *= side
+        arriving = dr.select(valid & (local.z > 0), arriving, 0)
+        lit |= arriving > 0
+        wo.append(local)
+        strength.append(arriving)
+    wi.z *= side
+    return _Traced(point, frame, wi, side, valid, lit, wo, strength)
+
+
+def _samples(
+    surface: TexturedMesh,
+    rays: _Traced,
+    kept: Integer[np.ndarray, " n"],
+    columns: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
+    variants: Integer[np.ndarray, " n"],
+    soft: Sky | None,
+    shadows: bool,
+) -> Samples:
+    """The rays `kept`, padded; `columns` are their slots, texels, steps and places, see `Samples`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    slot, texel, step, place = columns
+    size = padded(len(kept))
+    where = own(mi.UInt32, _pad(kept, size))
+    real = dr.arange(mi.UInt32, size) < len(kept)
+    axes: Any = None
+    variant, visible = None, None
+    if soft is not None:
+        point, frame = rays.point, rays.frame
+        axes = tuple(dr.gather(mi.Vector3f, mi.Vector3f(a), where) for a in (frame.s, frame.t, frame.n * rays.side))
+        position, normal = (dr.gather(mi.Vector3f, mi.Vector3f(a), where) for a in (point.p, point.n))
+        variant = own(mi.UInt8, _pad(variants, size))
+        visible = _visible(surface.traced, (position, normal, axes[2]), variant, soft, shadows)
+    return Samples(
+        slot=own(mi.UInt32, _pad(slot.astype(np.uint32), size)),
+        texel=own(mi.UInt32, _pad(texel.astype(np.uint32), size)),
+        step=own(mi.UInt8, _pad(step.astype(np.uint8), size)),
+        x=own(mi.Float, _pad(place[:, 0].astype(np.float32), size)),
+        y=own(mi.Float, _pad(place[:, 1].astype(np.float32), size)),
+        wi=dr.gather(mi.Vector3f, rays.wi, where),
+        wo=tuple(dr.gather(mi.Vector3f, w, where) for w in rays.wo),
+        strength=tuple(dr.select(real, dr.gather(mi.Float, s, where), 0) for s in rays.strength),
+        frame=axes,
+        variant=variant,
+        visible=visible,
     )
 
 
@@ -319,14 +403,15 @@ def _pad(values: np.ndarray, size: int) -> np.ndarray:
     return result
 
 
-def _rays(camera: Camera, pixel: Integer[np.ndarray, " n"], offset: Float[np.ndarray, "n 2"]) -> Any:
+def camera_rays(camera: Camera, pixel: Any, x: Any, y: Any) -> Any:
+    """Rays through the places (x, y), 0..1, in the pixels (UInt32, row · width + column); unit directions."""
     import drjit as dr
     import mitsuba as mi
 
-    index = mi.UInt32(aligned(pixel, np.uint32))
     width = camera.size[1]
-    x = (mi.Float(index % width) + mi.Float(aligned(offset[:, 0])) - camera.centre[0]) / camera.focal
-    y = (mi.Float(index // width) + mi.Float(aligned(offset[:, 1])) - camera.centre[1]) / camera.focal
+    x = (mi.Float(pixel % width) + x - camera.centre[0]) / camera.focal
+    y = (mi.Float(pixel // width) + y - camera.centre[1]) / camera.focal
+    # Made for every call: a product with a literal zero, as upright cameras have one, resizes that zero.
     axes: list[Any] = [mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T]
     right, down, forward = axes
     return mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))
@@ -356,11 +441,12 @@ def _variants(pixel, subsample, subsamples: int, width: int) -> Integer[np.ndarr
     return ((subsample * max(1, VARIANTS // subsamples) + dither) % VARIANTS).astype(np.uint8)
 
 
-def _visible(traced, position, normal, up, variant, soft: Sky, shadows: bool) -> Any:
-    """The words of `Samples.visible`; `up` is the shading normal on the camera's side."""
+def _visible(traced: Tracer, points: tuple[Any, Any, Any], variant: Any, soft: Sky, shadows: bool) -> Any:
+    """The words of `Samples.visible`; `points`: position, geometric normal, shading normal on the camera's side."""
     import drjit as dr
     import mitsuba as mi
 
+    position, normal, up = points
     point = dr.zeros(mi.SurfaceInteraction3f, dr.width(position))
     point.p, point.n = position, normal
     words, directions = [], mi.Float(aligned(soft.direction.ravel()))
@@ -388,7 +474,7 @@ def _transpose(texel, step, place, sizes, size: int) -> tuple[Transpose, int]:
     import mitsuba as mi
     import scipy.sparse as sparse
 
-    index, weight = corners(texel, step, place, sizes)
+    index, weight = bilinear_taps(texel, step, place, sizes)
     total = sum(rows * columns for rows, columns in sizes)
     shape = (len(texel), total)
     by_sample = sparse.csr_matrix(

@@ -8,14 +8,13 @@ are divided by the albedo, averaged over pixels that show the same surface, and 
 
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from mistyle.core.camera import Camera, binned
 from mistyle.core.image import gaussian, nearest_fill, resize
-from mistyle.core.lanes import aligned
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
@@ -77,10 +76,10 @@ class Indirect:
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, vectors: bool
     ) -> list[tuple[Any, Any]]:
         """Pairs of light and vector irradiance, which is None where no `vectors` are asked for."""
-        found = []
+        pairs = []
         for k in range(0, len(many), TOGETHER):
-            found += self._pictures(camera, many[k : k + TOGETHER], samples, seed, vectors)
-        return found
+            pairs += self._pictures(camera, many[k : k + TOGETHER], samples, seed, vectors)
+        return pairs
 
     def _pictures(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, vectors: bool
@@ -139,15 +138,7 @@ def _traced(
     import mitsuba
 
     mi: Any = mitsuba
-    width, height = (int(n) for n in sensor.film().size())
-    count = width * height * each
-    sampler = sensor.sampler()
-    sampler.set_samples_per_wavefront(each)
-    sampler.seed(seed, count)
-    pixel = dr.arange(mi.UInt32, count) // each
-    row = pixel // width
-    place = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row)) + sampler.next_2d()
-    ray, _ = sensor.sample_ray(0.0, 0.0, place / mi.Point2f(width, height), mi.Point2f(0.5))
+    sampler, pixel, ray = _camera_samples(sensor, each, seed)
     context = mi.BSDFContext()
     first = scene.ray_intersect(ray)
     seen, surface = first.is_valid(), first.bsdf()
@@ -166,10 +157,8 @@ def _traced(
         si = scene.ray_intersect(ray, active)
         # What escapes from the first point is direct light; what escapes from the last is looked for, no more points.
         escaped, hit = active & ~si.is_valid() & (k > 0), active & si.is_valid() & (k < points)
-        arriving = (
-            sum((_arriving(scene, e, ray, si, last, density, escaped, hit, sampler) for e in own), mi.Color3f(0))
-            for own in lit
-        )
+        segment = PathSegment(ray, si, last, density, escaped, hit)
+        arriving = (sum((_arriving(scene, e, segment, sampler) for e in own), mi.Color3f(0)) for own in lit)
         more = (total + through * light for total, light in zip(sums, arriving, strict=True))
         return k + 1, *onward(si, si.bsdf(), through, hit, sampler), sampler, *more
 
@@ -182,18 +171,47 @@ def _traced(
     )
     ended = dr.while_loop(start, lambda k, *rest: rest[4] & (k < points + soft), body, label="indirect")
     albedo = first.bsdf().eval_diffuse_reflectance(first, seen)
-    values, arriving = [mi.Float(1)], []
-    if vectors:
-        ray, reflected, density = start[1:4]
-        # `total` is radiance x reflectance x cosine / density, and `reflected` what it is multiplied by.
-        cosine: Any = dr.abs(dr.dot(ray.d, first.sh_frame.n))
-        share = dr.minimum(1, cosine / GRAZING) / dr.maximum(density, 1e-9)
-        for total in ended[7:]:
-            radiance = dr.select(seen & (reflected > 1e-6), total / reflected, 0) * share
-            arriving += [radiance * ray.d.x, radiance * ray.d.y, radiance * ray.d.z]
+    values = [mi.Float(1)]
+    arriving = _vector_irradiance(first, start[1:4], ended[7:]) if vectors else []
     for vector in (first.p, first.sh_frame.n, albedo, *ended[7:], *arriving):
         values += [vector.x, vector.y, vector.z]
+    width, height = (int(n) for n in sensor.film().size())
     return _pixels(values, pixel, seen, width * height, each).reshape(height, width, -1)
+
+
+def _camera_samples(sensor: Any, each: int, seed: int) -> tuple[Any, Any, Any]:
+    """The seeded sampler, and the pixel and ray of each of `each` samples a pixel."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba
+    width, height = (int(n) for n in sensor.film().size())
+    count = width * height * each
+    sampler = sensor.sampler()
+    sampler.set_samples_per_wavefront(each)
+    sampler.seed(seed, count)
+    pixel = dr.arange(mi.UInt32, count) // each
+    row = pixel // width
+    place = mi.Point2f(mi.Float(pixel - row * width), mi.Float(row)) + sampler.next_2d()
+    ray, _ = sensor.sample_ray(0.0, 0.0, place / mi.Point2f(width, height), mi.Point2f(0.5))
+    return sampler, pixel, ray
+
+
+def _vector_irradiance(first: Any, begin: Sequence[Any], totals: Sequence[Any]) -> list[Any]:
+    """x, y and z of the vector irradiance at the points `first`, under each set of emitters.
+
+    `begin` is the first ray, what it carries and its density; `totals` are radiance · reflectance · cosine / density.
+    """
+    import drjit as dr
+
+    ray, reflected, density = begin
+    cosine: Any = dr.abs(dr.dot(ray.d, first.sh_frame.n))
+    share = dr.minimum(1, cosine / GRAZING) / dr.maximum(density, 1e-9)
+    vectors = []
+    for total in totals:
+        radiance = dr.select(first.is_valid() & (reflected > 1e-6), total / reflected, 0) * share
+        vectors += [radiance * ray.d.x, radiance * ray.d.y, radiance * ray.d.z]
+    return vectors
 
 
 def _pixels(values: Sequence[Any], pixel: Any, seen: Any, count: int, each: int) -> np.ndarray:
@@ -207,10 +225,19 @@ def _pixels(values: Sequence[Any], pixel: Any, seen: Any, count: int, each: int)
     return np.stack([np.array(total) for total in sums], axis=-1)
 
 
-def _arriving(
-    scene: Any, emitter: Any, ray: Any, si: Any, last: Any, density: Any, escaped: Any, hit: Any, sampler: Any
-) -> Any:
-    """Radiance that one emitter sends back along `ray`: over the surface point `si`, or past all of them.
+class PathSegment(NamedTuple):
+    """A ray that left the surface point `last` with a density, and where it `hit` a point `si` or `escaped`."""
+
+    ray: Any
+    si: Any
+    last: Any
+    density: Any
+    escaped: Any
+    hit: Any
+
+
+def _arriving(scene: Any, emitter: Any, segment: PathSegment, sampler: Any) -> Any:
+    """Radiance that one emitter sends back along the ray: over the surface point `si`, or past all of them.
 
     Soft light is looked for both ways and weighted by the power heuristic (Veach and Guibas 1995).
     """
@@ -218,6 +245,7 @@ def _arriving(
     import mitsuba
 
     mi: Any = mitsuba
+    ray, si, last, density, escaped, hit = segment
     soft = emitter.is_environment()
     place = sampler.next_2d(hit) if soft else mi.Point2f(0.5)
     towards, power = emitter.sample_direction(si, place, hit)
@@ -302,15 +330,3 @@ def _around(
 def _overlap(size: int, step: int) -> tuple[slice, slice]:
     """Rows that have another one `step` further on, and those others."""
     return slice(max(0, -step), size - max(0, step)), slice(max(0, step), size + min(0, step))
-
-
-def retarget(shade: Any, picture: int, rgb: Float[np.ndarray, "h w 3"], weight: Float[np.ndarray, "h w"]) -> None:
-    """Give a picture of a `Shade` another reference and other weights; pictures it does not keep load theirs again."""
-    import mitsuba
-
-    mi: Any = mitsuba
-    for block in shade.kept(picture):
-        target = np.array(block.target).reshape(-1, 4)
-        target[: len(block.pixel), :3] = rgb.reshape(-1, 3)[block.pixel]
-        target[: len(block.pixel), 3] = weight.ravel()[block.pixel]
-        block.target = mi.Float(aligned(target.ravel()))

@@ -106,8 +106,8 @@ def _gltf_class(mi: Any) -> type:
         def _eval(self, si, wo, active, metallic, roughness):
             albedo = self.base_color.eval(si, active)
             angles = bsdf.upright(si.wi, wo)
-            paint, gloss = bsdf.MODELS["gltf"](angles, roughness, metallic, self.specular)
-            return dr.select(active & angles.valid, dr.fma(albedo, paint, gloss), 0)
+            linear, constant = bsdf.MODELS["gltf"](angles, roughness, metallic, self.specular)
+            return dr.select(active & angles.valid, dr.fma(albedo, linear, constant), 0)
 
     return Gltf
 

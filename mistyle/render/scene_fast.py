@@ -19,9 +19,15 @@ from mistyle.core.light import Directional, Point
 from mistyle.core.mesh import Mesh
 from mistyle.render import scene_grad, scene_keys, scene_walk
 from mistyle.render.draw import Tracer, gbuffer, tracer
+from mistyle.render.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT
 from mistyle.render.scene_keys import Parameter
 
-ROLES = {"base_color": slice(0, 3), "normalmap": slice(3, 5), "roughness": slice(5, 6), "metallic": slice(6, 7)}
+ROLES = {
+    "base_color": ALBEDO,
+    "normalmap": TILT,
+    "roughness": slice(ROUGHNESS, ROUGHNESS + 1),
+    "metallic": slice(METALLIC, METALLIC + 1),
+}
 # Lobes of `principled` that the fast path does not have.
 ABSENT = ("anisotropic", "spec_trans", "spec_tint", "sheen", "sheen_tint", "flatness", "clearcoat")
 CHECKS = 3  # cameras whose pictures are compared
@@ -80,16 +86,15 @@ class DeferredRenderer:
         references = [np.array(view.reference) for view in views]
         captures = in_memory(cameras, [lights] * len(cameras), references, masks)
         self.shares = [max(view.share, 1e-9) for view in views]
-        self.shade = self._agreeing(scene, traced, captures, views, engine, kinds.pop())
+        self.renderer = self._agreeing(scene, traced, captures, views, engine, kinds.pop())
 
     def gradients(self, values: Mapping[str, np.ndarray], k: int) -> tuple[float, dict[str, np.ndarray]]:
         """Loss of camera k and its gradient by key, as `scene_grad.gradients` has them, without noise.
 
         What lies beside the fitted materials adds nothing to the loss.
         """
-        self.shade.table = self._table(values)
-        value, gradient = self.shade.step([k], self.loss)
-        rows = np.array(gradient).reshape(-1, 8) / np.float32(self.shares[k])
+        value, gradient = self.renderer.step(self._table(values), [k], self.loss)
+        rows = np.array(gradient).reshape(-1, COLUMNS) / np.float32(self.shares[k])
         result = {p.key: np.zeros(p.shape, np.float32) for p in self.chosen}
         start = 0
         for material in self.materials:
@@ -104,8 +109,8 @@ class DeferredRenderer:
     def _table(self, values: Mapping[str, np.ndarray]) -> Float[np.ndarray, "t 8"]:
         parts = []
         for material in self.materials:
-            rows = np.zeros((4 if material is None else int(np.prod(material.size)), 8), np.float32)
-            rows[:, 5] = 0.5
+            rows = np.zeros((4 if material is None else int(np.prod(material.size)), COLUMNS), np.float32)
+            rows[:, ROUGHNESS] = 0.5
             for role, (key, stored) in material.roles.items() if material is not None else ():
                 value = values.get(key, stored)
                 flat = value.reshape(-1, value.shape[-1]) if value.ndim == 3 else value[None]
@@ -127,25 +132,32 @@ class DeferredRenderer:
 
     def _agreeing(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
         """The renderer whose pictures are the scene's, of the variants of a normal map that Mitsuba has."""
-        from mistyle.render.shade import Shade
+        from mistyle.render.shade import MaterialRenderer, RenderOptions
 
         sizes = [(2, 2) if m is None else m.size for m in self.materials]
         bumped = any("normalmap" in m.roles for m in self.materials if m is not None)
         looked = np.unique(np.linspace(0, len(views) - 1, CHECKS).round().astype(int)).tolist()
         pairs = {k: [_picture(scene, engine, views[k].sensor, 2 * k + j) for j in (0, 1)] for k in looked}
 
-        def renderer(flip: bool, shadowing: bool, **more: Any) -> Shade:
-            options = {"subsamples": self.subsamples, "flip_invalid": flip, "shadowing": shadowing} | more
-            return Shade(traced, captures, sizes, frame="mitsuba", specular=specular, **options)
+        def renderer(flip: bool, shadowing: bool, subsamples: int, **more: Any) -> MaterialRenderer:
+            options = RenderOptions(
+                frame="mitsuba",
+                subsamples=subsamples,
+                flip_invalid=flip,
+                shadowing=shadowing,
+                specular=specular,
+                **more,
+            )
+            return MaterialRenderer(traced, captures, sizes, options)
 
         def error(variant: tuple[bool, bool]) -> float:
             # Edges inside a pixel are all that differs by nature: many samples, kept nowhere.
             fine = [64 if np.prod(captures.cameras[k].size) <= MANY_PIXELS else 16 for k in looked]
-            shade = renderer(*variant, subsamples=min(fine), memory=0)
-            shade.table = self._table({})
+            exact = renderer(*variant, min(fine), memory=0)
+            table = exact.upload(self._table({}))
 
             def wrong(k: int) -> float:
-                image, coverage = shade.image_and_coverage(k)
+                image, coverage = exact.image_and_coverage(table, k)
                 return _beyond_noise(image, pairs[k], captures.load(k)[1], coverage)
 
             return max(wrong(k) for k in looked)
@@ -154,7 +166,7 @@ class DeferredRenderer:
         errors = [error(variant) for variant in variants]
         if min(errors) > AGREEMENT:
             raise Unsupported(f"its pictures differ from the scene's own by {min(errors):.1%}.")
-        return renderer(*variants[int(np.argmin(errors))])
+        return renderer(*variants[int(np.argmin(errors))], self.subsamples)
 
 
 def _picture(scene: Any, engine: Any, sensor: Any, seed: int) -> np.ndarray:

@@ -6,16 +6,36 @@ colours of the delta lights and the soft light, None where there is none.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from mistyle.core.lanes import aligned
 from mistyle.render.hits import Pixels, Samples, Transpose
+from mistyle.render.material_table import (
+    ALBEDO,
+    COLUMNS,
+    FETCHED_METALLIC,
+    FETCHED_ROUGHNESS,
+    LEAST_Z,
+    METALLIC,
+    NORMAL,
+    ROUGHNESS,
+    TILT_X,
+    TILT_Y,
+)
 from mistyle.render.sky import VARIANTS, Sky
 
-# A tilt longer than sqrt(1 - this²) has no gradient along its length any more.
-LEAST_Z = 0.05
+
+@dataclass(frozen=True)
+class BlockArrays:
+    """One block's arrays as the kernels read them; `transpose` is None in blocks without gradients."""
+
+    samples: Samples
+    pixels: Pixels
+    transpose: Transpose | None
+    lights: tuple[Any, Any]
 
 
 def _fetch(textures: Any, samples: Samples) -> list[Any]:
@@ -33,7 +53,8 @@ def _fetch(textures: Any, samples: Samples) -> list[Any]:
         for far_x, wx in ((0, 1 - x), (1, x)):
             index = corner + (right if far_x else 0) + (down if far_y else 0)
             row = dr.gather(_packets(), table, mi.UInt32(index), shape=(8, dr.width(index)))
-            values = [row[0], row[1], row[2], row[3], row[4], _tilted_z(row[3], row[4]), row[5], row[6]]
+            x_y = row[TILT_X], row[TILT_Y]
+            values = [row[0], row[1], row[2], *x_y, _tilted_z(*x_y), row[ROUGHNESS], row[METALLIC]]
             weight = wx * wy
             result = [dr.fma(weight, value, sum_) for value, sum_ in zip(values, result, strict=True)]
     return result
@@ -53,27 +74,27 @@ def _tilted_z(x: Any, y: Any) -> Any:
 
 
 def _delta_light(terms: Callable, values: list[Any], samples: Samples, colours: tuple) -> tuple[Any, Any]:
-    """(paint, gloss) of all delta lights: the sample sends albedo · paint + gloss to the camera."""
+    """Albedo-linear and constant term of all delta lights: the sample sends albedo · linear + constant."""
     import mitsuba as mi
 
-    paint, gloss = mi.Color3f(0), mi.Color3f(0)
+    linear, constant = mi.Color3f(0), mi.Color3f(0)
     for wo, strength, colour in zip(samples.wo, samples.strength, colours, strict=True):
-        p, g = terms(samples.wi, wo, mi.Vector3f(*values[3:6]), values[6], values[7])
+        p, g = terms(samples.wi, wo, mi.Vector3f(*values[NORMAL]), values[FETCHED_ROUGHNESS], values[FETCHED_METALLIC])
         light = colour * strength
-        paint += light * p
-        gloss += light * g
-    return paint, gloss
+        linear += light * p
+        constant += light * g
+    return linear, constant
 
 
 def _colour(terms: Callable, values: list[Any], samples: Samples, lights: tuple) -> Any:
     """Light that each sample sends to the camera; differentiable only without soft light."""
     import mitsuba as mi
 
-    paint, gloss = _delta_light(terms, values, samples, lights[0])
+    linear, constant = _delta_light(terms, values, samples, lights[0])
     if lights[1] is not None:
         soft = soft_light(terms, values, samples, lights[1])
-        paint, gloss = paint + soft[0], gloss + soft[1]
-    return mi.Color3f(*values[:3]) * paint + gloss
+        linear, constant = linear + soft[0], constant + soft[1]
+    return mi.Color3f(*values[ALBEDO]) * linear + constant
 
 
 def image(terms, subsamples: int, textures, samples, pixels, lights) -> Any:
@@ -99,14 +120,15 @@ def _resolve(colour: Any, pixels: Pixels, subsamples: int) -> Any:
     return mi.Color3f(total.x, total.y, total.z) / subsamples
 
 
-def step(terms, subsamples, loss, textures, samples, pixels, transpose, lights, target, scale) -> Any:
-    """Loss over a block, and its rows of the gradient."""
+def step(terms, subsamples, loss, textures, block: BlockArrays, goal) -> Any:
+    """Loss over a block, and its rows of the gradient; `goal` is (packets of reference and weight, their factor)."""
     import drjit as dr
     import mitsuba as mi
 
-    values = _fetch(textures, samples)
-    goal = dr.gather(mi.Vector4f, target, dr.arange(mi.UInt32, dr.width(pixels.index)))
-    reference, weight = mi.Color3f(goal.x, goal.y, goal.z), goal.w * scale
+    samples, pixels, lights = block.samples, block.pixels, block.lights
+    values, (target, scale) = _fetch(textures, samples), goal
+    wanted = dr.gather(mi.Vector4f, target, dr.arange(mi.UInt32, dr.width(pixels.index)))
+    reference, weight = mi.Color3f(wanted.x, wanted.y, wanted.z), wanted.w * scale
     if subsamples == 1 and lights[1] is None:
         dr.enable_grad(values)
         lost = LOSSES[loss](_colour(terms, values, samples, lights), reference) * weight
@@ -123,16 +145,18 @@ def step(terms, subsamples, loss, textures, samples, pixels, transpose, lights, 
     lost = dr.detach(lost)
     # Both at once: one kernel that shades each sample a single time.
     dr.eval(lost, packed)
-    return dr.sum(lost), _to_texels(textures[0], packed, transpose)
+    return dr.sum(lost), _to_texels(textures[0], packed, block.transpose)
 
 
-def pull(terms, subsamples, textures, samples, pixels, transpose, lights, adjoint) -> Any:
+def pull(terms, subsamples, textures, block: BlockArrays, adjoint) -> Any:
+    """A block's rows of the gradient of a loss whose derivative by the picture is `adjoint`."""
     import drjit as dr
     import mitsuba as mi
 
-    pixel = dr.gather(mi.UInt32, pixels.index, samples.slot)
+    pixel = dr.gather(mi.UInt32, block.pixels.index, block.samples.slot)
     at = dr.gather(mi.Vector3f, adjoint, pixel) / subsamples
-    return _to_texels(textures[0], _derivatives(terms, textures, samples, lights, at), transpose)
+    derivatives = _derivatives(terms, textures, block.samples, block.lights, at)
+    return _to_texels(textures[0], derivatives, block.transpose)
 
 
 def _derivatives(terms, textures, samples, lights, adjoint) -> Any:
@@ -144,8 +168,8 @@ def _derivatives(terms, textures, samples, lights, adjoint) -> Any:
     derivatives: list[Any] = [mi.Float(0)] * 8
     if lights[0]:
         dr.enable_grad(values)
-        paint, gloss = _delta_light(terms, values, samples, lights[0])
-        colour = mi.Color3f(*values[:3]) * paint + gloss
+        linear, constant = _delta_light(terms, values, samples, lights[0])
+        colour = mi.Color3f(*values[ALBEDO]) * linear + constant
         dr.backward(colour.x * adjoint.x + colour.y * adjoint.y + colour.z * adjoint.z)
         derivatives = dr.grad(values)
     if lights[1] is not None:
@@ -167,7 +191,10 @@ def _to_texels(table, packed, transpose) -> Any:
         return k + 1, dr.fma(weight, dr.gather(_packets(), packed, sample, shape=(8, width)), total)
 
     _, total = dr.while_loop((mi.UInt32(transpose.begin), total), lambda k, total: k < transpose.end, add)
-    x, y = dr.gather(mi.Float, table, transpose.texel * 8 + 3), dr.gather(mi.Float, table, transpose.texel * 8 + 4)
+    x, y = (
+        dr.gather(mi.Float, table, transpose.texel * COLUMNS + TILT_X),
+        dr.gather(mi.Float, table, transpose.texel * COLUMNS + TILT_Y),
+    )
     z = _tilted_z(x, y)
     lean = dr.select(z > LEAST_Z, total[5] / z, 0)
     rows = [total[0], total[1], total[2], total[3] - lean * x, total[4] - lean * y, total[6], total[7], mi.Float(0)]
@@ -229,7 +256,7 @@ def upload(sky: Sky) -> tuple[Any, ...]:
 
 
 def soft_light(terms: Callable, values: list[Any], samples: Samples, sky: tuple) -> tuple[Any, Any]:
-    """(paint, gloss) of the sky: its visible cells, and a GGX lobe of the sample's own normal and roughness.
+    """(linear, constant) of the sky: its visible cells, and a GGX lobe of the sample's own normal and roughness.
 
     Both see all of the light; the balance heuristic shares it between them, with a cell's density 1 / solid angle. In
     the lobe the radiance comes from the map and the visibility from the cell of the direction.
@@ -237,11 +264,11 @@ def soft_light(terms: Callable, values: list[Any], samples: Samples, sky: tuple)
     import mitsuba as mi
 
     def add(total, wo, light):
-        p, g = terms(samples.wi, wo, mi.Vector3f(*values[3:6]), values[6], values[7])
+        p, g = terms(samples.wi, wo, mi.Vector3f(*values[NORMAL]), values[FETCHED_ROUGHNESS], values[FETCHED_METALLIC])
         return [total[0] + light * p, total[1] + light * g]
 
-    paint, gloss = _over_sky(values, samples, sky, [mi.Color3f(0), mi.Color3f(0)], add)
-    return paint, gloss
+    linear, constant = _over_sky(values, samples, sky, [mi.Color3f(0), mi.Color3f(0)], add)
+    return linear, constant
 
 
 def _soft_derivatives(terms, values: list[Any], samples: Samples, sky: tuple, adjoint: Any) -> list[Any]:
@@ -249,7 +276,7 @@ def _soft_derivatives(terms, values: list[Any], samples: Samples, sky: tuple, ad
     import drjit as dr
     import mitsuba as mi
 
-    albedo = mi.Color3f(*values[:3])
+    albedo = mi.Color3f(*values[ALBEDO])
 
     def add(total, wo, light):
         at = mi.Color3f(adjoint.x, adjoint.y, adjoint.z) * light
@@ -306,8 +333,8 @@ class _Lobe:
         import drjit as dr
         import mitsuba as mi
 
-        self.normal = dr.normalize(mi.Vector3f(*values[3:6]))
-        self.alpha = dr.maximum(dr.square(values[6]), LEAST_ALPHA)
+        self.normal = dr.normalize(mi.Vector3f(*values[NORMAL]))
+        self.alpha = dr.maximum(dr.square(values[FETCHED_ROUGHNESS]), LEAST_ALPHA)
         wi = self.wi = samples.wi
         self.variant = mi.Float(samples.variant)
         cosine = dr.clip(dr.dot(wi, self.normal), 1e-3, 1)

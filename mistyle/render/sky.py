@@ -80,7 +80,7 @@ def sky(lights: Sequence[Light], directions: int = 128) -> Sky | None:
 
 
 @dataclass(frozen=True)
-class Cells:
+class EnvironmentCells:
     """Soft light gathered in cells of the sphere, one directional light each.
 
     direction  unit, from the surface, towards the centre of light of the cell
@@ -101,7 +101,7 @@ def even_directions(count: int) -> Float[np.ndarray, "k 3"]:
     return np.stack([side * np.sin(phi), y, side * np.cos(phi)], axis=1).astype(np.float32)
 
 
-def gathered_in(lights: Sequence[Light], middles: Float[np.ndarray, "k 3"]) -> Cells:
+def bin_environment(lights: Sequence[Light], middles: Float[np.ndarray, "k 3"]) -> EnvironmentCells:
     """The soft light among `lights`, each direction's light counted to the nearest of `middles`."""
     radiance, angle = _map([light for light in lights if isinstance(light, SOFT)])
     rows = len(radiance)
@@ -116,7 +116,7 @@ def gathered_in(lights: Sequence[Light], middles: Float[np.ndarray, "k 3"]) -> C
     weight = np.maximum(total(bright), 1e-30)
     centre = np.stack([total(towards[:, c] * bright) for c in range(3)], axis=1) / weight[:, None]
     length = np.linalg.norm(centre, axis=1)
-    return Cells(
+    return EnvironmentCells(
         (centre / np.maximum(length, 1e-9)[:, None]).astype(np.float32),
         np.stack([total(flux[:, c]) for c in range(3)], axis=1).astype(np.float32),
         np.clip(1 - length, 0, 1).astype(np.float32),

@@ -17,8 +17,14 @@ from jaxtyping import Float
 
 from mistyle.render import bsdf, deferred, device
 from mistyle.render.hits import own
+from mistyle.render.material_table import ALBEDO, FETCHED_METALLIC, FETCHED_ROUGHNESS, NORMAL
 
-COLUMNS = {"albedo": slice(0, 3), "normal": slice(3, 6), "roughness": slice(6, 7), "metallic": slice(7, 8)}
+COLUMNS = {
+    "albedo": ALBEDO,
+    "normal": NORMAL,
+    "roughness": slice(FETCHED_ROUGHNESS, FETCHED_ROUGHNESS + 1),
+    "metallic": slice(FETCHED_METALLIC, FETCHED_METALLIC + 1),
+}
 
 
 class Split:
@@ -29,7 +35,7 @@ class Split:
 
     def __init__(self, *, gloss: bool = True) -> None:
         device.use()
-        self._terms = partial(bsdf.terms, "principled", specular=0.5 if gloss else 0.0)
+        self._terms = partial(bsdf.terms, bsdf.Reflectance("principled", specular=0.5 if gloss else 0.0))
         self._frozen: dict[Any, device.Frozen] = {}
 
     def image(self, lit: deferred.Lit, materials: Float[np.ndarray, "n 8"]) -> Float[np.ndarray, "n 3"]:
@@ -68,16 +74,17 @@ def radiance(lit: deferred.Lit, packed: Any) -> Any:
 
     Both are Dr.Jit arrays, pixel after pixel. Each pixel reads its own material: the gradient adds nothing up.
     """
-    return _image(partial(bsdf.terms, "principled", specular=0.5), *_lights_of(lit), packed)
+    return _image(partial(bsdf.terms, bsdf.Reflectance("principled", specular=0.5)), _film(lit), packed)
 
 
 def _arrays(lit: deferred.Lit, materials: Float[np.ndarray, "n 8"]) -> tuple[Any, ...]:
     import mitsuba as mi
 
-    return *_lights_of(lit), own(mi.Float, np.ascontiguousarray(materials, np.float32).ravel())
+    return _film(lit), own(mi.Float, np.ascontiguousarray(materials, np.float32).ravel())
 
 
-def _lights_of(lit: deferred.Lit) -> tuple[Any, Any, Any, Any]:
+def _film(lit: deferred.Lit) -> tuple[Any, Any, Any, Any]:
+    """(wi, mask, directional lights, ambient light) of a lit film."""
     import drjit as dr
     import mitsuba as mi
 
@@ -93,26 +100,29 @@ def _lights(wi: Any, directional: list[Any], ambient: Any) -> Iterator[tuple[Any
         yield from ((wo, ambient * weight) for wo, weight in deferred.ambient_directions(wi))
 
 
-def _image(terms: Callable, wi, mask, directional, ambient, packed) -> Any:
+def _image(terms: Callable, film: tuple, packed) -> Any:
+    """`film` is (wi, mask, directional lights, ambient light), as in `deferred.Lit`."""
     import drjit as dr
     import mitsuba as mi
 
+    wi, mask, directional, ambient = film
     v = _values(packed, wi)
-    paint, gloss = mi.Color3f(0), mi.Color3f(0)
+    linear, constant = mi.Color3f(0), mi.Color3f(0)
     for wo, light in _lights(wi, directional, ambient):
-        p, g = terms(wi, wo, mi.Vector3f(*v[3:6]), v[6], v[7])
-        paint, gloss = paint + light * p, gloss + light * g
-    return dr.ravel(dr.select(mask, mi.Color3f(*v[:3]) * paint + gloss, 0))
+        p, g = terms(wi, wo, mi.Vector3f(*v[NORMAL]), v[FETCHED_ROUGHNESS], v[FETCHED_METALLIC])
+        linear, constant = linear + light * p, constant + light * g
+    return dr.ravel(dr.select(mask, mi.Color3f(*v[ALBEDO]) * linear + constant, 0))
 
 
-def _pull(terms: Callable, moving: tuple[str, ...], wi, mask, directional, ambient, packed, adjoint) -> Any:
+def _pull(terms: Callable, moving: tuple[str, ...], film: tuple, packed, adjoint) -> Any:
     """Light by light, so that each has a short gradient of its own; the directions are held fast."""
     import drjit as dr
     import mitsuba
 
     mi: Any = mitsuba  # its stubs do not know ArrayXf
+    wi, mask, directional, ambient = film
     v = _values(packed, wi)
-    albedo, lane = mi.Color3f(*v[:3]), dr.arange(mi.UInt32, dr.width(wi))
+    albedo, lane = mi.Color3f(*v[ALBEDO]), dr.arange(mi.UInt32, dr.width(wi))
     at = dr.select(mask, dr.gather(mi.Color3f, adjoint, lane), 0)
     by_albedo, by_rest = mi.Color3f(0), [mi.Float(0)] * 5
     for wo, light in _lights(wi, directional, ambient):

@@ -2,10 +2,11 @@
 
 Where geometry, cameras and lights are known and light arrives from deltas, a texel's own observations determine its
 own unknowns x = (albedo r, g, b, tilt x, tilt y, roughness, metallic), and no picture has to be rendered. Soft light is
-taken for as many directional lights as the sky has cells, each of which widens a gloss by its own width. With the
-reflectance albedo · paint + gloss of `render/bsdf.py` and irradiance E the model of an observation is, per channel c,
+taken for as many directional lights as the sky has cells, each of which widens the lobe by its own width. With the
+reflectance albedo · linear + constant of `render/bsdf.py` and irradiance E the model of an observation is, per channel
+c, with q = (tilt, roughness, metallic),
 
-    f_c(x) = sum over its lights of E_c (albedo_c paint(tilt, roughness, metallic) + gloss(tilt, roughness, metallic))
+    f_c(x) = sum over its lights of E_c (albedo_c linear(q) + constant(q))
 
 and the solver minimises  sum_c,k rho(w_k (f_ck - y_ck)) + sum_j prior_j (x_j - mean_j)²  with Huber's rho. The albedo
 enters linearly and its channels do not meet, so the normal matrix is an arrow: the albedo is eliminated by its Schur
@@ -125,9 +126,9 @@ class Problem:
 
         def body(k, done):
             index = k * chunk["width"] + chunk["lane"]
-            paint, gloss, _, _ = self._response(chunk, index, x, slopes=False)
+            linear, constant, _, _ = self._response(chunk, index, x, slopes=False)
             for c in range(3):
-                dr.scatter(seen[c], dr.fma(x[c], paint[c], gloss[c]), index)
+                dr.scatter(seen[c], dr.fma(x[c], linear[c], constant[c]), index)
             return k + 1, done
 
         start = (dr.zeros(type(chunk["count"]), chunk["width"]), dr.zeros(type(x[0]), chunk["width"]))
@@ -176,22 +177,22 @@ class Problem:
         def body(k, *flat):
             sums = unflat(flat)
             index = k * chunk["width"] + chunk["lane"]
-            paint, gloss, d_paint, d_gloss = self._response(chunk, index, x, slopes=True)
+            linear, constant, d_linear, d_constant = self._response(chunk, index, x, slopes=True)
             weight = dr.gather(kind, chunk["weight"], index)
             aa, aq, qq, ga, gq = (list(part) for part in sums[:5])
             cost = sums.cost
             residual, slope = [], []
             for c in range(3):
                 y = dr.gather(kind, chunk["rgb"][c], index)
-                residual.append(weight * (dr.fma(x[c], paint[c], gloss[c]) - y))
-                slope.append([weight * dr.fma(x[c], d_paint[c][q], d_gloss[c][q]) for q in range(4)])
+                residual.append(weight * (dr.fma(x[c], linear[c], constant[c]) - y))
+                slope.append([weight * dr.fma(x[c], d_linear[c][q], d_constant[c][q]) for q in range(4)])
             # One robust weight for the three channels: what spoils an observation spoils its colour.
             size = dr.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
             inside = size <= huber
             robust = dr.select(inside, 1, huber / dr.maximum(size, 1e-20))
             cost += dr.select(inside, dr.square(size), huber * (2 * size - huber))
             for c in range(3):
-                a, r = weight * paint[c], residual[c] * robust
+                a, r = weight * linear[c], residual[c] * robust
                 ra = a * robust
                 aa[c] = dr.fma(ra, a, aa[c])
                 ga[c] = dr.fma(a, r, ga[c])
@@ -208,7 +209,7 @@ class Problem:
         return unflat(done[1:])
 
     def _response(self, chunk: dict, index: Any, x: list, *, slopes: bool) -> tuple[list, list, list, list]:
-        """paint and gloss times irradiance per channel, and their derivatives by the tilt, roughness and metallic."""
+        """Both terms of the reflectance times irradiance per channel, and their derivatives by all but the albedo."""
         import drjit as dr
         import mitsuba
 
@@ -253,12 +254,12 @@ class Problem:
         irradiance = [row[4 + c] * scale for c in range(3)]
         chosen = terms if not slopes else differences if self.options.differences else derivatives
         width2 = dr.gather(mi.Float, self.rig["light"], light * 8 + 7) if self.soft else None
-        paint, gloss, d_paint, d_gloss = chosen(self.options, wi, wo, x[3:], width2)
+        linear, constant, d_linear, d_constant = chosen(self.options, wi, wo, x[3:], width2)
         return (
-            [e * paint for e in irradiance],
-            [e * gloss for e in irradiance],
-            [[e * d for d in d_paint] for e in irradiance],
-            [[e * d for d in d_gloss] for e in irradiance],
+            [e * linear for e in irradiance],
+            [e * constant for e in irradiance],
+            [[e * d for d in d_linear] for e in irradiance],
+            [[e * d for d in d_constant] for e in irradiance],
         )
 
 
@@ -272,8 +273,8 @@ def _project(x: list, options: Options) -> list:
 
 
 def _flat4(parts: tuple) -> list:
-    paint, gloss, d_paint, d_gloss = parts
-    return [*paint, *gloss, *(d for row in d_paint for d in row), *(d for row in d_gloss for d in row)]
+    linear, constant, d_linear, d_constant = parts
+    return [*linear, *constant, *(d for row in d_linear for d in row), *(d for row in d_constant for d in row)]
 
 
 def _unflat4(flat: Any, slopes: bool) -> tuple[list, list, list, list]:

@@ -29,7 +29,7 @@ class Rig:
     near        1 for a point light, whose irradiance is that at distance 1
     irradiance  linear Rec.709
     cells       from which light on those of picture v are the cells of the sky, in their order; None: nowhere
-    width2      of such a cell, see `sky.Cells`; 0 for other lights
+    width2      of such a cell, see `sky.EnvironmentCells`; 0 for other lights
     """
 
     eye: Float[np.ndarray, "v 3"]

@@ -10,10 +10,10 @@ from mistyle.render.texel_lm import Problem, local
 from mistyle.render.texel_response import terms
 
 
-def shares(
+def light_transport_matrix(
     problem: Problem, values: Float[np.ndarray, "t 7"], observations: int, cells: int
 ) -> tuple[Float[np.ndarray, "o k"], Float[np.ndarray, "o k"]]:
-    """paint and gloss of every observation per unit irradiance from each cell, zero where the mesh hides it.
+    """Both terms of every observation per unit irradiance from each cell, zero where the mesh hides it.
 
     The problem's pictures have `cells` cells of the sky and no other light; the model's radiance in channel c is
     sum_k E_kc (albedo_c paint_k + gloss_k), as in `texel_lm.py`.
@@ -22,7 +22,7 @@ def shares(
     import mitsuba
 
     mi: Any = mitsuba
-    paint, gloss = np.zeros((observations, cells), np.float32), np.zeros((observations, cells), np.float32)
+    linear, constant = np.zeros((observations, cells), np.float32), np.zeros((observations, cells), np.float32)
     for chunk in problem.chunks:
         width = chunk["width"]
         material = [mi.Float(aligned(values[chunk["texel"], j])) for j in range(3, 7)]
@@ -43,6 +43,6 @@ def shares(
             word = dr.gather(mi.UInt32, chunk["open"], (cell >> 5) * width + lane)
             free = ((word >> (cell & 31)) & 1) == 1
             rows = chunk["rows"].reshape(-1, width)[slot, :count]
-            for result, part in zip((paint, gloss), parts[:2], strict=True):
+            for result, part in zip((linear, constant), parts[:2], strict=True):
                 result[rows] = np.array(dr.select(free, part, 0)).reshape(count, cells)
-    return paint, gloss
+    return linear, constant

@@ -12,15 +12,15 @@ from mistyle.core.lanes import aligned
 from mistyle.core.light import SOFT, Directional, Light, Lights, Point, direction_in_world, position_in_world
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
-from mistyle.render.hits import BLOCK_RAYS
-from mistyle.render.sky import even_directions, gathered_in
+from mistyle.render.hits import BLOCK_RAYS, camera_rays
+from mistyle.render.sky import bin_environment, even_directions
 from mistyle.render.texel_lm import Rig
 
 SKY_CELLS = 128
 
 
 @dataclass(frozen=True)
-class Look:
+class GBuffer:
     """Surface points through the pixel centres of a camera, world; zero beside the mesh.
 
     normal  interpolated shading normal, unit, not turned towards the camera
@@ -33,7 +33,7 @@ class Look:
     lit: tuple[Bool[np.ndarray, "h w"], ...]
 
 
-def look(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> Look:
+def trace_gbuffer(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> GBuffer:
     """One exact ray through every pixel centre, and from where it ends one shadow ray to every delta light.
 
     Lights are Directional or Point; their frame "camera" is that of `camera`. Shadow rays start where Mitsuba's do.
@@ -48,13 +48,8 @@ def look(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> Look:
     mask, lit = np.zeros(height * width, bool), np.zeros((len(lights), height * width), bool)
     for low in range(0, height * width, BLOCK_RAYS):
         part = slice(low, min(low + BLOCK_RAYS, height * width))
-        # Made for every block: a product with a literal zero, as upright cameras have one, resizes that zero.
-        right, down, forward = (mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T)
         index = dr.arange(mi.UInt32, part.start, part.stop)
-        x = (mi.Float(index % width) + 0.5 - camera.centre[0]) / camera.focal
-        y = (mi.Float(index // width) + 0.5 - camera.centre[1]) / camera.focal
-        ray = mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))
-        point, _ = deferred.intersect(traced, ray, None)
+        point, _ = deferred.intersect(traced, camera_rays(camera, index, 0.5, 0.5), None)
         valid = point.is_valid()
         reached = [valid & ~traced.scene.ray_test(_shadow(point, light, camera), active=valid) for light in lights]
         where, facing = point.p & valid, point.sh_frame.n & valid
@@ -63,7 +58,7 @@ def look(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> Look:
         for k, each in enumerate(reached):
             lit[k, part] = np.array(each)
     shape = camera.size
-    return Look(
+    return GBuffer(
         position.reshape(*shape, 3),
         normal.reshape(*shape, 3),
         mask.reshape(shape),
@@ -94,7 +89,7 @@ def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
         if soft:
             key = tuple(map(id, soft))
             if key not in known:
-                known[key] = gathered_in(soft, even_directions(SKY_CELLS))
+                known[key] = bin_environment(soft, even_directions(SKY_CELLS))
             sky = known[key]
             vector.extend(sky.direction)
             irradiance.extend(sky.irradiance)

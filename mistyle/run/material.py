@@ -281,7 +281,7 @@ def pixels_of(captures: Captures) -> list[int]:
 
 def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, report: Report) -> Any:
     """The fit, with checkpoints in work/ under the stage's key: one of another job is not taken up."""
-    from mistyle.stages.recover import recover
+    from mistyle.stages.recover import Checkpoints, recover
     from mistyle.stages.texels import start_maps
 
     s: MaterialSettings = run.job.settings
@@ -300,8 +300,9 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
         s.seed,
         report,
         start=start,
-        save=lambda arrays: checkpoint.save(folder, arrays),
-        resume=checkpoint.load(folder, run.progress.note),
+        checkpoints=Checkpoints(
+            save=lambda arrays: checkpoint.save(folder, arrays), resume=checkpoint.load(folder, run.progress.note)
+        ),
     )
 
 
@@ -311,11 +312,11 @@ def measure(
     """Every picture predicted by the fitted maps and compared with what it shows."""
     from mistyle.core.image import srgb_from_linear
     from mistyle.measure.metrics import psnr
-    from mistyle.render import shade
     from mistyle.render.draw import tracer
+    from mistyle.render.material_table import pack
 
     chosen, sizes = settings.recover, [m.roughness.shape for m in maps]
-    traced, table = tracer(asset.mesh), shade.pack(maps)
+    traced, table = tracer(asset.mesh), pack(maps)
     other = "gltf" if chosen.model == "principled" else "principled"
     _, held = hold_out(captures, settings.references)
     errors: list[float] = []
@@ -351,8 +352,7 @@ def measure(
 
 def picture_of(traced: Any, captures: Captures, sizes, table, model: str, chosen: Any) -> tuple[np.ndarray, np.ndarray]:
     """The one picture of `captures` as the maps predict it, and its coverage."""
-    from mistyle.render.shade import Shade
+    from mistyle.render.shade import MaterialRenderer, RenderOptions
 
-    shade = Shade(traced, captures, sizes, model=model, frame=chosen.frame, subsamples=chosen.subsamples, memory=0)
-    shade.table = table
-    return shade.image_and_coverage(0)
+    options = RenderOptions(model, chosen.frame, chosen.subsamples, memory=0)
+    return MaterialRenderer(traced, captures, sizes, options).image_and_coverage(table, 0)

@@ -36,6 +36,23 @@ DESCRIBED = ("normal", "roughness", "albedo", "metallic")
 
 
 @dataclass(frozen=True)
+class LitViews:
+    """Views (linear rgb) that show the object under known lights."""
+
+    views: Sequence[View]
+    lights: Lights
+
+    def captures(self) -> Captures:
+        """The same as references of a recovery."""
+        return in_memory(
+            [view.camera for view in self.views],
+            [self.lights] * len(self.views),
+            [np.nan_to_num(view.rgb) for view in self.views],
+            [view_mask(view) for view in self.views],
+        )
+
+
+@dataclass(frozen=True)
 class Solved:
     """The solution at the fit's resolution, one set of maps per texture set, and the views without their light.
 
@@ -67,7 +84,8 @@ def lit_phases(
 
     `style` as in `two_phase`. The same inputs, settings, seed and thread count give the same bytes.
     """
-    solved = solve(mesh, maps, targets, texels, lights, settings, seed, lambda done: progress(SOLVED_SHARE * done))
+    lit = LitViews(targets, lights)
+    solved = solve(mesh, maps, lit, texels, settings, seed, lambda done: progress(SOLVED_SHARE * done))
     better = solved.residual[1] < solved.residual[0]
     begun = laid(maps, solved.start, solved.maps) if better else list(maps)
     only_albedo = settings.model_copy(update={"iterations1": 0})
@@ -93,23 +111,17 @@ def lit_phases(
 def solve(
     mesh: Mesh,
     maps: Sequence[Maps],
-    targets: Sequence[View],
+    lit: LitViews,
     texels: Sequence[Texels],
-    lights: Lights,
     settings: FitSettings,
     seed: int,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Solved:
     """Normal, roughness and albedo from the views, as fine as the views can tell texels apart."""
-    by = shrinkage(mesh, texels, targets, settings.texels_per_pixel)
+    by = shrinkage(mesh, texels, lit.views, settings.texels_per_pixel)
     coarse = [t if by == 1 else rasterise(mesh, k, len(t.covered) // by) for k, t in enumerate(texels)]
     start = [_shrunk(m, t.covered.shape) for m, t in zip(maps, coarse, strict=True)]
-    captures = in_memory(
-        [view.camera for view in targets],
-        [lights] * len(targets),
-        [np.nan_to_num(view.rgb) for view in targets],
-        [view_mask(view) for view in targets],
-    )
+    targets, captures = lit.views, lit.captures()
     # Under soft light steps on whole pictures took as long as the texels and were undone.
     chosen = RecoverSettings(
         solver="texels" if has_soft(captures.lights) else "both",
@@ -117,11 +129,11 @@ def solve(
         joint_subsamples=JOINT_SAMPLES,
     )  # fmt: skip
     found = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
-    made = tuple(_where_seen(found, start, coarse, k) for k in range(len(start)))
-    residual, unlit = _explained(mesh, captures, (start, made), targets)
+    fitted = tuple(_where_seen(found, start, coarse, k) for k in range(len(start)))
+    residual, unlit = _explained(mesh, captures, (start, fitted), targets)
     progress(1.0)
     trace = {f"phase1.{name}": values for name, values in found.trace.items()}
-    return Solved(tuple(start), made, tuple(unlit), residual, trace, found.notes)
+    return Solved(tuple(start), fitted, tuple(unlit), residual, trace, found.notes)
 
 
 def laid(
@@ -168,18 +180,20 @@ def _explained(
 ) -> tuple[tuple[float, float], list[View]]:
     """The residuals of two solutions, and the views without their light by the second one."""
     from mistyle.render.draw import tracer
-    from mistyle.render.shade import Shade, pack
+    from mistyle.render.material_table import pack
+    from mistyle.render.shade import MaterialRenderer, RenderOptions
     from mistyle.render.unlit import unlit
 
     traced, sizes = tracer(mesh), [m.roughness.shape for m in both[0]]
-    shade = Shade(traced, captures, sizes, subsamples=SUBSAMPLES, gradients=False)
+    options = RenderOptions(subsamples=SUBSAMPLES, gradients=False)
+    renderer = MaterialRenderer(traced, captures, sizes, options)
     lost = np.zeros((2, 2))
     plain = [rgb for rgb, _ in unlit(traced, both[1], captures.cameras)]
     result = []
     for j, maps in enumerate(both):
-        shade.table = pack(maps)
+        table = renderer.upload(pack(maps))
         for k, view in enumerate(targets):
-            mask, lit = captures.load(k)[1], shade.image(k)
+            mask, lit = captures.load(k)[1], renderer.image(table, k)
             lost[j] += [float(((view.rgb - lit)[mask] ** 2).sum()), float((view.rgb[mask] ** 2).sum())]
             if j == 1:
                 result.append(replace(view, rgb=without_light(view, lit, plain[k], mask)))

@@ -15,14 +15,14 @@ Blocks = Float[np.ndarray, "t 6 6"]
 
 
 @dataclass(frozen=True)
-class Linear:
+class LinearisedImage:
     """A picture around the maps: what its pixels fetch (sparse, pixels x texels: B), its channels' derivatives by their
     own albedo, tilt (2) and roughness (D), the weights of its channels (W), and reference - picture."""
 
     fetch: Any
     derivative: Float[np.ndarray, "p 3 4"]
     weight: Float[np.ndarray, "p 3"]
-    wrong: Float[np.ndarray, "p 3"]
+    residual: Float[np.ndarray, "p 3"]
 
 
 def _full(derivative: Float[np.ndarray, "p 3 4"]) -> Float[np.ndarray, "p 3 6"]:
@@ -32,11 +32,11 @@ def _full(derivative: Float[np.ndarray, "p 3 4"]) -> Float[np.ndarray, "p 3 6"]:
     return full
 
 
-def own_blocks(linear: Sequence[Linear], count: int) -> Blocks:
+def diagonal_blocks(images: Sequence[LinearisedImage], count: int) -> Blocks:
     """What the pictures say about each texel if all others stand still: sum of b² D' W D."""
     above = np.triu_indices(6)
     total = np.zeros((count, len(above[0])), np.float32)
-    for each in linear:
+    for each in images:
         full, square = _full(each.derivative), each.fetch.copy()
         square.data = square.data**2
         own = np.stack(
@@ -48,29 +48,29 @@ def own_blocks(linear: Sequence[Linear], count: int) -> Blocks:
     return blocks
 
 
-def curved(linear: Sequence[Linear], v: Unknowns) -> Unknowns:
+def normal_matvec(images: Sequence[LinearisedImage], v: Unknowns) -> Unknowns:
     """B' D' W D B v."""
     total = np.zeros_like(v)
-    for each in linear:
+    for each in images:
         pixels, d = each.fetch @ v, each.derivative
         change = d[:, :, 0] * pixels[:, :3] + np.einsum("pcj,pj->pc", d[:, :, 1:], pixels[:, 3:])
-        total += _back(each, change)
+        total += apply_transpose(each, change)
     return total
 
 
-def right_side(linear: Sequence[Linear], count: int) -> Unknowns:
+def rhs(images: Sequence[LinearisedImage], count: int) -> Unknowns:
     """B' D' W (reference - picture)."""
-    return sum((_back(each, each.wrong) for each in linear), np.zeros((count, 6), np.float32))
+    return sum((apply_transpose(each, each.residual) for each in images), np.zeros((count, 6), np.float32))
 
 
-def _back(each: Linear, channels: Float[np.ndarray, "p 3"]) -> Unknowns:
+def apply_transpose(each: LinearisedImage, channels: Float[np.ndarray, "p 3"]) -> Unknowns:
     """B' D' W of values of a picture's channels."""
     weighted, d = each.weight * channels, each.derivative
     pixels = np.concatenate([d[:, :, 0] * weighted, np.einsum("pcj,pc->pj", d[:, :, 1:], weighted)], axis=1)
     return each.fetch.T @ pixels
 
 
-def conjugate(applied: Callable[[Unknowns], Unknowns], right: Unknowns, inverse: Blocks) -> Unknowns:
+def pcg(applied: Callable[[Unknowns], Unknowns], right: Unknowns, inverse: Blocks) -> Unknowns:
     """Conjugate gradients from zero, preconditioned by `inverse`, texel by texel."""
 
     def dot(a: np.ndarray, b: np.ndarray) -> float:

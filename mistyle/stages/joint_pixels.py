@@ -10,19 +10,23 @@ highlights, and how a metal's tilt turns what it mirrors, are taken to stay.
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.camera import Camera, by_camera
 from mistyle.core.light import Point
-from mistyle.render.hits import Hits, collect, corners
+from mistyle.render.hits import SampleBlock, Sampling, TexturedMesh, bilinear_taps, collect
 from mistyle.render.indirect import PALE, enlarged
+from mistyle.render.material_table import ALBEDO, METALLIC, TILT
+from mistyle.stages.fit_context import FitContext
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover_observe import covered_rows, points_of
 from mistyle.stages.recover_table import fill
-from mistyle.stages.recover_texels import Work
+
+if TYPE_CHECKING:
+    from mistyle.render.shade import MaterialRenderer
 
 PIXEL, WEIGHT = 240, 8  # bytes of a pixel, and of a bilinear weight
 LEAST_Z = 0.2  # of a mapped normal
@@ -32,7 +36,7 @@ Frames = Float[np.ndarray, "t 9"]
 
 
 @dataclass(frozen=True)
-class Pixels:
+class ImageFootprint:
     """Pixels of one picture: flat indices, which share of their samples is lit, and the mean bilinear weights of those,
     as a sparse matrix, pixels x unknown texels; of all samples where none is lit."""
 
@@ -42,51 +46,54 @@ class Pixels:
 
 
 @dataclass(frozen=True)
-class Unknown:
+class UnknownTexels:
     """The texels that are solved for, rows of the table: those that are covered or that a picture shows (`seen`)."""
 
     rows: Int[np.ndarray, " t"]
     seen: Bool[np.ndarray, " t"]
 
 
-def all_pixels(shade, work: Work) -> tuple[list[Pixels], Unknown, float] | None:
+def image_footprints(
+    context: FitContext, renderer: "MaterialRenderer"
+) -> tuple[list[ImageFootprint], UnknownTexels, float] | None:
     """All pictures' lit pixels, and where light between surfaces is looked for the others that show the mesh; what is
     solved for; and the bytes that they leave of the memory. None where it does not suffice."""
-    settings, cameras = work.settings, work.captures.cameras
-    left, found, seen = settings.memory * 1e9, dict[int, Pixels](), np.zeros(shade.texels, bool)
+    settings, cameras = context.settings, context.captures.cameras
+    left, images, seen = settings.memory * 1e9, dict[int, ImageFootprint](), np.zeros(renderer.texels, bool)
     for group in by_camera(cameras):
-        every = _seen_pixels(shade, work, cameras[group[0]]) if settings.bounces else None
+        every = _covered_pixels(context, renderer, cameras[group[0]]) if settings.bounces else None
         for k in group:
-            lit = _lit_pixels(shade, k)
-            found[k] = lit if every is None else _and_dark(lit, every)
-            fetch = found[k].fetch
+            lit = _lit_pixels(renderer, k)
+            images[k] = lit if every is None else _and_dark(lit, every)
+            fetch = images[k].fetch
             seen[fetch.indices] = True
             left -= PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
             if left < 0:
                 return None
-    result = [found[k] for k in range(len(cameras))]
-    rows = np.flatnonzero(seen | np.concatenate([c.ravel() for c in work.where.covered]))
-    number = np.zeros(shade.texels, np.int32)
+    result = [images[k] for k in range(len(cameras))]
+    rows = np.flatnonzero(seen | np.concatenate([c.ravel() for c in context.atlas.covered]))
+    number = np.zeros(renderer.texels, np.int32)
     number[rows] = np.arange(len(rows), dtype=np.int32)
     for pixels in result:
         pixels.fetch.indices = number[pixels.fetch.indices]
         pixels.fetch.resize(pixels.fetch.shape[0], len(rows))
-    return result, Unknown(rows, seen[rows]), left
+    return result, UnknownTexels(rows, seen[rows]), left
 
 
-def _lit_pixels(shade, picture: int) -> Pixels:
+def _lit_pixels(renderer: "MaterialRenderer", picture: int) -> ImageFootprint:
     """Those that a light reaches."""
-    return _pixels((block.hits for block in shade.blocks(picture)), shade.sizes, shade.subsamples)
+    return _footprint((block.hits for block in renderer.blocks(picture)), renderer.sizes, renderer.subsamples)
 
 
-def _seen_pixels(shade, work: Work, camera: Camera) -> Pixels:
+def _covered_pixels(context: FitContext, renderer: "MaterialRenderer", camera: Camera) -> ImageFootprint:
     """Those that show the mesh: by a flash at the camera, which throws no shadow."""
-    every, options = np.ones(camera.size, bool), {"subsamples": shade.subsamples, "shadows": False, "gradients": False}
-    hits = collect(work.traced, camera, FLASH, every, shade.sizes, work.tangents, **options)
-    return _pixels(hits, shade.sizes, shade.subsamples)
+    surface = TexturedMesh(context.traced, renderer.sizes, context.tangents)
+    sampling = Sampling(renderer.subsamples, shadows=False, gradients=False)
+    blocks = collect(surface, camera, FLASH, np.ones(camera.size, bool), sampling)
+    return _footprint(blocks, renderer.sizes, renderer.subsamples)
 
 
-def _pixels(blocks: Iterable[Hits], sizes: Sequence[tuple[int, int]], subsamples: int) -> Pixels:
+def _footprint(blocks: Iterable[SampleBlock], sizes: Sequence[tuple[int, int]], subsamples: int) -> ImageFootprint:
     from scipy.sparse import csr_array, vstack
 
     texels_of_all = sum(rows * columns for rows, columns in sizes)
@@ -96,39 +103,39 @@ def _pixels(blocks: Iterable[Hits], sizes: Sequence[tuple[int, int]], subsamples
         samples, (count, pixels, _) = hits.samples, hits.counts
         slot, texel, step = (np.array(a)[:count].astype(np.int64) for a in (samples.slot, samples.texel, samples.step))
         place = np.stack([np.array(samples.x)[:count], np.array(samples.y)[:count]], axis=1)
-        texels, weights = corners(texel, step, place, sizes)
+        texels, weights = bilinear_taps(texel, step, place, sizes)
         number = np.bincount(slot, minlength=pixels)
         weights = weights / number[slot][:, None]
         entries = (np.repeat(slot, 4).astype(np.int32), texels.ravel().astype(np.int32))
         fetches.append(csr_array((weights.ravel().astype(np.float32), entries), shape=(pixels, texels_of_all)))
         index.append(np.array(hits.pixels.index)[:pixels].astype(int))
         lit.append((number / subsamples).astype(np.float32))
-    return Pixels(np.concatenate(index), np.concatenate(lit), vstack(fetches, format="csr"))
+    return ImageFootprint(np.concatenate(index), np.concatenate(lit), vstack(fetches, format="csr"))
 
 
-def _and_dark(pixels: Pixels, every: Pixels) -> Pixels:
+def _and_dark(pixels: ImageFootprint, every: ImageFootprint) -> ImageFootprint:
     """`pixels`, and those of `every` that are not among them."""
     from scipy.sparse import vstack
 
     dark = np.flatnonzero(~np.isin(every.index, pixels.index))
-    return Pixels(
+    return ImageFootprint(
         np.concatenate([pixels.index, every.index[dark]]),
         np.concatenate([pixels.lit, np.zeros(len(dark), np.float32)]),
         vstack([pixels.fetch, every.fetch[dark]], format="csr"),
     )
 
 
-def frames(work: Work, unknown: Unknown) -> Frames:
+def unknown_frames(context: FitContext, unknown: UnknownTexels) -> Frames:
     """Tangent, bitangent and normal of the unknown texels; of uncovered ones those of the nearest covered one."""
-    position, normal, face = points_of(work.texels)
-    every = np.zeros((work.where.count, 9), np.float32)
-    own = texel_frames(work.traced.mesh, face, position, normal, work.tangents)
-    every[covered_rows(work.texels)] = own.reshape(-1, 9)
-    return fill(every, work.where)[unknown.rows]
+    position, normal, face = points_of(context.texels)
+    every = np.zeros((context.atlas.count, 9), np.float32)
+    own = texel_frames(context.traced.mesh, face, position, normal, context.tangents)
+    every[covered_rows(context.texels)] = own.reshape(-1, 9)
+    return fill(every, context.atlas)[unknown.rows]
 
 
-def between(
-    pixels: Pixels,
+def indirect_jacobian(
+    pixels: ImageFootprint,
     light: Float[np.ndarray, "h w 3"],
     vectors: Float[np.ndarray, "h w 9"],
     size: tuple[int, int],
@@ -142,12 +149,12 @@ def between(
     frame /= np.maximum(np.linalg.norm(frame, axis=2, keepdims=True), 1e-6)
     x, y, z = np.einsum("pca,pja->jpc", arriving, frame)
     fetched = pixels.fetch @ values
-    metallic = fetched[:, 6:7]
-    tilt, diffuse = fetched[:, 3:5], (1 - metallic) / np.float32(np.pi)
-    mirrored = metallic * enlarged(light, size).reshape(-1, 3)[pixels.index] / (fetched[:, :3] + PALE)
+    metallic = fetched[:, METALLIC, None]
+    tilt, diffuse = fetched[:, TILT], (1 - metallic) / np.float32(np.pi)
+    mirrored = metallic * enlarged(light, size).reshape(-1, 3)[pixels.index] / (fetched[:, ALBEDO] + PALE)
     up = np.sqrt(np.maximum(1 - (tilt**2).sum(axis=1), LEAST_Z**2))[:, None]
     along, across = tilt[:, :1], tilt[:, 1:]
-    albedo = diffuse * fetched[:, :3]
+    albedo = diffuse * fetched[:, ALBEDO]
     by = (
         diffuse * np.maximum(along * x + across * y + up * z, 0) + mirrored,
         albedo * (x - along / up * z),
@@ -156,9 +163,9 @@ def between(
     return np.stack(by, axis=2).astype(np.float32)
 
 
-def change(
-    pixels: Pixels, derivative: Float[np.ndarray, "p 3 3"], moved: Float[np.ndarray, "t 8"]
+def indirect_delta(
+    pixels: ImageFootprint, derivative: Float[np.ndarray, "p 3 3"], moved: Float[np.ndarray, "t 8"]
 ) -> Float[np.ndarray, "p 3"]:
     """What light between surfaces changes by when the unknown texels move."""
-    fetched = pixels.fetch @ moved[:, :5]
-    return derivative[:, :, 0] * fetched[:, :3] + np.einsum("pcj,pj->pc", derivative[:, :, 1:], fetched[:, 3:])
+    fetched = pixels.fetch @ moved[:, : TILT.stop]
+    return derivative[:, :, 0] * fetched[:, ALBEDO] + np.einsum("pcj,pj->pc", derivative[:, :, 1:], fetched[:, TILT])

@@ -19,7 +19,7 @@ AROUND = 6  # neighbours of a cell
 
 
 @dataclass(frozen=True)
-class Cells:
+class EnvironmentCells:
     """Every direction belongs to the nearest of k unit vectors (world, towards the light).
 
     angle  solid angle of each cell
@@ -43,21 +43,21 @@ class Cells:
 Radiance = Float[np.ndarray, "k 3"]
 
 
-def cells_at(directions: Float[np.ndarray, "k 3"]) -> Cells:
+def cells_at(directions: Float[np.ndarray, "k 3"]) -> EnvironmentCells:
     """The cells of these directions."""
     towards, angle = _sphere()
     own = np.bincount(_owners(directions, towards), angle, minlength=len(directions))
     near = np.asarray(KDTree(directions).query(directions, AROUND + 1)[1])[:, 1:]
     both = np.stack([np.repeat(np.arange(len(directions)), AROUND), near.ravel()], axis=1)
-    return Cells(directions, np.maximum(own, 1e-6), np.unique(np.sort(both, axis=1), axis=0))
+    return EnvironmentCells(directions, np.maximum(own, 1e-6), np.unique(np.sort(both, axis=1), axis=0))
 
 
-def even_cells() -> Cells:
+def even_cells() -> EnvironmentCells:
     """CELLS cells of nearly one size."""
     return cells_at(even_directions(CELLS).astype(float))
 
 
-def refined(cells: Cells, radiance: Radiance) -> tuple[Cells, Float[np.ndarray, "n 3"]]:
+def refined(cells: EnvironmentCells, radiance: Radiance) -> tuple[EnvironmentCells, Float[np.ndarray, "n 3"]]:
     """CELLS even cells and FINE more inside the old ones, as their light demands, and the same light in all of them."""
     energy = luminance(radiance) * cells.angle
     wish = FINE * energy / max(float(energy.sum()), 1e-20)
@@ -71,7 +71,7 @@ def refined(cells: Cells, radiance: Radiance) -> tuple[Cells, Float[np.ndarray, 
     return new, np.stack(total, axis=1) / new.angle[:, None]
 
 
-def environment_of(cells: Cells, radiance: Radiance) -> Environment:
+def environment_of(cells: EnvironmentCells, radiance: Radiance) -> Environment:
     """The map of the cells' light."""
     towards = environment_directions(ROWS, 2 * ROWS)
     own = _owners(cells.direction, towards.reshape(-1, 3))
@@ -83,7 +83,7 @@ def _owners(middles: Float[np.ndarray, "k 3"], towards: Float[np.ndarray, "n 3"]
     return np.asarray(KDTree(middles).query(towards)[1])
 
 
-def _within(cells: Cells, k: int, count: int) -> Float[np.ndarray, "n 3"]:
+def _within(cells: EnvironmentCells, k: int, count: int) -> Float[np.ndarray, "n 3"]:
     """Directions spread evenly over a disc about the middle of cell k, as large as the cell (a Fibonacci spiral)."""
     middle = cells.direction[k]
     across = np.cross(middle, np.eye(3)[np.abs(middle).argmin()])
@@ -91,8 +91,8 @@ def _within(cells: Cells, k: int, count: int) -> Float[np.ndarray, "n 3"]:
     number = np.arange(count) + 0.5
     away, turn = np.sqrt(cells.angle[k] / np.pi * number / count), np.pi * (1 + 5**0.5) * number
     offset = np.cos(turn)[:, None] * across + np.sin(turn)[:, None] * np.cross(middle, across)
-    found = middle + away[:, None] * offset
-    return found / np.linalg.norm(found, axis=1, keepdims=True)
+    towards = middle + away[:, None] * offset
+    return towards / np.linalg.norm(towards, axis=1, keepdims=True)
 
 
 @cache

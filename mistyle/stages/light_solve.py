@@ -17,15 +17,16 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.render.draw import Tracer
+from mistyle.render.material_table import ALBEDO, ROUGHNESS, TILT
 from mistyle.render.texel_lm import Options, Points, Problem, Rig
-from mistyle.render.texel_shares import shares
+from mistyle.render.texel_shares import light_transport_matrix
 from mistyle.render.texel_views import open_sky
-from mistyle.stages.light_cells import Cells, Radiance
-from mistyle.stages.recover_observe import Gathered
+from mistyle.stages.light_cells import EnvironmentCells, Radiance
+from mistyle.stages.recover_observe import TexelObservations
 from mistyle.stages.recover_prior import LEAST_SEEN
 
 # Of a texel's unknowns: where they are thought to be, and standard deviations. Tilts are small on the whole, or the
-# whole surface would lean towards where the light is wrong.
+# whole surface would lean towards where the light is residual.
 MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.6, 0.0)
 SPREAD = (1.0, 1.0, 1.0, 0.1, 0.1, 0.3, 0.1)
 SMOOTH = 0.05  # weight of the squared relative difference between neighbouring cells
@@ -44,8 +45,8 @@ class Bundle:
     """Everything that stays while light and texels move: `owner` is each observation's texel, `used` whether its
     texel says something of the light, `free` how many of a texel's unknowns may move."""
 
-    gathered: Gathered
-    cells: Cells
+    observed: TexelObservations
+    cells: EnvironmentCells
     problem: Problem
     owner: Int[np.ndarray, " o"]
     used: Bool[np.ndarray, " o"]
@@ -64,14 +65,18 @@ class State:
 
 
 def bundle(
-    traced: Tracer, gathered: Gathered, normal: Float[np.ndarray, "t 3"], cells: Cells, options: Options
+    traced: Tracer,
+    observed: TexelObservations,
+    normal: Float[np.ndarray, "t 3"],
+    cells: EnvironmentCells,
+    options: Options,
 ) -> Bundle:
     """The problem with these cells for a sky; `normal` is the texels' geometric one."""
-    points, count, number = gathered.points, len(cells.angle), len(gathered.rig.eye)
+    points, count, number = observed.points, len(cells.angle), len(observed.rig.eye)
     words = open_sky(traced, points.position, normal, cells.direction.astype(np.float32))
     first = count * np.arange(number + 1)
     rig = Rig(
-        eye=gathered.rig.eye,
+        eye=observed.rig.eye,
         first=first,
         vector=np.tile(cells.direction, (number, 1)).astype(np.float32),
         near=np.zeros(number * count, np.float32),
@@ -79,28 +84,28 @@ def bundle(
         cells=first[:-1],
         width2=np.tile(cells.width2, number).astype(np.float32),
     )
-    problem = Problem(Points(points.position, points.frame, words), rig, gathered.observations, options)
-    owner = np.repeat(np.arange(len(gathered.texel)), gathered.seen)
-    used = (gathered.seen >= LEAST_SEEN)[owner]
-    return Bundle(gathered, cells, problem, owner, used, 7 if options.metallic else 6)
+    problem = Problem(Points(points.position, points.frame, words), rig, observed.observations, options)
+    owner = np.repeat(np.arange(len(observed.texel)), observed.seen)
+    used = (observed.seen >= LEAST_SEEN)[owner]
+    return Bundle(observed, cells, problem, owner, used, 7 if options.metallic else 6)
 
 
 def first_values(bundled: Bundle) -> Values:
     """Grey, flat and rough: where texels begin."""
-    return np.tile(np.array(MEAN, np.float32), (len(bundled.gathered.texel), 1))
+    return np.tile(np.array(MEAN, np.float32), (len(bundled.observed.texel), 1))
 
 
 def texels_under(bundled: Bundle, radiance: Radiance, start: Values, steps: int) -> State:
     """The texels' best answer to a light."""
     _relight(bundled, radiance)
     mean, prior = first_values(bundled), _prior(len(start))
-    found = bundled.problem.solve(start, mean, prior, steps)
-    cost = found.cost + ((found.values - mean) ** 2 * prior).sum(axis=1)
-    seen = bundled.gathered.observations.rgb
-    wrong = (seen - bundled.problem.predict(found.values))[bundled.used]
-    residual = np.sqrt((wrong.astype(float) ** 2).sum() / max(float((seen[bundled.used] ** 2).sum()), 1e-30))
-    told = bundled.gathered.seen >= LEAST_SEEN
-    return State(radiance, found.values, float(cost[told].sum()), float(residual))
+    solution = bundled.problem.solve(start, mean, prior, steps)
+    cost = solution.cost + ((solution.values - mean) ** 2 * prior).sum(axis=1)
+    seen = bundled.observed.observations.rgb
+    residual = (seen - bundled.problem.predict(solution.values))[bundled.used]
+    residual = np.sqrt((residual.astype(float) ** 2).sum() / max(float((seen[bundled.used] ** 2).sum()), 1e-30))
+    often = bundled.observed.seen >= LEAST_SEEN
+    return State(radiance, solution.values, float(cost[often].sum()), float(residual))
 
 
 def light_over(bundled: Bundle, radiance: Radiance, values: Values) -> Radiance:
@@ -112,7 +117,7 @@ def light_over(bundled: Bundle, radiance: Radiance, values: Values) -> Radiance:
     return _least_squares(full, gradient + (matrix + held) @ flat)
 
 
-def together(
+def solve_light_and_texels(
     bundled: Bundle,
     state: State,
     convention: Callable[[Bundle, State], Float[np.ndarray, "3"]],
@@ -156,35 +161,35 @@ def _prior(count: int) -> Values:
 
 def _relight(bundled: Bundle, radiance: Radiance) -> None:
     irradiance = (radiance * bundled.cells.angle[:, None]).astype(np.float32)
-    bundled.problem.relight(np.tile(irradiance, (len(bundled.gathered.rig.eye), 1)))
+    bundled.problem.relight(np.tile(irradiance, (len(bundled.observed.rig.eye), 1)))
 
 
 def _system(bundled: Bundle, radiance: Radiance, values: Values, *, follow: bool) -> tuple[np.ndarray, np.ndarray]:
     """Normal matrix and gradient of the light, channel after channel; with `follow` the texels go along with it."""
-    cells, seen = bundled.cells, bundled.gathered.observations
+    cells, seen = bundled.cells, bundled.observed.observations
     count, total = len(cells.angle), len(seen.rgb)
     _relight(bundled, radiance)
-    paint, gloss = shares(bundled.problem, values, total, count)
-    paint *= cells.angle.astype(np.float32)
-    gloss *= cells.angle.astype(np.float32)
-    albedo = values[bundled.owner, :3]
-    by_light = [albedo[:, c : c + 1] * paint + gloss for c in range(3)]
-    wrong = seen.rgb - np.stack([by_light[c] @ radiance[:, c] for c in range(3)], axis=1)
-    size = np.sqrt(((wrong * seen.weight[:, None]) ** 2).sum(axis=1))
+    linear, constant = light_transport_matrix(bundled.problem, values, total, count)
+    linear *= cells.angle.astype(np.float32)
+    constant *= cells.angle.astype(np.float32)
+    albedo = values[bundled.owner, ALBEDO]
+    by_light = [albedo[:, c : c + 1] * linear + constant for c in range(3)]
+    residual = seen.rgb - np.stack([by_light[c] @ radiance[:, c] for c in range(3)], axis=1)
+    size = np.sqrt(((residual * seen.weight[:, None]) ** 2).sum(axis=1))
     # Robust, and at first, when nothing fits yet, no more so than the middle one of all.
     most = bundled.problem.options.huber * max(1.0, float(np.median(size[bundled.used])) / 1.5)
     weight = seen.weight * np.sqrt(np.minimum(1, most / np.maximum(size, 1e-9)) * bundled.used)
-    wrong = wrong * weight[:, None]
+    residual = residual * weight[:, None]
     by_light = [(part * weight[:, None]).astype(np.float32) for part in by_light]
     matrix, gradient = np.zeros((3 * count, 3 * count)), np.zeros(3 * count)
     for c in range(3):
         # In double precision: what the texels take away later leaves little of it.
         own, part = slice(c * count, (c + 1) * count), by_light[c].astype(float)
-        matrix[own, own], gradient[own] = part.T @ part, part.T @ wrong[:, c]
+        matrix[own, own], gradient[own] = part.T @ part, part.T @ residual[:, c]
     if follow:
-        by_texel = _by_texel(bundled, values, [paint @ radiance[:, c] for c in range(3)]) * weight[:, None, None]
+        by_texel = _by_texel(bundled, values, [linear @ radiance[:, c] for c in range(3)]) * weight[:, None, None]
         by_texel *= ~_stuck(bundled, values)[bundled.owner, None]
-        lost, slope = _followed(bundled, values, by_texel, by_light, wrong)
+        lost, slope = _followed(bundled, values, by_texel, by_light, residual)
         matrix -= lost
         gradient -= slope
     return matrix, gradient
@@ -195,9 +200,9 @@ def _by_texel(bundled: Bundle, values: Values, shine: Sequence[np.ndarray]) -> F
     result = np.zeros((len(bundled.owner), 3, 7), np.float32)
     for c in range(3):
         result[:, c, c] = shine[c]
-    for k in range(3, bundled.free):
+    for k in range(TILT.start, bundled.free):
         low, high = values.copy(), values.copy()
-        low[:, k] = np.maximum(low[:, k] - STEP, bundled.problem.options.floor) if k == 5 else low[:, k] - STEP
+        low[:, k] = np.maximum(low[:, k] - STEP, bundled.problem.options.floor) if k == ROUGHNESS else low[:, k] - STEP
         high[:, k] += STEP
         between = (bundled.problem.predict(high) - bundled.problem.predict(low)) / (high - low)[bundled.owner, k, None]
         result[:, :, k] = between
@@ -207,16 +212,16 @@ def _by_texel(bundled: Bundle, values: Values, shine: Sequence[np.ndarray]) -> F
 def _stuck(bundled: Bundle, values: Values) -> Bool[np.ndarray, "t 7"]:
     """Unknowns at their bounds, which follow nothing."""
     low, high = np.zeros(7), np.ones(7)
-    low[3:5], low[5] = -1, bundled.problem.options.floor
+    low[TILT], low[ROUGHNESS] = -1, bundled.problem.options.floor
     return (values < low + 1e-5) | (values > high - 1e-5)
 
 
 def _followed(
-    bundled: Bundle, values: Values, by_texel: np.ndarray, by_light: Sequence[np.ndarray], wrong: np.ndarray
+    bundled: Bundle, values: Values, by_texel: np.ndarray, by_light: Sequence[np.ndarray], residual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """What the texels' own answers take from the light's matrix and gradient."""
-    cells, start, prior = len(bundled.cells.angle), bundled.gathered.observations.start, np.array(SPREAD) ** -2.0
-    seen = np.flatnonzero(bundled.gathered.seen >= LEAST_SEEN)
+    cells, start, prior = len(bundled.cells.angle), bundled.observed.observations.start, np.array(SPREAD) ** -2.0
+    seen = np.flatnonzero(bundled.observed.seen >= LEAST_SEEN)
     lost, slope = np.zeros((3 * cells, 3 * cells)), np.zeros(3 * cells)
     for low in range(0, len(seen), BLOCK):
         texel = seen[low : low + BLOCK]
@@ -229,7 +234,7 @@ def _followed(
 
         own = by_texel[rows]
         normal = summed(np.einsum("oci,ocj->oij", own, own)).astype(float) + np.diag(prior)
-        pull = summed(np.einsum("oci,oc->oi", own, wrong[rows])) - prior * (values[texel] - np.array(MEAN))
+        pull = summed(np.einsum("oci,oc->oi", own, residual[rows])) - prior * (values[texel] - np.array(MEAN))
         cross = np.zeros((len(texel), 7, 3 * cells))
         for c in range(3):
             for k in range(bundled.free):
@@ -241,7 +246,7 @@ def _followed(
     return lost, slope
 
 
-def _smoothness(cells: Cells, radiance: Radiance) -> Float[np.ndarray, "n n"]:
+def _smoothness(cells: EnvironmentCells, radiance: Radiance) -> Float[np.ndarray, "n n"]:
     """Squared differences of neighbours relative to how bright they are: lamps have edges, and walls are dim."""
     bright, count = radiance.mean(axis=1), len(cells.angle)
     i, j = cells.pairs.T
@@ -253,10 +258,10 @@ def _smoothness(cells: Cells, radiance: Radiance) -> Float[np.ndarray, "n n"]:
     return np.kron(np.eye(3), one)
 
 
-def _means(cells: Cells, wanted: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 n"]:
-    """Rows that give each channel's mean radiance relative to the wanted one."""
+def _means(cells: EnvironmentCells, target: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 n"]:
+    """Rows that give each channel's mean radiance relative to `target`."""
     share = cells.angle / cells.angle.sum()
-    return np.kron(np.diag(1 / np.maximum(wanted, 1e-12)), share)
+    return np.kron(np.diag(1 / np.maximum(target, 1e-12)), share)
 
 
 def _least_squares(matrix: np.ndarray, right: np.ndarray) -> Radiance:

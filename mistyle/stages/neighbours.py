@@ -2,7 +2,7 @@
 
 A chart's border is no border of the surface. Where a texel has no neighbour of its island on one side, the surface is
 followed by one texel's width in that direction, and the texel whose middle lies nearest to there takes that place.
-Charts often end where the material does, too: `believed` finds out where, as far as values are known.
+Charts often end where the material does, too: `weighted_seams` finds out where, as far as values are known.
 """
 
 from collections.abc import Iterable
@@ -63,7 +63,7 @@ def within(among: Links) -> Links:
     return replace(among, seams=(NONE, NONE, NONE, NONE))
 
 
-def believed(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
+def weighted_seams(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
     """The same with seams believed as far as the surface seems to go on there: half where any of `fields` (values and
     their standard deviations) jumps by twice what these and the mean difference of neighbours in the grid let expect.
     """
@@ -107,8 +107,8 @@ def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
         good &= np.einsum("nd,nkd->nk", normal[alone], normal[near]) > OTHER_SIDE
         away = np.maximum(np.abs(row[near] - row[alone, None]), np.abs(column[near] - column[alone, None]))
         good &= (away > BESIDE) | (own[near] != own[alone, None])
-        first, found = good.argmax(axis=1), good.any(axis=1)
-        return _seam(at[alone[found]], at[near[found, first[found]]])
+        first, sewn = good.argmax(axis=1), good.any(axis=1)
+        return _seam(at[alone[sewn]], at[near[sewn, first[sewn]]])
 
     right, left, below, above = (across(*step) for step in STEPS)
     return right, left, below, above

@@ -1,18 +1,18 @@
 """Recovering materials: albedo, normal, roughness and metallic from pictures of known cameras under known light.
 
-First texel by texel (`recover_solve.py`): with geometry, cameras and lights known nothing has to be rendered to
-solve for one texel, and Levenberg-Marquardt gets in twenty steps where gradient descent on pictures does not get in
-hundreds. Then on whole pictures (`recover_pictures.py`), by Adam through `render/shade.py`, which models pixels and
-interpolation exactly. Before, in between and after that neighbours have a word about what pictures leave open
-(`recover_smooth.py`). Under delta lights texels, pictures and neighbours are at last solved for together
-(`recover_joint.py`). Light that reaches the surface by way of other surfaces is estimated with the maps found so far
-and taken off the pictures, in all parts (`bounces`). Lights and cameras are taken as they are given; a common factor
-of light and albedo cannot be told apart, so albedo is as right as the lights' units are.
+1. `recover_texels.py` solves each texel alone by Levenberg-Marquardt. It renders nothing: cameras and lights are known.
+   Twenty such steps reach what hundreds of gradient steps on pictures do not.
+2. `recover_pictures.py` minimises the loss of whole pictures by Adam, through `render/shade.py`, which models pixels
+   and interpolation exactly.
+3. `recover_joint.py` ends with a joint Gauss-Newton over all texels and pictures, under delta lights only.
+
+Smoothness priors (`recover_smooth.py`) act before, between and after the passes of Adam. All parts fit to direct light:
+light between surfaces is estimated with the current maps and taken off the pictures (`bounces`). Lights and cameras are
+taken as given. A common factor of light and albedo is not identifiable: albedo is as right as the lights' units.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,24 +20,33 @@ from jaxtyping import Float, Int
 from mistyle.core.capture import Captures
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
-from mistyle.stages.recover_check import trust, usable, without
-from mistyle.stages.recover_joint import together, where_possible
-from mistyle.stages.recover_pictures import improved
+from mistyle.core.stage_progress import StageProgress
+from mistyle.render.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
+from mistyle.stages.fit_context import DirectCaptures, FitContext
+from mistyle.stages.recover_check import validate_captures
+from mistyle.stages.recover_joint import joint_gauss_newton, where_possible
+from mistyle.stages.recover_pictures import Checkpoints, optimise_on_pictures
 from mistyle.stages.recover_settings import RecoverSettings, descent_steps
-from mistyle.stages.recover_smooth import smoothed
-from mistyle.stages.recover_table import atlas, linked
-from mistyle.stages.recover_texels import Found, Work, solve_level
+from mistyle.stages.recover_smooth import map_smoothing
+from mistyle.stages.recover_table import atlas_of, linked
+from mistyle.stages.recover_texels import TexelEstimate, solve_level
 
-__all__ = ["RecoverSettings", "Recovered", "recover"]
+__all__ = ["Checkpoints", "RecoverSettings", "Recovered", "recover"]
 
 # Standard deviations at which a texel's confidence has fallen to a half: normal (sine), roughness, albedo, metallic.
 HALF_SURE = {"normal": 0.05, "roughness": 0.1, "albedo": 0.05, "metallic": 0.2}
-CHANNELS = {"albedo": slice(0, 3), "normal": slice(3, 5), "roughness": slice(5, 6), "metallic": slice(6, 7)}
+CHANNELS = {
+    "albedo": ALBEDO,
+    "normal": TILT,
+    "roughness": slice(ROUGHNESS, ROUGHNESS + 1),
+    "metallic": slice(METALLIC, METALLIC + 1),
+}
+NO_CHECKPOINTS = Checkpoints()
 
 
 @dataclass(frozen=True)
 class Recovered:
-    """What was found, per texture set.
+    """The fitted maps and their uncertainty, per texture set.
 
     maps        `known` is True where at least one picture observed the texel in the light
     confidence  0..1, 1 sure, 0 nothing seen: 1 / (1 + mean of (standard deviation / HALF_SURE)²)
@@ -68,110 +77,100 @@ def recover(
     progress: Callable[[float], None] = lambda done: None,
     *,
     start: Sequence[Maps] | None = None,
-    save: Callable[[dict[str, np.ndarray]], None] | None = None,
-    resume: dict[str, np.ndarray] | None = None,
+    checkpoints: Checkpoints = NO_CHECKPOINTS,
 ) -> Recovered:
     """Fit one set of maps per texture set to `captures`; equal input, settings, seed and threads give equal bytes.
 
-    `start` maps help the solver and keep their metallic where that is not fitted. Every `settings.checkpoint` seconds
-    `save` receives what `resume` needs to end with the same bytes (only within the steps on whole pictures; what comes
-    before is computed again). Raises InputRefused where no picture can be used; a picture that cannot is left out,
-    and a note says so.
+    `start` maps help the solver and keep their metallic where that is not fitted. `checkpoints` save what a later call
+    needs to end with the same bytes. Raises InputRefused where no picture can be used; a picture that cannot is left
+    out, and a note says so.
     """
     from mistyle.render.draw import tracer
     from mistyle.render.hits import tangents_of
-    from mistyle.render.shade import Shade
 
     settings, notes = where_possible(settings, captures), []
-    indirect: dict[int, np.ndarray] = {}
-    whole = usable(mesh, captures, notes)
-    captures = without(whole, indirect)
-    traced = tracer(mesh)
+    usable, traced = validate_captures(mesh, captures, notes), tracer(mesh)
     # The steps on whole pictures know no neighbours.
-    where = atlas(texels) if settings.solver == "pictures" else linked(mesh, texels)
-    work = Work(traced, tangents_of(mesh, settings.frame), texels, where, captures, settings, notes)
-    pictured = partial(
-        Shade, traced, captures, where.sizes, model=settings.model, frame=settings.frame, shadows=settings.shadows
-    )
-    descends = descent_steps(settings) > 0
-    shade = pictured(
-        subsamples=settings.subsamples, memory=settings.memory * 1e9, weights=trust(captures, indirect),
-        gradients=descends,
-    )  # fmt: skip
-    trace: dict[str, list[float]] = {}
-    found = solve_level(work, shade, start, indirect, seed, trace, lambda done: progress(0.5 * done))
-    if found.solved and settings.smooth:
-        table = smoothed(found.table, found.noise, where, settings.roughness_floor, settings.metallic)
-        found = replace(found, table=table)
-    table = found.table
+    grid = atlas_of(texels) if settings.solver == "pictures" else linked(mesh, texels)
+    tangents = tangents_of(mesh, settings.frame)
+    context = FitContext(traced, tangents, texels, grid, usable, settings, seed, notes)
+    part, descends = StageProgress(progress).part, descent_steps(settings) > 0
+    renderer = context.renderer(gradients=descends)
+    estimate, direct = solve_level(context, renderer, start, part(0, 0.5))
+    renderer.retarget(direct.direct_only(), direct.pixel_confidence)
+    if estimate.solved and settings.smooth:
+        table = map_smoothing(estimate.table, estimate.unconstrained, grid, settings.roughness_floor, settings.metallic)
+        estimate = replace(estimate, table=table)
+    table = estimate.table
     if descends:
-        table = improved(work, shade, found, indirect, seed, trace, lambda d: progress(0.5 + 0.35 * d), save, resume)
-        if found.solved and settings.joint:
+        table, direct = optimise_on_pictures(context, renderer, estimate, direct, part(0.5, 0.85), checkpoints)
+        if estimate.solved and settings.joint:
             # Of finer pictures; what was kept for the others makes room.
-            shade = pictured(subsamples=settings.joint_subsamples, memory=0, gradients=False)
-            table = together(work, shade, table, indirect, seed, trace, lambda d: progress(0.85 + 0.1 * d))
+            renderer = context.renderer(subsamples=settings.joint_subsamples, memory=0)
+            table, direct = joint_gauss_newton(context, renderer, table, direct, part(0.85, 0.95))
     if settings.polish:
-        # Its pictures keep the light between surfaces.
-        table = polished(work, whole, table, seed, trace, lambda d: progress(0.95 + 0.05 * d))
-    shade.table = table
-    residuals = {camera.name: _residual(shade, k) for k, camera in enumerate(captures.cameras)}
+        table = polished(context, table, part(0.95, 1))
+    uploaded = renderer.upload(table)
+    residuals = {
+        camera.name: _residual(direct, renderer.image_and_coverage(uploaded, k), k)
+        for k, camera in enumerate(usable.cameras)
+    }
     progress(1.0)
-    return _recovered(work, found, table, trace, residuals)
+    return _recovered(context, estimate, table, residuals)
 
 
-def polished(
-    work: Work,
-    captures: Captures,
-    table: Float[np.ndarray, "a 8"],
-    seed: int,
-    trace: dict[str, list[float]],
-    progress: Callable[[float], None],
-) -> Float[np.ndarray, "a 8"]:
-    """Steps through `prb` from `table`; a result that explains the pictures no better is dropped, with a note."""
+def polished(context: FitContext, table: MaterialTable, progress: Callable[[float], None]) -> MaterialTable:
+    """Steps through `prb` from `table`, against pictures with all their light.
+
+    A result that explains the pictures no better is dropped, with a note.
+    """
+    from mistyle.render.material_table import pack, unpack
     from mistyle.render.polish import PolishSettings, polish
-    from mistyle.render.shade import pack, unpack
 
-    s = work.settings
+    s = context.settings
     chosen = PolishSettings(s.polish, s.loss, s.polish_rate, s.metallic, s.polish_depth, model=s.model, frame=s.frame)
-    done = polish(work.traced.mesh, unpack(table, work.where.sizes), captures, chosen, seed, progress)
-    trace["polish.loss"], trace["polish.whole"] = list(done.trace), list(done.loss)
-    if not done.loss[1] < done.loss[0]:
-        work.notes.append(f"The polish was undone: the loss went from {done.loss[0]:.3g} to {done.loss[1]:.3g}.")
+    start = unpack(table, context.atlas.sizes)
+    result = polish(context.traced.mesh, start, context.captures, chosen, context.seed, progress)
+    context.trace["polish.loss"], context.trace["polish.whole"] = list(result.trace), list(result.loss)
+    if not result.loss[1] < result.loss[0]:
+        context.notes.append(f"The polish was undone: the loss went from {result.loss[0]:.3g} to {result.loss[1]:.3g}.")
         return table
-    return pack(done.maps)
+    return pack(result.maps)
 
 
-def _residual(shade, k: int) -> float:
-    rgb, mask = shade.captures.load(k)
-    image, coverage = shade.image_and_coverage(k)
+def _residual(direct: DirectCaptures, drawn: tuple[np.ndarray, np.ndarray], k: int) -> float:
+    """Of picture k and its render (`image_and_coverage`): root mean square, relative to the reference's."""
+    (rgb, mask), (image, coverage) = direct.load(k), drawn
     inside = mask & (coverage > 0.999)
     reference = rgb[inside].astype(np.float64)
-    wrong = reference - image[inside]
-    return float(np.sqrt((wrong**2).sum() / max((reference**2).sum(), 1e-30)))
+    residual = reference - image[inside]
+    return float(np.sqrt((residual**2).sum() / max((reference**2).sum(), 1e-30)))
 
 
-def _recovered(work: Work, found: Found, table: np.ndarray, trace, residuals) -> Recovered:
-    from mistyle.render.shade import unpack
+def _recovered(
+    context: FitContext, estimate: TexelEstimate, table: MaterialTable, residuals: dict[str, float]
+) -> Recovered:
+    from mistyle.render.material_table import unpack
 
-    where, settings = work.where, work.settings
+    grid, settings = context.atlas, context.settings
     names = [n for n in CHANNELS if n != "metallic" or settings.metallic]
-    variance = {n: (found.spread[:, CHANNELS[n]] ** 2).mean(axis=1) for n in CHANNELS}
+    variance = {n: (estimate.std[:, CHANNELS[n]] ** 2).mean(axis=1) for n in CHANNELS}
     doubt = np.mean([variance[n] / HALF_SURE[n] ** 2 for n in names], axis=0)
-    sure = np.where(found.seen > 0, 1 / (1 + doubt), 0).astype(np.float32)
+    sure = np.where(estimate.seen > 0, 1 / (1 + doubt), 0).astype(np.float32)
 
     def grids(values: np.ndarray) -> tuple[np.ndarray, ...]:
-        return tuple(values[part].reshape(size) for part, size in zip(where.parts, where.sizes, strict=True))
+        return tuple(values[part].reshape(size) for part, size in zip(grid.parts, grid.sizes, strict=True))
 
-    seen = grids(found.seen.astype(np.int32))
-    maps = [replace(m, known=s > 0) for m, s in zip(unpack(table, where.sizes), seen, strict=True)]
+    seen = grids(estimate.seen.astype(np.int32))
+    maps = [replace(m, known=s > 0) for m, s in zip(unpack(table, grid.sizes), seen, strict=True)]
     spreads = {n: grids(np.sqrt(v).astype(np.float32)) for n, v in variance.items()}
     return Recovered(
         maps=tuple(maps),
         confidence=grids(sure),
-        spread=tuple({n: spreads[n][k] for n in CHANNELS} for k in range(len(where.sizes))),
+        spread=tuple({n: spreads[n][k] for n in CHANNELS} for k in range(len(grid.sizes))),
         seen=seen,
-        views=grids(found.views.astype(np.int32)),
-        trace=trace,
+        views=grids(estimate.views.astype(np.int32)),
+        trace=context.trace,
         residuals=residuals,
-        notes=tuple(work.notes),
+        notes=tuple(context.notes),
     )

@@ -1,53 +1,50 @@
-"""Which reference pictures say something, and what is taken off them."""
+"""Which reference pictures say something, and how far they may be downsampled."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
-from jaxtyping import Float
 
 from mistyle.core.camera import Camera, in_frame, px_from_world
-from mistyle.core.capture import Captures, Loaded, subset
+from mistyle.core.capture import Captures, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.render.indirect import enlarged
 
 LEAST_VIEWS = 3
 FINE = 0.25  # share of the texels that may be narrower than ACROSS blocks of averaged pixels
 ACROSS = 2
 LEAST_PIXELS = 32  # along the shorter side of a picture that is left
-DISTRUST = 10.0  # of indirect light: what a pixel counts is halved by one tenth of the direct light
 
 
-def usable(mesh: Mesh, captures: Captures, notes: list[str]) -> Captures:
+def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captures:
     """The pictures that say something. A picture of another size than its camera is refused, as are captures of which
     nothing is left."""
     if len(captures) == 0:
         raise InputRefused("No reference pictures came; give at least three views of the object.")
-    kept, silent = [], []
+    usable, silent = [], []
     for k, camera in enumerate(captures.cameras):
         rgb, mask = captures.load(k)
         if rgb.shape[:2] != camera.size or mask.shape != camera.size:
-            found, wanted = "x".join(map(str, rgb.shape[1::-1])), "x".join(map(str, camera.size[::-1]))
+            size, expected = "x".join(map(str, rgb.shape[1::-1])), "x".join(map(str, camera.size[::-1]))
             raise InputRefused(
-                f"Picture '{camera.name}' has {found} pixels, its camera {wanted}. Resize one to the other's size."
+                f"Picture '{camera.name}' has {size} pixels, its camera {expected}. Resize one to the other's size."
             )
         reason = _why_not(mesh, camera, captures.lights[k], rgb, mask)
-        (silent if reason else kept).append((k, reason))
+        (silent if reason else usable).append((k, reason))
     for k, reason in silent:
         notes.append(f"Picture '{captures.cameras[k].name}' is left out: {reason}.")
-    if not kept:
+    if not usable:
         reasons = "; ".join(sorted({reason for _, reason in silent}))
         raise InputRefused(f"None of {len(captures)} reference pictures can be used ({reasons}). Check cameras, masks"
                            " and exposure.")  # fmt: skip
-    views = {captures.cameras[k].world_from_cam.tobytes() for k, _ in kept}
+    views = {captures.cameras[k].world_from_cam.tobytes() for k, _ in usable}
     if len(views) < LEAST_VIEWS:
         notes.append(
             f"Only {len(views)} different view(s) can be used: the fit is singular, normals and roughness are guesses."
             f" Give at least {LEAST_VIEWS} views, better 16 around the object."
         )
-    return subset(captures, [k for k, _ in kept])
+    return subset(captures, [k for k, _ in usable])
 
 
 def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: np.ndarray) -> str:
@@ -64,7 +61,7 @@ def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: 
     return ""
 
 
-def blocks(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
+def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
     """How many pixels of each camera's picture, along a side, can be averaged and leave texels ACROSS blocks wide.
 
     Of the texels that face the camera, hidden ones too, three in four are at least that wide. With texels as wide as
@@ -87,29 +84,3 @@ def blocks(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
         most = max(1, min(camera.size) // LEAST_PIXELS)
         result.append(int(np.clip(np.quantile(wide, FINE), 1, most)) if len(wide) else 1)
     return result
-
-
-def without(captures: Captures, indirect: dict[int, np.ndarray]) -> Captures:
-    """The pictures less their indirect light, which may still come, in pictures that may be coarser."""
-
-    def load(k: int) -> Loaded:
-        rgb, mask = captures.load(k)
-        if k in indirect:
-            rgb = rgb - enlarged(indirect[k], captures.cameras[k].size)
-        return rgb, mask
-
-    return Captures(captures.cameras, captures.lights, load)
-
-
-def trust(captures: Captures, indirect: dict[int, np.ndarray]) -> Callable[[int], np.ndarray]:
-    """Weights of a picture's pixels, 0..1: a half where a tenth of what came directly was taken off as indirect."""
-
-    def weights(k: int) -> Float[np.ndarray, "h w"]:
-        size = captures.cameras[k].size
-        if k not in indirect:
-            return np.ones(size, np.float32)
-        taken = enlarged(indirect[k], size).max(axis=-1)
-        direct = np.maximum(np.nan_to_num(captures.load(k)[0]).max(axis=-1), 0)
-        return (direct / np.maximum(direct + DISTRUST * taken, 1e-9)).astype(np.float32)
-
-    return weights

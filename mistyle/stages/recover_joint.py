@@ -1,54 +1,64 @@
-"""The last part of a recovery: all texels, all pictures and the neighbours' word in one system of equations.
+"""The last part of a recovery: a joint Gauss-Newton over all texels and pictures, with the smoothness prior.
 
-Steps of gradient descent on pictures move every unknown by itself and neighbours are asked in between. Where few
-pictures show a texel, albedo, roughness and tilt can nearly stand for each other, and it takes such steps very long to
-get to the end of that valley. Gauss-Newton steps follow it: around the maps x that were found a pixel is
+Where few pictures show a texel, albedo, roughness and tilt are nearly interchangeable, and gradient descent follows
+that valley slowly. Gauss-Newton steps follow it at once. Around the current maps x a pixel is
 
     I_p(x + d) = I_p(x) + D_p sum_t b_pt d_t
 
 with b the bilinear weights, averaged over the pixel's lit samples, and D its derivative by a change that all its texels
-share, from central differences of whole pictures. (Samples of a pixel are so taken to answer alike; the pictures
-themselves are exact, so where the steps end the pictures agree, up to that.) With R the references and P the
-priors of `recover_smooth.py`, of variances that are measured alike, each step solves
+share, from central differences of whole pictures. (D takes the samples of a pixel as equal. The pictures themselves are
+exact, so the fixed point of the steps is, up to that.) With R the references and P the priors of `recover_smooth.py`,
+whose variances are measured alike, each step solves
 
     (B' D' W D B + P) d = B' D' W (R - I(x)) - P x
 
 by conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, sections 10.3 and 5.1), preconditioned by the
 texels' own blocks. W are Cauchy's weights (Huber, Robust Statistics, 1981, section 7.8) of residuals r of standard
-deviation s, 1 / (s² (1 + (r / (WRONG s))²)): of edges of shadows and outlines some pixels are always wrong. Light
-between surfaces is taken off R as it was estimated; what it changes by with the texels that reflect it to the camera is
-in D and in I (`joint_pixels.py`), so places that no light reaches have a say too. Metallic stays; soft light, whose
-pictures take long to draw, has no such steps.
+deviation s, 1 / (s² (1 + (r / (CAUCHY_SCALE s))²)): some pixels at edges of shadows and outlines are outliers. R is
+without the estimated light between surfaces. Its change with the texels that reflect it to the camera is in D and in I
+(`joint_pixels.py`), so places without direct light count too. Metallic stays. Soft light, whose pictures take long to
+draw, has no such steps.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.capture import Captures
 from mistyle.core.light import has_soft
-from mistyle.render.indirect import enlarged
-from mistyle.stages.joint_algebra import Linear, Unknowns, conjugate, curved, own_blocks, right_side
-from mistyle.stages.joint_pixels import Pixels, Unknown, all_pixels, between, change, frames
-from mistyle.stages.recover_observe import deviation
+from mistyle.core.stage_progress import StageProgress
+from mistyle.render.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, TILT_X, TILT_Y, MaterialTable
+from mistyle.stages.fit_context import DirectCaptures, FitContext
+from mistyle.stages.joint_algebra import LinearisedImage, Unknowns, diagonal_blocks, normal_matvec, pcg, rhs
+from mistyle.stages.joint_pixels import (
+    ImageFootprint,
+    UnknownTexels,
+    image_footprints,
+    indirect_delta,
+    indirect_jacobian,
+    unknown_frames,
+)
+from mistyle.stages.recover_observe import observation_std
 from mistyle.stages.recover_prior import MARGIN, NOTHING
 from mistyle.stages.recover_settings import RecoverSettings, joint_estimates, joint_steps
-from mistyle.stages.recover_smooth import LEAST, firmness
-from mistyle.stages.recover_table import Atlas, joined
-from mistyle.stages.recover_texels import Work, take_off_indirect
+from mistyle.stages.recover_smooth import LEAST, prior_precision_matrix
+from mistyle.stages.recover_table import Atlas, with_seam_weights
+from mistyle.stages.recover_texels import estimate_indirect
+
+if TYPE_CHECKING:
+    from mistyle.render.shade import MaterialRenderer
 
 # By which the pictures' derivatives are taken: columns of the table that move together, and how far to either side. A
 # channel of a picture knows its own channel of the albedo only.
-MOVES = (((0, 1, 2), 0.02), ((3,), 0.003), ((4,), 0.003), ((5,), 0.01))
+MOVES = (((0, 1, 2), 0.02), ((TILT_X,), 0.003), ((TILT_Y,), 0.003), ((ROUGHNESS,), 0.01))
 # The standard deviation of residuals as a multiple of what `noise` and `relative` say: LOOSE times what the median
 # residual proves, since there are about as many unknowns as pixels and most fit better than they tell; FIT at least.
 LOOSE, FIT = 1.4, 0.1
 JUMP = 3.0  # times a change to one side is larger than to the other where it is none of a smooth function
-WRONG = 1.4  # standard deviations from which on a residual counts for less
+CAUCHY_SCALE = 1.4  # standard deviations from which on a residual counts for less
 EDGE = 0.1  # standard deviation where only some of a pixel's samples are lit, relative to those that are
 BETWEEN = 0.15  # that of light between surfaces, relative to it
 FREE = 0.5  # standard deviation that what no picture tells is left
@@ -57,104 +67,115 @@ LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # of a step
 STEEPEST = 0.98  # of a tilt
 SEED = 104_729  # between the seeds of these and others
 
-Table = Float[np.ndarray, "a 8"]
-
 
 @dataclass(frozen=True)
-class Errors:
+class ResidualStd:
     """Of one picture's pixels the standard deviations of residuals, and how far they count at all, 0..1."""
 
-    spread: Float[np.ndarray, " p"]
+    std: Float[np.ndarray, " p"]
     counts: Float[np.ndarray, " p"]
 
 
-def together(
-    work: Work,
-    shade,
-    table: Table,
-    indirect: dict[int, np.ndarray],
-    seed: int,
-    trace: dict[str, list[float]],
-    progress: Callable[[float], None],
-) -> Table:
-    """`settings.joint` such steps from `table`, after one more estimate of light between surfaces (`indirect`), and as
-    many after another one, of the better maps.
+@dataclass(frozen=True)
+class JointProblem:
+    """What stays the same over all steps after one estimate of the light between surfaces.
 
-    `shade` keeps nothing yet; what the steps' own arrays leave of `settings.memory` is for its samples. Steps after
-    which the pictures fit worse are undone, and steps that need more than there is are left out; a note says so.
+    footprints  of every picture
+    reflected   derivatives of that light per picture, see `indirect_jacobian`
     """
-    settings = work.settings
-    found = all_pixels(shade, work)
-    if found is None:
-        work.notes.append(
+
+    context: FitContext
+    renderer: "MaterialRenderer"
+    footprints: Sequence[ImageFootprint]
+    unknown: UnknownTexels
+    direct: DirectCaptures
+    reflected: Sequence[Float[np.ndarray, "_ 3 3"]]
+
+    def images(self, table: MaterialTable) -> list[Float[np.ndarray, "_ 3"]]:
+        """The footprints' pixels of all pictures."""
+        uploaded = self.renderer.upload(table)
+        return [self.renderer.image(uploaded, k).reshape(-1, 3)[p.index] for k, p in enumerate(self.footprints)]
+
+    def references(self) -> list[Float[np.ndarray, "_ 3"]]:
+        """The same of the references, without light between surfaces."""
+        return [self.direct.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(self.footprints)]
+
+
+def joint_gauss_newton(
+    context: FitContext,
+    renderer: "MaterialRenderer",
+    table: MaterialTable,
+    direct: DirectCaptures,
+    progress: StageProgress,
+) -> tuple[MaterialTable, DirectCaptures]:
+    """`settings.joint` such steps from `table`, after one more estimate of light between surfaces, and as many after
+    another one, of the better maps; and the captures with the last estimate.
+
+    `renderer` keeps nothing; what the steps' own arrays leave of `settings.memory` is for samples. Steps after which
+    the pictures fit worse are undone, and steps that need more than there is are left out; a note says so.
+    """
+    settings = context.settings
+    footprints = image_footprints(context, renderer)
+    if footprints is None:
+        context.notes.append(
             f"The joint steps at the end were left out: they need more than the {settings.memory:g} GB of "
             "recover.memory. Give more, or fewer or smaller pictures."
         )
-        return table
-    pictures, unknown, shade.memory = found
-    axes, estimates = frames(work, unknown), joint_estimates(settings) or (0,)
+        return table, direct
+    pictures, unknown, memory = footprints
+    renderer, axes = renderer.with_memory(memory), unknown_frames(context, unknown)
+    estimates = joint_estimates(settings) or (0,)
     for number, samples in enumerate(estimates):
-
-        def heard(done: float, number=number) -> None:
-            progress((number + done) / len(estimates))
-
+        part = progress.part(number / len(estimates), (number + 1) / len(estimates))
         reflected = [np.zeros((len(p.index), 3, 3), np.float32) for p in pictures]
         if samples:
-
-            def arrived(k: int, vectors: np.ndarray, table=table, reflected=reflected) -> None:
-                size = work.captures.cameras[k].size
-                reflected[k] = between(pictures[k], indirect[k], vectors, size, table[unknown.rows], axes)
-
-            new = seed + (number + 1) * SEED
-            take_off_indirect(work, shade, table, indirect, samples, new, lambda d, f=heard: f(0.5 * d), arrived)
-        stepped = partial(_steps, work, shade, table, pictures, unknown, reflected, indirect, trace)
-        moved = stepped(lambda d, f=heard: f(0.5 + 0.5 * d))
+            sampling = samples, context.seed + (number + 1) * SEED
+            for k, light, vectors in estimate_indirect(
+                context, renderer, table, sampling, part.part(0, 0.5), vectors=True
+            ):
+                assert vectors is not None
+                direct, size = direct.with_indirect(k, light), context.captures.cameras[k].size
+                reflected[k] = indirect_jacobian(pictures[k], light, vectors, size, table[unknown.rows], axes)
+        problem = JointProblem(context, renderer, pictures, unknown, direct, reflected)
+        moved = _steps(problem, table, part.part(0.5, 1))
         if moved is None:
             break
         table = moved
-    return table
+    return table, direct
 
 
-def _steps(
-    work: Work,
-    shade,
-    table: Table,
-    pictures: Sequence[Pixels],
-    unknown: Unknown,
-    reflected: Sequence[Float[np.ndarray, "_ 3 3"]],
-    indirect: dict[int, np.ndarray],
-    trace: dict[str, list[float]],
-    progress: Callable[[float], None],
-) -> Table | None:
+def _steps(problem: JointProblem, table: MaterialTable, progress: Callable[[float], None]) -> MaterialTable | None:
     """All steps after one estimate; None, with a note, where the pictures then fit worse."""
-    settings, captures = work.settings, work.captures
-    errors = _errors(captures, pictures, indirect, settings)
-    references = [captures.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(pictures)]
-    images = _images(shade, table, pictures)
-    wrong = _apart(references, images)
-    scale = max(FIT, LOOSE * _robust_spread(wrong, errors))
-    errors = [Errors(e.spread * np.float32(scale), e.counts) for e in errors]
-    costs, x = [_cost(wrong, errors)], table
+    settings, pictures, unknown = problem.context.settings, problem.footprints, problem.unknown
+    errors = _residual_stds(problem)
+    references = problem.references()
+    images = problem.images(table)
+    residuals = _differences(references, images)
+    scale = max(FIT, LOOSE * _robust_std(residuals, errors))
+    errors = [ResidualStd(e.std * np.float32(scale), e.counts) for e in errors]
+    costs, x = [_cost(residuals, errors)], table
     for k in range(settings.joint):
-        derivatives = _derivatives(shade, x, images, pictures, unknown.rows, settings.roughness_floor)
-        for derivative, more in zip(derivatives, reflected, strict=True):
+        derivatives = _derivatives(problem, x, images)
+        for derivative, more in zip(derivatives, problem.reflected, strict=True):
             derivative[:, :, :3] += more
-        linear = [
-            Linear(p.fetch, d, _weights(w, d, e), np.nan_to_num(w))
-            for p, d, w, e in zip(pictures, derivatives, wrong, errors, strict=True)
+        linearised = [
+            LinearisedImage(p.fetch, d, _weights(r, d, e), np.nan_to_num(r))
+            for p, d, r, e in zip(pictures, derivatives, residuals, errors, strict=True)
         ]
         progress((k + 0.5) / settings.joint)
-        x = _moved(x, unknown, _step(x, linear, unknown, work.where), settings.roughness_floor)
-        images = _images(shade, x, pictures)
+        x = _moved(x, unknown, _step(x, linearised, unknown, problem.context.atlas), settings.roughness_floor)
+        images = problem.images(x)
         # Light between surfaces was taken off as the maps were when it was estimated.
         moved = (x - table)[unknown.rows]
-        changed = [change(p, more, moved) for p, more in zip(pictures, reflected, strict=True)]
-        wrong = [w - c for w, c in zip(_apart(references, images), changed, strict=True)]
-        costs.append(_cost(wrong, errors))
+        changed = [indirect_delta(p, more, moved) for p, more in zip(pictures, problem.reflected, strict=True)]
+        residuals = [r - c for r, c in zip(_differences(references, images), changed, strict=True)]
+        costs.append(_cost(residuals, errors))
         progress((k + 1) / settings.joint)
-    trace.setdefault("joint.cost", []).extend(costs)
+    problem.context.trace.setdefault("joint.cost", []).extend(costs)
     if not costs[-1] < costs[0]:
-        work.notes.append(f"The joint steps were undone: the cost went from {costs[0]:.3g} to {costs[-1]:.3g}.")
+        problem.context.notes.append(
+            f"The joint steps were undone: the cost went from {costs[0]:.3g} to {costs[-1]:.3g}."
+        )
         return None
     return x
 
@@ -165,85 +186,77 @@ def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSett
     return settings.model_copy(update={"joint": some})
 
 
-def _errors(
-    captures: Captures, pictures: Sequence[Pixels], indirect: dict[int, np.ndarray], settings: RecoverSettings
-) -> list[Errors]:
+def _residual_stds(problem: JointProblem) -> list[ResidualStd]:
+    direct, pictures, settings = problem.direct, problem.footprints, problem.context.settings
     levels, counts = [], []
     for k, pixels in enumerate(pictures):
-        rgb, mask = captures.load(k)
+        rgb, mask = direct.load(k)
         rgb = rgb.reshape(-1, 3)[pixels.index]
         counts.append((mask.ravel()[pixels.index] & np.isfinite(rgb).all(axis=1)).astype(np.float32))
         levels.append(np.maximum(np.nan_to_num(rgb).max(axis=1, initial=0), 0))
-    every = np.split(
-        deviation(np.concatenate(levels), settings.noise, settings.relative), np.cumsum([len(a) for a in levels])[:-1]
+    stds = np.split(
+        observation_std(np.concatenate(levels), settings.noise, settings.relative),
+        np.cumsum([len(a) for a in levels])[:-1],
     )
     result = []
-    for k, (pixels, level, own, count) in enumerate(zip(pictures, levels, every, counts, strict=True)):
-        variance = own**2
+    for k, (pixels, level, std, count) in enumerate(zip(pictures, levels, stds, counts, strict=True)):
+        variance = std**2
         edge = (pixels.lit > 0) & (pixels.lit < 0.999)
         variance += np.where(edge, EDGE * level / np.maximum(pixels.lit, 1e-6), 0) ** 2
-        if k in indirect:
-            light = enlarged(indirect[k], captures.cameras[k].size).reshape(-1, 3)[pixels.index]
+        if k in direct.indirect:
+            light = direct.enlarged(k).reshape(-1, 3)[pixels.index]
             variance += (BETWEEN * light.max(axis=1)) ** 2
-        result.append(Errors(np.sqrt(variance).astype(np.float32), count))
+        result.append(ResidualStd(np.sqrt(variance).astype(np.float32), count))
     return result
 
 
-def _images(shade, table: Table, pictures: Sequence[Pixels]) -> list[Float[np.ndarray, "_ 3"]]:
-    shade.table = table
-    return [shade.image(k).reshape(-1, 3)[pixels.index] for k, pixels in enumerate(pictures)]
-
-
-def _apart(references: Sequence[np.ndarray], images: Sequence[np.ndarray]) -> list[Float[np.ndarray, "_ 3"]]:
+def _differences(references: Sequence[np.ndarray], images: Sequence[np.ndarray]) -> list[Float[np.ndarray, "_ 3"]]:
     return [r - i for r, i in zip(references, images, strict=True)]
 
 
-def _robust_spread(wrong: Sequence[np.ndarray], errors: Sequence[Errors]) -> float:
+def _robust_std(residuals: Sequence[np.ndarray], errors: Sequence[ResidualStd]) -> float:
     """What residuals are to their standard deviations: by the median, as if they were normally distributed."""
     every = np.concatenate(
-        [(np.abs(w) / e.spread[:, None])[e.counts > 0].ravel() for w, e in zip(wrong, errors, strict=True)]
+        [(np.abs(w) / e.std[:, None])[e.counts > 0].ravel() for w, e in zip(residuals, errors, strict=True)]
     )
     return float(np.median(every)) / 0.6745 if len(every) else 1.0
 
 
-def _cost(wrong: Sequence[np.ndarray], errors: Sequence[Errors]) -> float:
+def _cost(residuals: Sequence[np.ndarray], errors: Sequence[ResidualStd]) -> float:
     """Cauchy's, the mean over the channels of all pixels that count."""
     total, count = 0.0, 0.0
-    for w, e in zip(wrong, errors, strict=True):
-        units = np.nan_to_num(w / (WRONG * e.spread[:, None]))
+    for w, e in zip(residuals, errors, strict=True):
+        units = np.nan_to_num(w / (CAUCHY_SCALE * e.std[:, None]))
         total += float((np.log1p(units**2).sum(axis=1) * e.counts).sum(dtype=np.float64))
         count += 3 * float(e.counts.sum())
-    return WRONG**2 * total / max(count, 1)
+    return CAUCHY_SCALE**2 * total / max(count, 1)
 
 
-def _weights(wrong: np.ndarray, derivative: np.ndarray, errors: Errors) -> Float[np.ndarray, "p 3"]:
-    units = wrong / (WRONG * errors.spread[:, None])
-    weight = (errors.counts / errors.spread**2)[:, None] / (1 + units**2)
+def _weights(residuals: np.ndarray, derivative: np.ndarray, errors: ResidualStd) -> Float[np.ndarray, "p 3"]:
+    units = residuals / (CAUCHY_SCALE * errors.std[:, None])
+    weight = (errors.counts / errors.std**2)[:, None] / (1 + units**2)
     sound = np.isfinite(weight) & np.isfinite(derivative).all(axis=2)
     derivative[~sound] = 0
     return np.where(sound, weight, 0).astype(np.float32)
 
 
 def _derivatives(
-    shade,
-    table: Table,
-    images: Sequence[Float[np.ndarray, "_ 3"]],
-    pictures: Sequence[Pixels],
-    rows: Int[np.ndarray, " t"],
-    floor: float,
+    problem: JointProblem, table: MaterialTable, images: Sequence[Float[np.ndarray, "_ 3"]]
 ) -> list[Float[np.ndarray, "_ 3 4"]]:
     """Of `images`, which the table gives, by MOVES."""
+    pictures, floor = problem.footprints, problem.context.settings.roughness_floor
     result = [np.zeros((len(p.index), 3, len(MOVES)), np.float32) for p in pictures]
     for j, (columns, far) in enumerate(MOVES):
         up, down = table.copy(), table.copy()
         up[:, columns] += far
         down[:, columns] -= far
-        if columns == (5,):  # at its bounds roughness moves to one side only
-            up[:, 5], down[:, 5] = np.minimum(up[:, 5], 1), np.maximum(down[:, 5], floor)
-        high, low = _images(shade, up, pictures), _images(shade, down, pictures)
-        moved = (up - down)[rows, columns[0]]
+        if columns == (ROUGHNESS,):  # at its bounds roughness moves to one side only
+            up[:, ROUGHNESS] = np.minimum(up[:, ROUGHNESS], 1)
+            down[:, ROUGHNESS] = np.maximum(down[:, ROUGHNESS], floor)
+        high, low = problem.images(up), problem.images(down)
+        moved = (up - down)[problem.unknown.rows, columns[0]]
         for each, p, here, a, b in zip(result, pictures, images, high, low, strict=True):
-            change = _without_jumps(a - here, here - b) if columns in ((3,), (4,)) else a - b
+            change = _without_jumps(a - here, here - b) if columns in ((TILT_X,), (TILT_Y,)) else a - b
             each[:, :, j] = change / np.maximum(p.fetch @ moved, far / 10)[:, None]
     return result
 
@@ -256,36 +269,38 @@ def _without_jumps(ahead: np.ndarray, back: np.ndarray) -> np.ndarray:
     return np.where(np.abs(larger) > JUMP * np.abs(smaller), 2 * smaller, ahead + back)
 
 
-def _step(table: Table, linear: Sequence[Linear], unknown: Unknown, where: Atlas) -> Unknowns:
+def _step(table: MaterialTable, images: Sequence[LinearisedImage], unknown: UnknownTexels, atlas: Atlas) -> Unknowns:
     """The change that solves the equations of the module."""
     rows = unknown.rows
     # One after the other, in place: these are most of what the steps hold of each texel.
-    blocks, of = own_blocks(linear, len(rows)), np.arange(6)
+    blocks, of = diagonal_blocks(images, len(rows)), np.arange(6)
     blocks[:, of, of] += 1 / FREE**2
     own = np.einsum("tii->ti", np.linalg.inv(blocks)).copy()
-    noise = np.full((len(table), 7), NOTHING, np.float32)
-    noise[rows, :6] = np.where(unknown.seen[:, None], np.sqrt(MARGIN * np.maximum(own, 1e-12)), NOTHING)
-    priors, x = _priors(table, noise, rows, where), table[rows, :6]
-    right = right_side(linear, len(rows)) - _product(priors, x)
+    std = np.full((len(table), 7), NOTHING, np.float32)
+    std[rows, JOINT] = np.where(unknown.seen[:, None], np.sqrt(MARGIN * np.maximum(own, 1e-12)), NOTHING)
+    priors, x = _priors(table, std, rows, atlas), table[rows, JOINT]
+    right = rhs(images, len(rows)) - _product(priors, x)
     diagonal = np.stack([prior.diagonal() for prior in priors], axis=1)
     blocks[:, of, of] += np.maximum(diagonal, 1e-6) - 1 / FREE**2
     inverse = np.linalg.inv(blocks)
     del blocks
 
     def applied(v: Unknowns) -> Unknowns:
-        return curved(linear, v) + _product(priors, v)
+        return normal_matvec(images, v) + _product(priors, v)
 
-    return conjugate(applied, right, inverse)
+    return pcg(applied, right, inverse)
 
 
-def _priors(table: Table, noise: Float[np.ndarray, "a 7"], rows: Int[np.ndarray, " t"], where: Atlas) -> list[Any]:
+def _priors(
+    table: MaterialTable, std: Float[np.ndarray, "a 7"], rows: Int[np.ndarray, " t"], atlas: Atlas
+) -> list[Any]:
     """P of each unknown: the priors of covered texels; uncovered ones are nearly as the nearest covered one."""
     from scipy.sparse import csr_array
 
     number = np.full(len(table), -1, np.int64)
     number[rows] = np.arange(len(rows))
     pairs = []
-    for part, covered, closest in zip(where.parts, where.covered, where.closest, strict=True):
+    for part, covered, closest in zip(atlas.parts, atlas.covered, atlas.closest, strict=True):
         empty = np.flatnonzero(~covered.ravel())
         pairs.append(np.stack([empty, closest[empty]], axis=1) + part.start)
     both = number[np.concatenate(pairs)]
@@ -295,20 +310,21 @@ def _priors(table: Table, noise: Float[np.ndarray, "a 7"], rows: Int[np.ndarray,
         (np.tile([1, -1], len(both)).astype(np.float32) / ALIKE, both.ravel(), ends), (len(both), len(rows))
     )
     tied = apart.T @ apart
-    where = joined(where, table[:, :7], noise)
-    return [(firmness(table, noise, where, c)[rows][:, rows] + tied).tocsr() for c in LEAST]
+    atlas = with_seam_weights(atlas, table[:, SOLVED], std)
+    return [(prior_precision_matrix(table, std, atlas, c)[rows][:, rows] + tied).tocsr() for c in LEAST]
 
 
 def _product(priors: Sequence[Any], v: Unknowns) -> Unknowns:
     return np.stack([prior @ v[:, c] for c, prior in enumerate(priors)], axis=1)
 
 
-def _moved(table: Table, unknown: Unknown, change: Unknowns, floor: float) -> Table:
+def _moved(table: MaterialTable, unknown: UnknownTexels, change: Unknowns, floor: float) -> MaterialTable:
     """The table after a step: none where it is no number, LONGEST at most, within the bounds of its channels."""
     result, change = table.copy(), np.where(np.isfinite(change).all(axis=1, keepdims=True), change, 0)
-    values = result[unknown.rows, :6] + np.clip(change, -LONGEST, LONGEST)
-    values[:, :3], values[:, 5] = np.clip(values[:, :3], 0, 1), np.clip(values[:, 5], floor, 1)
-    length = np.linalg.norm(values[:, 3:5], axis=1, keepdims=True)
-    values[:, 3:5] *= np.minimum(1, STEEPEST / np.maximum(length, 1e-9))
-    result[unknown.rows, :6] = values
+    values = result[unknown.rows, JOINT] + np.clip(change, -LONGEST, LONGEST)
+    values[:, ALBEDO] = np.clip(values[:, ALBEDO], 0, 1)
+    values[:, ROUGHNESS] = np.clip(values[:, ROUGHNESS], floor, 1)
+    length = np.linalg.norm(values[:, TILT], axis=1, keepdims=True)
+    values[:, TILT] *= np.minimum(1, STEEPEST / np.maximum(length, 1e-9))
+    result[unknown.rows, JOINT] = values
     return result

@@ -8,6 +8,7 @@ material explains.
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt
@@ -19,7 +20,7 @@ from mistyle.core.light import DELTA, has_soft
 from mistyle.core.maps import Texels
 from mistyle.render.draw import Tracer
 from mistyle.render.texel_lm import Observations, Points, Rig
-from mistyle.render.texel_views import Look, look, open_sky, rig
+from mistyle.render.texel_views import GBuffer, open_sky, rig, trace_gbuffer
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.texels import beside
 
@@ -30,7 +31,7 @@ PERCENTILE = 95.0  # of the observed radiance: the unit of the noise
 
 
 @dataclass(frozen=True)
-class Sighting:
+class ImageSamples:
     """The observations of one picture: rows of the Observations, top left pixel and place between the four, 0..1."""
 
     rows: Int[np.ndarray, " n"]
@@ -40,11 +41,11 @@ class Sighting:
 
 
 @dataclass(frozen=True)
-class Gathered:
+class TexelObservations:
     """Everything that the pictures say about t covered texels (those of all sets, one set after the other).
 
     texel     flat index of each into the concatenated sets
-    sightings per picture
+    per_image per picture
     views     how many different cameras observed each texel
     """
 
@@ -52,7 +53,7 @@ class Gathered:
     points: Points
     rig: Rig
     observations: Observations
-    sightings: tuple[Sighting, ...]
+    per_image: tuple[ImageSamples, ...]
     views: Int[np.ndarray, " t"]
 
     @property
@@ -61,56 +62,66 @@ class Gathered:
         return np.diff(self.observations.start)
 
 
-def gather(
+@dataclass(frozen=True)
+class ObservationOptions:
+    """How pictures are observed.
+
+    facing    least cosine between the texel's normal and the camera
+    noise     with `relative`: the standard deviation of an observation of radiance y is noise · (the brightest
+              radiance, robustly) + relative · y. It is larger where the surface turns away, and where the texel is
+              smaller than the pixel, which then says more about its neighbours.
+    skies     False leaves out what hides the sky from each texel, which only the solver needs
+    move      how many pixels a look-up may move at most, 0 where all four have to count. It then shows what is beside
+              the texel; only the rounds correct that.
+    """
+
+    facing: float = 0.2
+    noise: float = 0.0005
+    relative: float = 0.01
+    skies: bool = True
+    move: float = 1.5
+
+
+DEFAULT_OPTIONS = ObservationOptions()
+
+
+def collect_observations(
     traced: Tracer,
     texels: Sequence[Texels],
     captures: Captures,
     tangents: Float[np.ndarray, "f 3 4"] | None,
-    *,
-    facing: float = 0.2,
-    noise: float = 0.0005,
-    relative: float = 0.01,
-    skies: bool = True,
-    move: float = 1.5,
+    options: ObservationOptions = DEFAULT_OPTIONS,
     progress: Callable[[float], None] = lambda done: None,
-) -> Gathered:
-    """All observations of all pictures. ValueError for lights that only a scene file describes.
-
-    `skies` False leaves out what hides the sky from each texel, which only the solver asks for. `move`: how many
-    pixels a look-up may move at most, 0 where all four have to count; it then shows what is beside the texel, which
-    only rounds of what pictures and maps differ by there make good.
-    `facing` is the least cosine between the texel's normal and the camera; the standard deviation of an observation of
-    radiance y is noise · (the brightest radiance, robustly) + relative · y, larger where the surface turns away and
-    where the texel is smaller than the pixel, which then says more about its neighbours.
-    """
+) -> TexelObservations:
+    """All observations of all pictures. ValueError for lights that only a scene file describes."""
     texel = covered_rows(texels)
     position, normal, face = points_of(texels)
     size = np.concatenate([texel_sizes(t) for t in texels])[texel]
     soft = [has_soft([own]) for own in captures.lights]
-    sky = open_sky(traced, position, normal) if skies and any(soft) else None
+    sky = open_sky(traced, position, normal) if options.skies and any(soft) else None
     points = Points(position, texel_frames(traced.mesh, face, position, normal, tangents), sky)
     parts: list[tuple] = []
     views = np.zeros(len(texel), np.int32)
     for done, group in enumerate(by_camera(captures.cameras)):
         camera = captures.cameras[group[0]]
         beams = [light for k in group for light in captures.lights[k] if isinstance(light, DELTA)]
-        seen, corners = look(traced, camera, beams), look(traced, of_corners(camera), beams)
+        seen, corners = trace_gbuffer(traced, camera, beams), trace_gbuffer(traced, of_corners(camera), beams)
         pure = _pure(camera, seen, corners)
-        near, pixel, x, y, own, worth = _visible(camera, seen, pure, position, normal, size, facing)
-        any_light, first = np.zeros(len(near), bool), 0
+        visible = _visible(camera, seen, pure, (position, normal, size), options.facing)
+        any_light, first = np.zeros(len(visible.texel), bool), 0
         for k in group:
             count = sum(isinstance(light, DELTA) for light in captures.lights[k])
             lit = [_steady(seen.lit[j], corners.lit[j]) for j in range(first, first + count)]
             first += count
             rgb, usable = captures.load(k)
-            ids, values, bits, chosen, *place, share = _observe(rgb, usable, lit, soft[k], near, pixel, x, y, own, move)
+            ids, values, bits, chosen, *place, share = _observe(rgb, usable, lit, soft[k], visible, options.move)
             any_light[chosen] = True
             # These are most of a fit's memory: nothing here is larger than it has to be.
-            where = pixel[chosen].astype(np.int32)
-            parts.append((k, ids.astype(np.int32), values, bits, where, *place, worth[chosen] * share))
-        views[near[any_light]] += 1
+            where = visible.pixel[chosen].astype(np.int32)
+            parts.append((k, ids.astype(np.int32), values, bits, where, *place, visible.worth[chosen] * share))
+        views[visible.texel[any_light]] += 1
         progress((done + 1) / max(len(captures) / max(len(group), 1), 1))
-    return _assemble(texel, points, captures, parts, views, noise, relative)
+    return _assemble(texel, points, captures, parts, views, options)
 
 
 def covered_rows(texels: Sequence[Texels]) -> Int[np.ndarray, " n"]:
@@ -126,17 +137,17 @@ def points_of(texels: Sequence[Texels]) -> tuple[np.ndarray, np.ndarray, np.ndar
     return position, normal, face
 
 
-def fetch(image: Float[np.ndarray, "h w 3"], at: Sighting) -> Float[np.ndarray, "n 3"]:
+def sample_image(image: Float[np.ndarray, "h w 3"], at: ImageSamples) -> Float[np.ndarray, "n 3"]:
     """Any picture of the camera, at the places of its observations."""
     return _bilinear(image, at.pixel, at.x, at.y)
 
 
-def less_sure(weight: Float[np.ndarray, " n"], more: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+def with_extra_std(weight: Float[np.ndarray, " n"], more: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Weights, one over a standard deviation, once `more` is added to it."""
     return weight / (1 + weight * more)
 
 
-def deviation(level: Float[np.ndarray, " n"], noise: float, relative: float) -> Float[np.ndarray, " n"]:
+def observation_std(level: Float[np.ndarray, " n"], noise: float, relative: float) -> Float[np.ndarray, " n"]:
     """Standard deviations of what was observed with radiance `level`: noise · (the brightest, robustly) + relative ·
     level."""
     unit = float(np.percentile(level, PERCENTILE)) if len(level) else 1.0
@@ -156,7 +167,7 @@ def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
 
 
-def _pure(camera: Camera, seen: Look, corners: Look) -> Bool[np.ndarray, "h w"]:
+def _pure(camera: Camera, seen: GBuffer, corners: GBuffer) -> Bool[np.ndarray, "h w"]:
     """Pixels whose corners show the surface that their centre shows: no silhouette and no crease goes through them."""
     p, n = seen.position, seen.normal
     away = camera.position.astype(np.float32) - p
@@ -190,9 +201,21 @@ def _steady(lit: Bool[np.ndarray, "h w"], corners: Bool[np.ndarray, "H W"]) -> I
     return np.where(count == 5, 1, np.where(count == 0, 0, -1)).astype(np.int8)
 
 
-def _visible(camera: Camera, seen: Look, pure, position, normal, size, facing: float) -> tuple[np.ndarray, ...]:
-    """Texels whose own surface one of the four pixels around them shows: index, top left pixel, place between the
-    pixels, which of the four do, and what the observation is worth, 0..1."""
+class VisibleTexels(NamedTuple):
+    """Texels of which a picture shows the own surface: index, top left of the four pixels around, place between them,
+    which of the four show it, and the observation's weight, 0..1."""
+
+    texel: Int[np.ndarray, " n"]
+    pixel: Int[np.ndarray, " n"]
+    x: Float[np.ndarray, " n"]
+    y: Float[np.ndarray, " n"]
+    own: Bool[np.ndarray, "4 n"]
+    worth: Float[np.ndarray, " n"]
+
+
+def _visible(camera: Camera, seen: GBuffer, pure, points: tuple[np.ndarray, ...], facing: float) -> VisibleTexels:
+    """Texels whose own surface one of the four pixels around them shows; `points`: positions, normals and sizes."""
+    position, normal, size = points
     height, width = camera.size
     eye = camera.position.astype(np.float32)
     away = eye - position
@@ -216,16 +239,17 @@ def _visible(camera: Camera, seen: Look, pure, position, normal, size, facing: f
     good = own.any(axis=0)
     chosen = near[good]
     worth = np.sqrt(cosine[chosen]) * np.minimum(size[chosen] / unit[good], 1)
-    return chosen, pixel[good], (x[near] - left)[good], (y[near] - top)[good], own[:, good], worth
+    return VisibleTexels(chosen, pixel[good], (x[near] - left)[good], (y[near] - top)[good], own[:, good], worth)
 
 
-def _observe(rgb, usable, lit, soft: bool, near, pixel, x, y, own, move: float) -> tuple[np.ndarray, ...]:
-    """Texels that one picture observes in the light: index, radiance, light bits, which of `near`, the place between
+def _observe(rgb, usable, lit, soft: bool, visible: VisibleTexels, move: float) -> tuple[np.ndarray, ...]:
+    """Texels that one picture observes in the light: index, radiance, light bits, which of `visible`, the place between
     the pixels that was looked up, and what that makes of the observation's worth. Soft light, where the picture has it
     too, is taken to reach them all.
 
     Where not all four pixels count, the place moves to the nearest ones that do, and the observation counts for less.
     """
+    near, pixel, x, y, own, _ = visible
     usable = erode(usable & np.isfinite(rgb).all(axis=-1), 1)
     rgb, width = np.where(usable[..., None], rgb, 0), rgb.shape[1]
     corners = [pixel + step for step in (0, 1, width, width + 1)]
@@ -268,7 +292,7 @@ def _bilinear(image: Float[np.ndarray, "h w 3"], pixel, x, y) -> Float[np.ndarra
     return top * (1 - y) + bottom * y
 
 
-def _assemble(texel, points, captures: Captures, parts, views, noise: float, relative: float) -> Gathered:
+def _assemble(texel, points, captures: Captures, parts, views, options: ObservationOptions) -> TexelObservations:
     """Sort the observations by texel; within a texel they follow the pictures' order. `parts` is empty afterwards."""
     parts.sort(key=lambda part: -part[0])
     count = np.zeros(len(texel), np.int64)
@@ -279,15 +303,17 @@ def _assemble(texel, points, captures: Captures, parts, views, noise: float, rel
     picture, lit = np.zeros(total, np.int32), np.zeros(total, np.uint32)
     rgb, worth = np.zeros((total, 3), np.float32), np.ones(total, np.float32)
     nothing = np.zeros(0, np.int64)
-    sightings = [Sighting(nothing, nothing, nothing.astype(np.float32), nothing.astype(np.float32))] * len(captures)
+    per_image = [ImageSamples(nothing, nothing, nothing.astype(np.float32), nothing.astype(np.float32))] * len(captures)
     index = np.int32 if total <= np.iinfo(np.int32).max else np.int64
     while parts:
         k, ids, values, bits, pixel, x, y, share = parts.pop()
         rows = filled[ids].astype(index)
         filled[ids] += 1
         picture[rows], lit[rows], rgb[rows], worth[rows] = k, bits, values, share
-        sightings[k] = Sighting(rows, pixel, x, y)
+        per_image[k] = ImageSamples(rows, pixel, x, y)
     level = np.maximum(rgb.max(axis=1, initial=0), 0)
-    weight = worth / deviation(level, noise, relative)
+    weight = worth / observation_std(level, options.noise, options.relative)
     observations = Observations(start, picture, rgb, weight.astype(np.float32), lit)
-    return Gathered(texel, points, rig(captures.cameras, captures.lights), observations, tuple(sightings), views)
+    return TexelObservations(
+        texel, points, rig(captures.cameras, captures.lights), observations, tuple(per_image), views
+    )

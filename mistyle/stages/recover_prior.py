@@ -1,12 +1,13 @@
-"""What is believed of a texel besides what its own pictures tell, and how much those tell."""
+"""Priors of the per-texel solver, and the uncertainty that a texel's own observations leave."""
 
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.render.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
 from mistyle.render.texel_lm import UNKNOWNS, Solution
-from mistyle.stages.recover_observe import Gathered
+from mistyle.stages.recover_observe import TexelObservations
 from mistyle.stages.recover_table import OVER_SEAMS, Atlas, Values, neighbourhood
 
 PRIOR_SPREAD = (1.0, 1.0, 1.0, 0.6, 0.6, 0.8, 0.2)  # standard deviations from PRIOR_MEAN before anything was seen
@@ -29,7 +30,7 @@ LEAST = 0.002  # of the standard deviation between a texel's tilt and the mean o
 LEAST_SEEN = 3  # times that a texel was seen, for what was seen to decide anything
 BEST_FIT = 0.02  # of what `noise` and `relative` say, as variance: observations are never thought better than that
 MARGIN = 1.5  # on the variance of what observations tell, since they err together
-NOTHING = 1.0  # standard deviation of what nothing was told about
+NOTHING = 1.0  # standard deviation of texels without observations
 
 
 def penalty(values: Values, mean: Values, prior: Values) -> Float[np.ndarray, " t"]:
@@ -37,33 +38,35 @@ def penalty(values: Values, mean: Values, prior: Values) -> Float[np.ndarray, " 
     return ((values - mean) ** 2 * prior).sum(axis=1)
 
 
-def unlikely(values: Values, seen: Int[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
+def log_prior_penalty(values: Values, seen: Int[np.ndarray, " t"]) -> Float[np.ndarray, " t"]:
     """What being a metal costs, and what looking black often and yet being none costs, where no gloss shows either:
     paint is never that black."""
-    black = np.maximum(1 - values[:, :3].max(axis=1) / PALEST_BLACK, 0) * np.minimum(seen / OFTEN, 1)
-    black *= np.clip((MATT - values[:, 5]) / (MATT - GLOSSY), 0, 1)
-    return np.where(values[:, 6] > 0.5, METAL_COST, BLACK_COST * black).astype(np.float32)
+    black = np.maximum(1 - values[:, ALBEDO].max(axis=1) / PALEST_BLACK, 0) * np.minimum(seen / OFTEN, 1)
+    black *= np.clip((MATT - values[:, ROUGHNESS]) / (MATT - GLOSSY), 0, 1)
+    return np.where(values[:, METALLIC] > 0.5, METAL_COST, BLACK_COST * black).astype(np.float32)
 
 
-def belief(solution: Solution, mean: Values, gathered: Gathered, where: Atlas, neighbours: float) -> Values:
+def prior_precision(
+    solution: Solution, mean: Values, observed: TexelObservations, atlas: Atlas, neighbours: float
+) -> Values:
     """How firmly each texel is held to `mean`, as weights of (x - mean)²: one over the variance of the surface itself.
 
     Of the tilt by empirical Bayes: that variance is what the texels around differ by from their means, less what their
     own observations leave open, at most `neighbours`² and at least LEAST². Everything else has `neighbours`: albedo,
     roughness and metallic can stand for each other, and held to its neighbours' albedo a texel becomes a metal.
     """
-    open_, gain = open_tilts(solution, gathered), likelihood(solution)[1][:, 3:5]
-    apart = (solution.values - mean)[:, 3:5] / np.maximum(gain, 1e-3)
+    open_, gain = unconstrained_tilts(solution, observed), likelihood(solution)[1][:, TILT]
+    apart = (solution.values - mean)[:, TILT] / np.maximum(gain, 1e-3)
     weight = (1 / (open_**2 + neighbours**2) ** 2).astype(np.float32)
-    weight[gathered.seen == 0] = 0
-    variance = neighbourhood((apart**2 - open_**2).astype(np.float32), weight, gathered, where, WIDE, OVER_SEAMS[3:5])
+    weight[observed.seen == 0] = 0
+    variance = neighbourhood((apart**2 - open_**2).astype(np.float32), weight, observed, atlas, WIDE, OVER_SEAMS[3:5])
     prior = np.full(mean.shape, 1 / neighbours**2, np.float32)
-    prior[:, 3:5] = 1 / np.clip(variance, min(LEAST, neighbours) ** 2, neighbours**2)
+    prior[:, TILT] = 1 / np.clip(variance, min(LEAST, neighbours) ** 2, neighbours**2)
     return prior
 
 
-def levelled(
-    solution: Solution, mean: Values, prior: Values, gathered: Gathered, where: Atlas
+def shrink_normals(
+    solution: Solution, mean: Values, prior: Values, observed: TexelObservations, atlas: Atlas
 ) -> tuple[Values, Values]:
     """`mean` and `prior` with the tilt drawn towards none where little is known of the texels around.
 
@@ -72,72 +75,74 @@ def levelled(
     observations do not fit, tilts would take up what the model lacks, and are held by the root of `misfit` more firmly:
     more costs strong relief, less lets light between surfaces through.
     """
-    precision = np.where(gathered.seen[:, None] > 0, 1 / open_tilts(solution, gathered) ** 2, 0).astype(np.float32)
-    precision = AMONG * neighbourhood(precision, np.ones_like(precision), gathered, where, BLUR, OVER_SEAMS[3:5])
-    left = 1 / (precision + 1 / varied(solution, gathered))
+    precision = np.where(observed.seen[:, None] > 0, 1 / unconstrained_tilts(solution, observed) ** 2, 0).astype(
+        np.float32
+    )
+    precision = AMONG * neighbourhood(precision, np.ones_like(precision), observed, atlas, BLUR, OVER_SEAMS[3:5])
+    left = 1 / (precision + 1 / tilt_variance(solution, observed))
     mean, prior = mean.copy(), prior.copy()
-    mean[:, 3:5] *= precision * left
-    prior[:, 3:5] = 1 / (1 / prior[:, 3:5] + left)
-    prior[:, 3:5] *= np.sqrt(1 + misfit(solution, gathered, where))[:, None]
+    mean[:, TILT] *= precision * left
+    prior[:, TILT] = 1 / (1 / prior[:, TILT] + left)
+    prior[:, TILT] *= np.sqrt(1 + misfit(solution, observed, atlas))[:, None]
     return mean, prior
 
 
-def varied(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "2"]:
+def tilt_variance(solution: Solution, observed: TexelObservations) -> Float[np.ndarray, "2"]:
     """The variance of tilts over the whole surface, by texels that are known: that of what was found, less what was
     left open."""
-    open_ = open_tilts(solution, gathered)
-    weight = np.where(gathered.seen[:, None] > 0, 1 / (open_**2 + KNOWN**2) ** 2, 0)
-    mean = ((solution.values[:, 3:5] ** 2 - open_**2) * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
+    open_ = unconstrained_tilts(solution, observed)
+    weight = np.where(observed.seen[:, None] > 0, 1 / (open_**2 + KNOWN**2) ** 2, 0)
+    mean = ((solution.values[:, TILT] ** 2 - open_**2) * weight).sum(axis=0) / np.maximum(weight.sum(axis=0), 1e-12)
     return np.clip(mean, LEAST**2, PRIOR_SPREAD[3] ** 2)
 
 
-def open_tilts(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "t 2"]:
+def unconstrained_tilts(solution: Solution, observed: TexelObservations) -> Float[np.ndarray, "t 2"]:
     """Standard deviations of the tilt that a texel's observations leave open."""
-    return likelihood(solution)[0][:, 3:5] * inflation(solution, gathered)
+    return likelihood(solution)[0][:, TILT] * inflation(solution, observed)
 
 
-def inflation(solution: Solution, gathered: Gathered) -> Float[np.ndarray, "t 1"]:
+def inflation(solution: Solution, observed: TexelObservations) -> Float[np.ndarray, "t 1"]:
     """What standard deviations are multiplied by: observations that do not fit say less than their number promises."""
-    return np.sqrt(1 + solution.cost / np.maximum(gathered.seen, 1))[:, None]
+    return np.sqrt(1 + solution.cost / np.maximum(observed.seen, 1))[:, None]
 
 
-def sureness(solution: Solution, gathered: Gathered) -> Values:
+def neighbour_weight(solution: Solution, observed: TexelObservations) -> Values:
     """What a texel counts in its neighbours' means: by its spread, and less where its observations do not fit."""
     sure = 1 / np.maximum(solution.spread, 1e-4) ** 2
     sure = np.minimum(sure, np.quantile(sure, 0.9, axis=0))
-    wrong = solution.cost / np.maximum(gathered.seen, 1) / MISFIT
-    sure = (sure / (1 + wrong[:, None]) ** 2).astype(np.float32)
-    sure[gathered.seen == 0] = 1e-6
+    misfits = solution.cost / np.maximum(observed.seen, 1) / MISFIT
+    sure = (sure / (1 + misfits[:, None]) ** 2).astype(np.float32)
+    sure[observed.seen == 0] = 1e-6
     return sure
 
 
-def misfit(solution: Solution, gathered: Gathered, where: Atlas) -> Float[np.ndarray, " t"]:
+def misfit(solution: Solution, observed: TexelObservations, atlas: Atlas) -> Float[np.ndarray, " t"]:
     """Cost per observation that is one too many, of the texels around each one together; 0 where there is none.
 
     An observation has three channels and a texel UNKNOWNS unknowns: one that few saw can explain whatever they saw, so
     only those around it tell how far its model can be believed.
     """
-    spare = np.maximum(gathered.seen - len(UNKNOWNS) / 3, 0)
+    spare = np.maximum(observed.seen - len(UNKNOWNS) / 3, 0)
     each = np.where(spare[:, None] > 0, np.stack([solution.cost, spare], axis=1), 0).astype(np.float32)
-    cost, count = neighbourhood(each, np.ones_like(each), gathered, where, AROUND).T
+    cost, count = neighbourhood(each, np.ones_like(each), observed, atlas, AROUND).T
     return np.where(count > 1e-6, cost / np.maximum(count, 1e-6), 0).astype(np.float32)
 
 
-def told(solution: Solution, gathered: Gathered, where: Atlas) -> Values:
+def observation_std(solution: Solution, observed: TexelObservations, atlas: Atlas) -> Values:
     """Standard deviations of what a texel's observations tell, by how well they and those of the texels around it fit:
     where they fit far better than `noise` and `relative` say, they also tell more; NOTHING where there are none."""
-    around = misfit(solution, gathered, where)
-    own = np.where(gathered.seen >= OFTEN, solution.cost / np.maximum(gathered.seen - len(UNKNOWNS) / 3, 1), 0)
+    around = misfit(solution, observed, atlas)
+    own = np.where(observed.seen >= OFTEN, solution.cost / np.maximum(observed.seen - len(UNKNOWNS) / 3, 1), 0)
     scale = MARGIN * np.maximum(np.maximum(around, own) / 3, BEST_FIT)
-    return left_open(solution, gathered, scale)
+    return unconstrained_std(solution, observed, scale)
 
 
-def decided(solution: Solution, gathered: Gathered) -> Float[np.ndarray, " t"]:
+def data_weight(solution: Solution, observed: TexelObservations) -> Float[np.ndarray, " t"]:
     """The share of a texel's tilt that its own pictures decide and not its neighbours, 0..1. Texels that too few saw
     whole are left to the pictures, which show parts of them that the solver knows nothing of, as far as tilts vary."""
-    variance = float(varied(solution, gathered).mean())
-    share = likelihood(solution)[1][:, 3:5].mean(axis=1)
-    return np.where(gathered.seen >= LEAST_SEEN, share, variance / (variance + KNOWN**2)).astype(np.float32)
+    variance = float(tilt_variance(solution, observed).mean())
+    share = likelihood(solution)[1][:, TILT].mean(axis=1)
+    return np.where(observed.seen >= LEAST_SEEN, share, variance / (variance + KNOWN**2)).astype(np.float32)
 
 
 def likelihood(solution: Solution) -> tuple[Values, Values]:
@@ -147,25 +152,29 @@ def likelihood(solution: Solution) -> tuple[Values, Values]:
     return 1 / np.sqrt(alone), alone / (alone + solution.prior)
 
 
-def left_open(solution: Solution, gathered: Gathered, scale: float | Float[np.ndarray, " t"] = 1.0) -> Values:
+def unconstrained_std(
+    solution: Solution, observed: TexelObservations, scale: float | Float[np.ndarray, " t"] = 1.0
+) -> Values:
     """Standard deviations of what the texels' observations tell, `scale` on their variance; NOTHING without any."""
-    found = np.minimum(likelihood(solution)[0] * np.sqrt(np.reshape(scale, (-1, 1))), NOTHING)
-    found[gathered.seen == 0] = NOTHING
-    return found.astype(np.float32)
+    std = np.minimum(likelihood(solution)[0] * np.sqrt(np.reshape(scale, (-1, 1))), NOTHING)
+    std[observed.seen == 0] = NOTHING
+    return std.astype(np.float32)
 
 
-def both(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) -> tuple[Values, Values, np.ndarray]:
+def combine_class_prior(
+    mean: Values, prior: Values, metal: Float[np.ndarray, " t"]
+) -> tuple[Values, Values, np.ndarray]:
     """A prior and the belief that a texel is a metal or not as one prior, and the constant that this leaves."""
-    mean, prior, left = reflecting(mean, prior, metal)
+    mean, prior, left = metal_f0_prior(mean, prior, metal)
     mean[:, 6:], prior[:, 6:], constant = _product(mean[:, 6:], prior[:, 6:], metal[:, None], 1 / METAL_SPREAD**2)
     return mean, prior, left + constant
 
 
-def reflecting(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) -> tuple[Values, Values, np.ndarray]:
+def metal_f0_prior(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) -> tuple[Values, Values, np.ndarray]:
     """The same of a prior and of how much metals reflect, where a texel is one."""
     mean, prior = mean.copy(), prior.copy()
-    mean[:, :3], prior[:, :3], constant = _product(
-        mean[:, :3], prior[:, :3], METAL_ALBEDO, metal[:, None] / METAL_ALBEDOS**2
+    mean[:, ALBEDO], prior[:, ALBEDO], constant = _product(
+        mean[:, ALBEDO], prior[:, ALBEDO], METAL_ALBEDO, metal[:, None] / METAL_ALBEDOS**2
     )
     return mean, prior, constant
 

@@ -1,15 +1,15 @@
-"""The neighbours' last word: maps as smooth as the surface is, as far as the pictures leave them open.
+"""Empirical-Bayes smoothing of the maps; its strength is estimated locally.
 
-A texel's own pictures tell its albedo, tilt and roughness with an error that is known roughly (`Found.noise`). What
-texels in a row differ by from a straight line through their neighbours has a variance that is the surface's own plus
-that of these errors; so the surface's own is measured around every texel (empirical Bayes), and the most likely values
-under both minimise
+A texel's own pictures tell its albedo, tilt and roughness with an error that is known roughly
+(`TexelEstimate.unconstrained`). What texels in a row differ by from a straight line through their neighbours has a
+variance that is the surface's own plus that of these errors; so the surface's own is measured around every texel
+(empirical Bayes), and the most likely values under both minimise
 
-    sum (x - found)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance  +  SHARE sum x² / spread²
+    sum (x - estimate)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance  +  SHARE sum x² / spread²
 
 over rows and columns of each island, of albedo and roughness also across seams (a Gaussian field of second
 differences: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.4). Where the surface is rough the variance is
-large, and what was found stays. The last sum is of tilts alone: where little was seen, one that a few texels began
+large, and the estimate stays. The last sum is of tilts alone: where little was seen, one that a few texels began
 would else go on along its slope, farther than any that is known. `spread` is measured around every texel too.
 """
 
@@ -20,14 +20,15 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.render.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT_X, TILT_Y
 from mistyle.stages.neighbours import Links, within
 from mistyle.stages.recover_prior import METAL_SPREAD
-from mistyle.stages.recover_table import OVER_SEAMS, Atlas, diffused, fill, joined
+from mistyle.stages.recover_table import OVER_SEAMS, Atlas, diffused, fill, with_seam_weights
 
 # Channels of the table that are smoothed, and the least standard deviation of their second differences. Not metallic:
 # surfaces are metal or not.
-LEAST = {0: 0.008, 1: 0.008, 2: 0.008, 3: 0.006, 4: 0.006, 5: 0.008}
-TILTS = 3, 4
+LEAST = {0: 0.008, 1: 0.008, 2: 0.008, TILT_X: 0.006, TILT_Y: 0.006, ROUGHNESS: 0.008}
+TILTS = TILT_X, TILT_Y
 MOST = 0.3  # of that standard deviation
 ODD = 20  # times rarer than metals and others together: what is neither
 OPEN = 0.3  # what is taken for left open where nothing was seen
@@ -46,21 +47,21 @@ Both = tuple[np.ndarray, np.ndarray]  # along rows, and along columns (transpose
 
 @dataclass(frozen=True)
 class Field:
-    """One channel in one texture set: its rows of the table, what was found and its errors, the variance of its second
-    differences, how firmly values are held to none, and which texels are neighbours."""
+    """One channel in one texture set: its rows of the table, the estimate and its errors, the variance of its second
+    differences, the weight of x², and which texels are neighbours."""
 
     part: slice
-    found: Grid
+    estimate: Grid
     error: Grid
     variance: Grid
-    held: Grid
+    ridge: Grid
     among: Links
 
 
-def smoothed(
+def map_smoothing(
     table: Float[np.ndarray, "a 8"],
     noise: Float[np.ndarray, "a 7"],
-    where: Atlas,
+    atlas: Atlas,
     floor: float,
     metallic: bool,
 ) -> Float[np.ndarray, "a 8"]:
@@ -70,38 +71,40 @@ def smoothed(
     `noise`: standard deviations of what the pictures tell, OPEN and above where they tell nothing. Cannot see edges: a
     crease in a smooth surround is rounded by as much as its texels are uncertain.
     """
-    moved, where = np.zeros_like(table), joined(where, table[:, :7], noise)
+    moved, atlas = np.zeros_like(table), with_seam_weights(atlas, table[:, SOLVED], noise)
     for c in LEAST:
-        for one in _fields(table, noise, where, c):
-            moved[one.part, c] = (_likely(one) - one.found).ravel()
-    result = table + fill(moved, where)
+        for one in _fields(table, noise, atlas, c):
+            moved[one.part, c] = (_likely(one) - one.estimate).ravel()
+    result = table + fill(moved, atlas)
     if metallic:
-        result = _settled(result, noise)
-    result[:, :3] = np.clip(result[:, :3], 0, 1)
-    result[:, 5] = np.clip(result[:, 5], floor, 1)
+        result = binarise_metallic(result, noise)
+    result[:, ALBEDO] = np.clip(result[:, ALBEDO], 0, 1)
+    result[:, ROUGHNESS] = np.clip(result[:, ROUGHNESS], floor, 1)
     return result
 
 
-def firmness(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"], where: Atlas, channel: int) -> Any:
+def prior_precision_matrix(
+    table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"], atlas: Atlas, channel: int
+) -> Any:
     """The second and third sum above for one of LEAST's channels, as a sparse symmetric matrix P of the whole atlas:
-    x' P x, of variances as `smoothed` measures them on `table`. `where`: with its seams believed (`joined`)."""
+    x' P x, of variances as `map_smoothing` measures them on `table`. `atlas`: after `with_seam_weights`."""
     from scipy.sparse import block_diag
 
-    return block_diag([_prior(one) for one in _fields(table, noise, where, channel)], format="csr")
+    return block_diag([_prior(one) for one in _fields(table, noise, atlas, channel)], format="csr")
 
 
-def _fields(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Iterator[Field]:
+def _fields(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: int) -> Iterator[Field]:
     """The channel in every texture set."""
-    held = _held(table, noise, where, channel) if channel in TILTS else np.zeros(len(table), np.float32)
-    for part, size, links in zip(where.parts, where.sizes, where.links, strict=True):
-        found = table[part, channel].reshape(size)
+    ridge = ridge_weight(table, noise, atlas, channel) if channel in TILTS else np.zeros(len(table), np.float32)
+    for part, size, links in zip(atlas.parts, atlas.sizes, atlas.links, strict=True):
+        estimate = table[part, channel].reshape(size)
         error = np.minimum(noise[part, channel].reshape(size), OPEN)
         among = links if OVER_SEAMS[channel] else within(links)
-        error, variance = _measured(found, error, among, LEAST[channel])
-        yield Field(part, found, error, variance, held[part].reshape(size), among)
+        error, variance = _measured(estimate, error, among, LEAST[channel])
+        yield Field(part, estimate, error, variance, ridge[part].reshape(size), among)
 
 
-def _held(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> Float[np.ndarray, " a"]:
+def ridge_weight(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: int) -> Float[np.ndarray, " a"]:
     """SHARE / spread² of every texel: of what the texels around it are known to be, and a little of those of the whole
     atlas, which are the only ones where none around is known; 0 where none is known at all.
 
@@ -111,24 +114,24 @@ def _held(table: np.ndarray, noise: np.ndarray, where: Atlas, channel: int) -> F
     weight = np.where(error < OPEN, 1 / (error**2 + KNOWN**2) ** 2, 0)
     sums = np.stack([weight * x2, weight], axis=1)
     every = sums.sum(axis=0) / max(sums[:, 1].sum(), 1e-12) * (ELSEWHERE / KNOWN**4)
-    for part, size, links in zip(where.parts, where.sizes, where.links, strict=True):
+    for part, size, links in zip(atlas.parts, atlas.sizes, atlas.links, strict=True):
         sums[part] = diffused(sums[part].reshape(1, *size, 2), within(links), AROUND).reshape(-1, 2)
     spread2, weights = (sums + every).T
     return (SHARE * weights / np.maximum(spread2, weights * LEAST[channel] ** 2 + 1e-12)).astype(np.float32)
 
 
-def _settled(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"]) -> Float[np.ndarray, "a 8"]:
+def binarise_metallic(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"]) -> Float[np.ndarray, "a 8"]:
     """`table` with metallic drawn to 0 or 1, whichever is nearer, as far as it is left open: surfaces are metal or not.
     What lies far from both is left alone, as if it were neither. What is no metal keeps its diffuse reflectance,
     albedo (1 - metallic)."""
-    metallic, nearer = table[:, 6], np.round(table[:, 6])
+    metallic, nearer = table[:, METALLIC], np.round(table[:, METALLIC])
     away = metallic - nearer
     likely = np.exp(-0.5 * (away / METAL_SPREAD) ** 2)
-    error2 = np.minimum(noise[:, 6], OPEN) ** 2
+    error2 = np.minimum(noise[:, METALLIC], OPEN) ** 2
     open_ = error2 / (METAL_SPREAD**2 + error2) * likely / (likely + 1 / ODD)
     result = table.copy()
-    result[:, 6] = metallic - open_ * away
-    result[:, :3] *= np.where(nearer == 0, (1 - metallic) / np.maximum(1 - result[:, 6], 0.5), 1)[:, None]
+    result[:, METALLIC] = metallic - open_ * away
+    result[:, ALBEDO] *= np.where(nearer == 0, (1 - metallic) / np.maximum(1 - result[:, METALLIC], 0.5), 1)[:, None]
     return result
 
 
@@ -142,15 +145,15 @@ def _second(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
     return np.where(links, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
 
 
-def _measured(found: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
+def _measured(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
     """Of what second differences vary by around every texel: how much is error, and the surface's own variance of them.
 
     Where values vary less than their errors say, the errors are shared with the neighbours (the solver's prior made
     them so): then only as much error is taken as the variation shows, since no smoothing could remove the rest.
     """
-    total = np.zeros((3, *found.shape, 1), np.float32)
+    total = np.zeros((3, *estimate.shape, 1), np.float32)
     for turned, link in enumerate(_lines(among)):
-        x, e = (found.T, error.T) if turned else (found, error)
+        x, e = (estimate.T, error.T) if turned else (estimate, error)
         noise = 0.25 * (e[:, :-2] ** 2 + e[:, 2:] ** 2) + e[:, 1:-1] ** 2
         weight = np.where(link, 1 / (noise + SURE**2) ** 2, 0)
         sums = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
@@ -206,8 +209,8 @@ def _prior(one: Field) -> Any:
     """The second and third sum of one set, as a sparse matrix."""
     from scipy.sparse import dia_array
 
-    differences, size = _differences(one.variance, one.among), one.held.size
-    return (differences.T @ differences + dia_array((one.held.ravel()[None], 0), shape=(size, size))).tocsr()
+    differences, size = _differences(one.variance, one.among), one.ridge.size
+    return (differences.T @ differences + dia_array((one.ridge.ravel()[None], 0), shape=(size, size))).tocsr()
 
 
 def _likely(one: Field) -> Float[np.ndarray, "h w"]:
@@ -218,6 +221,6 @@ def _likely(one: Field) -> Float[np.ndarray, "h w"]:
     sure = (1 / np.maximum(one.error, 1e-4) ** 2).astype(np.float32).ravel()
     matrix = prior + dia_array((sure[None], 0), shape=prior.shape)
     inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=prior.shape)
-    # From what was found: the change is solved for, so that little of it is lost to rounding.
-    change, _ = cg(matrix, -(prior @ one.found.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
-    return one.found + change.reshape(one.found.shape).astype(np.float32)
+    # From the estimate: the change is solved for, so that little of it is lost to rounding.
+    change, _ = cg(matrix, -(prior @ one.estimate.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
+    return one.estimate + change.reshape(one.estimate.shape).astype(np.float32)

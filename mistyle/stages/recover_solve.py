@@ -1,4 +1,4 @@
-"""Rounds of the per-texel solver: neighbours help those that saw little, and the pictures correct what they model not.
+"""Rounds of the per-texel solver, with priors from neighbours, and defect correction by rendered pictures.
 
 The solver takes a texel's radiance for that of the picture at one place, but a pixel is a mean over its area of
 interpolated texels. So after each solve the pictures are rendered as they are really made (`render/shade.py`), and
@@ -13,22 +13,23 @@ from dataclasses import fields
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.render.material_table import METALLIC, ROUGHNESS
 from mistyle.render.texel_lm import Problem, Solution
-from mistyle.stages.recover_observe import Gathered, fetch, less_sure
+from mistyle.stages.recover_observe import TexelObservations, sample_image, with_extra_std
 from mistyle.stages.recover_prior import (
     BLUR,
     PRIOR_SPREAD,
-    belief,
-    both,
-    left_open,
-    levelled,
+    combine_class_prior,
+    log_prior_penalty,
+    metal_f0_prior,
+    neighbour_weight,
     penalty,
-    reflecting,
-    sureness,
-    unlikely,
+    prior_precision,
+    shrink_normals,
+    unconstrained_std,
 )
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.recover_table import OVER_SEAMS, Atlas, Values, joined, neighbourhood, placed
+from mistyle.stages.recover_table import OVER_SEAMS, Atlas, Values, neighbourhood, scatter, with_seam_weights
 
 STARTS = (0.08, 0.25, 0.7)  # roughness has local minima
 UNLIKE = 0.3  # of what a texel and the picture drawn there differ by: what it adds to an observation's deviation
@@ -37,75 +38,82 @@ RESTARTS = 3  # rounds in which texels also try what their neighbours found
 
 def first_solve(
     problem: Problem,
-    start: Values,
-    mean: Values,
+    begin: tuple[Values, Values],
     seen: Int[np.ndarray, " t"],
     settings: RecoverSettings,
     progress: Callable[[float], None],
 ) -> Solution:
-    """The best of several starts: `start` itself, and every roughness of a coarse grid, as paint and as metal."""
+    """The best of several starts: `begin`'s first, and every roughness of a coarse grid, as dielectric and as metal.
+
+    `begin` is (start, prior mean).
+    """
+    start, mean = begin
     prior = np.tile(1 / np.array(PRIOR_SPREAD, np.float32) ** 2, (len(mean), 1)).astype(np.float32)
     tries = [(start, mean, prior)]
     for metal in (0.0, 1.0) if settings.metallic else (None,):
         for roughness in STARTS:
             other, around, weight = mean.copy(), mean.copy(), prior
-            other[:, 5] = roughness
+            other[:, ROUGHNESS] = roughness
             if metal is not None:
-                other[:, 6], around[:, 6] = abs(metal - 0.1), metal
-                around, weight, _ = reflecting(around, prior, np.full(len(mean), metal, np.float32))
+                other[:, METALLIC], around[:, METALLIC] = abs(metal - 0.1), metal
+                around, weight, _ = metal_f0_prior(around, prior, np.full(len(mean), metal, np.float32))
             tries.append((other, around, weight))
     tries = tries if not np.array_equal(start, mean) else tries[1:]
     solved = []
     for k, (each, around, weight) in enumerate(tries):
         done = lambda share, k=k: progress((k + share) / len(tries))  # noqa: E731
         solution = problem.solve(each, around, weight, settings.solver_iterations, done)
-        extra = unlikely(solution.values, seen) if settings.metallic else 0
+        extra = log_prior_penalty(solution.values, seen) if settings.metallic else 0
         solved.append((solution, penalty(solution.values, around, weight) + extra))
     return best(solved)
 
 
 def another_round(
     problem: Problem,
-    gathered: Gathered,
-    where: Atlas,
+    observed: TexelObservations,
+    atlas: Atlas,
     solution: Solution,
-    differences: Callable[[int], np.ndarray],
+    residuals: Callable[[int], np.ndarray],
     settings: RecoverSettings,
     number: int,
 ) -> Solution:
-    """Solve again for targets corrected by `differences(k)`, reference minus render of picture k for `solution`; the
-    references, and how much they count, are `gathered`'s observations.
+    """Solve again for targets corrected by `residuals(k)`, reference minus render of picture k for `solution`; the
+    references, and how much they count, are `observed`'s observations.
 
     Each texel's prior is the mean of its neighbours, weighted by how sure they are, as firm as the surface is smooth.
     """
     target = problem.predict(solution.values)
-    if len(target) < len(gathered.observations.rgb):
-        target = np.pad(target, ((0, len(gathered.observations.rgb) - len(target)), (0, 0)))
-    for k, sighting in enumerate(gathered.sightings):
-        if len(sighting.rows):
-            target[sighting.rows] += fetch(differences(k), sighting)
+    if len(target) < len(observed.observations.rgb):
+        target = np.pad(target, ((0, len(observed.observations.rgb) - len(target)), (0, 0)))
+    for k, samples in enumerate(observed.per_image):
+        if len(samples.rows):
+            target[samples.rows] += sample_image(residuals(k), samples)
     problem.retarget(target)
-    apart = np.abs(target - gathered.observations.rgb).max(axis=1)
-    problem.reweight(less_sure(gathered.observations.weight, UNLIKE * apart))
-    where = joined(where, *(placed(v, gathered, where, 0) for v in (solution.values, left_open(solution, gathered))))
-    mean = neighbourhood(solution.values, sureness(solution, gathered), gathered, where, BLUR, OVER_SEAMS)
-    prior = belief(solution, mean, gathered, where, settings.neighbours)
-    mean, prior = levelled(solution, mean, prior, gathered, where)
+    apart = np.abs(target - observed.observations.rgb).max(axis=1)
+    problem.reweight(with_extra_std(observed.observations.weight, UNLIKE * apart))
+    atlas = with_seam_weights(
+        atlas, *(scatter(v, observed, atlas, 0) for v in (solution.values, unconstrained_std(solution, observed)))
+    )
+    mean = neighbourhood(solution.values, neighbour_weight(solution, observed), observed, atlas, BLUR, OVER_SEAMS)
+    prior = prior_precision(solution, mean, observed, atlas, settings.neighbours)
+    mean, prior = shrink_normals(solution, mean, prior, observed, atlas)
 
     def tried(start: Values, steps: int, metal: Float[np.ndarray, " t"]) -> tuple[Solution, Float[np.ndarray, " t"]]:
         if not settings.metallic:
             solved = problem.solve(start, mean, prior, steps)
             return solved, penalty(solved.values, mean, prior)
-        around, weight, constant = both(mean, prior, metal)
+        around, weight, constant = combine_class_prior(mean, prior, metal)
         solved = problem.solve(start, around, weight, steps)
-        return solved, penalty(solved.values, around, weight) + constant + unlikely(solved.values, gathered.seen)
+        return solved, penalty(solved.values, around, weight) + constant + log_prior_penalty(
+            solved.values, observed.seen
+        )
 
     solved = [tried(solution.values, 5, _nearest(solution.values))]
     if number < RESTARTS:
         for roughness in (None, 0.15, 0.4, 0.8):
             other = mean.copy()
             if roughness is not None:
-                other[:, 5] = roughness
+                other[:, ROUGHNESS] = roughness
             solved.append(tried(other, 8, _nearest(mean)))
     return best(solved)
 
@@ -128,4 +136,4 @@ def _pick(choice: Bool[np.ndarray, " t"], a: np.ndarray, b: np.ndarray) -> np.nd
 
 def _nearest(values: Values) -> Float[np.ndarray, " t"]:
     """Metal or not."""
-    return (values[:, 6] > 0.5).astype(np.float32)
+    return (values[:, METALLIC] > 0.5).astype(np.float32)

@@ -9,8 +9,9 @@ from jaxtyping import Float
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels, rows_of
 from mistyle.core.mesh import Mesh
-from mistyle.stages.neighbours import Links, believed, links
-from mistyle.stages.recover_observe import Gathered
+from mistyle.render.material_table import COLUMNS, ROUGHNESS, SOLVED
+from mistyle.stages.neighbours import Links, links, weighted_seams
+from mistyle.stages.recover_observe import TexelObservations
 
 # Where a texel is thought to be before anything was seen.
 PRIOR_MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.5, 0.0)
@@ -43,7 +44,7 @@ class Atlas:
         return self.parts[-1].stop
 
 
-def atlas(texels: Sequence[Texels]) -> Atlas:
+def atlas_of(texels: Sequence[Texels]) -> Atlas:
     """The atlas of some texture sets."""
     covered = tuple(t.covered for t in texels)
     return Atlas(
@@ -55,29 +56,29 @@ def atlas(texels: Sequence[Texels]) -> Atlas:
 
 def linked(mesh: Mesh, texels: Sequence[Texels]) -> Atlas:
     """The same with neighbours."""
-    return replace(atlas(texels), links=tuple(links(mesh, t) for t in texels))
+    return replace(atlas_of(texels), links=tuple(links(mesh, t) for t in texels))
 
 
-def spread_out(values: Values, gathered: Gathered, where: Atlas) -> Table:
+def scatter_to_atlas(values: Values, observed: TexelObservations, atlas: Atlas) -> Table:
     """The table of an atlas: covered texels have their values, the others those of the nearest covered one."""
-    table = np.zeros((where.count, 8), np.float32)
-    table[:, :7] = PRIOR_MEAN
-    table[gathered.texel, :7] = values
-    return fill(table, where)
+    table = np.zeros((atlas.count, COLUMNS), np.float32)
+    table[:, SOLVED] = PRIOR_MEAN
+    table[observed.texel, SOLVED] = values
+    return fill(table, atlas)
 
 
-def placed(values: np.ndarray, gathered: Gathered, where: Atlas, otherwise) -> np.ndarray:
+def scatter(values: np.ndarray, observed: TexelObservations, atlas: Atlas, otherwise) -> np.ndarray:
     """The covered texels' values in an array of the whole atlas, which has `otherwise` elsewhere."""
-    result = np.zeros((where.count, *values.shape[1:]), values.dtype)
+    result = np.zeros((atlas.count, *values.shape[1:]), values.dtype)
     result[...] = otherwise
-    result[gathered.texel] = values
+    result[observed.texel] = values
     return result
 
 
-def fill(table: Float[np.ndarray, "a c"], where: Atlas, only: np.ndarray | None = None) -> Float[np.ndarray, "a c"]:
+def fill(table: Float[np.ndarray, "a c"], atlas: Atlas, only: np.ndarray | None = None) -> Float[np.ndarray, "a c"]:
     """Uncovered texels (of `only`, where given) take the values of the nearest covered one of their set."""
     result = table.copy()
-    for part, covered, closest in zip(where.parts, where.covered, where.closest, strict=True):
+    for part, covered, closest in zip(atlas.parts, atlas.covered, atlas.closest, strict=True):
         empty = ~covered.ravel()
         if only is not None:
             empty &= only[part]
@@ -88,20 +89,20 @@ def fill(table: Float[np.ndarray, "a c"], where: Atlas, only: np.ndarray | None 
 def neighbourhood(
     values: Float[np.ndarray, "t c"],
     weight: Float[np.ndarray, "t c"],
-    gathered: Gathered,
-    where: Atlas,
+    observed: TexelObservations,
+    atlas: Atlas,
     steps: int,
     over: Float[np.ndarray, " c"] | float = 1.0,
 ) -> Float[np.ndarray, "t c"]:
     """Weighted mean over the neighbours and theirs; `over`: how much those beyond seams count, 0..1 (of each column).
     Where none has a weight, the texel's own value."""
     channels = values.shape[1]
-    full = np.zeros((2, where.count, channels), np.float32)
-    full[0, gathered.texel], full[1, gathered.texel] = values * weight, weight
-    for part, size, among in zip(where.parts, where.sizes, where.links, strict=True):
+    full = np.zeros((2, atlas.count, channels), np.float32)
+    full[0, observed.texel], full[1, observed.texel] = values * weight, weight
+    for part, size, among in zip(atlas.parts, atlas.sizes, atlas.links, strict=True):
         sums = full[:, part].reshape(2, *size, channels)
         sums[...] = diffused(sums, among, steps, over)
-    summed, weights = full[:, gathered.texel]
+    summed, weights = full[:, observed.texel]
     return np.where(weights > 1e-12, summed / np.maximum(weights, 1e-12), values).astype(np.float32)
 
 
@@ -125,10 +126,10 @@ def diffused(
     return part
 
 
-def joined(where: Atlas, values: Float[np.ndarray, "a 7"], spread: Float[np.ndarray, "a 7"]) -> Atlas:
+def with_seam_weights(atlas: Atlas, values: Float[np.ndarray, "a 7"], spread: Float[np.ndarray, "a 7"]) -> Atlas:
     """The same with seams believed by albedo and roughness; `spread`: standard deviations."""
-    found = []
-    for part, size, among in zip(where.parts, where.sizes, where.links, strict=True):
-        fields = ((values[part, c].reshape(size), spread[part, c].reshape(size)) for c in (0, 1, 2, 5))
-        found.append(believed(among, fields))
-    return replace(where, links=tuple(found))
+    links_by_set = []
+    for part, size, among in zip(atlas.parts, atlas.sizes, atlas.links, strict=True):
+        fields = ((values[part, c].reshape(size), spread[part, c].reshape(size)) for c in (0, 1, 2, ROUGHNESS))
+        links_by_set.append(weighted_seams(among, fields))
+    return replace(atlas, links=tuple(links_by_set))

@@ -21,11 +21,12 @@ from mistyle.core.light import Ambient, Environment
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.render.draw import Tracer
+from mistyle.render.material_table import ALBEDO
 from mistyle.stages import light_cells, light_solve, recover_prior
 from mistyle.stages.light_solve import Bundle, State
-from mistyle.stages.recover_observe import Gathered, gather
+from mistyle.stages.recover_observe import ObservationOptions, TexelObservations, collect_observations
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.recover_table import atlas, placed, spread_out
+from mistyle.stages.recover_table import atlas_of, scatter, scatter_to_atlas
 from mistyle.stages.texels import rasterise
 
 SIDE = 192  # pixels along the longer side of the small pictures
@@ -62,7 +63,7 @@ def find_light(
     from mistyle.render.texel_lm import Options
 
     traced = tracer(mesh)
-    texels, gathered = _observations(traced, captures, settings)
+    texels, observed = _observations(traced, captures, settings)
     normal = np.concatenate([t.normal[t.covered] for t in texels])
     options = Options(settings.model, settings.metallic, floor=max(FLOOR, settings.roughness_floor))
     residuals: list[float] = []
@@ -72,23 +73,25 @@ def find_light(
         progress(min(0.99, len(residuals) / (sum(STEPS) + 1)))
 
     cells = light_cells.even_cells()
-    bundled = light_solve.bundle(traced, gathered, normal, cells, options)
+    bundled = light_solve.bundle(traced, observed, normal, cells, options)
     state = _begin(bundled)
     heard(state)
-    state = light_solve.together(bundled, state, _conventional, STEPS[0], heard)
+    state = light_solve.solve_light_and_texels(bundled, state, _conventional, STEPS[0], heard)
     cells, radiance = light_cells.refined(cells, state.radiance)
-    bundled = light_solve.bundle(traced, gathered, normal, cells, options)
+    bundled = light_solve.bundle(traced, observed, normal, cells, options)
     values = state.values
     for _ in range(3):
         radiance = light_solve.light_over(bundled, radiance, values)
     state = light_solve.texels_under(bundled, radiance, values, 8)
-    state = light_solve.together(bundled, state, _conventional, STEPS[1], heard)
+    state = light_solve.solve_light_and_texels(bundled, state, _conventional, STEPS[1], heard)
     progress(1.0)
     light = light_cells.environment_of(cells, state.radiance)
-    return FoundLight(light, tuple(residuals), _maps(state, gathered, texels))
+    return FoundLight(light, tuple(residuals), _maps(state, observed, texels))
 
 
-def _observations(traced: Tracer, captures: Captures, settings: RecoverSettings) -> tuple[list[Texels], Gathered]:
+def _observations(
+    traced: Tracer, captures: Captures, settings: RecoverSettings
+) -> tuple[list[Texels], TexelObservations]:
     """What small pictures say of a coarse atlas, as fine as OBSERVATIONS allows."""
     from mistyle.render.hits import tangents_of
 
@@ -97,36 +100,36 @@ def _observations(traced: Tracer, captures: Captures, settings: RecoverSettings)
     lit = in_memory(cameras, [(Ambient((1.0, 1.0, 1.0)),)] * len(cameras), pictures, masks)
     mesh, tangents = traced.mesh, tangents_of(traced.mesh, settings.frame)
 
-    def observed(side: int) -> tuple[list[Texels], Gathered]:
+    options = ObservationOptions(settings.facing, NOISE, RELATIVE, skies=False, move=0)
+
+    def observed_at(side: int) -> tuple[list[Texels], TexelObservations]:
         texels = [rasterise(mesh, part, side) for part in range(len(mesh.parts))]
-        return texels, gather(
-            traced, texels, lit, tangents, facing=settings.facing, noise=NOISE, relative=RELATIVE, skies=False, move=0
-        )
+        return texels, collect_observations(traced, texels, lit, tangents, options)
 
     side = max(LEAST, int(ATLAS / len(mesh.parts) ** 0.5))
-    texels, gathered = observed(side)
-    count = len(gathered.observations.rgb)
+    texels, observed = observed_at(side)
+    count = len(observed.observations.rgb)
     if count > OBSERVATIONS:
-        texels, gathered = observed(max(LEAST, int(side * (OBSERVATIONS / count) ** 0.5)))
-    if not (gathered.seen >= recover_prior.LEAST_SEEN).any():
+        texels, observed = observed_at(max(LEAST, int(side * (OBSERVATIONS / count) ** 0.5)))
+    if not (observed.seen >= recover_prior.LEAST_SEEN).any():
         raise InputRefused(
             f"found no place of the mesh that {recover_prior.LEAST_SEEN} of the pictures show, expected pictures from "
             "around it. Check the cameras (--align where they are in other units than the mesh) and the masks."
         )
-    return texels, gathered
+    return texels, observed
 
 
 def _begin(bundled: Bundle) -> State:
     """Light over grey texels, then texels under it, brought to the convention."""
     values = light_solve.first_values(bundled)
-    middle = float(np.median(bundled.gathered.observations.rgb))
+    middle = float(np.median(bundled.observed.observations.rgb))
     radiance = np.full((len(bundled.cells.angle), 3), max(middle, 1e-6))
     radiance = light_solve.light_over(bundled, radiance, values)
     for _ in range(2):
         state = light_solve.texels_under(bundled, radiance, values, 8)
         factor = _factor(bundled, state)
         values, radiance = state.values.copy(), state.radiance / factor
-        values[:, :3] = np.clip(values[:, :3] * factor, 0, 1)
+        values[:, ALBEDO] = np.clip(values[:, ALBEDO] * factor, 0, 1)
     return light_solve.texels_under(bundled, radiance, values, 8)
 
 
@@ -134,7 +137,7 @@ def _factor(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
     """What albedo would be multiplied by, and light divided, to be as the convention has them."""
     mean = bundled.cells.mean(state.radiance)
     colour = mean / max(float(luminance(mean[None])[0]), 1e-9)
-    seen = state.values[bundled.gathered.seen > 0, :3]
+    seen = state.values[bundled.observed.seen > 0, ALBEDO]
     bright = float(np.quantile(luminance(seen * colour), 0.95))
     return np.maximum(colour, 1e-3) * BRIGHT / max(bright, 1e-6)
 
@@ -144,13 +147,13 @@ def _conventional(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
     return bundled.cells.mean(state.radiance) / _factor(bundled, state)
 
 
-def _maps(state: State, gathered: Gathered, texels: Sequence[Texels]) -> tuple[Maps, ...]:
-    from mistyle.render.shade import unpack
+def _maps(state: State, observed: TexelObservations, texels: Sequence[Texels]) -> tuple[Maps, ...]:
+    from mistyle.render.material_table import unpack
 
-    where = atlas(texels)
-    known = placed(gathered.seen > 0, gathered, where, False)
-    found = unpack(spread_out(state.values, gathered, where), where.sizes)
-    return tuple(replace(m, known=known[p].reshape(m.known.shape)) for m, p in zip(found, where.parts, strict=True))
+    atlas = atlas_of(texels)
+    known = scatter(observed.seen > 0, observed, atlas, False)
+    maps = unpack(scatter_to_atlas(state.values, observed, atlas), atlas.sizes)
+    return tuple(replace(m, known=known[p].reshape(m.known.shape)) for m, p in zip(maps, atlas.parts, strict=True))
 
 
 def _small(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:

@@ -1,0 +1,96 @@
+"""What all parts of one recovery share, and the references that they fit to."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.capture import Captures, Loaded
+from mistyle.core.maps import Texels
+from mistyle.render.draw import Tracer
+from mistyle.render.indirect import enlarged
+from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.stages.recover_table import Atlas
+
+if TYPE_CHECKING:
+    from mistyle.render.shade import MaterialRenderer
+
+DISTRUST = 10.0  # of indirect light: what a pixel counts is halved by one tenth of the direct light
+
+Radiance = Float[np.ndarray, "h w 3"]
+
+
+@dataclass(frozen=True)
+class FitContext:
+    """What all parts of one fit share.
+
+    tangents  per face corner, None for Mitsuba's frames
+    texels    of each texture set, at the atlas's resolution
+    captures  the reference pictures with all their light
+    notes     sentences for the report, in the order in which they come up
+    trace     figures per round and step, by name
+    """
+
+    traced: Tracer
+    tangents: Float[np.ndarray, "f 3 4"] | None
+    texels: Sequence[Texels]
+    atlas: Atlas
+    captures: Captures
+    settings: RecoverSettings
+    seed: int = 0
+    notes: list[str] = field(default_factory=list)
+    trace: dict[str, list[float]] = field(default_factory=dict)
+
+    def renderer(
+        self, subsamples: int | None = None, memory: float | None = None, gradients: bool = False
+    ) -> "MaterialRenderer":
+        """Pictures of tables of this atlas; `memory` in bytes. Without either, those of the settings."""
+        from mistyle.render.shade import MaterialRenderer, RenderOptions
+
+        s = self.settings
+        options = RenderOptions(
+            model=s.model,
+            frame=s.frame,
+            subsamples=s.subsamples if subsamples is None else subsamples,
+            shadows=s.shadows,
+            memory=s.memory * 1e9 if memory is None else memory,
+            gradients=gradients,
+        )
+        return MaterialRenderer(self.traced, self.captures, self.atlas.sizes, options)
+
+
+@dataclass(frozen=True)
+class DirectCaptures:
+    """Reference pictures, and the estimate of their indirect light: linear radiance per picture, perhaps coarser."""
+
+    captures: Captures
+    indirect: Mapping[int, Radiance] = field(default_factory=dict)
+
+    def with_indirect(self, k: int, light: Radiance) -> "DirectCaptures":
+        """The same with another estimate for picture k."""
+        return replace(self, indirect={**self.indirect, k: light})
+
+    def load(self, k: int) -> Loaded:
+        """Picture k less its indirect light, and which pixels count."""
+        rgb, mask = self.captures.load(k)
+        if k in self.indirect:
+            rgb = rgb - self.enlarged(k)
+        return rgb, mask
+
+    def enlarged(self, k: int) -> Float[np.ndarray, "h w 3"]:
+        """The indirect light of picture k, as large as the picture."""
+        return enlarged(self.indirect[k], self.captures.cameras[k].size)
+
+    def direct_only(self) -> Captures:
+        """The pictures without their indirect light."""
+        return Captures(self.captures.cameras, self.captures.lights, self.load)
+
+    def pixel_confidence(self, k: int) -> Float[np.ndarray, "h w"]:
+        """Weights of a picture's pixels, 0..1: a half where a tenth of the direct light was taken off as indirect."""
+        if k not in self.indirect:
+            return np.ones(self.captures.cameras[k].size, np.float32)
+        taken = self.enlarged(k).max(axis=-1)
+        direct = np.maximum(np.nan_to_num(self.load(k)[0]).max(axis=-1), 0)
+        return (direct / np.maximum(direct + DISTRUST * taken, 1e-9)).astype(np.float32)
