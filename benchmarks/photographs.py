@@ -42,10 +42,9 @@ from mistyle.files.cameras import transforms
 from mistyle.files.captures import read_captures
 from mistyle.files.read_mesh import read_mesh
 from mistyle.render.draw import tracer
-from mistyle.render.shade import MaterialRenderer
-from mistyle.render.shade import RenderOptions
-from mistyle.run.material_budget import material_gb
 from mistyle.render.material_table import pack
+from mistyle.render.shade import MaterialRenderer, RenderOptions
+from mistyle.run.material_budget import material_gb
 from mistyle.run.material_settings import MaterialSettings
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import downsampling_factors

@@ -8,7 +8,17 @@ from pathlib import Path
 import pytest
 from helpers import ROOT
 
-FLOORS = {"core": 0, "files": 1, "render": 1, "measure": 1, "surface": 1, "stages": 2, "backends": 3, "run": 4, "api": 5}
+FLOORS = {
+    "core": 0,
+    "files": 1,
+    "render": 1,
+    "measure": 1,
+    "surface": 1,
+    "stages": 2,
+    "backends": 3,
+    "run": 4,
+    "api": 5,
+}
 DOORS = {
     "mitsuba": {"render"},
     "drjit": {"render", "surface"},

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from mistyle.api import html
 from mistyle.core.errors import InputRefused
 from mistyle.core.view import View
-from mistyle.files.layers import BEAUTY, Frame, Layer
+from mistyle.files.layers import BEAUTY, Layer, LayeredPicture
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ def compare(
     )
 
 
-def _frame(given: Any, who: str, kind: Literal["colour", "data"], layer: str) -> Frame:
+def _frame(given: Any, who: str, kind: Literal["colour", "data"], layer: str) -> LayeredPicture:
     """A file's frame, or an array as one."""
     if isinstance(given, str | PathLike):
         from mistyle.files.read import read_frame
@@ -117,4 +117,4 @@ def _frame(given: Any, who: str, kind: Literal["colour", "data"], layer: str) ->
     planes = tuple(np.moveaxis(values, -1, 0))
     finite = values[np.isfinite(values)]
     high = bool(finite.size and (finite.max() > 1 or finite.min() < 0))
-    return Frame(Path(who), (Layer(layer, names, planes, kind, whole, whole),), high)
+    return LayeredPicture(Path(who), (Layer(layer, names, planes, kind, whole, whole),), high)

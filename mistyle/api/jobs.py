@@ -85,8 +85,8 @@ def stylize(
     from mistyle.core.names import asset_name
     from mistyle.run.pipeline import stylize as run
     from mistyle.run.progress import Progress
-    from mistyle.run.settings import resolve
-    from mistyle.run.stages import Job
+    from mistyle.run.stylize_job import Job
+    from mistyle.run.stylize_settings import resolve
 
     mesh, style, chosen = Path(mesh), Path(style), resolve(preset, None, dict(settings))
     job = Job(mesh, style, Path(out), chosen, asset_name(name, mesh.stem, style.stem), overwrite=overwrite)
@@ -169,7 +169,7 @@ def bake(
     """
     from mistyle.core.names import asset_name
     from mistyle.run.progress import Progress
-    from mistyle.run.settings import resolve
+    from mistyle.run.stylize_settings import resolve
     from mistyle.run.verbs import bake_views
 
     mesh, chosen = Path(mesh), resolve(preset, None, dict(settings))
@@ -205,7 +205,7 @@ def lookdev(
     from mistyle.run.progress import Progress
     from mistyle.run.settings import validate
 
-    chosen, progress = validate(settings, "lookdev", LookSettings), Progress(quiet=quiet)
+    chosen, progress = validate({**settings, "mp4": mp4}, "lookdev", LookSettings), Progress(quiet=quiet)
     place = None if hdri is None else Path(hdri)
-    written = run(Path(asset), Path(out), chosen, progress, hdri=place, date=date, mp4=mp4, overwrite=overwrite)
+    written = run(Path(asset), Path(out), chosen, progress, hdri=place, date=date, overwrite=overwrite)
     return JobResult(written | {"notes": list(progress.notes)})

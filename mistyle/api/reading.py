@@ -35,7 +35,7 @@ def read_mesh(
 
     Raises InputRefused for files that cannot be used. Animations are not read.
     """
-    from mistyle.files.read import read_mesh as read
+    from mistyle.files.read_mesh import read_mesh as read
 
     return read(Path(path), uv=uv, up=up, size=size, max_faces=max_faces)
 

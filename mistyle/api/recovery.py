@@ -85,7 +85,7 @@ def recover(
     """
     from mistyle.run.settings import validate
     from mistyle.stages.recover import recover as solve
-    from mistyle.stages.recover_check import blocks
+    from mistyle.stages.recover_check import downsampling_factors
     from mistyle.stages.texels import rasterise
 
     shape = mesh.mesh if isinstance(mesh, Asset) else mesh
@@ -96,7 +96,7 @@ def recover(
         raise InputRefused(f"recover: found no light for the picture '{unlit[0]}', expected one for each. mistyle.fit"
                            '(..., lights="unknown") solves for an unknown light.')  # fmt: skip
     texels = tuple(rasterise(shape, part, size) for part in range(len(shape.parts)))
-    by = blocks(texels, captures.cameras)
+    by = downsampling_factors(texels, captures.cameras)
     done = solve(
         shape,
         texels,

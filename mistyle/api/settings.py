@@ -20,7 +20,7 @@ class StylizeSettings(TypedDict, total=False):
     rig: Stage
     draw: Stage
     surface: Stage
-    coat: Stage
+    paint: Stage
     sweep: Stage
     atlas: Stage
     bake: Stage

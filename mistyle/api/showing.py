@@ -51,18 +51,18 @@ def gallery(rows: Mapping[str, Any], size: int = 160, *, names: Sequence[str] = 
 
     Colours above 1 clip; there is no tone curve.
     """
-    from mistyle.run.sheet_canvas import Panel, Row, Sheet, compose, measures
+    from mistyle.run.sheet_canvas import Panel, PanelRow, Sheet, compose, measures
 
     scale = size / 200
     gutter = measures(scale)["gutter"]
     made = []
     for heading, given in rows.items():
         panels = [Panel(_fitted(picture, size), name) for name, picture in _pictures(given, names, exposure)]
-        made.append(Row(heading, tuple(panels)))
+        made.append(PanelRow(heading, tuple(panels)))
     widths = [sum(p.picture.shape[1] for p in row.panels) + gutter * (len(row.panels) - 1) for row in made]
     # Equal distances: a shorter row is filled up to the width of the longest.
     full = [
-        Row(row.heading, (*row.panels, *_blank(row, max(widths) - width, gutter)))
+        PanelRow(row.heading, (*row.panels, *_blank(row, max(widths) - width, gutter)))
         for row, width in zip(made, widths, strict=True)
     ]
     sheet = compose(Sheet("", (), tuple(full)), max(widths), scale)
