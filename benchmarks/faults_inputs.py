@@ -136,7 +136,7 @@ def _weights(path: Path) -> None:
 def _of(module: str, function: str) -> Callable[[Path], object]:
     from importlib import import_module
 
-    return lambda path: getattr(import_module(f"mistyle.files.{module}"), function)(path)
+    return lambda path: getattr(import_module(f"mistyle.io.{module}"), function)(path)
 
 
 READERS: dict[str, Callable[[Path], object]] = {

@@ -21,9 +21,9 @@ import numpy as np
 
 from benchmarks.material_metrics import texel_areas
 from mistyle.core.camera import Camera, in_frame, px_from_world
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import nearest_fill
-from mistyle.core.lanes import aligned
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.files.read_mesh import read_mesh

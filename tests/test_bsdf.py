@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.render import bsdf, device
 
 COUNT = 8000

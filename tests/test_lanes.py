@@ -1,4 +1,4 @@
-"""NumPy's memory as Dr.Jit reads it: nothing is read that is not there, and nothing goes past core/lanes.py."""
+"""NumPy's memory as Dr.Jit reads it: nothing is read that is not there, and nothing goes past core/drjit_arrays.py."""
 
 import ast
 import subprocess
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from helpers import ROOT
 
-from mistyle.core.lanes import ALIGNMENT, LANES, aligned, whole
+from mistyle.core.drjit_arrays import ALIGNMENT, LANES, aligned, whole
 
 # An array that ends with its page, behind which nothing may be read.
 AT_THE_END_OF_A_PAGE = """
@@ -17,7 +17,7 @@ import ctypes, mmap, sys
 import numpy as np
 import drjit as dr
 from drjit.llvm import Float
-from mistyle.core.lanes import aligned, whole
+from mistyle.core.drjit_arrays import aligned, whole
 
 memory = mmap.mmap(-1, 3 * mmap.PAGESIZE)
 base = ctypes.addressof(ctypes.c_char.from_buffer(memory))

@@ -12,8 +12,8 @@ import pytest
 from helpers import ROOT
 
 from mistyle.core.camera import Camera, orbit, pixel_centres, px_from_world, world_from_px, zoom
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.errors import EnvironmentMissing, InputRefused
-from mistyle.core.lanes import aligned
 from mistyle.core.light import (
     Directional,
     SphericalGaussian,

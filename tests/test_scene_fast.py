@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_scene_fit import bitmap, smooth
 
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.render import device, scene_fit, scene_grad, scene_job, scene_keys
 from mistyle.render.scene_fast import DeferredRenderer, Unsupported
 

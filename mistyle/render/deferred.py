@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.camera import Camera
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import Ambient, Directional, Lights, Point, direction_in_world, position_in_world
 from mistyle.render import device
 from mistyle.render.draw import Tracer

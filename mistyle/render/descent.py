@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.render import device
 from mistyle.render.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT_X, TILT_Y
 

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core import memory
 from mistyle.core.camera import Camera, pixel_centres
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.image import resize
-from mistyle.core.lanes import aligned
 from mistyle.core.maps import Maps, coarser
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View

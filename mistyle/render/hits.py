@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Integer
 
 from mistyle.core.camera import Camera, px_from_world
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import Directional, Lights, Point, SceneLights, direction_in_world, position_in_world
 from mistyle.core.mesh import Mesh
 from mistyle.core.tangents import corner_tangents

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core import memory
-from mistyle.core.lanes import LANES, aligned
+from mistyle.core.drjit_arrays import LANES, aligned
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.tangents import corner_tangents

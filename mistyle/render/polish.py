@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.capture import Captures
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device, scene_grad, scene_keys

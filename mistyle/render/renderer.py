@@ -14,8 +14,8 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera
+from mistyle.core.drjit_arrays import LANES, aligned
 from mistyle.core.errors import UsageError
-from mistyle.core.lanes import LANES, aligned
 from mistyle.core.light import Ambient, Directional, Light, Lights, Point
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
@@ -167,7 +167,7 @@ class Renderer:
             self._wrapped[camera] = dr.wrap(source="torch", target="drjit")(
                 lambda packed: mi.TensorXf(split.radiance(lit, packed.array), shape)
             )
-        # Dr.Jit reads torch's memory beyond its end (core/lanes.py).
+        # Dr.Jit reads torch's memory beyond its end (core/drjit_arrays.py).
         padded = torch.nn.functional.pad(pixels.reshape(-1), (0, LANES))[: pixels.numel()]
         return self._wrapped[camera](padded).clone()
 

@@ -25,8 +25,8 @@ from jaxtyping import Float
 
 from mistyle.core import memory
 from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
+from mistyle.core.drjit_arrays import aligned, whole
 from mistyle.core.errors import InputRefused
-from mistyle.core.lanes import aligned, whole
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh, weld
 from mistyle.core.paths import scenes

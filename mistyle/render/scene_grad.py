@@ -15,9 +15,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
-from mistyle.core.lanes import aligned
 from mistyle.render import scene as scenery
 from mistyle.render import scene_walk
 from mistyle.render.scene_keys import Parameter

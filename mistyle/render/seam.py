@@ -19,7 +19,7 @@ import numpy as np
 import scipy.sparse as sparse
 from jaxtyping import Float, Int
 
-from mistyle.core.lanes import LANES, aligned
+from mistyle.core.drjit_arrays import LANES, aligned
 from mistyle.core.maps import flat_maps
 from mistyle.render import deferred, device, split
 from mistyle.render import scene as scenery
@@ -144,8 +144,8 @@ class _Wrapped:
             if name == "normal":
                 image = image * 0.5 + 0.5
             if name in moving:
-                # A fresh tensor: Dr.Jit works on torch's memory, beyond its end too (core/lanes.py), and does not
-                # recognise nn.Parameter.
+                # A fresh tensor: Dr.Jit works on torch's memory, beyond its end too (core/drjit_arrays.py), and does
+                # not recognise nn.Parameter.
                 wanted[name] = torch.nn.functional.pad(image.reshape(-1), (0, LANES))[: image.numel()].view_as(image)
             else:
                 self.parameters[self.names[name]] = mi.TensorXf(aligned(image.detach().numpy()))

@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.capture import Captures
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import SOFT, Lights
 from mistyle.render import bsdf, device, shading
 from mistyle.render import hits as collecting

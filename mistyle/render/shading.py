@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.render.hits import Pixels, Samples, Transpose
 from mistyle.render.material_table import (
     ALBEDO,

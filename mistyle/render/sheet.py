@@ -15,8 +15,8 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera, look_at, orbit
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.image import luminance
-from mistyle.core.lanes import aligned
 from mistyle.core.light import Ambient, Environment, SphericalGaussian, bake_environment, environment_directions
 from mistyle.render import device
 from mistyle.render.lookdev import asset_scene, asset_shapes, drawn, light_rig

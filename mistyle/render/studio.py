@@ -23,7 +23,7 @@ from jaxtyping import Float, UInt32
 
 from mistyle.core import memory
 from mistyle.core.camera import Camera
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import Environment, environment_directions, environment_radiance, turn_about_y
 from mistyle.core.maps import Maps
 from mistyle.core.tangents import corner_tangents

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.render import device
 from mistyle.render.texel_algebra import Sums, flat_of, nothing, spread_of, step, triangle, unflat
 from mistyle.render.texel_records import UNKNOWNS, Observations, Options, Points, Rig, Solution

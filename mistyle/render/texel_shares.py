@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.render.texel_lm import Problem, local
 from mistyle.render.texel_response import terms
 

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt32
 
 from mistyle.core.camera import Camera
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import SOFT, Directional, Light, Lights, Point, direction_in_world, position_in_world
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from mistyle.core import memory
 from mistyle.core.camera import Camera
-from mistyle.core.lanes import aligned, whole
+from mistyle.core.drjit_arrays import aligned, whole
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.render import device

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.camera import Camera, in_frame, px_from_world
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 from mistyle.render import device
 from mistyle.render.draw import Tracer
 

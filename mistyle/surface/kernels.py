@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.lanes import aligned
+from mistyle.core.drjit_arrays import aligned
 
 TURNED = np.uint32(1 << 31)  # the bit of a table entry that says the neighbour's picture is upside down
 PAGES = 4  # the picture in its four quarter turns
