@@ -20,7 +20,7 @@ def main():
             sys.stderr.write("mistyle: this is Python %s; 3.11 or newer is needed. Install one and use it.\n" % found)
             sys.exit(4)
         os.execv(newer, [newer, "-m", "mistyle"] + sys.argv[1:])
-    from mistyle.bootstrap import start
+    from mistyle.setup.bootstrap import start
 
     sys.exit(start(sys.argv[1:], command_line, doctor))
 

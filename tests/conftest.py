@@ -9,7 +9,7 @@ from browser import NO_BROWSER
 from helpers import NO_DATA
 from hypothesis import settings
 
-from mistyle import environment
+from mistyle.setup import environment
 
 # Skips that CI accepts, by the beginning of their reason, and why. Where the environment variable CI is set, any
 # other skip fails the run: a test that never runs proves nothing.

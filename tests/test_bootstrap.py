@@ -17,7 +17,7 @@ import pytest
 from helpers import ROOT
 from packaging.requirements import Requirement
 
-from mistyle import bootstrap, environment
+from mistyle.setup import bootstrap, environment
 
 HEAVY = {"numpy", "pydantic", "rich", "torch", "mitsuba", "trimesh", "cv2", "scipy"}
 HELP_SECONDS = 0.5  # of processor time, which other programs on the machine do not lengthen
@@ -178,7 +178,7 @@ def test_dr_jit_that_came_too_early_is_said(monkeypatch):
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(device, "known_llvm", lambda: "/l/libLLVM.so.19.1")
     assert "/l/libLLVM.so.19.1" in device._missing("llvm_ad_rgb")
-    assert "mistyle.environment.use_llvm()" in device._missing("llvm_ad_rgb")
+    assert "mistyle.setup.environment.use_llvm()" in device._missing("llvm_ad_rgb")
 
 
 def test_private_folders_come_first_and_once():

@@ -4,8 +4,8 @@ import json
 
 import pytest
 
-from mistyle import facts, llvm
 from mistyle.run import doctor
+from mistyle.setup import facts, llvm
 
 
 @pytest.fixture(scope="module")

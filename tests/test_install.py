@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from mistyle import environment, install
+from mistyle.setup import environment, install
 
 FAKE_PIP = """
 import sys, pathlib, sysconfig

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from test_install import program
 
-from mistyle import environment, llvm
+from mistyle.setup import environment, llvm
 
 # A system that lacks libllvm and libatomic1, as apt-get describes it.
 APT = """

@@ -9,7 +9,7 @@ from typing import Any
 
 from mistyle.core import stopping
 from mistyle.core.errors import EnvironmentMissing, InputRefused
-from mistyle.environment import known_llvm, use_llvm
+from mistyle.setup.environment import known_llvm, use_llvm
 
 # The first that answers is taken; a GPU needs no LLVM.
 VARIANTS = {"cuda_ad_rgb": "CUDA", "metal_ad_rgb": "Metal", "llvm_ad_rgb": "LLVM"}
@@ -146,7 +146,7 @@ def _missing(variant: str) -> str:
     if (ours := known_llvm()) and not os.environ.get("DRJIT_LIBLLVM_PATH"):
         return (
             f"Dr.Jit was imported before it could load the working LLVM ({ours}). Call"
-            " `mistyle.environment.use_llvm()` before the first import of mitsuba or drjit."
+            " `mistyle.setup.environment.use_llvm()` before the first import of mitsuba or drjit."
         )
     if not dr.has_backend(dr.JitBackend.LLVM):
         return f"No LLVM library that Dr.Jit can load was found, and no GPU answers. {LLVM_HELP}"

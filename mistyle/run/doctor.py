@@ -6,9 +6,10 @@ Runs on a Python that has nothing installed, too, since that is when it is asked
 import json as _json
 from collections.abc import Sequence
 
-from mistyle import __version__, facts
+from mistyle import __version__
 from mistyle.core.cores import cores
-from mistyle.facts import Row, works
+from mistyle.setup import facts
+from mistyle.setup.facts import Row, works
 
 ENVIRONMENT_MISSING = 4
 

@@ -19,10 +19,10 @@ from pathlib import Path
 
 from mistyle import __version__
 from mistyle.core.errors import EnvironmentMissing, MistyleError
-from mistyle.environment import CONSTRAINTS, ROOT, home, in_clone, read_record
 from mistyle.files.output import claim, replace_files
 from mistyle.files.store import sha256_file
 from mistyle.run.progress import Progress
+from mistyle.setup.environment import CONSTRAINTS, ROOT, home, in_clone, read_record
 
 INSTALL = """#!/bin/sh
 # Installs mistyle {version} from this folder into TARGET. Needs no network and no root.

@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from urllib.parse import urljoin
 
-from mistyle.environment import CONSTRAINTS, ROOT, SetupError, in_clone, say, write_record
+from mistyle.setup.environment import CONSTRAINTS, ROOT, SetupError, in_clone, say, write_record
 
 NEEDED_BYTES = 3_000_000_000
 CPU_WHEELS = "https://download.pytorch.org/whl/cpu"

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 
-from mistyle.environment import told
+from mistyle.setup.environment import told
 
 Say = Callable[[str], None]
 

@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from mistyle.environment import (
+from mistyle.setup.environment import (
     ROOT,
     SetupError,
     home,
@@ -137,7 +137,7 @@ def _banner(folder: Path, record: dict[str, Any]) -> str:
 
 def set_up(folder: Path, extras: set[str], system: bool) -> None:
     """Make the virtual environment, install the packages, make sure of LLVM; whatever is there already is kept."""
-    from mistyle import install, llvm
+    from mistyle.setup import install, llvm
 
     begun = time.monotonic()
     say(f"setting up {folder}")
@@ -165,7 +165,7 @@ def set_up(folder: Path, extras: set[str], system: bool) -> None:
 
 
 def _find_llvm(folder: Path) -> dict[str, Any]:
-    from mistyle import llvm
+    from mistyle.setup import llvm
 
     say("looking for an LLVM that compiles (each is tried on one pixel)")
     python = str(python_of(folder))

@@ -17,7 +17,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from mistyle import __version__, environment, install, llvm
+from mistyle import __version__
+from mistyle.setup import environment, install, llvm
 
 State = Literal["ok", "missing", "optional"]
 

@@ -1,0 +1,1 @@
+"""From a bare Python to a working environment: the virtual environment, its packages, LLVM. Standard library only."""
