@@ -14,8 +14,8 @@ import time
 from pathlib import Path
 
 from benchmarks.common import arguments, finish
-from mistyle.core.cores import cores
 from mistyle.core.paths import scenes
+from mistyle.process.cores import cores
 from mistyle.run import engines
 from mistyle.run.batch import Choices, planned, run_batch
 from mistyle.run.batch_plan import BatchPlan, write_plan

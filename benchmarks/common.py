@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
-from mistyle.core.cores import cores
+from mistyle.process.cores import cores
 
 T = TypeVar("T")
 

@@ -20,8 +20,8 @@ from benchmarks.faults_kills import Kill, undisturbed
 from benchmarks.faults_kills import run as kills
 from benchmarks.faults_rows import Row
 from benchmarks.faults_rows import run as rows
-from mistyle.core.cores import cores
 from mistyle.core.paths import scenes
+from mistyle.process.cores import cores
 
 PARTS = ("kills", "rows", "inputs")
 JOBS = ("stylize", "fit", "fit --scene", "batch")

@@ -127,7 +127,7 @@ def _limits(path: Path) -> None:
 
 
 def _weights(path: Path) -> None:
-    from mistyle.core.weights import tensors
+    from mistyle.process.weights import tensors
 
     for tensor in tensors(path).values():
         tensor.sum()

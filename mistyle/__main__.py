@@ -27,7 +27,7 @@ def main():
 
 def command_line(arguments):
     """Run a verb and return its exit code."""
-    from mistyle.core.children import end_with_asker
+    from mistyle.process.children import end_with_asker
 
     # Before the imports, which take seconds on a busy machine: a shard whose batch is gone must not linger in them.
     end_with_asker()

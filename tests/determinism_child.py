@@ -264,7 +264,7 @@ def scene_fitted(made: Stages) -> None:
 
 
 def main(out: Path, threads: int, budget: float) -> None:
-    from mistyle.core import memory
+    from mistyle.process import memory
     from mistyle.run.start import start_engines
     from mistyle.run.stylize_settings import resolve
 

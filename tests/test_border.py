@@ -17,13 +17,13 @@ import numpy as np
 import pytest
 from helpers import ROOT, data
 
-from mistyle.core import weights
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.files import bounds, lending, reader_process, wire
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.raw import RawMap, Textures, Tile
 from mistyle.files.read import read_exr, read_json, read_npy, read_picture, read_size, read_toml, read_yaml
 from mistyle.files.read_mesh import read_mesh
+from mistyle.process import weights
 
 posix = os.name == "posix"
 
@@ -54,11 +54,11 @@ DECODERS = {
 ALLOWED = {
     "environment": "pyproject.toml of the clone",
     "core/light": "scene files that come with mistyle",
-    "core/memory": "arrays that mistyle wrote into a run's folder",
+    "process/memory": "arrays that mistyle wrote into a run's folder",
     "core/unwrap": "what its own child wrote into a folder of its own",
     "core/xatlas_worker": "what its parent wrote into a folder of its own",
-    "core/weights": "safetensors, mapped in place after their header was checked",
-    "core/weights_worker": "a child process of its own: weights that are no safetensors",
+    "process/weights": "safetensors, mapped in place after their header was checked",
+    "process/weights_worker": "a child process of its own: weights that are no safetensors",
     "files/images": "writes EXR",
     "files/usd": "the package that it has just written",
     "files/usd_look": "the USD file that the reader process has read in the same run, to lay materials over it",

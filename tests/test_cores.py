@@ -5,7 +5,7 @@ import sys
 
 LINES = """
 import sys
-from mistyle.core.cores import use_threads
+from mistyle.process.cores import use_threads
 use_threads(1)
 assert "torch" not in sys.modules
 import torch

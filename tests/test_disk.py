@@ -14,10 +14,11 @@ import pytest
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.paths import PACKAGE, scenes
-from mistyle.files import faults, output, store
+from mistyle.files import output, store
 from mistyle.files.images import write_png
 from mistyle.files.keeper import Keeper
 from mistyle.files.store import atomic_folder, atomic_write
+from mistyle.process import disk_errors
 from mistyle.run import engines, exits
 from mistyle.run.batch import Choices, planned, summarise
 from mistyle.run.cli import main
@@ -198,7 +199,7 @@ def test_an_input_that_vanished_is_a_sentence_and_a_mistake_of_ours_is_not(tmp_p
     assert code == 1 and "TMPDIR" in words
     with pytest.raises(FileNotFoundError):
         ends(FileNotFoundError(errno.ENOENT, "No such file", str(PACKAGE / "run" / "lost.j2")), capsys)
-    assert isinstance(faults.unexpected(OSError(errno.ENOENT, "x", str(gone))), InputRefused)
+    assert isinstance(disk_errors.unexpected(OSError(errno.ENOENT, "x", str(gone))), InputRefused)
 
 
 def test_a_shard_that_cannot_be_started_does_not_stop_the_batch(tmp_path, monkeypatch):

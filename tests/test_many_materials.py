@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from test_seam import random_maps, torus
 
-from mistyle.core import memory
 from mistyle.core.asset import Material
 from mistyle.core.camera import rig
 from mistyle.core.errors import UsageError
@@ -18,6 +17,7 @@ from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.paths import scenes
 from mistyle.core.rig_settings import RigSettings
 from mistyle.files.read_mesh import read_extent, read_mesh
+from mistyle.process import memory
 from mistyle.render import device, draw, lookdev, pages
 from mistyle.render import scene as scenery
 from mistyle.run import budget, stylize_budget, verbs

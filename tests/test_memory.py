@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from helpers import ROOT
 
-from mistyle.core import memory
 from mistyle.core.maps import Texels
 from mistyle.files.records import load_record, save_record
+from mistyle.process import memory
 
 BLOCK = 48_000_000
 FREED = """
 import ctypes, resource
-from mistyle.core import memory
+from mistyle.process import memory
 BLOCK = 48_000_000  # larger than any that glibc keeps of its own accord
 library = ctypes.CDLL(None)
 library.malloc.restype, library.malloc.argtypes = ctypes.c_void_p, [ctypes.c_size_t]

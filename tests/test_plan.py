@@ -5,8 +5,8 @@ import json
 
 import pytest
 
-from mistyle.core import memory
 from mistyle.core.errors import UsageError
+from mistyle.process import memory
 from mistyle.run import budget, material_budget, stylize_budget
 from mistyle.run.cli import main
 from mistyle.run.material_job import MATERIAL_STAGES

@@ -5,8 +5,8 @@ import json
 import numpy as np
 import pytest
 
-from mistyle.core import stopping
 from mistyle.core.errors import InputRefused, Stopped, UsageError
+from mistyle.process import stopping
 from mistyle.render import device, scene_fit, scene_grad, scene_keys, scene_source, scene_xml
 from mistyle.run import cli
 from mistyle.run.scene_references import choose_channels

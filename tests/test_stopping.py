@@ -9,14 +9,14 @@ from pathlib import Path
 
 import pytest
 
-from mistyle.core import stopping
 from mistyle.core.errors import Stopped
+from mistyle.process import stopping
 
 ROOT = Path(__file__).parents[1]
 VERB = """
 import argparse, os, signal, sys, time
 from pathlib import Path
-from mistyle.core import stopping
+from mistyle.process import stopping
 from mistyle.run import exits
 def command(options):
     print("ready", flush=True)
@@ -112,7 +112,7 @@ def test_an_interrupt_that_is_ignored_stays_so():
 
 def test_a_process_ends_with_its_parent_and_not_before_it(tmp_path):
     worker = (
-        "from mistyle.core.children import end_with_asker as end; end()\n"
+        "from mistyle.process.children import end_with_asker as end; end()\n"
         "import time; print('on', flush=True); time.sleep(60)"
     )
     parent = (
@@ -141,6 +141,6 @@ def alive(pid: int) -> bool:
 
 
 def test_a_parent_that_is_gone_counts():
-    code = "from mistyle.core.children import end_with_parent as end; end(0); print('on')"
+    code = "from mistyle.process.children import end_with_parent as end; end(0); print('on')"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 75 and not done.stdout

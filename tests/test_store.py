@@ -16,9 +16,10 @@ import pytest
 from pydantic import BaseModel
 
 from mistyle.core.errors import MistyleError, UsageError
-from mistyle.files import faults, lock, output, store
+from mistyle.files import lock, output, store
 from mistyle.files.keeper import Keeper
 from mistyle.files.store import atomic_folder, atomic_write, digest, sha256_file
+from mistyle.process import disk_errors
 from mistyle.run import checkpoint
 
 ROOT = Path(__file__).parents[1]
@@ -82,7 +83,7 @@ def test_full_disk_is_a_sentence_and_leaves_nothing(tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="/dev/full is a Linux device")
 def test_real_full_device():
     with pytest.raises(MistyleError, match="disk is full"):
-        with faults.told(Path("x")), open("/dev/full", "wb") as file:
+        with disk_errors.told(Path("x")), open("/dev/full", "wb") as file:
             file.write(b"x" * 100_000)
 
 

@@ -15,8 +15,8 @@ from typing import Any
 
 from mistyle.backends.models_list import MODELS, PublishedModel
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
-from mistyle.core.weights import header as weights_header
 from mistyle.files.store import sha256_file
+from mistyle.process.weights import header as weights_header
 
 LOCK = "mistyle-models.json"
 WEIGHTS = ("diffusion_pytorch_model", "model")

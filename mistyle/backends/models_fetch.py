@@ -12,9 +12,9 @@ from urllib.parse import urlparse
 
 from mistyle.backends import models
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
-from mistyle.core.weights import converted
-from mistyle.files import faults
 from mistyle.files.store import atomic_write, sha256_file
+from mistyle.process import disk_errors
+from mistyle.process.weights import converted
 
 PARTIAL = ".partial"
 
@@ -47,7 +47,11 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
         revision = _commit(model, noted.get("revision", ""))
         wanted = _download(model, revision, place, None if overwrite else known) | dict(model.sha256)
     except (transport, OSError) as error:
-        if isinstance(error, OSError) and error.errno in (*faults.FULL, errno.EFBIG, *faults.NOT_TO_BE_WRITTEN):
+        if isinstance(error, OSError) and error.errno in (
+            *disk_errors.FULL,
+            errno.EFBIG,
+            *disk_errors.NOT_TO_BE_WRITTEN,
+        ):
             raise MistyleError(
                 f"{place}: cannot be written ({os.strerror(error.errno or 0)}); '{name}' takes about {model.gigabytes} "
                 "GB. Make room or name another folder with --models, and rerun to resume"

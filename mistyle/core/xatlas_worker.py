@@ -9,10 +9,10 @@ import sys
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.children import end_with_parent
 from mistyle.core.raster import fragments
 from mistyle.core.rows import distinct
 from mistyle.core.uvs import signed_areas
+from mistyle.process.children import end_with_parent
 
 # Charts may deviate this much before a new one begins. xatlas's own default of 2 gives half as many charts again for
 # less than 1 % less stretch (measured on the bunny: 1053 charts against 653).

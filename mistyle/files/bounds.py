@@ -7,8 +7,8 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from mistyle.core.cores import in_pieces
 from mistyle.core.errors import InputRefused
+from mistyle.process.cores import in_pieces
 
 USD = (".usd", ".usda", ".usdc", ".usdz")
 MAX_FILE_BYTES = 2 << 30

@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import MistyleError
-from mistyle.files import faults, lock, output, store
+from mistyle.files import lock, output, store
 from mistyle.files.store import DONE, LOCK
+from mistyle.process import disk_errors
 
 
 class Keeper:
@@ -35,7 +36,7 @@ class Keeper:
         replace those of the same names in a folder that is the user's.
         """
         self.root, self._say, self._overwrite = Path(os.path.abspath(root)), say, overwrite
-        with faults.told(self.root):
+        with disk_errors.told(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
             self._owner = lock.take(self.root / LOCK)
         self._release = weakref.finalize(self, lock.release, self.root / LOCK, self._owner)

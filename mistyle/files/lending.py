@@ -10,7 +10,7 @@ import os
 from functools import cache
 from typing import Any
 
-from mistyle.core.cores import in_pieces
+from mistyle.process.cores import in_pieces
 
 SIGN = b"mistyle reader  "
 LENT = 1 << 18  # arrays of so many bytes are lent, smaller ones are sent

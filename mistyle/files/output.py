@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from mistyle.core.errors import UsageError
-from mistyle.files import faults
 from mistyle.files.own import read_own
 from mistyle.files.store import (
     COUNTER,
@@ -33,6 +32,7 @@ from mistyle.files.store import (
     sha256_file,
     swap,
 )
+from mistyle.process import disk_errors
 
 RECORD = ".mistyle.written"
 # Files by which a folder of a version that kept no record is known.
@@ -199,7 +199,7 @@ def replace_files(
     def whole() -> bool:
         return _wholly(root, by) and not any(stays(name) for name in read_written(root).files)
 
-    with faults.told(root):
+    with disk_errors.told(root):
         root.parent.mkdir(parents=True, exist_ok=True)
     clean_leftovers(root.parent, name=root.name)
     if root.is_dir():
@@ -210,7 +210,7 @@ def replace_files(
     count = next(COUNTER)
     temporary = hidden(place, count, "tmp")
     try:
-        with faults.told(root, temporary):
+        with disk_errors.told(root, temporary):
             temporary.mkdir()
             fill(temporary)
             new = {name: sha256_file(temporary / name) for name in files_of(temporary)}
@@ -269,10 +269,10 @@ def write_file(root: Path, name: str, data: bytes, *, overwrite: bool = False) -
     if name in written.files and os.path.lexists(path) and not ours(root, name, written):
         places = (path.with_stem(f"{path.stem}.edited-{n}") for n in itertools.count(1))
         aside = next(place for place in places if not os.path.lexists(place))
-        with faults.told(path):
+        with disk_errors.told(path):
             os.rename(path, aside)
     _refuse_file(root, name, written, overwrite)
-    with faults.told(root):
+    with disk_errors.told(root):
         root.mkdir(parents=True, exist_ok=True)
     entry = Entry("run", (*_hashes(written, name), hashlib.sha256(data).hexdigest()))
     _write_record(root, Written({**written.files, name: entry}, written.folders))

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.core.cores import cores
 from mistyle.core.errors import MistyleError
-from mistyle.core.memory import trim
 from mistyle.files import bounds, lending, wire
+from mistyle.process.cores import cores
+from mistyle.process.memory import trim
 
 try:
     import resource

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.core import memory
 from mistyle.core.errors import InputRefused
 from mistyle.files.own import read_own
 from mistyle.files.record_tree import from_tree, to_tree
+from mistyle.process import memory
 
 
 def save_record(folder: Path, record: Any) -> None:

@@ -19,8 +19,9 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel
 
-from mistyle.files import faults, lock
+from mistyle.files import lock
 from mistyle.files.own import read_own
+from mistyle.process import disk_errors
 
 DONE = "done.json"
 LOCK = ".mistyle.lock"
@@ -31,15 +32,15 @@ _LEFTOVER = re.compile(r"\.(?P<name>.+)\.(?P<kind>tmp|old)-(?P<host>.+)-(?P<pid>
 def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
     """Write a file so that it is seen either whole or not at all.
 
-    `data` is the content, or a function that writes it to the temporary path it is given (same folder, same suffix).
-    A disk that is full, not to be written or gone raises MistyleError (`files/faults.py`) and leaves neither the file
-    nor a temporary one; any other error passes through.
+    `data` is the content, or a function that writes it to the temporary path it is given (same folder, same suffix). A
+    disk that is full, not to be written or gone raises MistyleError (`process/disk_errors.py`) and leaves neither the
+    file nor a temporary one; any other error passes through.
     """
     temporary = hidden(path, next(COUNTER), "tmp", path.suffix)
-    with faults.told(path):
+    with disk_errors.told(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with faults.told(path, temporary):
+        with disk_errors.told(path, temporary):
             if callable(data):
                 data(temporary)
             else:
@@ -67,12 +68,12 @@ def atomic_folder(
     target = Path(os.path.realpath(target))  # a link to a folder elsewhere stays a link
     count = next(COUNTER)
     temporary, old = hidden(target, count, "tmp"), hidden(target, count, "old")
-    with faults.told(target):
+    with disk_errors.told(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         clean_leftovers(target.parent, name=target.name)
         temporary.mkdir()
     try:
-        with faults.told(target, temporary):
+        with disk_errors.told(target, temporary):
             write(temporary)
             flush_all(temporary)
             (put or swap)(temporary, target, old)

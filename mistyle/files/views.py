@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core import memory
 from mistyle.core.camera import Camera, resized
 from mistyle.core.image import canny, linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Lights, from_json, to_json
@@ -34,6 +33,7 @@ from mistyle.files.capture_files import COPY
 from mistyle.files.images import encode_png, write_exr, write_png
 from mistyle.files.read import read_exr, read_json, read_picture, read_radiance
 from mistyle.files.store import atomic_write, sha256_file
+from mistyle.process import memory
 
 __all__ = ["read_cameras", "read_lights", "read_views", "write_views"]
 

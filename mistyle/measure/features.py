@@ -16,7 +16,7 @@ import torch.nn.functional as functional
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused
-from mistyle.core.weights import tensors
+from mistyle.process.weights import tensors
 
 Features = Callable[[torch.Tensor], list[torch.Tensor]]
 
@@ -43,7 +43,7 @@ NORMALISED_TAPS = (2, 9, 16, 29, 42)
 
 
 def load_features(path: Path | None, levels: int = 5) -> Features:
-    """The filter bank (None) or VGG-19 from `path`: .safetensors, .npz or .pth (core/weights.py).
+    """The filter bank (None) or VGG-19 from `path`: .safetensors, .npz or .pth (process/weights.py).
 
     Accepted: torchvision's layer order (`features.N.weight` or `N.weight`, N = 0, 2, 5, …), truncated anywhere after
     relu1_1; the normalised VGG of Li et al. (`0.weight` 1x1, then 2, 5, 9, 12, 16, …). Anything else is refused. Of

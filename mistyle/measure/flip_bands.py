@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.cores import cores
+from mistyle.process.cores import cores
 
 BAND = 384  # rows
 SHARE = 0.6  # of the rows that the second process gets where the first has other things to do

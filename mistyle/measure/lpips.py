@@ -28,7 +28,7 @@ SMALLEST = 32  # pixels: the deepest taps have one place then
 
 
 def load_lpips(backbone: Path, heads: Path) -> Lpips:
-    """LPIPS-squeeze v0.1 from its two files (.npz, .safetensors or .pth; core/weights.py).
+    """LPIPS-squeeze v0.1 from its two files (.npz, .safetensors or .pth; process/weights.py).
 
     The function takes (reference, test, mask): outside the mask the test takes the reference's pixels, and each tap's
     difference is averaged over the mask at the tap's resolution; over a full mask that is LPIPS as published. NaN for

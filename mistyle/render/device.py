@@ -7,8 +7,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
-from mistyle.core import stopping
 from mistyle.core.errors import EnvironmentMissing, InputRefused
+from mistyle.process import stopping
 from mistyle.setup.environment import known_llvm, use_llvm
 
 # The first that answers is taken; a GPU needs no LLVM.

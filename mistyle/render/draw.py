@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core import memory
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.image import resize
 from mistyle.core.maps import Maps, coarser
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
+from mistyle.process import memory
 from mistyle.render import device
 from mistyle.render import scene as scenery
 from mistyle.render.pages import paged_shapes

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import Literal
 
-from mistyle.core import memory
 from mistyle.core.camera import Camera
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
+from mistyle.process import memory
 from mistyle.render import device
 from mistyle.render import scene as scenery
 from mistyle.render.draw import mean_of_passes, tracer, view_of

@@ -11,7 +11,6 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core import stopping
 from mistyle.core.asset import Asset, Material
 from mistyle.core.camera import Camera
 from mistyle.core.light import (
@@ -27,6 +26,7 @@ from mistyle.core.light import (
 )
 from mistyle.core.maps import OwnMaps
 from mistyle.core.paths import scenes
+from mistyle.process import stopping
 from mistyle.render import appearance, device
 from mistyle.render.emitters import emitters
 from mistyle.render.scene import passes, sensor_dict

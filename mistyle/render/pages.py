@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core import memory
 from mistyle.core.drjit_arrays import LANES, aligned
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.tangents import corner_tangents
+from mistyle.process import memory
 from mistyle.render import device, plugins
 from mistyle.render import scene as scenery
 

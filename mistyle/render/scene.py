@@ -23,7 +23,6 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core import memory
 from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
 from mistyle.core.drjit_arrays import aligned, whole
 from mistyle.core.errors import InputRefused
@@ -31,6 +30,7 @@ from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh, weld
 from mistyle.core.paths import scenes
 from mistyle.core.tangents import corner_tangents
+from mistyle.process import memory
 from mistyle.render import device, plugins
 
 TEMPLATES = ("paper_views", "phase1_directional", "phase2_ambient", "studio", "hdri")

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.core import stopping
+from mistyle.process import stopping
 from mistyle.render import device, scene_grad, scene_job, scene_keys, scene_newton, scene_result
 from mistyle.render import pyramid as laplacian
 from mistyle.render.scene_job import Bad, Regularizer

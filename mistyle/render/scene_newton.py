@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core import stopping
+from mistyle.process import stopping
 from mistyle.render import scene_grad, scene_keys
 from mistyle.render.scene_keys import Parameter
 

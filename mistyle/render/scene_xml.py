@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.core import stopping
 from mistyle.core.errors import InputRefused
 from mistyle.core.names import WRITTEN, distinct, safe_name
+from mistyle.process import stopping
 from mistyle.render import device, scene_source, scene_text
 from mistyle.render.scene_keys import Parameter
 

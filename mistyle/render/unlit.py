@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core import memory
 from mistyle.core.camera import Camera
 from mistyle.core.drjit_arrays import aligned, whole
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
+from mistyle.process import memory
 from mistyle.render import device
 from mistyle.render.draw import Tracer, tracer
 from mistyle.render.hits import window

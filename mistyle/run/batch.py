@@ -15,11 +15,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.cores import cores
 from mistyle.core.errors import MistyleError, UsageError
 from mistyle.files.keeper import Keeper
 from mistyle.files.output import keep_folder, write_file
 from mistyle.files.store import clean_leftovers
+from mistyle.process.cores import cores
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs
 from mistyle.run.batch_plan import PLAN, BatchPlan, read_plan, write_plan

@@ -10,10 +10,10 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from mistyle.core import memory
 from mistyle.core.asset import Asset
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import coarser
+from mistyle.process import memory
 
 
 class Need(NamedTuple):

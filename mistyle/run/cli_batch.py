@@ -10,7 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.children import PARENT
+from mistyle.process.children import PARENT
 from mistyle.run.options import (
     DELIVERY_OPTIONS,
     NAME_HELP,

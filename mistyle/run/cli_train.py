@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mistyle.core.cores import use_threads
 from mistyle.core.errors import UsageError
+from mistyle.process.cores import use_threads
 from mistyle.run.cli_models import add_model_options
 from mistyle.run.options import add_job_options, examples, given_settings
 

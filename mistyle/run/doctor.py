@@ -7,7 +7,7 @@ import json as _json
 from collections.abc import Sequence
 
 from mistyle import __version__
-from mistyle.core.cores import cores
+from mistyle.process.cores import cores
 from mistyle.setup import facts
 from mistyle.setup.facts import Row, works
 

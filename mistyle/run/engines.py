@@ -19,8 +19,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from mistyle.core.children import PARENT
 from mistyle.core.errors import EnvironmentMissing, MistyleError
+from mistyle.process.children import PARENT
 from mistyle.run.batch_plan import PLAN, BatchPlan
 from mistyle.run.shard import SHARDS
 

@@ -5,8 +5,8 @@ import json
 import sys
 from collections.abc import Callable
 
-from mistyle.core import stopping
 from mistyle.core.errors import MistyleError
+from mistyle.process import stopping
 
 Command = Callable[[argparse.Namespace], int]
 
@@ -24,7 +24,7 @@ def run(command: Command, options: argparse.Namespace) -> int:
         except BrokenPipeError:
             return 1
         except OSError as error:
-            from mistyle.files.faults import unexpected
+            from mistyle.process.disk_errors import unexpected
 
             sentence = unexpected(error)
             if sentence is None:

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from mistyle.core import memory
 from mistyle.core.capture import Captures, Loaded, shrunk
 from mistyle.core.maps import Texels
 from mistyle.files.records import load_record, save_record
+from mistyle.process import memory
 from mistyle.run.progress import Report
 
 KEPT = 2  # pictures held in memory

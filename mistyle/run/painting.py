@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mistyle.core import memory
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
@@ -14,6 +13,7 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import face_areas
 from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
+from mistyle.process import memory
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report
 from mistyle.run.stages import Run

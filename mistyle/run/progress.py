@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 
-from mistyle.core import memory
+from mistyle.process import memory
 
 Report = Callable[[float], None]
 

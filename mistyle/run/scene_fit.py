@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core import stopping
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.files.keeper import Keeper
 from mistyle.files.output import claim, keep_folder
 from mistyle.files.store import atomic_write, digest
+from mistyle.process import stopping
 from mistyle.run import checkpoint
 from mistyle.run.progress import Progress
 from mistyle.run.record import write_record

@@ -13,8 +13,8 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
-from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.process.cores import cores
 
 # Settings, and tables of settings, by their earlier names.
 RENAMED = {"surface.style_scale": "surface.stroke_scale", "coat": "paint"}

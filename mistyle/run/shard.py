@@ -16,10 +16,10 @@ from typing import Any
 
 from mistyle.core.errors import MistyleError, Stopped
 from mistyle.files import lock
-from mistyle.files.faults import unexpected
 from mistyle.files.output import claim, keep_folder
 from mistyle.files.own import read_own
 from mistyle.files.store import LOCK, atomic_write, digest, sha256_file
+from mistyle.process.disk_errors import unexpected
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan
 from mistyle.run.inputs import input_files

@@ -7,13 +7,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
-from mistyle.core import memory, stopping
 from mistyle.core.errors import UsageError
 from mistyle.core.paths import PACKAGE
 from mistyle.files import output, store
 from mistyle.files.keeper import Keeper
 from mistyle.files.records import load_record, save_record
 from mistyle.files.store import digest
+from mistyle.process import memory, stopping
 from mistyle.run import edits
 from mistyle.run.progress import Progress, Report
 from mistyle.run.settings import thread_count

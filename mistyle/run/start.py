@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset
-from mistyle.core.cores import use_threads
+from mistyle.process.cores import use_threads
 from mistyle.run.job_settings import ReadSettings
 from mistyle.run.progress import Report
 from mistyle.run.settings import thread_count

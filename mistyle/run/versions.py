@@ -4,7 +4,7 @@ import platform
 from importlib.metadata import PackageNotFoundError, version
 
 from mistyle import __version__
-from mistyle.core import memory
+from mistyle.process import memory
 
 PACKAGES = (
     "mitsuba",

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core import memory
 from mistyle.core.camera import Camera, px_from_world, world_from_px, zoom
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.core.light import Directional, Lights, direction_in_world
 from mistyle.core.maps import Maps, rows_of
 from mistyle.core.view import View
 from mistyle.measure.overlap import Overlap
+from mistyle.process import memory
 from mistyle.stages.texels import BAND_TEXELS
 
 VIEWS = 6

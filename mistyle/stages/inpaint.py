@@ -10,9 +10,9 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core import memory
 from mistyle.core.image import dilate_within, distance_to, gaussian
 from mistyle.core.maps import Maps, Texels
+from mistyle.process import memory
 from mistyle.stages.repair_settings import RepairSettings
 
 # (albedo (h w 3) linear, hole (h w), texels, generator) -> albedo (h w 3); only what it answers inside the hole counts.

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core import stopping
 from mistyle.core.maps import place_of
 from mistyle.core.stage_progress import StageProgress
+from mistyle.process import stopping
 from mistyle.render.material_table import COLUMNS, SOLVED, TILT, MaterialTable
 from mistyle.stages.fit_context import DirectCaptures, FitContext
 from mistyle.stages.recover_prior import NOTHING

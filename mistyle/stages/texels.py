@@ -13,9 +13,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core import memory
 from mistyle.core.asset import Material
-from mistyle.core.cores import cores
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import dilate, nearest, resize
 from mistyle.core.maps import Maps, Texels
@@ -23,6 +21,8 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.normals import same_points
 from mistyle.core.raster import fragment_pieces
 from mistyle.core.uvs import islands
+from mistyle.process import memory
+from mistyle.process.cores import cores
 
 ROWS = 2**17  # texels handled at a time; the intermediate arrays then stay in the cache
 BAND_TEXELS = 2**20  # and where only the temporaries of large atlases count

@@ -3,8 +3,8 @@
 A safetensors file is eight bytes of header length, a JSON header {name: {dtype, shape, data_offsets}} and raw
 little-endian data. Checked before anything is used: the header's length (at most HEADER_LIMIT), every type, shape and
 range, that the data lie inside the file without overlaps. A pickle (.pth, .bin, .pt, .ckpt) can run code when it is
-opened: core/weights_worker.py opens it, with `weights_only=True`, limits on memory and time and no right to write, and
-hands back the same layout; it also unpacks .npz archives.
+opened: process/weights_worker.py opens it, with `weights_only=True`, limits on memory and time and no right to write,
+and hands back the same layout; it also unpacks .npz archives.
 """
 
 import json
@@ -92,7 +92,7 @@ def converted(path: Path) -> dict[str, Any]:
         raise InputRefused(f"{path}: no such file of weights.")
     try:
         done = subprocess.run(
-            [sys.executable, "-B", "-m", "mistyle.core.weights_worker", str(path)],
+            [sys.executable, "-B", "-m", "mistyle.process.weights_worker", str(path)],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             env={**os.environ, "PYTHONPATH": paths},

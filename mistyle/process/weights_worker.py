@@ -1,11 +1,11 @@
 """Opens one file of weights that is not safetensors, in a process of its own, and writes its tensors to the output as
 safetensors does.
 
-Run by core/weights.py as `python -m mistyle.core.weights_worker FILE`. torch opens pickles with `weights_only=True`:
-tensors, numbers, texts and tables, and nothing that could run; an .npz archive is opened without pickles, if it unpacks
-to at most MAX_RATIO times its size. No file can be written here (RLIMIT_FSIZE 0), the address space is limited to 8 GiB
-and four times the file, the processor time to five minutes; on Windows, which has no such limits, only the ways of
-opening hold.
+Run by process/weights.py as `python -m mistyle.process.weights_worker FILE`. torch opens pickles with
+`weights_only=True`: tensors, numbers, texts and tables, and nothing that could run; an .npz archive is opened without
+pickles, if it unpacks to at most MAX_RATIO times its size. No file can be written here (RLIMIT_FSIZE 0), the address
+space is limited to 8 GiB and four times the file, the processor time to five minutes; on Windows, which has no such
+limits, only the ways of opening hold.
 """
 
 import json
