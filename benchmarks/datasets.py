@@ -19,8 +19,8 @@ TensoIR-Synthetic (Blender renders):
                               /albedo.png           linear, /normal.png (n + 1) / 2 in the world (Z up)
     <maps>/<light>.hdr|.exr                         the middle looks along world +X, right is -Y, up is +Z
 
-The spaces are the sets' own: `core/align.py moved` with the mesh's `Source.work_from_user` takes them to the working
-space.
+The spaces are the sets' own: `geometry/similarity.py moved` with the mesh's `Source.work_from_user` takes them to the
+working space.
 """
 
 from collections.abc import Callable
@@ -32,16 +32,16 @@ import numpy as np
 from jaxtyping import Bool, Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mistyle.core.align import turned
 from mistyle.core.camera import MITSUBA_FROM_OPENCV, OPENGL_FROM_OPENCV, Camera
 from mistyle.core.capture import Captures
-from mistyle.core.distortion import Lens
 from mistyle.core.image import bilinear, linear_from_srgb
 from mistyle.core.light import Environment, Lights
 from mistyle.files.bounds import inside, refuse
 from mistyle.files.cameras import MAX_SIDE, CameraFrame, check_rotation, read_frames
 from mistyle.files.captures import CapturedPicture, load_shot
 from mistyle.files.read import read_json, read_npy, read_picture, read_radiance, read_size
+from mistyle.geometry.lens import Lens
+from mistyle.geometry.similarity import turned
 
 # Axes of an environment map (up +Y, middle +Z, right -X) in TensoIR's world.
 WORLD_FROM_TENSOIR_MAP = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

@@ -34,13 +34,13 @@ from benchmarks.material_metrics import map_errors
 from benchmarks.recovery_truth import data_folder, find_asset, truth
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.capture import Captures, in_memory, shrunk
-from mistyle.core.distortion import Lens, distort
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, to_json
 from mistyle.core.maps import flat_maps
 from mistyle.files.cameras import transforms
 from mistyle.files.captures import read_captures
 from mistyle.files.read_mesh import read_mesh
+from mistyle.geometry.lens import Lens, distort
 from mistyle.render.draw import tracer
 from mistyle.render.material_table import pack
 from mistyle.render.shade import MaterialRenderer, RenderOptions

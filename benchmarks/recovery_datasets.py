@@ -19,12 +19,12 @@ from benchmarks.datasets import TENSOIR_LIGHTS, read_stanford_orb, read_tensoir
 from benchmarks.material_metrics import align_channels, orb_mask, psnr_hdr, psnr_ldr
 from benchmarks.recovery_pictures import Shot, render
 from benchmarks.recovery_truth import fitted_size
-from mistyle.core.align import moved
 from mistyle.core.asset import Asset
 from mistyle.core.capture import Captures, shrunk, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps
 from mistyle.files.read_mesh import read_mesh
+from mistyle.geometry.similarity import moved
 from mistyle.render.scene import Frame
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings

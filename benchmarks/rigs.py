@@ -19,7 +19,7 @@ from mistyle.core.camera import Camera, rig
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
-from mistyle.core.rigs import candidate_cameras, overlaps, visit
+from mistyle.geometry.next_best_view import candidate_cameras, overlaps, visit
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MESHES = {"spot": "spot", "teapot": "teapot", "bunny": "stanford-bunny", "armadillo": "armadillo"}

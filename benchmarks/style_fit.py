@@ -240,7 +240,7 @@ def _style(run: Any, sets: Sequence[Any]) -> float:
 def lights(where: Problem, figures: dict[str, float]) -> None:
     """Phase 1 under all lights together, and one a crop."""
     from mistyle.core.light import lights as scene_lights
-    from mistyle.core.tangents import corner_tangents
+    from mistyle.geometry.tangents import corner_tangents
     from mistyle.render.draw import tracer
     from mistyle.stages import fit_judge
     from mistyle.stages.fit import FitStart, FitTargets, two_phase

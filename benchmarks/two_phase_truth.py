@@ -21,8 +21,8 @@ from mistyle.core.image import nearest_fill
 from mistyle.core.light import SOFT, Environment, Lights, bake_environment
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.rig_settings import RigSettings
-from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.run import painting
 from mistyle.run.made import Atlas
 from mistyle.run.stylize_settings import Settings

@@ -162,7 +162,7 @@ def write_mesh(
     stem: str, material: str, mesh: tuple[np.ndarray, np.ndarray, np.ndarray], uvs: np.ndarray | None = None
 ) -> None:
     """Write `stem`.obj and `stem`.mtl; a mesh without corner UVs is unwrapped."""
-    from mistyle.core.unwrap import unwrap
+    from mistyle.geometry.unwrap import unwrap
 
     if uvs is None:
         (uvs,) = unwrap([(mesh[0], mesh[1])])

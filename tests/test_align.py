@@ -8,11 +8,9 @@ import pytest
 from helpers import ROOT
 from scipy.spatial.transform import Rotation
 
-from mistyle.core.align import fit_similarity, moved, moved_camera, moved_lights, scale_of, similarity, turned
 from mistyle.core.camera import Camera, orbit, px_from_world
 from mistyle.core.capture import in_memory
 from mistyle.core.errors import InputRefused
-from mistyle.core.icp import align_points, in_masks, visual_hull
 from mistyle.core.light import (
     Ambient,
     Directional,
@@ -30,6 +28,8 @@ from mistyle.files.cameras import transforms
 from mistyle.files.captures import read_captures
 from mistyle.files.images import write_png
 from mistyle.files.read_mesh import read_mesh
+from mistyle.geometry.icp import align_points, in_masks, visual_hull
+from mistyle.geometry.similarity import fit_similarity, moved, moved_camera, moved_lights, scale_of, similarity, turned
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
 

@@ -11,7 +11,6 @@ import pytest
 from benchmarks.photographs import undistort
 from mistyle.core.camera import Camera, orbit, pixel_centres
 from mistyle.core.capture import in_memory
-from mistyle.core.distortion import Lens, distort, pinhole, px_in_photograph, resample
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Ambient, Directional, Environment, Point
@@ -21,6 +20,7 @@ from mistyle.files.captures import camera_space, check_pixels, read_captures, re
 from mistyle.files.images import write_exr, write_png
 from mistyle.files.read import read_size
 from mistyle.files.views import write_views
+from mistyle.geometry.lens import Lens, distort, pinhole, px_in_photograph, resample
 
 SIZE = (12, 16)
 LENS = Lens((80.0, 84.0), (33.0, 22.5), (48, 64), (-0.21, 0.06, -0.01), (0.003, -0.002))

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.photographs import undistort
 from mistyle.core.camera import Camera, pixel_centres, px_from_world
-from mistyle.core.distortion import distort
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
 from mistyle.files.captures import camera_space, read_captures, sparse_points
 from mistyle.files.colmap import find_model, read_model, read_points
 from mistyle.files.images import write_png
+from mistyle.geometry.lens import distort
 
 # By COLMAP's documentation: number, name, parameters for a picture of 64 x 48.
 KINDS = (

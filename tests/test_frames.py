@@ -9,7 +9,7 @@ from mistyle.core.camera import orbit
 from mistyle.core.light import Directional
 from mistyle.core.maps import flat_maps
 from mistyle.core.mesh import Mesh
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.render import deferred, draw, seam
 from mistyle.stages.frames import mitsuba_normals
 from mistyle.stages.texels import pad, rasterise

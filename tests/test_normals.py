@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from mistyle.core.normals import MAX_VALENCE, crease_normals, same_points, usable_normals
+from mistyle.geometry.normals import MAX_VALENCE, crease_normals, same_points, usable_normals
 
 # An icosphere of 5,120 faces: vertex normals are exact up to the mesh's own unevenness.
 SPHERE_COSINE = 0.9995

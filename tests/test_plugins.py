@@ -9,7 +9,7 @@ from test_seam import KEY, Path, crop, random_maps, tables, torus
 
 from mistyle.core.light import direction_in_world
 from mistyle.core.mesh import Mesh, weld
-from mistyle.core.tangents import mikktspace
+from mistyle.geometry.tangents import mikktspace
 from mistyle.render import bsdf, deferred, device, draw, plugins
 from mistyle.render import scene as scenery
 

@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 
 from mistyle.core.image import linear_from_srgb
-from mistyle.core.retexture import fetch
 from mistyle.files.mesh_formats import read_off, read_stl
 from mistyle.files.obj_read import read_obj
 from mistyle.files.ply_read import read_ply
 from mistyle.files.raw import Raw
 from mistyle.files.read_mesh import read_mesh, read_references
+from mistyle.geometry.retexture import fetch
 
 POINTS = ["-1 -1 0", "1 -1 0", "1 1 0", "-1 1 0"]
 BYTES = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 64, 200]])

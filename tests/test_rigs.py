@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import trimesh
 
-from mistyle.core import rigs
 from mistyle.core.camera import orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
+from mistyle.geometry import next_best_view as rigs
 from mistyle.render.draw import tracer
 from mistyle.render.visible import face_on
 from mistyle.run.stylize_settings import resolve

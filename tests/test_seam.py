@@ -8,7 +8,7 @@ from mistyle.core.camera import Camera, orbit, zoom
 from mistyle.core.light import Ambient, Directional
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.core.tangents import mikktspace
+from mistyle.geometry.tangents import mikktspace
 from mistyle.render import deferred, device, draw, seam
 from mistyle.render import scene as scenery
 

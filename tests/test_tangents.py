@@ -10,7 +10,7 @@ import pytest
 from helpers import data
 from node_tools import mikktspace as reference
 
-from mistyle.core.tangents import mikktspace
+from mistyle.geometry.tangents import mikktspace
 
 # Both compute in float32 (0.006 degrees); only the order of the sums differs, which needles multiply.
 ROUNDING = 1e-4

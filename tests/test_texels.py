@@ -10,7 +10,7 @@ from mistyle.core.asset import Material
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps, Texels, place_of, rows_of
 from mistyle.core.mesh import Mesh
-from mistyle.core.raster import fragments
+from mistyle.geometry.raster import fragments
 from mistyle.stages import texels as atlas
 from mistyle.stages.texels import pad, pad_maps, rasterise, sharpen_in_place, start_maps
 

@@ -11,16 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter, minimum_filter
 
-from mistyle.core import proxy
-from mistyle.core import unwrap as unwrapping
 from mistyle.core.errors import InputRefused
-from mistyle.core.normals import area_vectors, same_points
-from mistyle.core.raster import fragments
-from mistyle.core.retexture import carry, fetch, turn_normals
-from mistyle.core.unwrap import estimated_seconds, unwrap
-from mistyle.core.uvs import islands, signed_areas
-from mistyle.core.xatlas_worker import cut_overlaps, landscape, lay_flat, mend, pack, unmirror
 from mistyle.files.read_mesh import read_mesh
+from mistyle.geometry import decimated
+from mistyle.geometry import unwrap as unwrapping
+from mistyle.geometry.normals import area_vectors, same_points
+from mistyle.geometry.raster import fragments
+from mistyle.geometry.retexture import carry, fetch, turn_normals
+from mistyle.geometry.unwrap import estimated_seconds, unwrap
+from mistyle.geometry.uvs import islands, signed_areas
+from mistyle.geometry.xatlas_worker import cut_overlaps, landscape, lay_flat, mend, pack, unmirror
 
 SIZE = 1024
 # xatlas lets borders that cross each other by less than a texel in a thousand through.
@@ -114,7 +114,7 @@ def test_large_meshes_go_through_a_proxy(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_closest_points_on_triangles(rng: np.random.Generator) -> None:
     """Against a dense search over each triangle."""
     corners, point = rng.normal(size=(40, 2, 3, 3)), rng.normal(size=(40, 1, 3))
-    weights, squared = proxy.closest(point, corners)
+    weights, squared = decimated.closest(point, corners)
     found = np.einsum("nkc,nkcd->nkd", weights, corners)
     assert (weights >= -1e-12).all() and weights.sum(axis=2) == pytest.approx(1)
     assert ((found - point) ** 2).sum(axis=2) == pytest.approx(squared)

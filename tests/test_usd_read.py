@@ -10,9 +10,9 @@ from PIL import Image
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
-from mistyle.core.normals import area_vectors
 from mistyle.files.read_mesh import read_mesh
 from mistyle.files.usd_read import read_usd
+from mistyle.geometry.normals import area_vectors
 
 pxr = pytest.importorskip("pxr")
 

@@ -87,9 +87,9 @@ def read_captures(
     unrelated space are not aligned here: `mistyle.fit(..., references={"align": True})` does that. Raises
     InputRefused.
     """
-    from mistyle.core.align import moved
     from mistyle.files.captures import camera_space
     from mistyle.files.captures import read_captures as read
+    from mistyle.geometry.similarity import moved
 
     def place(given: str | PathLike | None) -> Path | None:
         return None if given is None else Path(given)

@@ -32,13 +32,13 @@ import numpy as np
 from jaxtyping import Float
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from mistyle.core.align import moved_camera, similarity
 from mistyle.core.asset import Pixels
 from mistyle.core.camera import OPENGL_FROM_OPENCV, Camera
-from mistyle.core.distortion import Lens, is_distorted
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import refuse
 from mistyle.files.read import read_json
+from mistyle.geometry.lens import Lens, is_distorted
+from mistyle.geometry.similarity import moved_camera, similarity
 
 SPACE = "working space: bounding sphere of radius 1 about the origin, right-handed, Y up"
 PIXELS: Pixels = "upright"  # that a camera.json describes

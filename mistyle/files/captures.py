@@ -29,7 +29,6 @@ from jaxtyping import Bool, Float
 from mistyle.core.asset import Picture, Pixels
 from mistyle.core.camera import Camera
 from mistyle.core.capture import Captures, Loaded
-from mistyle.core.distortion import Lens, pinhole, resample
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Lights, lights_of_views
@@ -58,6 +57,7 @@ from mistyle.files.read import (
     read_stored_size,
 )
 from mistyle.files.views import standing_picture
+from mistyle.geometry.lens import Lens, pinhole, resample
 
 EXPECTED = "a folder with camera.json, transforms.json or a COLMAP model (sparse/0), or one of these files"
 KEPT = 2  # pictures held decoded

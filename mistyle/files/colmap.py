@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.distortion import Lens
 from mistyle.core.errors import InputRefused
 from mistyle.files.bounds import read_bytes, refuse
 from mistyle.files.cameras import MAX_SIDE, CameraFrame, check_rotation, unique_names
+from mistyle.geometry.lens import Lens
 
 # By the number in binary files: the name in text files and the number of parameters.
 MODELS = (

@@ -15,11 +15,11 @@ from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import local_origin, weld
 from mistyle.core.rows import corner_rows, distinct
-from mistyle.core.tangents import mikktspace
 from mistyle.files.glb import Builder, Tree, unit_normals
 from mistyle.files.gltf_patch import patch_tree
 from mistyle.files.store import atomic_write
 from mistyle.files.textures import Pictures, add_textures, encode_pictures, part_stems, set_textures
+from mistyle.geometry.tangents import mikktspace
 
 
 def write_glb(

@@ -8,12 +8,12 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
-from mistyle.core.retexture import REPEAT, Wraps
 from mistyle.files.bounds import beside, read_bytes
 from mistyle.files.glb import Buffers, Tree, values
 from mistyle.files.gltf_check import data_uri
 from mistyle.files.gltf_infos import image_of, set_of, texture_transform, wrap_of
 from mistyle.files.read_mesh import load_gltf, read_gltf_alpha
+from mistyle.geometry.retexture import REPEAT, Wraps
 
 
 @dataclass(frozen=True)

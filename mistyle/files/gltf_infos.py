@@ -5,8 +5,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from mistyle.core.retexture import Wrap, Wraps
 from mistyle.files.glb import CLAMP_TO_EDGE, MIRRORED_REPEAT, REPEAT
+from mistyle.geometry.retexture import Wrap, Wraps
 
 Tree = dict[str, Any]
 WRAPS: dict[int | None, Wrap] = {CLAMP_TO_EDGE: "clamp", MIRRORED_REPEAT: "mirror", REPEAT: "repeat"}

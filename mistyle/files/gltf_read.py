@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive, Shading
-from mistyle.core.normals import area_vectors
 from mistyle.files.bounds import refuse
 from mistyle.files.glb import Buffers, values
 from mistyle.files.gltf_check import AGAIN, load_gltf
@@ -19,6 +18,7 @@ from mistyle.files.gltf_vertices import triangles
 from mistyle.files.pictures import Budget
 from mistyle.files.polygons import check_indices, check_positions, too_many
 from mistyle.files.raw import Corners, Indexed, Raw, RawMaterial
+from mistyle.geometry.normals import area_vectors
 
 Tree = dict[str, Any]
 MAX_INSTANCED = 500_000  # faces up to which all instances of a node are read

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.rows import corner_rows, distinct
-from mistyle.core.tangents import mikktspace
 from mistyle.files.glb import FAN, STRIP, TRIANGLES, Buffers, Builder, Tree, element_bytes, unit_normals, values
+from mistyle.geometry.tangents import mikktspace
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,9 @@ from functools import partial
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.core.retexture import REPEAT, Wrap, Wraps, wrapped
 from mistyle.files.bounds import WORK_TEXTURE
 from mistyle.files.raw import Maps, Raw, RawMap, RawMaterial
+from mistyle.geometry.retexture import REPEAT, Wrap, Wraps, wrapped
 
 # UVs that leave the unit square by less show nothing of what lies outside.
 OUTSIDE = 1e-3

@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive
-from mistyle.core.normals import same_points
 from mistyle.files.bounds import read_bytes, refuse
 from mistyle.files.colours import linear_colours
 from mistyle.files.nearby import unmarked
 from mistyle.files.polygons import check_indices, check_positions, parse_numbers, too_many, triangulate
 from mistyle.files.raw import Raw, RawMaterial, no_textures
+from mistyle.geometry.normals import same_points
 
 AGAIN = "Export the mesh again"
 MAX_PADDING = 512  # bytes that programs and copies leave after the last face of an STL

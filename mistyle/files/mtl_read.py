@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from mistyle.core.retexture import REPEAT
 from mistyle.files.bounds import read_bytes
 from mistyle.files.nearby import decoded, unmarked
 from mistyle.files.pictures import Budget, named_texture
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 from mistyle.files.texels import Kind, fractions, linear_rows
+from mistyle.geometry.retexture import REPEAT
 
 MAX_LIBRARY_BYTES = 16 << 20
 TEXTURES = {"map_kd": "albedo", "map_pr": "roughness", "map_pm": "metallic", "norm": "normal"}

@@ -12,16 +12,16 @@ from mistyle.core.asset import TURNED, Asset, Material, Source
 from mistyle.core.image import resize
 from mistyle.core.mesh import Mesh
 from mistyle.core.names import distinct
-from mistyle.core.normals import area_vectors, crease_normals, same_points, usable_normals
-from mistyle.core.raster import fragments
-from mistyle.core.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
-from mistyle.core.unwrap import unwrap
-from mistyle.core.upright import lies_on_its_side
-from mistyle.core.uvs import Layout, Verdict, arrange, signed_areas
 from mistyle.files.bounds import refuse
 from mistyle.files.lookups import effective, framed, looked_up, plain_lookups
 from mistyle.files.polygons import check_positions
 from mistyle.files.raw import Extent, Raw, RawMap, RawMaterial
+from mistyle.geometry.normals import area_vectors, crease_normals, same_points, usable_normals
+from mistyle.geometry.raster import fragments
+from mistyle.geometry.retexture import REPEAT, carry, carry_corners, texel_weights, turn_normals
+from mistyle.geometry.unwrap import unwrap
+from mistyle.geometry.upright import lies_on_its_side
+from mistyle.geometry.uvs import Layout, Verdict, arrange, signed_areas
 
 # Faces below this area in the unit sphere have none that anything could be computed from (float32 positions).
 NO_AREA = 1e-13

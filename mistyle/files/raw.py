@@ -9,9 +9,9 @@ from jaxtyping import Float, Int
 
 from mistyle.core.asset import Primitive, Shading
 from mistyle.core.errors import InputRefused
-from mistyle.core.retexture import REPEAT, Wraps
 from mistyle.files.bounds import WORK_TEXTURE
 from mistyle.files.texels import Kind, finished
+from mistyle.geometry.retexture import REPEAT, Wraps
 
 
 @dataclass(frozen=True)

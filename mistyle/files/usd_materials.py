@@ -11,10 +11,10 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Shading
 from mistyle.core.errors import InputRefused
-from mistyle.core.retexture import Wrap
 from mistyle.files.pictures import MAX_PICTURE_BYTES, Budget, alpha_map, decode
 from mistyle.files.raw import Maps, RawMap, RawMaterial, no_textures
 from mistyle.files.usd_layers import PackagedFile, bytes_of, locate, place_of
+from mistyle.geometry.retexture import Wrap
 
 CHANNELS = {"r": (0,), "g": (1,), "b": (2,), "rgb": (0, 1, 2), "a": ()}
 INPUTS = {"albedo": "diffuseColor", "roughness": "roughness", "metallic": "metallic", "normal": "normal"}

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.normals import crease_normals, same_points
 from mistyle.files.bounds import refuse
 from mistyle.files.polygons import check_indices, check_positions, too_many, triangulate
 from mistyle.files.usd_materials import UsdMaterial
 from mistyle.files.usd_shapes import is_shape, outline
+from mistyle.geometry.normals import crease_normals, same_points
 
 CAGE_CREASE = 89.0  # degrees; sharper edges of a cage would have normals that face away from who sees them
 UV_NAMES = ("st", "UVMap", "map1", "uv")

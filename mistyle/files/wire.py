@@ -24,7 +24,7 @@ RECORDS = {
     "Picture": "mistyle.core.asset:Picture",
     "Primitive": "mistyle.core.asset:Primitive",
     "Shading": "mistyle.core.asset:Shading",
-    "Lens": "mistyle.core.distortion:Lens",
+    "Lens": "mistyle.geometry.lens:Lens",
     "Corners": "mistyle.files.raw:Corners",
     "Indexed": "mistyle.files.raw:Indexed",
     "CameraFrame": "mistyle.files.cameras:CameraFrame",

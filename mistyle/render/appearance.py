@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from mistyle.core.asset import Asset, Material, Shading
 from mistyle.core.maps import OwnMaps
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.render import bsdf, device, plugins
 from mistyle.render import scene as scenery
 

@@ -21,7 +21,7 @@ from mistyle.core.camera import Camera, px_from_world
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import Directional, Lights, Point, SceneLights, direction_in_world, position_in_world
 from mistyle.core.mesh import Mesh
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer
 from mistyle.render.sky import VARIANTS, Sky, sky

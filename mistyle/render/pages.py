@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from mistyle.core.drjit_arrays import LANES, aligned
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
 from mistyle.render import device, plugins
 from mistyle.render import scene as scenery

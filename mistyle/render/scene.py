@@ -29,7 +29,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh, weld
 from mistyle.core.paths import scenes
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
 from mistyle.render import device, plugins
 

@@ -11,7 +11,7 @@ from mistyle.core.camera import Camera, resized
 from mistyle.core.image import bilinear, srgb_from_linear
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh, face_areas
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.render.draw import Hits, gbuffer
 from mistyle.render.lookdev import material_maps
 

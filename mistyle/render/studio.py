@@ -25,7 +25,7 @@ from mistyle.core.camera import Camera
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import Environment, environment_directions, environment_radiance, turn_about_y
 from mistyle.core.maps import Maps
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
 from mistyle.render import deferred, device
 from mistyle.render.draw import Tracer

@@ -184,8 +184,8 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
 def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Placed:
     """The cameras in working space: as they are, through the mesh's own units, or aligned and refined on request; and
     whether the mesh's outlines are where the pictures have them."""
-    from mistyle.core.align import moved
     from mistyle.files.captures import camera_space, outline_of, silhouette, sparse_points
+    from mistyle.geometry.similarity import moved
     from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
     from mistyle.stages.outline_check import check_outlines, overlap_notes
 

@@ -11,8 +11,8 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import face_areas
-from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
 from mistyle.run.made import Atlas, Baked
 from mistyle.run.progress import Report

@@ -64,8 +64,8 @@ def claim_baked(mesh: Path, views: Path, out: Path, name: str, overwrite: bool) 
 def files_of_views(settings: Settings) -> list[str]:
     """What a folder of views will consist of; of a rig made for the mesh, of all views that it may choose from."""
     from mistyle.core.camera import rig
-    from mistyle.core.rigs import candidate_cameras
     from mistyle.files.views import file_names, read_cameras
+    from mistyle.geometry.next_best_view import candidate_cameras
 
     chosen = settings.rig
     if chosen.kind == "file":

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from mistyle.core.align import moved_camera, similarity
 from mistyle.core.camera import Camera
-from mistyle.core.contours import block_means, contour_distance, rim_of, signed_distance, slope_of
 from mistyle.core.errors import InputRefused
-from mistyle.core.icp import align_points, in_masks, visual_hull
 from mistyle.core.image import luminance
 from mistyle.core.mesh import Mesh
+from mistyle.geometry.contours import block_means, contour_distance, rim_of, signed_distance, slope_of
+from mistyle.geometry.icp import align_points, in_masks, visual_hull
+from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.render.draw import Tracer, gbuffer, tracer
 
 LEVELS = (96, 256)  # pixels along the longer side, coarse to fine

@@ -9,8 +9,8 @@ from jaxtyping import Bool, Float, Int
 from mistyle.core.camera import Camera
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.core.normals import area_vectors
 from mistyle.core.view import View
+from mistyle.geometry.normals import area_vectors
 from mistyle.process import memory
 from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.gaps import fill_in_place

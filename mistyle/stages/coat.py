@@ -13,7 +13,7 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.stages.frames import texel_frames
 from mistyle.surface.linefield import DirectionConstraint
 from mistyle.surface.lookup import PaintedSurface

@@ -35,8 +35,8 @@ from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.light import Lights, lights
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
-from mistyle.core.tangents import corner_tangents
 from mistyle.core.view import View
+from mistyle.geometry.tangents import corner_tangents
 from mistyle.process import memory
 from mistyle.stages import fit_judge, fit_table
 from mistyle.stages.fit_run import CropBatch, Loss, Phase, PhaseRunner, SceneContext

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
-from mistyle.core.tangents import corner_tangents
+from mistyle.geometry.tangents import corner_tangents
 
 
 def mitsuba_normals(mesh: Mesh, maps: Maps, texels: Texels) -> Float[np.ndarray, "h w 3"]:

@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.spatial.transform import Rotation
 
-from mistyle.core.align import moved_camera, similarity
 from mistyle.core.camera import Camera
 from mistyle.core.image import overlap
 from mistyle.core.mesh import Mesh
+from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.stages.align import shrunk
 

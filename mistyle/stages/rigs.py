@@ -10,7 +10,7 @@ from mistyle.core.camera import Camera
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
 from mistyle.core.rig_settings import RigSettings
-from mistyle.core.rigs import candidate_cameras, choose
+from mistyle.geometry.next_best_view import candidate_cameras, choose
 
 SAMPLES = 20_000
 

@@ -18,9 +18,9 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import dilate, nearest, resize
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
-from mistyle.core.normals import same_points
-from mistyle.core.raster import fragment_pieces
-from mistyle.core.uvs import islands
+from mistyle.geometry.normals import same_points
+from mistyle.geometry.raster import fragment_pieces
+from mistyle.geometry.uvs import islands
 from mistyle.process import memory
 from mistyle.process.cores import cores
 

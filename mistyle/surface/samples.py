@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas, face_normals
-from mistyle.core.normals import crease_normals, same_points
 from mistyle.core.rows import distinct
+from mistyle.geometry.normals import crease_normals, same_points
 from mistyle.surface import cells, kernels
 
 OVERSAMPLING = 5  # candidates per sample asked for

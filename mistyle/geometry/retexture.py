@@ -5,9 +5,9 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.normals import area_vectors
-from mistyle.core.raster import fragments
-from mistyle.core.uvs import signed_areas
+from mistyle.geometry.normals import area_vectors
+from mistyle.geometry.raster import fragments
+from mistyle.geometry.uvs import signed_areas
 
 # What a texture shows outside the unit square: itself again, itself mirrored at every whole number, or its last texel.
 Wrap = Literal["repeat", "mirror", "clamp"]

@@ -4,7 +4,7 @@ plain. A form that could stand on several of its sides, or on none, says nothing
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.normals import area_vectors
+from mistyle.geometry.normals import area_vectors
 
 CONTACT = 0.01  # what lies this close to the lowest point touches the ground, in shares of the height
 LEAST_BASE = 0.15  # a base that one sees: its hull in shares of the footprint's box

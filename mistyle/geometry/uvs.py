@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.raster import fragments
+from mistyle.geometry.raster import fragments
 
 # UVs are float32: a coordinate this close to a tile's border lies on it.
 BORDER = 1e-5

@@ -5,7 +5,7 @@ from collections.abc import Callable
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.core.normals import area_vectors
+from mistyle.geometry.normals import area_vectors
 
 NEIGHBOURS = 12
 CHUNK = 200_000
@@ -113,7 +113,7 @@ def _nearest_faces(positions, faces, tree, sample_face, corners, unit, tick) -> 
 def _smooth(home: Int[np.ndarray, " f"], chart: Int[np.ndarray, " g"], faces: Int[np.ndarray, "f 3"]) -> np.ndarray:
     """Let faces join the chart that two of their three neighbours belong to, SMOOTHING times: borders get straighter
     and single faces do not become charts."""
-    from mistyle.core.uvs import group_rows
+    from mistyle.geometry.uvs import group_rows
 
     a, b = faces[:, [1, 2, 0]].reshape(-1), faces[:, [2, 0, 1]].reshape(-1)
     edge = group_rows(np.maximum(a, b), np.minimum(a, b))
@@ -173,7 +173,7 @@ def _barycentric(point: np.ndarray, corners: np.ndarray) -> np.ndarray:
 def _border(faces: np.ndarray, uvs: np.ndarray, chart: np.ndarray) -> Bool[np.ndarray, "g 3"]:
     """Whether the edge opposite to each corner is a border of its chart: no other face of the chart continues there
     with the same UVs."""
-    from mistyle.core.uvs import corner_nodes, group_rows
+    from mistyle.geometry.uvs import corner_nodes, group_rows
 
     nodes = corner_nodes(faces, uvs)
     a, b = nodes[:, [1, 2, 0]].reshape(-1), nodes[:, [2, 0, 1]].reshape(-1)

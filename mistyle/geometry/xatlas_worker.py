@@ -1,7 +1,7 @@
 """The child process that runs xatlas: arrays in from one .npz file, arrays out to another.
 
 xatlas reports no progress, cannot be interrupted and may abort the process on broken meshes, so it never runs in the
-main process: `python -m mistyle.core.xatlas_worker IN.npz OUT.npz`.
+main process: `python -m mistyle.geometry.xatlas_worker IN.npz OUT.npz`.
 """
 
 import sys
@@ -9,9 +9,9 @@ import sys
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.core.raster import fragments
 from mistyle.core.rows import distinct
-from mistyle.core.uvs import signed_areas
+from mistyle.geometry.raster import fragments
+from mistyle.geometry.uvs import signed_areas
 from mistyle.process.children import end_with_parent
 
 # Charts may deviate this much before a new one begins. xatlas's own default of 2 gives half as many charts again for

@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.errors import InputRefused
-from mistyle.core.normals import area_vectors, same_points
 from mistyle.core.paths import PACKAGE
+from mistyle.geometry.normals import area_vectors, same_points
 
 # Above this a decimated proxy is unwrapped and its UVs are transferred. xatlas's time grows with the faces' power 1.65
 # (bunny, 69,451 faces: 24 s) and its charts follow every bump; through the proxy the bunny takes 5 s, falls into 109
@@ -49,7 +49,7 @@ def unwrap(
 
     `progress` hears a share estimated from the time gone by: xatlas reports nothing. An interrupt ends the child.
     """
-    from mistyle.core import proxy
+    from mistyle.geometry import decimated as proxy
 
     padding = max(2, size // 256) if padding is None else padding
     jobs = [_clean(positions, faces) for positions, faces in meshes]
@@ -100,7 +100,7 @@ def _clean(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 def _repeats(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
     """How many earlier faces have the same three points."""
-    from mistyle.core.uvs import group_rows
+    from mistyle.geometry.uvs import group_rows
 
     corners = np.sort(faces, axis=1)
     group = group_rows(corners[:, 2], corners[:, 1], corners[:, 0])
@@ -122,7 +122,7 @@ def _child(
         numbers = {"count": len(meshes), "resolution": size, "padding": padding}
         np.savez(source, allow_pickle=False, **(arrays | {k: np.array(v) for k, v in numbers.items()}))
         path = os.pathsep.join(p for p in (str(PACKAGE.parent), os.environ.get("PYTHONPATH", "")) if p)
-        command = [sys.executable, "-m", "mistyle.core.xatlas_worker", str(source), str(target)]
+        command = [sys.executable, "-m", "mistyle.geometry.xatlas_worker", str(source), str(target)]
         child = subprocess.Popen(
             command, env={**os.environ, "PYTHONPATH": path}, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE
         )

@@ -8,10 +8,10 @@ from jaxtyping import Bool, Float
 from scipy.spatial import KDTree
 from scipy.spatial.transform import Rotation
 
-from mistyle.core.align import degrees_between, fit_similarity, scale_of, similarity
 from mistyle.core.camera import Camera, in_frame, px_from_world
 from mistyle.core.image import dilate
 from mistyle.core.mesh import Mesh, face_areas, face_normals
+from mistyle.geometry.similarity import degrees_between, fit_similarity, scale_of, similarity
 
 COARSE_POINTS, COARSE_STEPS, COARSE_SURFACE = 250, 12, 5000
 FINE_POINTS, FINE_STEPS, FINE_SURFACE = 5000, 25, 40_000  # points that stand for the mesh's surface

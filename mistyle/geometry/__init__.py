@@ -1,0 +1,1 @@
+"""Meshes as geometry: UV unwrapping, tangents, rasterisation, registration, lens models."""
