@@ -47,7 +47,7 @@ def main() -> None:
 
 def compare(path: Path, blender: str, size: int, samples: int, pictures: Path | None) -> dict[str, float]:
     """Render one asset on both sides and measure how far apart the pictures are."""
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     asset = read_mesh(path, uv="keep")
     camera = orbit(35.0, 15.0, distance=4.0, fov=30.0, size=(size, size))
@@ -65,7 +65,7 @@ def compare(path: Path, blender: str, size: int, samples: int, pictures: Path | 
         "correlation_mirrored": float(np.corrcoef(ours[..., :3].ravel(), theirs[:, ::-1, :3].ravel())[0, 1]),
     }
     if pictures is not None:
-        from mistyle.files.images import write_png
+        from mistyle.io.images.write import write_png
 
         pictures.mkdir(parents=True, exist_ok=True)
         pair = np.concatenate([image[..., :3] + 0.8 * (1 - image[..., 3:]) for image in (ours, theirs)], axis=1)
@@ -96,7 +96,7 @@ def draw(asset: Asset, camera: Camera, samples: int) -> np.ndarray:
 
 def cycles(path: Path, asset: Asset, camera: Camera, samples: int, blender: str) -> np.ndarray:
     """Blender's side, in a process of its own."""
-    from mistyle.files.read import read_exr
+    from mistyle.io.read import read_exr
 
     user_from_work = np.linalg.inv(asset.source.work_from_user)
     scale = float(np.cbrt(np.linalg.det(user_from_work[:3, :3])))

@@ -67,7 +67,7 @@ def streamed(work: Path, size: tuple[int, int]) -> dict[str, float]:
 
 def write_pair(a: Path, b: Path, size: tuple[int, int]) -> None:
     """A smooth picture with highlights beyond 1, and the same with noise as of a few samples; half floats."""
-    from mistyle.files.images import write_exr
+    from mistyle.io.images.write import write_exr
 
     rng = np.random.default_rng(0)
     y, x = np.mgrid[0 : size[0], 0 : size[1]].astype(np.float32) / max(size)

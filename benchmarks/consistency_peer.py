@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.consistency_rows import Row
 from benchmarks.consistency_scene import Scene
 from mistyle.core.image import nearest_fill
-from mistyle.files.read import read_picture
+from mistyle.io.read import read_picture
 from mistyle.surface import style as styles
 
 

@@ -14,7 +14,7 @@ from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels, flat_maps
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.files.records import load_record, save_record
+from mistyle.io.store.records import load_record, save_record
 from mistyle.run.stylize_settings import Settings, resolve
 from mistyle.surface import style as styles
 
@@ -66,8 +66,8 @@ def cameras(resolution: int) -> list[Camera]:
 
 def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, atlas: int) -> Scene:
     """Read, draw and guide; the scene is left in `folder` for the rows, which run in processes of their own."""
-    from mistyle.files.read import read_picture
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read import read_picture
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.render.draw import draw_views
     from mistyle.run.start import start_engines
     from mistyle.stages.texels import rasterise

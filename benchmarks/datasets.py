@@ -36,12 +36,12 @@ from mistyle.core.camera import MITSUBA_FROM_OPENCV, OPENGL_FROM_OPENCV, Camera
 from mistyle.core.capture import Captures
 from mistyle.core.image import bilinear, linear_from_srgb
 from mistyle.core.light import Environment, Lights
-from mistyle.files.bounds import inside, refuse
-from mistyle.files.cameras import MAX_SIDE, CameraFrame, check_rotation, read_frames
-from mistyle.files.captures import CapturedPicture, load_shot
-from mistyle.files.read import read_json, read_npy, read_picture, read_radiance, read_size
 from mistyle.geometry.lens import Lens
 from mistyle.geometry.similarity import turned
+from mistyle.io.cameras.camera_files import MAX_SIDE, CameraFrame, check_rotation, read_frames
+from mistyle.io.cameras.captures import CapturedPicture, load_shot
+from mistyle.io.read import read_json, read_npy, read_picture, read_radiance, read_size
+from mistyle.io.sandbox.bounds import inside, refuse
 
 # Axes of an environment map (up +Y, middle +Z, right -X) in TensoIR's world.
 WORLD_FROM_TENSOIR_MAP = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

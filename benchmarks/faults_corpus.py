@@ -38,7 +38,7 @@ def seeds() -> list[Seed]:
 
 
 def png(bits: int = 8, channels: int = 3) -> bytes:
-    from mistyle.files.images import encode_png
+    from mistyle.io.images.write import encode_png
 
     rng = np.random.default_rng(0)
     return encode_png(rng.random((12, 16, channels) if channels > 1 else (12, 16)).astype(np.float32), bits)
@@ -249,7 +249,7 @@ def _exrs() -> dict[str, bytes]:
 def _cameras() -> list[Seed]:
     from mistyle.core.camera import orbit
     from mistyle.core.light import lights, to_json
-    from mistyle.files.cameras import SPACE, camera_entry, transforms
+    from mistyle.io.cameras.camera_files import SPACE, camera_entry, transforms
 
     cameras = [orbit(a, 10, distance=4, fov=30, size=(12, 16)) for a in (0, 90)]
     own = {"version": 1, "space": SPACE, "views": [camera_entry(c) for c in cameras]}

@@ -51,7 +51,7 @@ class Outcome:
 
 
 def _mesh(path: Path) -> None:
-    from mistyle.files.read_mesh import read_mesh, read_references
+    from mistyle.io.read_mesh import read_mesh, read_references
 
     read_references(path)
     asset = read_mesh(path, uv="keep", max_faces=100_000)
@@ -62,9 +62,9 @@ def _mesh(path: Path) -> None:
 def _patched(asset: Any) -> None:
     """A glTF that is read is written again with plain textures as well, and read once more: its faces are all there."""
     from mistyle.core.maps import flat_maps
-    from mistyle.files.gltf import patch_glb
-    from mistyle.files.gltf_alpha import cutouts
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.gltf.alpha import cutouts
+    from mistyle.io.gltf.write import patch_glb
+    from mistyle.io.read_mesh import read_mesh
 
     parts = len(asset.mesh.parts)
     cutouts(asset)
@@ -77,7 +77,7 @@ def _patched(asset: Any) -> None:
 
 
 def _picture(path: Path) -> None:
-    from mistyle.files.read import read_frame, read_picture, read_size
+    from mistyle.io.read import read_frame, read_picture, read_size
 
     read_size(path)
     read_picture(path)
@@ -85,7 +85,7 @@ def _picture(path: Path) -> None:
 
 
 def _exr(path: Path) -> None:
-    from mistyle.files.read import read_exr, read_frame, read_radiance
+    from mistyle.io.read import read_exr, read_frame, read_radiance
 
     read_frame(path)
     read_exr(path)
@@ -93,7 +93,7 @@ def _exr(path: Path) -> None:
 
 
 def _captures(path: Path) -> None:
-    from mistyle.files.captures import read_captures, sparse_points
+    from mistyle.io.cameras.captures import read_captures, sparse_points
 
     found = read_captures(path, lights="unknown")
     for k in range(len(found)):
@@ -102,7 +102,7 @@ def _captures(path: Path) -> None:
 
 
 def _colmap(path: Path) -> None:
-    from mistyle.files.read import read_colmap, read_colmap_points
+    from mistyle.io.read import read_colmap, read_colmap_points
 
     read_colmap(path)
     read_colmap_points(path)
@@ -192,7 +192,7 @@ def listing(folder: Path) -> list[tuple[str, int]]:
 
 def peak_reader_gb() -> float:
     """The most memory that the reader process has held, in GB."""
-    from mistyle.files.reader_process import peak_bytes
+    from mistyle.io.sandbox.reader_process import peak_bytes
 
     return peak_bytes() / 1e9
 
@@ -200,7 +200,7 @@ def peak_reader_gb() -> float:
 def unwrapped(count: int, folder: Path, report: Callable[[str], None]) -> list[Outcome]:
     """Damaged meshes that get new texture coordinates: finite, in the unit square, one a corner; or refused."""
     from mistyle.core.errors import MistyleError
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     chosen = [seed for seed in seeds() if seed.kind == "mesh"]
     found = []

@@ -65,7 +65,7 @@ def sets(values: dict[str, Any]) -> list[str]:
 
 def made(folder: Path, wanted: Sequence[str]) -> dict[str, Job]:
     """Write the inputs of the jobs wanted ("stylize", "fit", "fit --scene", "batch") into a folder."""
-    from mistyle.files.images import write_png
+    from mistyle.io.images.write import write_png
 
     mesh, style = scenes() / "demo.obj", scenes() / "demo_style.png"
     folder.mkdir(parents=True, exist_ok=True)

@@ -390,7 +390,7 @@ def main(argv: list[str] | None = None) -> None:
     own.add_argument("--skip", nargs="+", default=[], choices=[m.__name__ for m in MEASUREMENTS])
     chosen, rest = own.parse_known_args(argv)
     options = arguments(__doc__ or "", rest)
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     mesh = read_mesh(chosen.mesh).mesh
     figures: dict[str, float] = {}

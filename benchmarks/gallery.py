@@ -43,8 +43,8 @@ from benchmarks.common import finish, parser
 from benchmarks.gallery_draw import Drawn, draw_cycles, draw_ours
 from mistyle.core.errors import UsageError
 from mistyle.core.image import srgb_from_linear
-from mistyle.files.images import write_png
-from mistyle.files.read import read_json
+from mistyle.io.images.write import write_png
+from mistyle.io.read import read_json
 from mistyle.measure.compare_metrics import measure_colour
 from mistyle.run.blender import find_blender
 

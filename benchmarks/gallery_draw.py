@@ -18,9 +18,9 @@ from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera, orbit
 from mistyle.core.errors import MistyleError
 from mistyle.core.light import Ambient, SphericalGaussian
-from mistyle.files.images import write_exr
-from mistyle.files.read import read_exr
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.images.write import write_exr
+from mistyle.io.read import read_exr
+from mistyle.io.read_mesh import read_mesh
 from mistyle.run.blender import blender_command
 
 # A sky without edges: what differs is the model then, not the noise of two ways to sample small lamps.

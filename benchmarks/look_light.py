@@ -22,7 +22,7 @@ ATLAS = 1024
 @once
 def sky(name: str) -> Any:
     """An environment, exposed so that a grey ball in it has a mean luminance of 0.18."""
-    from mistyle.files.read import read_radiance
+    from mistyle.io.read import read_radiance
     from mistyle.render.lookdev import light_rig
     from mistyle.render.sheet import LightRig, exposed
 
@@ -33,7 +33,7 @@ def lit(glb: Path, size: int = SIZE, spp: int = SPP) -> list[np.ndarray]:
     """The asset under every environment from every side, (size, size, 3) uint8 sRGB; kept beside the GLB."""
     kept = glb.with_name(f"{glb.name}.lit-{size}-{spp}.npy")
     if not kept.exists():
-        from mistyle.files.read_mesh import read_mesh
+        from mistyle.io.read_mesh import read_mesh
         from mistyle.render.lookdev import asset_scene, asset_shapes, drawn
 
         asset, pictures = read_mesh(glb), []
@@ -72,7 +72,7 @@ def encoded(picture: np.ndarray) -> np.ndarray:
 
 def light_of(glb: Path) -> BakedLight:
     """What the albedo of a kept GLB says about light, over all its texels."""
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.stages.light_left import light_left
     from mistyle.stages.texels import rasterise, start_maps
 
@@ -118,7 +118,7 @@ def piece_of_asset(glb: Path, unit: float, pixels: int, seed: int) -> np.ndarray
     from mistyle.core.image import srgb_from_linear
     from mistyle.core.maps import flat_maps
     from mistyle.core.mesh import face_areas, face_normals
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.render.draw import gbuffer, tracer
     from mistyle.render.lookdev import material_maps
     from mistyle.render.unlit import unlit

@@ -51,9 +51,9 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     from mistyle.core.camera import rig
     from mistyle.core.image import linear_from_srgb
     from mistyle.core.rig_settings import RigSettings
-    from mistyle.files.read import read_picture
-    from mistyle.files.read_mesh import read_mesh
-    from mistyle.files.views import write_views
+    from mistyle.io.cameras.views import write_views
+    from mistyle.io.read import read_picture
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.render.draw import draw_views as drawn
     from mistyle.run.stylize_settings import resolve
     from mistyle.stages.lift import lift
@@ -100,7 +100,7 @@ def before(lifted: Sequence[Any], view: Any, picture: np.ndarray) -> np.ndarray:
 def stylized(program: Path, folder: Path, mask: np.ndarray, wanted: dict[str, np.ndarray], detail: str) -> np.ndarray:
     """What EbSynth paints after the guides, encoded sRGB."""
     from mistyle.core.image import nearest_fill
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     sources = {
         "colour": ("source_colour", "1"),

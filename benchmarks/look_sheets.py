@@ -36,7 +36,7 @@ def flipped(name: str, seed: int) -> bool:
 
 def read(path: Path) -> np.ndarray:
     """A picture, (h w 3) uint8 RGB; transparent parts lie on white."""
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     picture = read_picture(path)
     alpha = 1.0 if picture.alpha is None else picture.alpha[..., None]

@@ -37,10 +37,10 @@ from mistyle.core.capture import Captures, in_memory, shrunk
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, to_json
 from mistyle.core.maps import flat_maps
-from mistyle.files.cameras import transforms
-from mistyle.files.captures import read_captures
-from mistyle.files.read_mesh import read_mesh
 from mistyle.geometry.lens import Lens, distort
+from mistyle.io.cameras.camera_files import transforms
+from mistyle.io.cameras.captures import read_captures
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render.draw import tracer
 from mistyle.render.material_table import pack
 from mistyle.render.shade import MaterialRenderer, RenderOptions

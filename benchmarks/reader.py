@@ -30,8 +30,8 @@ RUNS, MOST, ENOUGH = 9, 41, 20.0
 
 def start_seconds(path: Path) -> float:
     """From nothing to the answer about a small file; the median of RUNS children."""
-    from mistyle.files import reader_process
-    from mistyle.files.read import read_size
+    from mistyle.io.read import read_size
+    from mistyle.io.sandbox import reader_process
 
     found = []
     for _ in range(RUNS):
@@ -54,7 +54,7 @@ def grid(side: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def files(folder: Path, share: float) -> dict[str, Path]:
     """The large files; `share` of their sizes."""
-    from mistyle.files.images import write_exr, write_png
+    from mistyle.io.images.write import write_exr, write_png
 
     positions, uvs, faces = grid(int(640 * share**0.5))
     rows = [f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in positions] + [f"vt {u:.6f} {v:.6f}" for u, v in uvs]
@@ -100,7 +100,7 @@ def sheet(positions: np.ndarray, uvs: np.ndarray, faces: np.ndarray) -> tuple[di
 
 def processor_seconds() -> float:
     """Processor time of this process and of the reader process (Linux: in hundredths of a second)."""
-    from mistyle.files import reader_process
+    from mistyle.io.sandbox import reader_process
 
     reader = reader_process._reader
     stat = Path(f"/proc/{reader.process.pid}/stat") if reader is not None else None
@@ -127,12 +127,12 @@ def compared(direct: Callable[[], Any], through: Callable[[], Any]) -> tuple[flo
 
 
 def run(quick: bool) -> dict[str, float]:
-    from mistyle.files import reader_tasks
-    from mistyle.files.images import write_png
-    from mistyle.files.raw import spelled
-    from mistyle.files.read import read_exr
-    from mistyle.files.read_mesh import MESHES
-    from mistyle.files.reader_process import ask
+    from mistyle.io.images.write import write_png
+    from mistyle.io.meshes.parsed_mesh import spelled
+    from mistyle.io.read import read_exr
+    from mistyle.io.read_mesh import MESHES
+    from mistyle.io.sandbox import reader_tasks
+    from mistyle.io.sandbox.reader_process import ask
 
     with tempfile.TemporaryDirectory(prefix="mistyle-reader-") as folder:
         there = files(Path(folder), 0.1 if quick else 1.0)

@@ -23,8 +23,8 @@ from mistyle.core.asset import Asset
 from mistyle.core.capture import Captures, shrunk, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps
-from mistyle.files.read_mesh import read_mesh
 from mistyle.geometry.similarity import moved
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render.scene import Frame
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings

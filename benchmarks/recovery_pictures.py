@@ -27,7 +27,7 @@ from mistyle.core.light import (
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
-from mistyle.files.read import read_hdr
+from mistyle.io.read import read_hdr
 from mistyle.render import device
 from mistyle.render.scene import Frame, object_shapes, passes, sensor_dict
 

@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.common import lettered, machine
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps
-from mistyle.files.images import write_png
+from mistyle.io.images.write import write_png
 
 Columns = Mapping[str, Mapping[str, float]]  # method -> figure -> value
 

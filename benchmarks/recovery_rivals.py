@@ -17,7 +17,7 @@ from benchmarks.recovery_pictures import FOV, Shot, sensor_to_world
 from benchmarks.recovery_truth import Truth
 from mistyle.core.light import Directional, direction_in_world
 from mistyle.core.maps import Maps
-from mistyle.files.images import write_exr
+from mistyle.io.images.write import write_exr
 from mistyle.render.scene import mitsuba_mesh
 
 NAIVE = Path(__file__).with_name("naive_fit.py")

@@ -26,7 +26,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import nearest_fill
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.read_mesh import read_mesh
 from mistyle.stages.texels import rasterise, start_maps
 
 UV = Literal["auto", "new"]

@@ -20,8 +20,8 @@ from mistyle.core.camera import rig
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.files.read import read_picture
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.read import read_picture
+from mistyle.io.read_mesh import read_mesh
 from mistyle.run import painting, start, stylize_start
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages import fit

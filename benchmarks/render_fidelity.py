@@ -83,7 +83,7 @@ def helmet(data: Path, spp: int, pictures: Path | None) -> dict[str, float]:
         peers = [psnr(other, rgb, mask) for peer, (other, _) in goldens.items() if peer != name]
         figures[f"farthest_peer.{name}"] = min(peers)
     if pictures is not None:
-        from mistyle.files.images import write_png
+        from mistyle.io.images.write import write_png
 
         shown = [ours, goldens["blender-cycles"][0], 4 * np.abs(ours - goldens["blender-cycles"][0])]
         row = [np.where(mask[..., None], np.clip(p, 0, 1), 0.2).astype(np.float32) for p in shown]
@@ -93,7 +93,7 @@ def helmet(data: Path, spp: int, pictures: Path | None) -> dict[str, float]:
 
 def read_golden(path: Path) -> tuple[np.ndarray, np.ndarray]:
     """A published picture (display encoding) and its coverage."""
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     picture = read_picture(path)
     alpha = picture.alpha if picture.alpha is not None else np.ones(picture.rgb.shape[:2], np.float32)
@@ -113,8 +113,8 @@ def displayed(linear: np.ndarray) -> np.ndarray:
 
 def draw_helmet(data: Path, size: tuple[int, int], spp: int) -> np.ndarray:
     """Linear picture."""
-    from mistyle.files.read import read_radiance
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read import read_radiance
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.render import lookdev
 
     path = data / "meshes/pbr/DamagedHelmet/DamagedHelmet.glb"
@@ -132,7 +132,7 @@ def draw_helmet(data: Path, size: tuple[int, int], spp: int) -> np.ndarray:
 
 def cycles(data: Path, blender: str, quick: bool, pictures: Path | None, only: str | None = None) -> dict[str, float]:
     """Mean LDR-FLIP between Mitsuba and Cycles on GLBs that we wrote."""
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.measure.compare_metrics import measure_colour
     from mistyle.run.render_files import write_asset_glb
     from mistyle.run.renderers import renderer, shots, subject
@@ -159,7 +159,7 @@ def cycles(data: Path, blender: str, quick: bool, pictures: Path | None, only: s
                 figures[f"bias.{name}.{shot.name}"] = float(ours.mean() / theirs.mean() - 1)
                 print(f"{name} {shot.name}: FLIP {found['flip']:.4f}", file=sys.stderr)
                 if pictures is not None:
-                    from mistyle.files.images import write_png
+                    from mistyle.io.images.write import write_png
 
                     row = np.concatenate([ours, theirs, 8 * np.abs(ours - theirs)], axis=1)
                     write_png(pictures / f"{name}_{shot.name}_mitsuba_cycles_difference8.png", srgb_from_linear(row))

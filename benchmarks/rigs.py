@@ -42,7 +42,7 @@ def main(argv: list[str] | None = None) -> None:
 
 def measure(name: str, path: Path) -> dict[str, float]:
     """All rigs on one mesh."""
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.render.draw import tracer
     from mistyle.render.visible import face_on
     from mistyle.stages.rigs import face_fronts, next_best_views, sample_surface

@@ -16,9 +16,9 @@ from PIL import Image
 from mistyle.core.camera import rig
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.rig_settings import RigSettings
-from mistyle.files.images import write_png
-from mistyle.files.read import read_picture
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.images.write import write_png
+from mistyle.io.read import read_picture
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render.unlit import unlit
 from mistyle.run import painting, start, stylize_start
 from mistyle.run.stylize_settings import Settings

@@ -52,7 +52,7 @@ from benchmarks.common import finish, parser
 from benchmarks.strangers_seen import Seen, cells, read, run
 from mistyle.core.errors import UsageError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
-from mistyle.files.read import read_json
+from mistyle.io.read import read_json
 
 EXPECTED = Path(__file__).with_name("strangers_expected.json")
 LETTERS = {"R": (220, 40, 40), "G": (40, 200, 40), "B": (40, 40, 220), "Y": (230, 220, 40)}

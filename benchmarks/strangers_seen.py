@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.core.image import srgb_from_linear
-from mistyle.files.captures import read_captures, read_shots, reading_notes
-from mistyle.files.read import read_frame, read_picture
-from mistyle.files.read_mesh import MESHES, read_mesh
+from mistyle.io.cameras.captures import read_captures, read_shots, reading_notes
+from mistyle.io.read import read_frame, read_picture
+from mistyle.io.read_mesh import MESHES, read_mesh
 
 PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main(sys.argv[1:]))"
 PIXELS = 64  # along each side of a drawn mesh

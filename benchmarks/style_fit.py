@@ -59,7 +59,7 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
     """The stages of `mistyle stylize` up to the fit, without files."""
     from mistyle.backends.embedded import surface_colour
     from mistyle.core.image import linear_from_srgb
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
     from mistyle.render.draw import gbuffer, tracer
     from mistyle.run import painting, start, stylize_start
 

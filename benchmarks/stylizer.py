@@ -29,8 +29,8 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     from mistyle.core.camera import rig
     from mistyle.core.rig_settings import RigSettings
     from mistyle.core.view import View
-    from mistyle.files.read import read_picture
-    from mistyle.files.records import load_record
+    from mistyle.io.read import read_picture
+    from mistyle.io.store.records import load_record
     from mistyle.run import painting, start, stylize_start
     from mistyle.run.stylize_settings import resolve
 
@@ -105,8 +105,8 @@ def main() -> None:
 def unwrap(mesh: Path, target: Path) -> None:
     """Read a mesh and give it UVs where it has none, out of the measured process."""
     code = (
-        "import sys; from pathlib import Path; from mistyle.files.read import read_mesh;"
-        "from mistyle.files.records import save_record;"
+        "import sys; from pathlib import Path; from mistyle.io.read import read_mesh;"
+        "from mistyle.io.store.records import save_record;"
         "save_record(Path(sys.argv[2]), read_mesh(Path(sys.argv[1])))"
     )
     subprocess.run([sys.executable, "-c", code, str(mesh), str(target)], check=True)

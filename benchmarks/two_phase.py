@@ -32,8 +32,8 @@ from mistyle.core.capture import in_memory
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.core.light import Directional, Lights, has_soft, lights
 from mistyle.core.maps import Maps
-from mistyle.files.read import read_picture
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.read import read_picture
+from mistyle.io.read_mesh import read_mesh
 from mistyle.run import start, stylize_start
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.fit import FitStart, FitTargets, two_phase, view_mask

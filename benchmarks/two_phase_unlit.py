@@ -86,8 +86,8 @@ def settings_of(preset: str, change: Mapping[str, Any]) -> Any:
 def paint(mesh: str, style: str, preset: str) -> Painted:
     """The stages before the bake, as a job runs them."""
     from mistyle.core.view import View
-    from mistyle.files.read import read_picture
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read import read_picture
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.render.draw import gbuffer, tracer
     from mistyle.run import painting, stylize_start
 

@@ -18,8 +18,8 @@ from benchmarks.relief_start import silent, views_of
 from mistyle.core.asset import Picture
 from mistyle.core.image import luminance
 from mistyle.core.view import View
-from mistyle.files.read import read_picture
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.read import read_picture
+from mistyle.io.read_mesh import read_mesh
 from mistyle.run import painting, start, stylize_start, sweep
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.mvst import PaintedView

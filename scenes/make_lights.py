@@ -16,7 +16,7 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
 from mistyle.core.light import bake_environment, environment_directions, lights  # noqa: E402
-from mistyle.files.images import write_exr  # noqa: E402
+from mistyle.io.images.write import write_exr  # noqa: E402
 
 # The narrowest of the paper's lobes (sharpness 6) is 40 degrees wide; a texel of this map spans 2.8 degrees.
 PAPER_HEIGHT = 64

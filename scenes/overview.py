@@ -36,7 +36,7 @@ def lamp_map(azimuth: float, rows: int = 97) -> np.ndarray:
 
 def painted(mesh: Path, style: Path) -> tuple[Any, list[Any]]:
     """The asset and the maps of its texture sets, painted as `mistyle demo` paints them."""
-    from mistyle.files.read import read_mesh, read_picture
+    from mistyle.io.read import read_mesh, read_picture
     from mistyle.run import painting, start
     from mistyle.run.settings import resolve
 

@@ -92,8 +92,8 @@ class Stages:
 def style_job(made: Stages, settings: Any) -> None:
     """The stages of `stylize`."""
     from mistyle.core.light import lights
-    from mistyle.files.read import read_picture
-    from mistyle.files.views import read_views, write_views
+    from mistyle.io.cameras.views import read_views, write_views
+    from mistyle.io.read import read_picture
     from mistyle.render.draw import draw_views
     from mistyle.run import painting, start, stylize_start
     from mistyle.stages.fit import FitStart, FitTargets, two_phase
@@ -192,7 +192,7 @@ def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any
 
 def compared(made: Stages) -> None:
     """Two pictures compared: the tables, the pictures, the page."""
-    from mistyle.files.images import write_exr
+    from mistyle.io.images.write import write_exr
     from mistyle.run.compare import compare
     from mistyle.run.compare_records import CompareJob
     from mistyle.run.progress import Progress

@@ -89,7 +89,7 @@ def bumpy_sphere(rings: int = 12) -> Asset:
 
 def from_gltf(path: Path, *, new_uvs: bool = False) -> Asset:
     """A glTF file as it is, one part per material; with `new_uvs` every face gets a cell of its own in the square."""
-    from mistyle.files.gltf_read import read_gltf
+    from mistyle.io.gltf.read import read_gltf
 
     raw = read_gltf(path, 1_000_000).finished()
     uvs, kind = raw.uvs, "kept"
@@ -142,7 +142,7 @@ def strange_gltf(path: Path) -> Path:
     attribute, a sparse accessor; shown by two nodes, one of which mirrors space. Materials: one cut out by the alpha
     of an external image, with a texture transform on the base colour, an emissive texture and extras; one blended.
     """
-    from mistyle.files.images import encode_png
+    from mistyle.io.images.write import encode_png
 
     x, y = np.meshgrid(np.linspace(-1, 1, 5), np.linspace(0, 1, 3))
     positions = np.stack([x, y, 0.2 * np.cos(3 * x)], -1).reshape(-1, 3).astype(np.float32)
@@ -199,7 +199,7 @@ def strange_gltf(path: Path) -> Path:
 
 
 def _strange_mesh(tree: dict, positions, normals, uvs, faces):
-    from mistyle.files.glb import ARRAY_BUFFER, Builder
+    from mistyle.io.gltf.glb import ARRAY_BUFFER, Builder
 
     builder, count = Builder(tree, []), len(positions)
 

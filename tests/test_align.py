@@ -24,12 +24,12 @@ from mistyle.core.light import (
     spherical_gaussian,
 )
 from mistyle.core.mesh import Mesh
-from mistyle.files.cameras import transforms
-from mistyle.files.captures import read_captures
-from mistyle.files.images import write_png
-from mistyle.files.read_mesh import read_mesh
 from mistyle.geometry.icp import align_points, in_masks, visual_hull
 from mistyle.geometry.similarity import fit_similarity, moved, moved_camera, moved_lights, scale_of, similarity, turned
+from mistyle.io.cameras.camera_files import transforms
+from mistyle.io.cameras.captures import read_captures
+from mistyle.io.images.write import write_png
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
 

@@ -79,7 +79,7 @@ def test_the_settings_of_the_verbs_are_those_that_there_are():
 @pytest.fixture(scope="module")
 def square(tmp_path_factory) -> Path:
     """A folder with square.obj and, in shots/, two lit views of it with their cameras and light."""
-    from mistyle.files.views import write_views
+    from mistyle.io.cameras.views import write_views
 
     folder = tmp_path_factory.mktemp("square")
     (folder / "square.obj").write_text(SQUARE)
@@ -281,7 +281,7 @@ def test_cameras_in_the_files_own_units_are_moved(tmp_path):
     frame = {"file_path": "a.png", "transform_matrix": matrix, "fl_x": 20, "w": 8, "h": 8}
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
     (tmp_path / "lights.json").write_text(json.dumps({"lights": [{"type": "ambient", "radiance": [1, 1, 1]}]}))
-    from mistyle.files.images import write_png
+    from mistyle.io.images.write import write_png
 
     write_png(tmp_path / "a.png", np.full((8, 8, 3), 0.5, np.float32))
     own, moved = (mistyle.read_captures(tmp_path, given).cameras[0].position for given in (None, asset))
@@ -292,7 +292,7 @@ def test_cameras_in_the_files_own_units_are_moved(tmp_path):
 
 def test_compare_takes_arrays_views_and_files(tmp_path, rng):
     from mistyle.core.image import srgb_from_linear
-    from mistyle.files.images import write_png
+    from mistyle.io.images.write import write_png
 
     reference = rng.random((24, 32, 3)).astype(np.float32)
     test = np.clip(reference + 0.1, 0, 1).astype(np.float32)

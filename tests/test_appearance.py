@@ -14,8 +14,8 @@ from test_read_gltf import INDEX, NORMAL, POSITION, File, square
 from mistyle.core.asset import Asset, Shading
 from mistyle.core.camera import orbit
 from mistyle.core.light import Ambient
-from mistyle.files.gltf import patch_glb
-from mistyle.files.read_mesh import load_gltf, read_mesh
+from mistyle.io.gltf.write import patch_glb
+from mistyle.io.read_mesh import load_gltf, read_mesh
 from mistyle.render import appearance, lookdev
 from mistyle.render.lookdev import material_maps
 
@@ -297,7 +297,7 @@ def test_too_many_instances_are_read_once(tmp_path: Path) -> None:
 
 
 def test_normals_turn_with_the_joints(tmp_path: Path) -> None:
-    from mistyle.files.gltf_pose import turned
+    from mistyle.io.gltf.pose import turned
 
     rng = np.random.default_rng(1)
     matrices = np.tile(np.eye(4), (len(NORMAL), 1, 1))

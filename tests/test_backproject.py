@@ -409,8 +409,8 @@ def test_no_views_are_refused():
 
 def test_spot_keeps_its_own_texture():
     # Mitsuba says where each pixel's ray meets the real mesh; its unlit texture goes into the views and comes back.
-    from mistyle.files.read import read_picture
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read import read_picture
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.render.draw import gbuffer, tracer
 
     mesh = read_mesh(data("meshes/plain/spot.obj")).mesh

@@ -250,8 +250,8 @@ def done_by_hand(plan, index: int) -> None:
     asset = plan.out / job.name / "asset" / "a.glb"
     asset.parent.mkdir(parents=True)
     asset.write_bytes(b"glTF")
-    from mistyle.files.output import keep_folder
-    from mistyle.files.store import sha256_file
+    from mistyle.io.store.atomic import sha256_file
+    from mistyle.io.store.output import keep_folder
 
     keep_folder(plan.out / job.name, "asset")
     keep_folder(plan.out, "shards")

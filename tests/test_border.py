@@ -18,11 +18,11 @@ import pytest
 from helpers import ROOT, data
 
 from mistyle.core.errors import InputRefused, MistyleError
-from mistyle.files import bounds, lending, reader_process, wire
-from mistyle.files.images import write_exr, write_png
-from mistyle.files.raw import RawMap, Textures, Tile
-from mistyle.files.read import read_exr, read_json, read_npy, read_picture, read_size, read_toml, read_yaml
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.images.write import write_exr, write_png
+from mistyle.io.meshes.parsed_mesh import RawMap, Textures, Tile
+from mistyle.io.read import read_exr, read_json, read_npy, read_picture, read_size, read_toml, read_yaml
+from mistyle.io.read_mesh import read_mesh
+from mistyle.io.sandbox import bounds, reader_process, rpc_codec, shared_copy
 from mistyle.process import weights
 
 posix = os.name == "posix"
@@ -46,10 +46,17 @@ CALLS = {
     *(("trimesh", "load"), ("imageio", "imread"), ("Stage", "Open"), ("json", "load"), ("xatlas", "parse_mesh")),
 }
 DECODERS = {
-    *("files/pictures", "files/hdr", "files/layers", "files/obj_read", "files/mesh_formats", "files/gltf_read"),
-    *("files/gltf_check", "files/gltf_materials", "files/colmap", "files/references", "files/reader_tasks"),
-    *("files/usd_read", "files/usd_layers", "files/usd_materials", "files/mtl_read", "files/ply_read"),
-    *("files/gltf_pose", "files/usd_stage", "files/usd_mesh"),
+    *(
+        "io/images/read",
+        "io/images/hdr",
+        "io/images/layers",
+        "io/meshes/obj_read",
+        "io/meshes/stl_off_read",
+        "io/gltf/read",
+    ),
+    *("io/gltf/check", "io/gltf/materials", "io/cameras/colmap", "io/sandbox/references", "io/sandbox/reader_tasks"),
+    *("io/usd/read", "io/usd/layers", "io/usd/materials", "io/meshes/mtl_read", "io/meshes/ply_read"),
+    *("io/gltf/pose", "io/usd/stage", "io/usd/mesh"),
 }
 ALLOWED = {
     "environment": "pyproject.toml of the clone",
@@ -59,9 +66,9 @@ ALLOWED = {
     "geometry/xatlas_worker": "what its parent wrote into a folder of its own",
     "process/weights": "safetensors, mapped in place after their header was checked",
     "process/weights_worker": "a child process of its own: weights that are no safetensors",
-    "files/images": "writes EXR",
-    "files/usd": "the package that it has just written",
-    "files/usd_look": "the USD file that the reader process has read in the same run, to lay materials over it",
+    "io/images/write": "writes EXR",
+    "io/usd/write": "the package that it has just written",
+    "io/usd/look": "the USD file that the reader process has read in the same run, to lay materials over it",
     "measure/flip_bands": "what its parent wrote into a folder of its own",
     "render/cycles_worker": "the job that mistyle wrote for it",
     "render/mitsuba_worker": "the job that mistyle wrote for it, or the user's scene, trusted like code",
@@ -129,7 +136,7 @@ def test_decoders_are_reached_through_the_reader_process_only():
         if name not in DECODERS
         for what in borrowed(tree)
         # The child itself, and the writer of layers over a USD file that the child has read before.
-        if name not in {"files/reader_child", "files/usd_look"}
+        if name not in {"io/sandbox/reader_child", "io/usd/look"}
     ]
     assert not wrong, "\n".join(wrong)
 
@@ -137,9 +144,11 @@ def test_decoders_are_reached_through_the_reader_process_only():
 def test_the_rules_can_be_broken():
     assert decoding(ast.parse("from PIL import Image\ndef f(p):\n    return Image.open(p)"))
     assert decoding(ast.parse("import numpy as np\nnp.load('a.npy')")) == ["np.load (line 2)"]
-    assert borrowed(ast.parse("from mistyle.files.pictures import read_picture"))
-    assert borrowed(ast.parse("from mistyle.files import hdr")) and borrowed(ast.parse("import mistyle.files.hdr"))
-    assert not borrowed(ast.parse("from mistyle.files.layers import LayeredPicture"))
+    assert borrowed(ast.parse("from mistyle.io.images.read import read_picture"))
+    assert borrowed(ast.parse("from mistyle.io.images import hdr")) and borrowed(
+        ast.parse("import mistyle.io.images.hdr")
+    )
+    assert not borrowed(ast.parse("from mistyle.io.images.layers import LayeredPicture"))
 
 
 def test_what_is_excused_is_there():
@@ -150,7 +159,7 @@ def test_what_is_excused_is_there():
 
 def test_the_reader_loads_no_renderer_and_no_torch():
     """It starts in well under a second, and a hostile file meets only decoders."""
-    source = "import sys, mistyle.files.reader_tasks; print(sorted({m.split('.')[0] for m in sys.modules}))"
+    source = "import sys, mistyle.io.sandbox.reader_tasks; print(sorted({m.split('.')[0] for m in sys.modules}))"
     done = subprocess.run([sys.executable, "-c", source], capture_output=True, text=True, cwd=ROOT, check=True)
     loaded = set(ast.literal_eval(done.stdout))
     assert not loaded & {"mitsuba", "drjit", "torch", "diffusers", "transformers", "ray", "jinja2", "socketserver"}
@@ -244,8 +253,8 @@ LITTLE = """
 import sys
 from pathlib import Path
 from mistyle.core.errors import InputRefused
-from mistyle.files import reader_process
-from mistyle.files.read import read_picture
+from mistyle.io.sandbox import reader_process
+from mistyle.io.read import read_picture
 path, usual = Path(sys.argv[1]), reader_process.MEMORY
 reader_process.MEMORY = 80 << 20
 try:
@@ -285,7 +294,7 @@ def test_threads_share_the_child(tmp_path: Path):
     assert found == {k: [float(k)] * 5 for k in range(8)}
 
 
-READ = "from pathlib import Path; from mistyle.files import read, reader_process; read.read_size(Path(r'{}'));"
+READ = "from pathlib import Path; from mistyle.io import read; from mistyle.io.sandbox import reader_process; read.read_size(Path(r'{}'));"
 READ += "pid = reader_process._reader.process.pid; print(pid, flush=True);"
 
 
@@ -311,7 +320,7 @@ def test_no_child_outlives_its_parent(rest: str, picture: Path):
 def test_the_reader_cannot_write(tmp_path: Path):
     source = f"""
 import numpy as np, cv2, os, socket, subprocess
-from mistyle.files import reader_child
+from mistyle.io.sandbox import reader_child
 reader_child._confine()
 place = {str(tmp_path)!r} + "/"
 for act in (lambda: open(place + "a", "w"), lambda: os.remove(place + "kept"), lambda: socket.socket(),
@@ -349,7 +358,7 @@ def test_a_reader_that_cannot_start_says_so(picture: Path, monkeypatch: pytest.M
 def through(value):
     """What arrives of a value."""
     sent = bytearray()
-    wire.send(lambda part: sent.extend(part) or len(part), value, extra=1)
+    rpc_codec.send(lambda part: sent.extend(part) or len(part), value, extra=1)
     at = 0
 
     def read(into: memoryview) -> int:
@@ -359,7 +368,7 @@ def through(value):
         at += count
         return count
 
-    found, head = wire.receive(read)
+    found, head = rpc_codec.receive(read)
     assert head == {"extra": 1} and at == len(sent)
     return found
 
@@ -375,7 +384,7 @@ def test_values_arrive_as_they_were_sent(rng: np.random.Generator):
         "note",
     )
     assert through(np.zeros((0, 3), np.float16)).shape == (0, 3) and through(np.array(2.5)).shape == ()
-    assert through(wire.Json({"a": [1, {"b": None}]})) == {"a": [1, {"b": None}]}
+    assert through(rpc_codec.Json({"a": [1, {"b": None}]})) == {"a": [1, {"b": None}]}
     for value in (object(), np.array([None]), np.array(["a"]), 1j, {1, 2}):
         with pytest.raises(TypeError, match="cannot be sent"):
             through(value)
@@ -410,21 +419,23 @@ def test_a_captured_reader_cannot_make_the_job_build_things(head):
         at += count
         return count
 
-    with pytest.raises(wire.BrokenMessage):
-        wire.receive(read)
+    with pytest.raises(rpc_codec.BrokenMessage):
+        rpc_codec.receive(read)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory of another process is read on Linux only")
 def test_large_arrays_are_copied_from_the_senders_memory(rng):
     large, small, sent = rng.random((300, 200)), rng.random(5), bytearray()
-    lent = wire.send(lambda part: sent.extend(part) or len(part), {"a": large, "b": [small, large]}, True)
+    lent = rpc_codec.send(lambda part: sent.extend(part) or len(part), {"a": large, "b": [small, large]}, True)
     assert [a is large for a in lent] == [True] and len(sent) < 1000
     stream = io.BytesIO(bytes(sent))
-    found, _ = wire.receive(stream.readinto, lambda address, into: lending.copy_from(os.getpid(), address, into))
+    found, _ = rpc_codec.receive(
+        stream.readinto, lambda address, into: shared_copy.copy_from(os.getpid(), address, into)
+    )
     assert np.array_equal(found["a"], large) and np.array_equal(found["b"][0], small) and found["b"][1] is found["a"]
     assert found["a"].ctypes.data != large.ctypes.data
     with pytest.raises(OSError):
-        lending.copy_from(os.getpid(), 64, memoryview(bytearray(8)))
+        shared_copy.copy_from(os.getpid(), 64, memoryview(bytearray(8)))
 
 
 @pytest.mark.parametrize("allowed", [True, False])
@@ -433,7 +444,7 @@ def test_lent_or_through_the_pipe_a_picture_is_the_same(tmp_path, monkeypatch, r
     write_png(tmp_path / "a.png", pixels / 255)
     reader_process.stop()
     if not allowed:
-        monkeypatch.setattr(lending, "can_read", lambda process, address: False)
+        monkeypatch.setattr(shared_copy, "can_read", lambda process, address: False)
     for _ in range(2):
         assert np.array_equal(np.rint(read_picture(tmp_path / "a.png").rgb * 255), pixels)
     assert reader_process._reader.lends == (allowed and sys.platform == "linux")
@@ -474,7 +485,7 @@ def test_memory_that_cannot_be_copied_is_a_refusal_and_the_next_file_gets_a_new_
     if not reader_process._reader.lends:
         pytest.skip("this system does not let a process read its child's memory")
     with monkeypatch.context() as patch:
-        patch.setattr(lending, "copy_from", lambda process, address, into: (_ for _ in ()).throw(OSError(14, "no")))
+        patch.setattr(shared_copy, "copy_from", lambda process, address, into: (_ for _ in ()).throw(OSError(14, "no")))
         with pytest.raises(InputRefused, match="its decoder ended"):
             read_picture(tmp_path / "a.png")
     assert read_picture(tmp_path / "a.png").rgb.shape == (400, 500, 3)

@@ -23,12 +23,12 @@ from mistyle.core.camera import Camera, orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.mesh import Mesh
-from mistyle.files.cameras import camera_entry, read_cameras, read_frames, transforms
-from mistyle.files.captures import load_shot, outline_of, read_captures, read_shots, reading_notes
-from mistyle.files.colmap import read_model
-from mistyle.files.images import write_exr
-from mistyle.files.read import read_picture, read_size, read_stored_size
-from mistyle.files.views import read_views
+from mistyle.io.cameras.camera_files import camera_entry, read_cameras, read_frames, transforms
+from mistyle.io.cameras.captures import load_shot, outline_of, read_captures, read_shots, reading_notes
+from mistyle.io.cameras.colmap import read_model
+from mistyle.io.cameras.views import read_views
+from mistyle.io.images.write import write_exr
+from mistyle.io.read import read_picture, read_size, read_stored_size
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.stages.outline_check import Outlines, check_outlines, overlap_line, overlap_notes
 

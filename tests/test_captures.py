@@ -15,12 +15,12 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Ambient, Directional, Environment, Point
 from mistyle.core.view import View
-from mistyle.files.cameras import camera_entry, transforms
-from mistyle.files.captures import camera_space, check_pixels, read_captures, read_shots, silhouette, sparse_points
-from mistyle.files.images import write_exr, write_png
-from mistyle.files.read import read_size
-from mistyle.files.views import write_views
 from mistyle.geometry.lens import Lens, distort, pinhole, px_in_photograph, resample
+from mistyle.io.cameras.camera_files import camera_entry, transforms
+from mistyle.io.cameras.captures import camera_space, check_pixels, read_captures, read_shots, silhouette, sparse_points
+from mistyle.io.cameras.views import write_views
+from mistyle.io.images.write import write_exr, write_png
+from mistyle.io.read import read_size
 
 SIZE = (12, 16)
 LENS = Lens((80.0, 84.0), (33.0, 22.5), (48, 64), (-0.21, 0.06, -0.01), (0.003, -0.002))
@@ -191,7 +191,7 @@ def test_lights_of_every_kind_beside_or_elsewhere(tmp_path):
 
 
 def test_pictures_are_loaded_one_at_a_time(tmp_path, monkeypatch):
-    import mistyle.files.captures as module
+    import mistyle.io.cameras.captures as module
 
     nerf(tmp_path, [grey(0.1), grey(0.2), grey(0.3)])
     read: list[str] = []

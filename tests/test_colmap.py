@@ -12,10 +12,10 @@ from benchmarks.photographs import undistort
 from mistyle.core.camera import Camera, pixel_centres, px_from_world
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import srgb_from_linear
-from mistyle.files.captures import camera_space, read_captures, sparse_points
-from mistyle.files.colmap import find_model, read_model, read_points
-from mistyle.files.images import write_png
 from mistyle.geometry.lens import distort
+from mistyle.io.cameras.captures import camera_space, read_captures, sparse_points
+from mistyle.io.cameras.colmap import find_model, read_model, read_points
+from mistyle.io.images.write import write_png
 
 # By COLMAP's documentation: number, name, parameters for a picture of 64 x 48.
 KINDS = (

@@ -14,8 +14,8 @@ import pytest
 from helpers import data
 from PIL import Image
 
-from mistyle.files.images import write_exr, write_png
-from mistyle.files.read import read_frame
+from mistyle.io.images.write import write_exr, write_png
+from mistyle.io.read import read_frame
 from mistyle.run.cli import main
 from mistyle.run.compare_inputs import matches
 from mistyle.run.compare_limits import Limit, broken

@@ -11,8 +11,8 @@ from helpers import data
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
 from mistyle.core.light import Ambient, Directional, Environment, environment_directions
 from mistyle.core.paths import scenes
-from mistyle.files.read import read_exr, read_radiance
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.read import read_exr, read_radiance
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render import lookdev
 from mistyle.render.draw import gbuffer
 from mistyle.run.cli import main

@@ -13,8 +13,8 @@ from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.light import Environment, environment_radiance
-from mistyle.files.images import write_exr, write_png
-from mistyle.files.read import read_npy
+from mistyle.io.images.write import write_exr, write_png
+from mistyle.io.read import read_npy
 
 SIZE = (8, 8)
 

@@ -14,8 +14,8 @@ from PIL import Image
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
-from mistyle.files import output
-from mistyle.files.packing import TARGETS
+from mistyle.io.images.packing import TARGETS
+from mistyle.io.store import output
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan, with_delivery
 from mistyle.run.cli import main, parser
@@ -122,7 +122,7 @@ def test_names_follow_the_pattern_and_tell_sets_apart(made, tmp_path):
 @pytest.mark.parametrize("target", ["blender", "unreal", "houdini"])
 def test_usd_has_nothing_against_it_and_shows_the_mesh(made, tmp_path, target):
     pytest.importorskip("pxr")
-    from mistyle.files import usd
+    from mistyle.io.usd import write as usd
 
     export(made, tmp_path / "out", DeliveryRequest(formats=["usd"], target=target))
     stage_file = tmp_path / "out" / "ball.usda"

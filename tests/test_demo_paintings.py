@@ -44,7 +44,7 @@ def test_every_part_of_the_robot_is_closed_and_right_side_out(scripts):
 
 
 def test_the_robots_file_is_the_scripts_form_and_its_uvs_are_kept(scripts):
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     points, faces, normals = scripts("robot").robot()
     rows = [line.split() for line in (SCENES / "robot.obj").read_text(encoding="ascii").splitlines()]

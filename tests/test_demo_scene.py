@@ -123,7 +123,7 @@ def test_the_mesh_is_the_scripts_shape(obj, scripts):
 
 
 def test_the_reader_takes_the_mesh_as_it_is(obj):
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     asset = read_mesh(SCENES / "demo.obj")
     assert asset.source.uv == "kept" and not asset.source.notes

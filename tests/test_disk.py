@@ -14,10 +14,10 @@ import pytest
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.paths import PACKAGE, scenes
-from mistyle.files import output, store
-from mistyle.files.images import write_png
-from mistyle.files.keeper import Keeper
-from mistyle.files.store import atomic_folder, atomic_write
+from mistyle.io.images.write import write_png
+from mistyle.io.store import atomic, output
+from mistyle.io.store.atomic import atomic_folder, atomic_write
+from mistyle.io.store.keeper import Keeper
 from mistyle.process import disk_errors
 from mistyle.run import engines, exits
 from mistyle.run.batch import Choices, planned, summarise
@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.name != store.LOCK)
+    return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.name != atomic.LOCK)
 
 
 def text(content: str):
@@ -86,10 +86,10 @@ import json, resource, sys
 import numpy as np
 from pathlib import Path
 from mistyle.core.errors import MistyleError
-from mistyle.files.images import write_exr, write_png
-from mistyle.files.records import save_record
-from mistyle.files.keeper import Keeper
-from mistyle.files.store import atomic_write
+from mistyle.io.images.write import write_exr, write_png
+from mistyle.io.store.records import save_record
+from mistyle.io.store.keeper import Keeper
+from mistyle.io.store.atomic import atomic_write
 root = Path(sys.argv[1])
 noise = np.random.default_rng(0).random((200, 200)).astype(np.float32)
 writers = {
@@ -122,15 +122,15 @@ def test_writers_that_hide_the_reason_are_asked_again(tmp_path):
     assert all("ulimit -f" in text and ".tmp-" not in text for text in said.values()), said
     with Keeper(tmp_path) as keeper:
         assert all(keeper.get(name, "old") is not None for name in said)
-        assert not [p for p in tmp_path.rglob(".*") if p.name not in (store.LOCK, output.RECORD)]
+        assert not [p for p in tmp_path.rglob(".*") if p.name not in (atomic.LOCK, output.RECORD)]
 
 
 FORBIDDEN = """
 import os, sys
 from pathlib import Path
 from mistyle.core.errors import MistyleError
-from mistyle.files.keeper import Keeper
-from mistyle.files.store import atomic_folder, atomic_write
+from mistyle.io.store.keeper import Keeper
+from mistyle.io.store.atomic import atomic_folder, atomic_write
 place = Path(sys.argv[1])
 if os.getuid() == 0:
     os.setgroups([]); os.setgid(65534); os.setuid(65534)

@@ -14,8 +14,8 @@ from PIL import Image
 from mistyle.core.camera import look_at
 from mistyle.core.errors import InputRefused
 from mistyle.core.view import View
-from mistyle.files.read import read_exr, read_picture
-from mistyle.files.records import load_record
+from mistyle.io.read import read_exr, read_picture
+from mistyle.io.store.records import load_record
 from mistyle.run import pipeline
 from mistyle.run.progress import Progress
 from mistyle.run.retouch import EXACT, LOSSY, differs
@@ -140,7 +140,7 @@ def test_a_map_that_was_painted_over_is_in_the_asset(inputs, out, ending):
         picture[10:40, 10:40] = RED
         Image.fromarray(picture).save(textures / "ball_albedo.png")
     else:
-        from mistyle.files.images import write_exr
+        from mistyle.io.images.write import write_exr
 
         planes = dict(read_exr(textures / "ball_albedo.exr"))
         for name, value in zip("RGB", (0.791, 0.007, 0.013), strict=True):

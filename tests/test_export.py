@@ -12,10 +12,10 @@ from gltf_cases import bumpy_sphere, from_gltf, glb_parts, no_texels, quad, quar
 
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import flat_maps
-from mistyle.files import textures
-from mistyle.files.gltf import write_glb
-from mistyle.files.images import encode_png
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.gltf.write import write_glb
+from mistyle.io.images import textures
+from mistyle.io.images.write import encode_png
+from mistyle.io.read_mesh import read_mesh
 from mistyle.stages import export
 from mistyle.stages.export import write_asset
 from mistyle.stages.texels import rasterise

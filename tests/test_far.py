@@ -10,8 +10,8 @@ import trimesh
 from gltf_cases import no_texels, quarters
 
 from mistyle.core.mesh import local_origin
-from mistyle.files.read_mesh import read_mesh
-from mistyle.files.usd import library
+from mistyle.io.read_mesh import read_mesh
+from mistyle.io.usd.write import library
 from mistyle.run.deliver import DeliveryRequest, export
 from mistyle.stages.export import write_asset
 

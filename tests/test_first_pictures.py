@@ -8,7 +8,7 @@ import pytest
 from test_pipeline import inputs, job  # noqa: F401  (a fixture)
 
 from mistyle.core.errors import Stopped, UsageError
-from mistyle.files.read import read_picture
+from mistyle.io.read import read_picture
 from mistyle.run import pipeline, preview
 from mistyle.run.cli import main
 from mistyle.run.finished import read_finished

@@ -12,8 +12,8 @@ from PIL import Image
 from mistyle.backends import consislora
 from mistyle.core.camera import rig
 from mistyle.core.paths import scenes
-from mistyle.files.records import load_record
-from mistyle.files.views import read_views
+from mistyle.io.cameras.views import read_views
+from mistyle.io.store.records import load_record
 from mistyle.run.cli import main
 from mistyle.run.generative import opaque, watcher
 
@@ -199,7 +199,7 @@ def test_losses_are_spoken_of_now_and_then():
 
 
 def test_transparent_styles_are_laid_on_white(tmp_path):
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     pixels = np.zeros((4, 4, 4), np.uint8)
     pixels[:2] = [255, 0, 0, 255]

@@ -25,7 +25,7 @@ from node_tools import gltf_issues
 from node_tools import mikktspace as reference_tangents
 
 from mistyle.core.errors import InputRefused, MistyleError
-from mistyle.files.gltf import patch_glb, write_glb
+from mistyle.io.gltf.write import patch_glb, write_glb
 
 ERROR, WARNING = 0, 1
 OPEN = np.ones((16, 16), np.float32)
@@ -213,7 +213,7 @@ def numbers(tree, binary, index) -> np.ndarray:
 @pytest.mark.parametrize("new_uvs", [False, True], ids=["kept", "new"])
 @pytest.mark.parametrize("name", FILES)
 def test_a_patched_file_is_the_users_file(tmp_path, name, new_uvs):
-    from mistyle.files.gltf_check import load_gltf
+    from mistyle.io.gltf.check import load_gltf
 
     source = data(f"meshes/{name}")
     asset = from_gltf(source, new_uvs=new_uvs)
@@ -387,7 +387,7 @@ def test_a_missing_image_does_not_stop_the_export(tmp_path, strange):
 
 
 def test_the_older_glossiness_model_goes(tmp_path, strange):
-    from mistyle.files.glb import Builder
+    from mistyle.io.gltf.glb import Builder
 
     tree, binary = glb_parts(strange)
     tree["extensionsUsed"].append("KHR_materials_pbrSpecularGlossiness")
@@ -417,7 +417,7 @@ def textures_of(tree, material) -> list[str]:
 
 def test_unpainted_users_of_a_material_keep_it(tmp_path, strange):
     """Lines that show a painted material keep its old textures; the painted primitive gets a copy of the material."""
-    from mistyle.files.glb import Builder
+    from mistyle.io.gltf.glb import Builder
 
     tree, binary = glb_parts(strange)
     tree["meshes"][0]["primitives"][1]["material"] = 0
@@ -449,7 +449,7 @@ def test_several_texture_sets_of_one_material_become_several(tmp_path, strange):
 
 
 def test_textures_of_an_unknown_extension_stay(tmp_path, strange):
-    from mistyle.files.glb import Builder
+    from mistyle.io.gltf.glb import Builder
 
     tree, binary = glb_parts(strange)
     tree["extensionsUsed"].append("ACME_images_by_number")
@@ -459,7 +459,7 @@ def test_textures_of_an_unknown_extension_stay(tmp_path, strange):
 
 
 def test_a_file_that_changed_meanwhile_is_refused(tmp_path, strange):
-    from mistyle.files.glb import Builder
+    from mistyle.io.gltf.glb import Builder
 
     asset = from_gltf(strange)
     tree, binary = glb_parts(strange)
@@ -472,7 +472,7 @@ def test_a_file_that_changed_meanwhile_is_refused(tmp_path, strange):
 
 @pytest.mark.parametrize("where", ["texture", "image", "sampler"])
 def test_damaged_references_are_refused(tmp_path, strange, where):
-    from mistyle.files.glb import Builder
+    from mistyle.io.gltf.glb import Builder
 
     tree, binary = glb_parts(strange)
     if where == "texture":
@@ -486,7 +486,7 @@ def test_damaged_references_are_refused(tmp_path, strange, where):
 
 
 def test_strips_and_fans_are_spelled_out():
-    from mistyle.files.gltf_vertices import triangles
+    from mistyle.io.gltf.vertices import triangles
 
     tree = {"accessors": [{"count": 5}]}
     strip = triangles(tree, [], {"attributes": {"POSITION": 0}, "mode": 5})

@@ -18,10 +18,10 @@ from mistyle.core.asset import Asset
 from mistyle.core.camera import orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
-from mistyle.files import lookups
-from mistyle.files.gltf import patch_glb
-from mistyle.files.read_mesh import read_extent, read_mesh
 from mistyle.geometry.retexture import Wraps, fetch
+from mistyle.io.gltf.write import patch_glb
+from mistyle.io.meshes import lookups
+from mistyle.io.read_mesh import read_extent, read_mesh
 from mistyle.render.draw import draw_views
 from mistyle.stages.export import write_asset
 from mistyle.stages.texels import rasterise, start_maps

@@ -8,7 +8,7 @@ import pytest
 from PIL import Image
 
 from mistyle.core.errors import MistyleError
-from mistyle.files.images import LINEAR_REC709, REC709_CHROMATICITIES, encode_png, write_exr, write_png
+from mistyle.io.images.write import LINEAR_REC709, REC709_CHROMATICITIES, encode_png, write_exr, write_png
 
 
 @pytest.mark.parametrize("channels", [(), (3,), (4,)])

@@ -17,7 +17,7 @@ import pytest
 from benchmarks import faults_jobs as jobs
 from benchmarks.faults_kills import Moment
 from mistyle.core.paths import scenes
-from mistyle.files.keeper import Keeper
+from mistyle.io.store.keeper import Keeper
 from mistyle.run import engines, shard
 from mistyle.run.batch import Choices, describe, planned, summarise
 from mistyle.run.progress import Progress

@@ -9,8 +9,8 @@ import pytest
 from PIL import Image
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.bounds import beside
-from mistyle.files.read_mesh import read_mesh, read_references, read_usd_files
+from mistyle.io.read_mesh import read_mesh, read_references, read_usd_files
+from mistyle.io.sandbox.bounds import beside
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="links need a privilege on Windows")
 RED, BLUE = (255, 0, 0), (0, 0, 255)

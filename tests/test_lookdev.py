@@ -13,8 +13,8 @@ from PIL import Image
 from mistyle.core.errors import EnvironmentMissing
 from mistyle.core.image import linear_from_srgb, luminance, srgb_from_linear
 from mistyle.core.light import Ambient, Environment, bake_environment
-from mistyle.files.read import read_exr
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.read import read_exr
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render import sheet
 from mistyle.render.sheet_aovs import aovs, density
 from mistyle.run import sheet_canvas

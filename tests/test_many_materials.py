@@ -16,7 +16,7 @@ from mistyle.core.errors import UsageError
 from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.paths import scenes
 from mistyle.core.rig_settings import RigSettings
-from mistyle.files.read_mesh import read_extent, read_mesh
+from mistyle.io.read_mesh import read_extent, read_mesh
 from mistyle.process import memory
 from mistyle.render import device, draw, lookdev, pages
 from mistyle.render import scene as scenery

@@ -16,9 +16,9 @@ from mistyle.core.light import Ambient, Directional, Lights, SphericalGaussian, 
 from mistyle.core.maps import flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.files.images import write_png
-from mistyle.files.read_mesh import read_mesh
-from mistyle.files.views import read_views, write_views
+from mistyle.io.cameras.views import read_views, write_views
+from mistyle.io.images.write import write_png
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render import draw
 from mistyle.render.material_table import pack
 from mistyle.render.shade import MaterialRenderer
@@ -144,7 +144,7 @@ def test_the_mitsuba_scene_shows_what_the_reference_shows(fitted, shots):
     assert "mistyle" not in text
     scene = mi.load_file(summary["scene"])
     picture = np.array(mi.render(scene, sensor=0, spp=64))[..., :3]
-    from mistyle.files.read import read_exr
+    from mistyle.io.read import read_exr
 
     planes = read_exr(shots / "shots" / "c00_0.exr")
     reference = np.stack([planes[c] for c in "RGB"], -1)
@@ -156,7 +156,7 @@ def test_the_mitsuba_scene_shows_what_the_reference_shows(fitted, shots):
 @pytest.mark.parametrize("align", [False, True])
 def test_cameras_that_do_not_fit_the_mesh_are_said(shots, tmp_path, capsys, monkeypatch, align):
     """Turned by 90 degrees about X, as if Z were up."""
-    from mistyle.files.captures import read_shots
+    from mistyle.io.cameras.captures import read_shots
 
     asset = read_mesh(shots / "bowl.obj", size=SIZE)
     job = MaterialJob(shots / "bowl.obj", shots / "shots", tmp_path, MaterialSettings(), "bowl")
@@ -179,7 +179,7 @@ def test_cameras_that_do_not_fit_the_mesh_are_said(shots, tmp_path, capsys, monk
     printed = capsys.readouterr().err
     assert note in printed and f"c00_0 {wrong.overlap[0]:.2f}, " in printed
     blind = [replace(shot, picture=shot.picture.with_suffix(".png"), alpha_of=None) for shot in read]
-    monkeypatch.setattr("mistyle.files.captures.outline_of", lambda shot: None)
+    monkeypatch.setattr("mistyle.io.cameras.captures.outline_of", lambda shot: None)
     if not align:
         (note,) = place(job, asset, captures, blind, lambda done: None).notes
         assert "not checked whether the cameras fit" in note
@@ -310,7 +310,7 @@ def test_a_mitsuba_scene_is_fitted_from_the_command_line(tmp_path, capsys):
     (tmp_path / "room.xml").write_text(SCENE.format(id="front", file="grey.png"))
     (tmp_path / "truth.xml").write_text(SCENE.format(id="front", file="true.png"))
     picture = np.array(mi.render(mi.load_file(str(tmp_path / "truth.xml")), spp=64))[..., :3]
-    from mistyle.files.images import write_exr
+    from mistyle.io.images.write import write_exr
 
     write_exr(tmp_path / "shots" / "front.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)))
     scene = str(tmp_path / "room.xml")

@@ -11,7 +11,7 @@ import mistyle
 from mistyle.core.camera import Camera, look_at
 from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render import draw, hits, shade, texel_views
 from mistyle.render.material_table import pack
 from mistyle.run.material_pictures import look_through, looked

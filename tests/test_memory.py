@@ -10,7 +10,7 @@ import pytest
 from helpers import ROOT
 
 from mistyle.core.maps import Texels
-from mistyle.files.records import load_record, save_record
+from mistyle.io.store.records import load_record, save_record
 from mistyle.process import memory
 
 BLOCK = 48_000_000

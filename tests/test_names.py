@@ -21,10 +21,10 @@ from PIL import Image
 
 from mistyle.core import names
 from mistyle.core.errors import UsageError
-from mistyle.files import store
-from mistyle.files.packing import TARGETS, TextureSet
-from mistyle.files.textures import part_stems
-from mistyle.files.usd import library
+from mistyle.io.images.packing import TARGETS, TextureSet
+from mistyle.io.images.textures import part_stems
+from mistyle.io.store import atomic
+from mistyle.io.usd.write import library
 from mistyle.run import deliver_files
 from mistyle.run.batch_jobs import BatchJob, _names
 from mistyle.run.cli import main
@@ -103,8 +103,8 @@ def test_every_map_of_every_part_has_a_file_and_room_for_its_temporary_name(name
 def test_the_temporary_name_of_the_longest_file_fits(monkeypatch, tmp_path):
     monkeypatch.setattr(socket, "gethostname", lambda: "h" * 64)
     path = tmp_path / ("x" * (names.WRITTEN - 5) + ".usda")
-    assert len(store.hidden(path, 10**6, "tmp", ".usda").name) <= names.FILE_NAME
-    store.atomic_write(path, b"1")
+    assert len(atomic.hidden(path, 10**6, "tmp", ".usda").name) <= names.FILE_NAME
+    atomic.atomic_write(path, b"1")
     assert path.read_bytes() == b"1"
     endings = [f"_{slot.map}.1001.{slot.ext}" for t in TARGETS.values() for slot in t.slots]
     assert max(map(len, endings)) <= names.ENDING

@@ -15,14 +15,14 @@ from mistyle.core.capture import Captures
 from mistyle.core.errors import UsageError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Directional, Environment
-from mistyle.files.images import write_exr
+from mistyle.io.images.write import write_exr
 from mistyle.run.colour import in_working_space, key_of, read_style
 from mistyle.run.deliver import DeliveryRequest, export
 from mistyle.run.deliver_settings import ColourSettings
 from mistyle.stages.export import write_asset
 
 pytest.importorskip("PyOpenColorIO")
-from mistyle.files.ocio import KNOWN, colour_space, exr_tags
+from mistyle.io.images.ocio import KNOWN, colour_space, exr_tags
 
 CONFIG = "ocio://cg-config-v1.0.0_aces-v1.3_ocio-v2.1"
 # ACEScg (AP1, D60) from linear Rec.709 (D65), adapted by Bradford's transform as the ACES configs have it.
@@ -55,7 +55,7 @@ def test_names_aliases_and_roles_mean_one_space():
 @pytest.mark.parametrize("interop", sorted(KNOWN))
 def test_chromaticities_are_those_of_the_conversion(interop):
     """The tagged primaries and whites, by SMPTE RP 177 and Bradford's adaptation, give the config's own matrix."""
-    from mistyle.files.images import REC709_CHROMATICITIES
+    from mistyle.io.images.write import REC709_CHROMATICITIES
 
     bradford = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
@@ -157,7 +157,7 @@ def test_delivered_textures_are_converted_and_tagged(run, tmp_path):
 
 def test_usd_says_what_its_float_textures_are(run, tmp_path):
     pytest.importorskip("pxr")
-    from mistyle.files.usd import complaints, library
+    from mistyle.io.usd.write import complaints, library
 
     export(
         run, tmp_path / "out", DeliveryRequest(formats=["usd"], target="houdini", colour=ColourSettings(space="ACEScg"))

@@ -2,7 +2,7 @@
 
 import pytest
 
-from mistyle.files.own import read_own
+from mistyle.io.store.trusted_json import read_own
 
 
 @pytest.mark.parametrize("content", [b"", b"{", b"\xff\xfe", b"[" * 100_000, b'{"a": ' * 50_000, b" " * 65 + b"1"])

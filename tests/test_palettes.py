@@ -7,8 +7,8 @@ import pytest
 from PIL import Image
 
 from mistyle.core.image import linear_from_srgb
-from mistyle.files.read_mesh import read_extent, read_mesh
 from mistyle.geometry.retexture import fetch
+from mistyle.io.read_mesh import read_extent, read_mesh
 
 SIDE = 20  # faces along each side of the sheet
 

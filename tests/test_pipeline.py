@@ -84,7 +84,7 @@ def test_an_independent_reader_opens_the_asset(whole, inputs):
 
 
 def test_the_fit_moved_the_maps(whole):
-    from mistyle.files.records import load_record
+    from mistyle.io.store.records import load_record
 
     start, final = (load_record(whole / "work" / name / "record").maps[0] for name in ("bake", "repair"))
     assert not np.array_equal(start.normal, final.normal)
@@ -114,7 +114,7 @@ def test_a_stopped_run_resumes_to_the_same_bytes(inputs, whole, tmp_path, monkey
 
 def test_a_painted_surface_is_final_by_default(inputs, tmp_path):
     """No fit, no masks, no repair, no asset that another replaces; --from goes on behind what was left out."""
-    from mistyle.files.records import load_record
+    from mistyle.io.store.records import load_record
 
     made, progress = job(inputs, tmp_path), Progress(quiet=True)
     unfitted = made.settings.model_copy(update={"fit": made.settings.fit.model_copy(update={"refine": "auto"})})

@@ -13,13 +13,13 @@ from PIL import Image
 
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
-from mistyle.files import bounds
-from mistyle.files.mesh_formats import read_off, read_stl
-from mistyle.files.obj_read import read_obj
-from mistyle.files.ply_read import read_ply
-from mistyle.files.polygons import fan, triangulate
-from mistyle.files.read import read_json
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.meshes.obj_read import read_obj
+from mistyle.io.meshes.ply_read import read_ply
+from mistyle.io.meshes.polygons import fan, triangulate
+from mistyle.io.meshes.stl_off_read import read_off, read_stl
+from mistyle.io.read import read_json
+from mistyle.io.read_mesh import read_mesh
+from mistyle.io.sandbox import bounds
 
 # float32 positions in the unit sphere
 FLOAT32 = 1e-6

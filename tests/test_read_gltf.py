@@ -18,9 +18,9 @@ from test_read import check_asset
 
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
-from mistyle.files.gltf_read import read_gltf, world_matrices
-from mistyle.files.raw import Corners
-from mistyle.files.read_mesh import load_gltf, read_mesh
+from mistyle.io.gltf.read import read_gltf, world_matrices
+from mistyle.io.meshes.parsed_mesh import Corners
+from mistyle.io.read_mesh import load_gltf, read_mesh
 
 Tree = dict[str, Any]
 TYPES = {"f4": 5126, "u4": 5125, "u2": 5123, "u1": 5121, "i2": 5122, "i1": 5120}

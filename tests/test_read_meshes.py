@@ -8,12 +8,12 @@ import pytest
 from PIL import Image
 
 from mistyle.core.image import linear_from_srgb
-from mistyle.files.mesh_formats import read_off, read_stl
-from mistyle.files.obj_read import read_obj
-from mistyle.files.ply_read import read_ply
-from mistyle.files.raw import Raw
-from mistyle.files.read_mesh import read_mesh, read_references
 from mistyle.geometry.retexture import fetch
+from mistyle.io.meshes.obj_read import read_obj
+from mistyle.io.meshes.parsed_mesh import Raw
+from mistyle.io.meshes.ply_read import read_ply
+from mistyle.io.meshes.stl_off_read import read_off, read_stl
+from mistyle.io.read_mesh import read_mesh, read_references
 
 POINTS = ["-1 -1 0", "1 -1 0", "1 1 0", "-1 1 0"]
 BYTES = np.array([[255, 0, 0], [0, 255, 0], [0, 0, 255], [128, 64, 200]])

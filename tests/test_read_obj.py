@@ -9,12 +9,12 @@ from PIL import Image
 
 from mistyle.core.asset import Asset
 from mistyle.core.image import linear_from_srgb
-from mistyle.files.images import write_exr
-from mistyle.files.mtl_read import Statement, statement
-from mistyle.files.nearby import unmarked
-from mistyle.files.obj_read import read_obj
-from mistyle.files.read_mesh import read_mesh, read_references
 from mistyle.geometry.retexture import fetch
+from mistyle.io.images.write import write_exr
+from mistyle.io.meshes.mtl_read import Statement, statement
+from mistyle.io.meshes.obj_read import read_obj
+from mistyle.io.read_mesh import read_mesh, read_references
+from mistyle.io.sandbox.nearby import unmarked
 
 SQUARE = "v -1 -1 0\nv 1 -1 0\nv 1 1 0\nv -1 1 0\nvt 0 0\nvt 1 0\nvt 1 1\nvt 0 1\nvn 0 0 1\n"
 FACE = "f 1/1/1 2/2/1 3/3/1 4/4/1\n"

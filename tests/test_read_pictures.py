@@ -16,9 +16,10 @@ from PIL import Image, ImageCms
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import luminance
-from mistyle.files import hdr, pictures
-from mistyle.files.pictures import Budget, decode
-from mistyle.files.read import read_exr, read_hdr, read_picture
+from mistyle.io.images import hdr
+from mistyle.io.images import read as pictures
+from mistyle.io.images.read import Budget, decode
+from mistyle.io.read import read_exr, read_hdr, read_picture
 
 # One step of an 8-bit channel; lossy codecs stay within a few.
 STEP = 1 / 255

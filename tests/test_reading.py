@@ -211,7 +211,7 @@ REAL = {
 
 @pytest.mark.parametrize("name", sorted(REAL))
 def test_paintings_read_as_what_they_are(name):
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     reading = read_style(read_picture(data(f"styles/{name}")).rgb)
     assert REAL[name](reading), reading

@@ -8,7 +8,7 @@ import pytest
 from mistyle.core.camera import look_at
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import flat_maps
-from mistyle.files.records import load_record, save_record
+from mistyle.io.store.records import load_record, save_record
 
 
 def test_round_trip_keeps_values_types_and_bytes(tmp_path):

@@ -270,7 +270,7 @@ def test_the_scene_files_render_as_they_stand(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("template", TEMPLATES)
 def test_the_demo_mesh_stands_in_the_slot_as_in_the_working_space(template: str) -> None:
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     expected = read_mesh(ROOT / "scenes" / "demo.obj").mesh.positions
     slot = next(s for s in scene.read_template(template).shapes() if s.id() == "object")

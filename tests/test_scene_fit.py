@@ -350,7 +350,7 @@ def test_the_written_scene_shows_the_fitted_picture(tmp_path, truth):
     """A user's file with a shared texture and literals, given and not; `mi.load_file` renders what was fitted."""
     import mitsuba as mi
 
-    from mistyle.files.images import write_exr, write_png
+    from mistyle.io.images.write import write_exr, write_png
 
     device.use()
     (tmp_path / "in").mkdir()

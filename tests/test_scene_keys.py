@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.files.images import write_exr, write_png
+from mistyle.io.images.write import write_exr, write_png
 from mistyle.render import device, scene_keys, scene_xml
 
 SCENE = """<?xml version="1.0" encoding="utf-8"?>

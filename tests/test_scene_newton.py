@@ -240,7 +240,7 @@ def test_the_function_says_what_it_takes():
 def test_pictures_by_path_and_shapes_that_share_a_material_are_noted(tmp_path):
     import mitsuba as mi
 
-    from mistyle.files.images import write_exr
+    from mistyle.io.images.write import write_exr
 
     device.use()
     same = {"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.4, 0.4, 0.4]}}

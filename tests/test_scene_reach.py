@@ -228,7 +228,7 @@ def test_every_value_is_printed_and_written_where_mitsuba_finds_it(house, tmp_pa
     """In an included file, in a group of instances, in a mesh; on the console, in run.json, in the report."""
     import mitsuba as mi
 
-    from mistyle.files.images import write_exr
+    from mistyle.io.images.write import write_exr
 
     device.use()
     true = {"paint.reflectance.value": [0.2, 0.6, 0.3], "group.shape.bsdf.reflectance.value": [0.7, 0.3, 0.4]}

@@ -135,7 +135,7 @@ def test_a_process_ends_with_its_parent_and_not_before_it(tmp_path):
 
 
 def alive(pid: int) -> bool:
-    from mistyle.files.lock import alive
+    from mistyle.io.store.lock import alive
 
     return alive(pid)
 

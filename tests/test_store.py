@@ -16,9 +16,9 @@ import pytest
 from pydantic import BaseModel
 
 from mistyle.core.errors import MistyleError, UsageError
-from mistyle.files import lock, output, store
-from mistyle.files.keeper import Keeper
-from mistyle.files.store import atomic_folder, atomic_write, digest, sha256_file
+from mistyle.io.store import atomic, lock, output
+from mistyle.io.store.atomic import atomic_folder, atomic_write, digest, sha256_file
+from mistyle.io.store.keeper import Keeper
 from mistyle.process import disk_errors
 from mistyle.run import checkpoint
 
@@ -26,7 +26,7 @@ ROOT = Path(__file__).parents[1]
 
 
 def names(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir() if p.name not in (store.LOCK, output.RECORD))
+    return sorted(p.name for p in folder.iterdir() if p.name not in (atomic.LOCK, output.RECORD))
 
 
 def text(content: str):
@@ -167,7 +167,7 @@ def test_killed_run_leaves_nothing(tmp_path, moment):
     code = f"""
 import os, signal
 from pathlib import Path
-from mistyle.files.keeper import Keeper
+from mistyle.io.store.keeper import Keeper
 keeper = Keeper(Path({str(tmp_path)!r}))
 keeper.put("bake", "old", lambda f: (f / "a").write_text("old"))
 def write(f):
@@ -212,13 +212,13 @@ def test_second_run_is_refused_and_the_lock_goes(tmp_path):
     keeper.close()
     second = Keeper(tmp_path)
     del second
-    assert not (tmp_path / store.LOCK).exists(), "a forgotten keeper releases its lock"
+    assert not (tmp_path / atomic.LOCK).exists(), "a forgotten keeper releases its lock"
 
 
 def lock_of(path: Path, **changes: object) -> None:
     parent = os.getppid()
     owner = {"pid": parent, "host": lock.this_host(), "started": lock.started_at(parent), "time": 0.0}
-    (path / store.LOCK).write_text(json.dumps(owner | changes))
+    (path / atomic.LOCK).write_text(json.dumps(owner | changes))
 
 
 def test_lock_of_a_living_process_another_host_and_the_dead(tmp_path):
@@ -236,7 +236,7 @@ def test_lock_of_a_living_process_another_host_and_the_dead(tmp_path):
 HOLDS = """
 import sys, time
 from pathlib import Path
-from mistyle.files.keeper import Keeper
+from mistyle.io.store.keeper import Keeper
 keeper = Keeper(Path(sys.argv[1]))
 print("holds", flush=True)
 time.sleep(60)
@@ -247,17 +247,17 @@ def test_a_living_holder_is_known_from_another_container_and_a_killed_one_gives_
     """Another host's name and another process's number on the same kernel: the kernel's own lock decides."""
     child = subprocess.Popen([sys.executable, "-c", HOLDS, str(tmp_path)], cwd=ROOT, stdout=subprocess.PIPE)
     assert child.stdout is not None and child.stdout.readline() == b"holds\n"
-    owner = json.loads((tmp_path / store.LOCK).read_text())
+    owner = json.loads((tmp_path / atomic.LOCK).read_text())
     assert owner["flock"]
-    with open(tmp_path / store.LOCK, "r+") as file:  # in place: the file that the child has locked
+    with open(tmp_path / atomic.LOCK, "r+") as file:  # in place: the file that the child has locked
         file.write(json.dumps(owner | {"host": "elsewhere", "pid": dead_pid()}))
         file.truncate()
-    assert lock.busy(tmp_path / store.LOCK)
+    assert lock.busy(tmp_path / atomic.LOCK)
     with pytest.raises(UsageError, match="has been working in this folder"):
         Keeper(tmp_path)
     child.kill()  # and not yet collected: a zombie holds nothing
     until = time.monotonic() + 5
-    while lock.busy(tmp_path / store.LOCK) and time.monotonic() < until:
+    while lock.busy(tmp_path / atomic.LOCK) and time.monotonic() < until:
         time.sleep(0.02)
     Keeper(tmp_path).close()
     child.wait()
@@ -277,7 +277,7 @@ TAKES = """
 import sys
 from pathlib import Path
 from mistyle.core.errors import UsageError
-from mistyle.files.keeper import Keeper
+from mistyle.io.store.keeper import Keeper
 root, mark = Path(sys.argv[1]), Path(sys.argv[2])
 for turn in range(60):
     try:
@@ -297,10 +297,10 @@ def test_a_dead_lock_is_taken_over_by_one_only(tmp_path):
     children = [subprocess.Popen(line, cwd=ROOT, stderr=subprocess.PIPE, text=True) for _ in range(4)]
     dead = dead_pid()
     while any(child.poll() is None for child in children):
-        if not (root / store.LOCK).exists():
+        if not (root / atomic.LOCK).exists():
             lock_of(tmp_path, pid=dead)
             try:
-                os.link(tmp_path / store.LOCK, root / store.LOCK)
+                os.link(tmp_path / atomic.LOCK, root / atomic.LOCK)
             except FileExistsError:
                 pass
         time.sleep(0.001)
@@ -312,7 +312,7 @@ REPLACES = """
 import sys
 from pathlib import Path
 from mistyle.core.errors import UsageError
-from mistyle.files.store import atomic_folder
+from mistyle.io.store.atomic import atomic_folder
 name, target = sys.argv[1], Path(sys.argv[2])
 def write(folder):
     for k in range(3):
@@ -383,7 +383,7 @@ def test_a_damaged_checkpoint_is_not_taken_up(tmp_path, damage):
         case "gone":
             array.unlink()
         case "unsealed":
-            (place / store.DONE).unlink()
+            (place / atomic.DONE).unlink()
     assert checkpoint.load(place, said.append) is None
     assert len(said) == 1 and "damaged" in said[0]
 
@@ -395,9 +395,9 @@ def test_a_process_number_used_again_is_another_process(tmp_path):
 
 
 def test_a_lock_cut_off_by_a_crash_is_taken_over(tmp_path):
-    (tmp_path / store.LOCK).write_text('{"pid"')
+    (tmp_path / atomic.LOCK).write_text('{"pid"')
     past = time.time() - 60
-    os.utime(tmp_path / store.LOCK, (past, past))
+    os.utime(tmp_path / atomic.LOCK, (past, past))
     Keeper(tmp_path).close()
 
 
@@ -434,7 +434,7 @@ def test_digest_tells_apart_what_differs(tmp_path):
 
 
 def test_digest_is_the_same_in_another_process(tmp_path):
-    code = "from mistyle.files.store import digest; print(digest({'a': {'x', 'y', 'z'}, 'b': 0.1}))"
+    code = "from mistyle.io.store.atomic import digest; print(digest({'a': {'x', 'y', 'z'}, 'b': 0.1}))"
     for seed in ("1", "2"):
         out = subprocess.run(
             [sys.executable, "-c", code], cwd=Path(__file__).parents[1], env=os.environ | {"PYTHONHASHSEED": seed},

@@ -12,7 +12,7 @@ from scipy.spatial import KDTree
 from mistyle.core.asset import Picture
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas
-from mistyle.files.records import load_record, save_record
+from mistyle.io.store.records import load_record, save_record
 from mistyle.render import device
 from mistyle.render.occlusion import ambient_occlusion
 from mistyle.surface import creases, field, guides, kernels, linefield, lookup, samples, style, synthesis

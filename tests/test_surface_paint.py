@@ -18,8 +18,8 @@ from mistyle.core.image import bilinear
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import face_areas
 from mistyle.core.rig_settings import RigSettings
-from mistyle.files.images import write_png
 from mistyle.geometry.tangents import corner_tangents
+from mistyle.io.images.write import write_png
 from mistyle.render.draw import gbuffer, tracer
 from mistyle.render.unlit import unlit
 from mistyle.run import options, painting, preview, stylize_start, variations

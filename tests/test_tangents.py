@@ -115,8 +115,8 @@ def test_reference_agrees_on_real_meshes(name, silent):
 
 def test_tangents_that_blender_wrote():
     """Suzanne carries the tangents of Blender's exporter, which has an implementation of its own."""
-    from mistyle.files.glb import values
-    from mistyle.files.gltf_check import load_gltf
+    from mistyle.io.gltf.check import load_gltf
+    from mistyle.io.gltf.glb import values
 
     tree, buffers = load_gltf(data("meshes/pbr/Suzanne/02_suzanne.gltf"))
     primitive = tree["meshes"][0]["primitives"][0]

@@ -12,7 +12,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import luminance, resize
 from mistyle.core.light import Environment, environment_directions
 from mistyle.core.maps import flat_maps
-from mistyle.files.read_mesh import read_mesh
+from mistyle.io.read_mesh import read_mesh
 from mistyle.render.draw import tracer
 from mistyle.render.sky import bin_environment, even_directions
 from mistyle.render.texel_lm import Options

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from scipy.ndimage import maximum_filter, minimum_filter
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.read_mesh import read_mesh
 from mistyle.geometry import decimated
 from mistyle.geometry import unwrap as unwrapping
 from mistyle.geometry.normals import area_vectors, same_points
@@ -21,6 +20,7 @@ from mistyle.geometry.retexture import carry, fetch, turn_normals
 from mistyle.geometry.unwrap import estimated_seconds, unwrap
 from mistyle.geometry.uvs import islands, signed_areas
 from mistyle.geometry.xatlas_worker import cut_overlaps, landscape, lay_flat, mend, pack, unmirror
+from mistyle.io.read_mesh import read_mesh
 
 SIZE = 1024
 # xatlas lets borders that cross each other by less than a texel in a thousand through.

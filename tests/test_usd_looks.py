@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mistyle.files.raw import Raw
-from mistyle.files.read_mesh import read_mesh
-from mistyle.files.usd_read import read_usd
-from mistyle.files.usd_stage import metres
+from mistyle.io.meshes.parsed_mesh import Raw
+from mistyle.io.read_mesh import read_mesh
+from mistyle.io.usd.read import read_usd
+from mistyle.io.usd.stage import metres
 
 pxr = pytest.importorskip("pxr")
 

@@ -10,9 +10,9 @@ from PIL import Image
 
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
-from mistyle.files.read_mesh import read_mesh
-from mistyle.files.usd_read import read_usd
 from mistyle.geometry.normals import area_vectors
+from mistyle.io.read_mesh import read_mesh
+from mistyle.io.usd.read import read_usd
 
 pxr = pytest.importorskip("pxr")
 
@@ -374,7 +374,7 @@ def test_indices_and_numbers_are_checked(tmp_path):
 
 def test_without_the_library_the_sentence_says_what_to_install(tmp_path, monkeypatch):
     from mistyle.core.errors import EnvironmentMissing
-    from mistyle.files import usd
+    from mistyle.io.usd import write as usd
 
     def missing(name):
         raise ImportError(name)
@@ -395,7 +395,7 @@ def test_a_change_in_a_layer_or_a_texture_is_noticed(tmp_path):
 
 def run_of(folder: Path, source: Path, style: str, uv="keep") -> Path:
     """What a run over a USD mesh leaves: the asset, and the mesh as it was read."""
-    from mistyle.files.records import save_record
+    from mistyle.io.store.records import save_record
     from mistyle.stages.export import write_asset
 
     asset = read_mesh(source, uv=uv)
@@ -422,7 +422,7 @@ def opened(layer: Path, variant: str):
 def test_a_look_layer_holds_a_variant_per_style_over_the_untouched_source(tmp_path):
     from pxr import UsdGeom, UsdShade
 
-    from mistyle.files.usd import complaints
+    from mistyle.io.usd.write import complaints
     from mistyle.run.deliver import DeliveryRequest, export
 
     source = painted(tmp_path)
@@ -463,8 +463,8 @@ def test_a_look_layer_holds_a_variant_per_style_over_the_untouched_source(tmp_pa
 def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
     from pxr import UsdGeom
 
-    from mistyle.files.usd import complaints
-    from mistyle.files.usd_look import write_look
+    from mistyle.io.usd.look import write_look
+    from mistyle.io.usd.write import complaints
     from mistyle.run.deliver import DeliveryRequest, export
 
     extra = '    float3 xformOp:scale = (-1, 1, 1)\n    uniform token[] xformOpOrder = ["xformOp:scale"]\n'
@@ -500,7 +500,7 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
     torn = asset.mesh.corner_uvs.copy()
     torn[1] += 0.25
     asset = dataclasses.replace(asset, mesh=dataclasses.replace(asset.mesh, corner_uvs=torn))
-    from mistyle.files.materialx import TexturedMaterial
+    from mistyle.io.materialx import TexturedMaterial
 
     looks = [
         TexturedMaterial(
@@ -514,8 +514,8 @@ def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
 
 def test_a_sphere_gets_no_look(tmp_path):
     """It has no faces that a layer could bind materials to, or give coordinates."""
-    from mistyle.files.materialx import TexturedMaterial
-    from mistyle.files.usd_look import write_look
+    from mistyle.io.materialx import TexturedMaterial
+    from mistyle.io.usd.look import write_look
 
     asset = read_mesh(stage(tmp_path / "a.usda", 'def Sphere "Ball" {}\n'), size=64)
     looks = [

@@ -6,9 +6,9 @@ from helpers import data
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mistyle.files.read_mesh import read_mesh
 from mistyle.geometry.raster import fragments
 from mistyle.geometry.uvs import arrange, group_rows, islands, judge, shift, signed_areas, tiles
+from mistyle.io.read_mesh import read_mesh
 
 # A shift adds an integer of at most a few tiles in float32: half a unit in the last place at 16.
 SHIFT_ROUNDING = 1e-6

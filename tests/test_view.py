@@ -18,7 +18,7 @@ from PIL import Image
 from test_report import Page, sample
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.read import shrink_picture
+from mistyle.io.read import shrink_picture
 from mistyle.run import cli_lookdev, report_model
 from mistyle.run.cli import main
 from mistyle.run.report import Report, write_report

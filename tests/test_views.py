@@ -15,9 +15,9 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Ambient, Directional, SceneLights, SphericalGaussian, from_json, lights, to_json
 from mistyle.core.view import View
-from mistyle.files.cameras import camera_entry, read_entries, transforms
-from mistyle.files.images import write_png
-from mistyle.files.views import paper_depth, read_cameras, read_lights, read_views, write_views
+from mistyle.io.cameras.camera_files import camera_entry, read_entries, transforms
+from mistyle.io.cameras.views import paper_depth, read_cameras, read_lights, read_views, write_views
+from mistyle.io.images.write import write_png
 
 # Rotations go through a transpose, translations through one product in float64.
 ROUNDING = 1e-12

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from mistyle.api import html
 from mistyle.core.errors import InputRefused
 from mistyle.core.view import View
-from mistyle.files.layers import BEAUTY, Layer, LayeredPicture
+from mistyle.io.images.layers import BEAUTY, Layer, LayeredPicture
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def compare(
 def _frame(given: Any, who: str, kind: Literal["colour", "data"], layer: str) -> LayeredPicture:
     """A file's frame, or an array as one."""
     if isinstance(given, str | PathLike):
-        from mistyle.files.read import read_frame
+        from mistyle.io.read import read_frame
 
         return read_frame(Path(given))
     values = np.asarray(given.rgb if isinstance(given, View) else given)

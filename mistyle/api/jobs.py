@@ -44,7 +44,7 @@ class JobResult(dict[str, Any]):
 
     def _pictures(self) -> dict[str, np.ndarray]:
         """What can be shown of the files; those that are gone are left out."""
-        from mistyle.files.read import read_picture
+        from mistyle.io.read import read_picture
 
         named = [Path(self[name]) for name in ("picture", "sheet") if name in self]
         folder = Path(self["textures"]) if "textures" in self else None

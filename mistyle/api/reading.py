@@ -35,7 +35,7 @@ def read_mesh(
 
     Raises InputRefused for files that cannot be used. Animations are not read.
     """
-    from mistyle.files.read_mesh import read_mesh as read
+    from mistyle.io.read_mesh import read_mesh as read
 
     return read(Path(path), uv=uv, up=up, size=size, max_faces=max_faces)
 
@@ -46,7 +46,7 @@ def read_cameras(path: str | PathLike, size: tuple[int, int] = (1024, 1024)) -> 
     `size` (height, width) in pixels holds where a transforms.json does not say. Raises InputRefused for lens
     distortion, unequal focal lengths and matrices that are not rigid motions.
     """
-    from mistyle.files.cameras import read_cameras as read
+    from mistyle.io.cameras.camera_files import read_cameras as read
 
     return read(Path(path), size)
 
@@ -56,7 +56,7 @@ def read_lights(path: str | PathLike) -> Lights:
 
     Lists of single views are not looked at; `read_captures` reads those. Raises InputRefused.
     """
-    from mistyle.files.views import read_lights as read
+    from mistyle.io.cameras.views import read_lights as read
 
     return read(Path(path))
 
@@ -87,9 +87,9 @@ def read_captures(
     unrelated space are not aligned here: `mistyle.fit(..., references={"align": True})` does that. Raises
     InputRefused.
     """
-    from mistyle.files.captures import camera_space
-    from mistyle.files.captures import read_captures as read
     from mistyle.geometry.similarity import moved
+    from mistyle.io.cameras.captures import camera_space
+    from mistyle.io.cameras.captures import read_captures as read
 
     def place(given: str | PathLike | None) -> Path | None:
         return None if given is None else Path(given)
@@ -113,7 +113,7 @@ def read_views(folder: str | PathLike) -> list[View]:
     `view.rgb` is linear Rec.709 and premultiplied. Edited PNGs take the place of the EXRs beside them. Raises
     InputRefused.
     """
-    from mistyle.files.views import read_views as read
+    from mistyle.io.cameras.views import read_views as read
 
     return read(Path(folder))
 
@@ -123,8 +123,8 @@ def read_picture(path: str | PathLike) -> Float[np.ndarray, "h w 3"]:
 
     Of an EXR with several layers it is the beauty layer. Raises InputRefused where there is none.
     """
-    from mistyle.files.bounds import refuse
-    from mistyle.files.read import read_frame
+    from mistyle.io.read import read_frame
+    from mistyle.io.sandbox.bounds import refuse
 
     frame = read_frame(Path(path))
     layer = next((layer for layer in frame.layers if layer.kind == "colour"), None)

@@ -34,7 +34,7 @@ class Gallery:
 
     def save(self, path: str | PathLike) -> Path:
         """Write the sheet as a PNG file, over one that is there; returns its path."""
-        from mistyle.files.store import atomic_write
+        from mistyle.io.store.atomic import atomic_write
 
         atomic_write(Path(path), self._repr_png_())
         return Path(path)

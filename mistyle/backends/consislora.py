@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from mistyle.backends.models import header
 from mistyle.core.errors import InputRefused
-from mistyle.files.store import atomic_write
+from mistyle.io.store.atomic import atomic_write
 
 Half = Literal["content", "style"]
 BLOCKS: dict[Half, str] = {"content": "up_blocks.0.attentions.0", "style": "up_blocks.0.attentions.1"}

@@ -13,7 +13,7 @@ from mistyle.backends import models, models_check
 from mistyle.backends.diffusion_settings import ModelSettings, TrainSettings
 from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, cut
-from mistyle.files.store import digest
+from mistyle.io.store.atomic import digest
 
 NETWORKS = ("unet", "vae", "text_encoder", "text_encoder_2")
 STEPS_A_SECOND = (2.0, 4.0)  # of a 1024² picture on a recent GPU; an estimate, not measured here

@@ -21,7 +21,7 @@ from mistyle.backends.consislora import Half
 from mistyle.backends.diffusion_settings import TrainSettings
 from mistyle.core.errors import InputRefused, MistyleError, Stopped
 from mistyle.core.image import resize
-from mistyle.files.store import atomic_write
+from mistyle.io.store.atomic import atomic_write
 
 # (step, steps, loss over its weight)
 Watch = Callable[[int, int, float], None]

@@ -28,7 +28,7 @@ from mistyle.backends.models_list import ENCODER, LOOSE_NEEDED
 from mistyle.core.errors import UsageError
 from mistyle.core.image import linear_from_srgb, resize, srgb_from_linear
 from mistyle.core.view import Prior, View
-from mistyle.files.store import digest
+from mistyle.io.store.atomic import digest
 
 
 @dataclass(frozen=True)

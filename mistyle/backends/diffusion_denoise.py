@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.image import canny, nearest_fill, resize, srgb_from_linear
 from mistyle.core.view import Prior, View
-from mistyle.files.views import paper_depth
+from mistyle.io.cameras.views import paper_depth
 
 # Extra terms of the guidance: (weight, adapters that speak and prompt, the same for what is subtracted).
 Term = tuple[float, tuple[Mapping[str, float], str], tuple[Mapping[str, float], str]]

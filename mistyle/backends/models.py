@@ -15,7 +15,7 @@ from typing import Any
 
 from mistyle.backends.models_list import MODELS, PublishedModel
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
-from mistyle.files.store import sha256_file
+from mistyle.io.store.atomic import sha256_file
 from mistyle.process.weights import header as weights_header
 
 LOCK = "mistyle-models.json"
@@ -149,7 +149,7 @@ def variant(folder: Path) -> str | None:
 
 def read_json(path: Path) -> dict[str, Any]:
     """A configuration file, decoded by the reader process."""
-    from mistyle.files.read import read_json as read
+    from mistyle.io.read import read_json as read
 
     try:
         return read(path)
@@ -233,6 +233,6 @@ def _sha256(path: Path, size: int, modified: int) -> str:
 
 
 def write_lock(folder: Path, lock: Mapping[str, Any]) -> None:
-    from mistyle.files.store import atomic_write
+    from mistyle.io.store.atomic import atomic_write
 
     atomic_write(folder / LOCK, (json.dumps(lock, indent=1, sort_keys=True) + "\n").encode())

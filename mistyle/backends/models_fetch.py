@@ -12,7 +12,7 @@ from urllib.parse import urlparse
 
 from mistyle.backends import models
 from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
-from mistyle.files.store import atomic_write, sha256_file
+from mistyle.io.store.atomic import atomic_write, sha256_file
 from mistyle.process import disk_errors
 from mistyle.process.weights import converted
 

@@ -93,11 +93,11 @@ PAPER_ANGLES = tuple((30.0 * k, 0.0) for k in range(1, 13)) + tuple((30.0, e) fo
 def rig(settings: RigSettings) -> list[Camera]:
     """The cameras of a job in visiting order; 'paper' gives the 16 views of section 4.1.1, 'turntable' a ring.
 
-    Cameras of kind 'file' are read by `files/cameras.py`, since this floor opens no files; those of kind 'nbv' hang on
-    the mesh (`stages/rigs.py`).
+    Cameras of kind 'file' are read by `io/cameras/camera_files.py`, since this floor opens no files; those of kind
+    'nbv' hang on the mesh (`stages/rigs.py`).
     """
     if settings.kind == "file":
-        raise ValueError("cameras from a file are read by mistyle.files.cameras.read_cameras")
+        raise ValueError("cameras from a file are read by mistyle.io.cameras.camera_files.read_cameras")
     if settings.kind == "nbv":
         raise ValueError("cameras of kind 'nbv' are chosen for a mesh by mistyle.stages.rigs.next_best_views")
     size = (settings.resolution, settings.resolution)

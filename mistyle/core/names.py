@@ -12,7 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from mistyle.core.errors import UsageError
 
 FILE_NAME = 255  # bytes that ext4, APFS and NTFS allow for the name of a file
-HIDDEN = 96  # bytes that files/store.py puts around it meanwhile: .<name>.tmp-<host>-<pid>-<n>.<ending>
+HIDDEN = 96  # bytes that io/store/atomic.py puts around it meanwhile: .<name>.tmp-<host>-<pid>-<n>.<ending>
 WRITTEN = FILE_NAME - HIDDEN
 ENDING = 31  # room for the longest "_<map>.<tile>.<ending>": _metallicsmoothness.1001.png
 STEM = WRITTEN - ENDING

@@ -149,7 +149,7 @@ def write_scene(
     `<path>` leads to the folder of the original, where its meshes and other files stay. A mesh with fitted attributes
     is written as PLY. It needs no mistyle. It is loaded once and its values are compared with the
     fitted ones; where that fails it is not kept and a note says why. From a live `mi.Scene` only textures are written.
-    `write_exr` is that of `files/images.py`, `write_file` may be `atomic_write` of `files/store.py`.
+    `write_exr` is that of `io/images/write.py`, `write_file` may be `atomic_write` of `io/store/atomic.py`.
     """
     out = Path(path)
     out.parent.mkdir(parents=True, exist_ok=True)

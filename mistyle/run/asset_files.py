@@ -8,7 +8,7 @@ import numpy as np
 
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps, Texels
-from mistyle.files.textures import part_stems
+from mistyle.io.images.textures import part_stems
 from mistyle.run.edits import Edited
 from mistyle.run.progress import Report
 from mistyle.run.start import ambient

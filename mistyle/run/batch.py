@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import MistyleError, UsageError
-from mistyle.files.keeper import Keeper
-from mistyle.files.output import keep_folder, write_file
-from mistyle.files.store import clean_leftovers
+from mistyle.io.store.atomic import clean_leftovers
+from mistyle.io.store.keeper import Keeper
+from mistyle.io.store.output import keep_folder, write_file
 from mistyle.process.cores import cores
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs

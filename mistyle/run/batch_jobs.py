@@ -29,7 +29,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.names import ASSET, distinct, safe_name
-from mistyle.files.read_mesh import MESHES
+from mistyle.io.read_mesh import MESHES
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import merge, validate
 
@@ -129,7 +129,7 @@ def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
 
 
 def _of_file(path: Path) -> JobsFile:
-    from mistyle.files.read import read_toml, read_yaml
+    from mistyle.io.read import read_toml, read_yaml
 
     if not path.is_file():
         raise InputRefused(f"{path}: found nothing, expected a jobs file (.toml, .yaml) or a folder")

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.files.html import csp_hash, template
-from mistyle.files.output import write_file
+from mistyle.io.store.output import write_file
 from mistyle.run.batch_plan import BatchPlan
 
 THUMBNAIL = 288  # pixels

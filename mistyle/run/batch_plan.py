@@ -12,8 +12,8 @@ from typing import Any
 
 from mistyle import __version__
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.files.output import write_file
-from mistyle.files.own import read_own
+from mistyle.io.store.output import write_file
+from mistyle.io.store.trusted_json import read_own
 from mistyle.run.batch_jobs import Record
 from mistyle.run.settings import merge, validate
 

@@ -132,8 +132,8 @@ def must_tile(
     """Whether a job's large arrays must lie in files for its budget; `count` gives its counts for any settings.
 
     Raises UsageError where even that is not enough, with the need, the limit, and which of the settings `keys` helps. A
-    budget that nobody gave leaves out the stage 'mesh': what reading takes is bounded in files/bounds.py, and its need
-    here is that of unwrapping.
+    budget that nobody gave leaves out the stage 'mesh': what reading takes is bounded in io/sandbox/bounds.py, and its
+    need here is that of unwrapping.
     """
     budget = allowed(settings)
     if not budget.given:

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.records import load_record, save_record
-from mistyle.files.store import atomic_folder, intact, seal
+from mistyle.io.store.atomic import atomic_folder, intact, seal
+from mistyle.io.store.records import load_record, save_record
 
 
 def place(out: Path, key: str) -> Path:

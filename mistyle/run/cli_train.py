@@ -85,11 +85,11 @@ def training_set(kind: str, source: Path, word: str) -> "list[TrainingImage]":
     from mistyle.core.image import srgb_from_linear
 
     if kind == "style":
-        from mistyle.files.read import read_picture
+        from mistyle.io.read import read_picture
         from mistyle.run.generative import opaque
 
         return [TrainingImage("style", source.stem, opaque(read_picture(source)), word or "[v]")]
-    from mistyle.files.views import read_views
+    from mistyle.io.cameras.views import read_views
 
     views = read_views(source)
     return [TrainingImage("content", v.camera.name, srgb_from_linear(v.rgb), word or "[c]") for v in views]

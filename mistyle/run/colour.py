@@ -18,14 +18,14 @@ LIGHT = (".exr", ".hdr")
 
 def light_space(colour: ColourSettings) -> Any:
     """The ColourSpace of EXR and HDR files, None where it is linear Rec.709."""
-    from mistyle.files.ocio import colour_space
+    from mistyle.io.images.ocio import colour_space
 
     return None if colour.space is None else colour_space(colour.space, colour.config)
 
 
 def picture_space(colour: ColourSettings) -> Any:
     """The ColourSpace of encoded pictures, None where their profiles, else sRGB, are believed."""
-    from mistyle.files.ocio import colour_space
+    from mistyle.io.images.ocio import colour_space
 
     return None if colour.pictures is None else colour_space(colour.pictures, colour.config, linear=False)
 
@@ -43,7 +43,7 @@ def read_style(path: Path, colour: ColourSettings) -> Picture:
     An .exr or .hdr is light in `colour.space` (linear Rec.709): it is clipped to 0..1, not tone-mapped, and `notes`
     says so. Any other picture's numbers are taken as `colour.pictures` where that is set, profiles notwithstanding.
     """
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     if Path(path).suffix.lower() in LIGHT:
         return _style_of_light(Path(path), colour)
@@ -55,8 +55,8 @@ def read_style(path: Path, colour: ColourSettings) -> Picture:
 
 
 def _style_of_light(path: Path, colour: ColourSettings) -> Picture:
-    from mistyle.files.bounds import refuse
-    from mistyle.files.read import read_frame
+    from mistyle.io.read import read_frame
+    from mistyle.io.sandbox.bounds import refuse
 
     frame = read_frame(path)
     beauty, alpha = frame.layer("beauty"), frame.layer("alpha")

@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.layers import BEAUTY, LayeredPicture
-from mistyle.files.output import claim, replace_files
-from mistyle.files.store import atomic_write
+from mistyle.io.images.layers import BEAUTY, LayeredPicture
+from mistyle.io.store.atomic import atomic_write
+from mistyle.io.store.output import claim, replace_files
 from mistyle.measure import compare_metrics as metrics
 from mistyle.measure import compare_protocols as protocols
 from mistyle.measure.compare_metrics import METRICS, MetricValues
@@ -113,7 +113,7 @@ def _one(job: CompareJob, match: Match, folder: Path, found: ComparisonState, re
         failures = () if job.allow_missing else (missing,)
         found.rows.append(ComparisonRow(match.name, match.test_name, "", failures=failures, notes=(missing,)))
         return
-    from mistyle.files.read import read_frame
+    from mistyle.io.read import read_frame
 
     try:
         reference, test = read_frame(match.reference), read_frame(match.test)

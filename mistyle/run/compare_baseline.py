@@ -7,7 +7,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from mistyle.core.errors import UsageError
-from mistyle.files.store import atomic_write, sha256_file
+from mistyle.io.store.atomic import atomic_write, sha256_file
 from mistyle.run.compare_inputs import ENDINGS, pictures_of
 
 RECORD = "approved.json"
@@ -71,7 +71,7 @@ def _some(names: Sequence[str] | dict) -> str:
 
 
 def _read(baseline: Path) -> dict[str, dict[str, str]]:
-    from mistyle.files.read import read_json
+    from mistyle.io.read import read_json
 
     path = baseline / RECORD
     return read_json(path) if path.is_file() else {}

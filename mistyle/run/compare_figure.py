@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from mistyle.core.errors import UsageError
-from mistyle.files.store import atomic_write
+from mistyle.io.store.atomic import atomic_write
 from mistyle.measure.flip_bands import flip_map
 from mistyle.run.compare_inputs import Match, Planes, chosen_layers, planes
 from mistyle.run.compare_pictures import shown
@@ -23,7 +23,7 @@ FRAME = (255, 150, 0)
 
 def inset(job: CompareJob, pairs: Sequence[Match], folder: Path) -> None:
     """Write inset.png and inset.pdf of the first picture that all tests have, with job.crop framed."""
-    from mistyle.files.read import read_frame
+    from mistyle.io.read import read_frame
 
     if job.crop is None:
         raise ValueError("an inset figure needs a crop")

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import resize
-from mistyle.files.layers import BEAUTY, Layer, LayeredPicture, Window
+from mistyle.io.images.layers import BEAUTY, Layer, LayeredPicture, Window
 
 ENDINGS = (".exr", ".hdr", ".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 
@@ -214,7 +214,7 @@ def _sorted_out(name: str, kind, left: np.ndarray, right: np.ndarray, counted: n
 
 def read_mask(path: Path, frame: LayeredPicture) -> Bool[np.ndarray, "h w"]:
     """A mask file: its luminance above one half, or its alpha where it has one that is not everywhere 1."""
-    from mistyle.files.read import read_frame
+    from mistyle.io.read import read_frame
 
     given = read_frame(path)
     layer = given.layer("alpha") or given.layer(BEAUTY) or given.layers[0]

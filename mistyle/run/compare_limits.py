@@ -54,7 +54,7 @@ def checked(name: str, known: Sequence[str], where: str) -> str:
 
 def read_limits(path: Path, known: Sequence[str]) -> tuple[list[Limit], list[Limit]]:
     """Of a compare.toml: the limits for all images, and those for some images or layers, in the file's order."""
-    from mistyle.files.read import read_toml
+    from mistyle.io.read import read_toml
 
     try:
         data = read_toml(path)

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.names import safe_name
-from mistyle.files.images import write_exr
-from mistyle.files.output import claim
-from mistyle.files.store import atomic_write
+from mistyle.io.images.write import write_exr
+from mistyle.io.store.atomic import atomic_write
+from mistyle.io.store.output import claim
 from mistyle.measure.compare_stats import Tested, same_picture
 from mistyle.run.compare import FILES, compare
 from mistyle.run.compare_pictures import webp

@@ -19,8 +19,8 @@ from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.files.html import csp_hash, template
-from mistyle.files.output import claim, replace_files
-from mistyle.files.store import atomic_write
+from mistyle.io.store.atomic import atomic_write
+from mistyle.io.store.output import claim, replace_files
 from mistyle.measure.compare_metrics import definitions, measure_colour
 from mistyle.measure.compare_stats import interval, slope
 from mistyle.run.charts import Chart
@@ -138,7 +138,7 @@ def _defined(scene: Path, defines: Mapping[str, str], work: Path) -> Path:
 def _reference(job: ConvergeJob, what: Subject, shot: RenderView, first: Renderer, progress: Progress):
     """The picture that errors are measured against, and a sentence about it."""
     if job.reference is not None:
-        from mistyle.files.read import read_frame
+        from mistyle.io.read import read_frame
 
         layer = read_frame(job.reference).layer("beauty")
         if layer is None:

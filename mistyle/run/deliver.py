@@ -17,11 +17,11 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, FILE_NAME, folded, safe_name, shortened
-from mistyle.files.bounds import USD
-from mistyle.files.output import claim, keep_folder, read_written, replace_files
-from mistyle.files.own import read_own
-from mistyle.files.packing import TARGETS
-from mistyle.files.store import atomic_write, digest, sha256_file
+from mistyle.io.images.packing import TARGETS
+from mistyle.io.sandbox.bounds import USD
+from mistyle.io.store.atomic import atomic_write, digest, sha256_file
+from mistyle.io.store.output import claim, keep_folder, read_written, replace_files
+from mistyle.io.store.trusted_json import read_own
 from mistyle.run.colour import key_of, light_space, picture_space
 from mistyle.run.deliver_files import Delivery, fields_for, write_delivery
 from mistyle.run.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
@@ -162,7 +162,7 @@ def check(settings: Any) -> None:
     light_space(settings.colour)
     picture_space(settings.colour)
     if settings.deliver.wanted and "usd" in settings.deliver.formats:
-        from mistyle.files.usd import library
+        from mistyle.io.usd.write import library
 
         library()
 

@@ -19,12 +19,12 @@ from mistyle.core.names import (
     split_tile,
     uses,
 )
-from mistyle.files.bounds import USD
-from mistyle.files.materialx import TexturedMaterial, write_materialx
-from mistyle.files.obj_write import write_obj
-from mistyle.files.ocio import ColourSpace, exr_tags
-from mistyle.files.packing import TARGETS, Target, TextureSet, write_slot
-from mistyle.files.store import sha256_file
+from mistyle.io.images.ocio import ColourSpace, exr_tags
+from mistyle.io.images.packing import TARGETS, Target, TextureSet, write_slot
+from mistyle.io.materialx import TexturedMaterial, write_materialx
+from mistyle.io.meshes.obj_write import write_obj
+from mistyle.io.sandbox.bounds import USD
+from mistyle.io.store.atomic import sha256_file
 from mistyle.run.finished import FinishedAsset
 
 # What materials in files refer to: every map by itself, whatever the target packs.
@@ -191,7 +191,7 @@ def _materials(
     if "usd" in chosen.formats and Path(str(finished.manifest.get("source", ""))).suffix.lower() in USD:
         return _look_layer(folder, out, finished, chosen, looks)
     if "usd" in chosen.formats:
-        from mistyle.files.usd import write_usd, write_usdz
+        from mistyle.io.usd.write import write_usd, write_usdz
 
         stage = folder / f"{chosen.name}.usda"
         write_usd(stage, identifier(chosen.name), mesh, positions, looks, metres_per_unit=chosen.unit)
@@ -203,8 +203,8 @@ def _look_layer(
     folder: Path, out: Path, finished: FinishedAsset, chosen: Delivery, looks: Sequence[TexturedMaterial]
 ) -> list[str]:
     """A USD mesh gets its look as a layer over the file it came from, one variant per style."""
-    from mistyle.files.records import load_record
-    from mistyle.files.usd_look import write_look
+    from mistyle.io.store.records import load_record
+    from mistyle.io.usd.look import write_look
 
     record = finished.folder.parent / "work" / "mesh" / "record"
     if not record.is_dir():

@@ -41,7 +41,7 @@ def run_all(jobs: Sequence[Any], out: Path, progress: Any, *, overwrite: bool = 
 
     Returns the sheet's path ("" where no job wrote a report) and the summaries.
     """
-    from mistyle.files.output import claim, replace_files
+    from mistyle.io.store.output import claim, replace_files
     from mistyle.run.pipeline import stylize
     from mistyle.run.progress import Progress
 
@@ -64,7 +64,7 @@ def _write_sheet(rows: Sequence[Path], folder: Path) -> None:
     import numpy as np
     from PIL import Image
 
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     pictures = []
     for path in rows:

@@ -19,8 +19,8 @@ import numpy as np
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
 from mistyle.core.maps import Maps
-from mistyle.files.own import read_own
-from mistyle.files.store import DONE, sha256_file
+from mistyle.io.store.atomic import DONE, sha256_file
+from mistyle.io.store.trusted_json import read_own
 
 # Stage -> names of its files that a person may edit.
 EDITABLE = {
@@ -128,14 +128,14 @@ def tell_edits(run: Any) -> None:
 
 def write_mask(path: Path, mask: np.ndarray) -> None:
     """A mask (h w) as an 8-bit PNG: white where it holds."""
-    from mistyle.files.images import write_png
+    from mistyle.io.images.write import write_png
 
     write_png(path, mask.astype(np.float32))
 
 
 def read_mask(path: Path, like: np.ndarray) -> np.ndarray:
     """A mask back from its picture: light texels hold. InputRefused for another size than that of `like`."""
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     light = read_picture(path).rgb.mean(axis=-1) > 0.5
     _same_size(path, light.shape, like.shape)
@@ -165,7 +165,7 @@ def _any(names: Sequence[str], stem: str, kind: str) -> bool:
 
 
 def _with(maps: Maps, occlusion: np.ndarray, kind: str, path: Path) -> tuple[Maps, np.ndarray]:
-    from mistyle.files.read import read_exr, read_picture
+    from mistyle.io.read import read_exr, read_picture
 
     if path.suffix == ".exr":
         planes = read_exr(path)

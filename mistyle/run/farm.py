@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-from mistyle.files.output import claim, keep_folder, replace_files
-from mistyle.files.store import atomic_write
+from mistyle.io.store.atomic import atomic_write
+from mistyle.io.store.output import claim, keep_folder, replace_files
 from mistyle.run.batch_plan import PLAN, BatchPlan, write_plan
 from mistyle.run.shard import SHARDS, claim_batch
 

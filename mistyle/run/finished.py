@@ -11,7 +11,7 @@ import numpy as np
 from mistyle.core.asset import Asset
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb
-from mistyle.files.packing import TextureSet
+from mistyle.io.images.packing import TextureSet
 
 
 @dataclass(frozen=True)
@@ -26,7 +26,7 @@ class FinishedAsset:
 
 def read_finished(place: Path) -> FinishedAsset:
     """The asset of a run folder, an asset folder or a <name>.json. Raises InputRefused."""
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     folder, manifest = read_listing(place)
     stems = [(str(part["name"]), str(part["textures"])) for part in manifest["parts"]]
@@ -45,7 +45,7 @@ def read_finished(place: Path) -> FinishedAsset:
 
 def read_listing(place: Path) -> tuple[Path, dict[str, Any]]:
     """The asset folder and its list of files."""
-    from mistyle.files.read import read_json
+    from mistyle.io.read import read_json
 
     listing = _listing(place)
     manifest = read_json(listing)
@@ -75,7 +75,7 @@ def _listing(place: Path) -> Path:
 
 
 def _texture_set(folder: Path, part: str, stem: str) -> TextureSet:
-    from mistyle.files.read import read_exr, read_picture
+    from mistyle.io.read import read_exr, read_picture
 
     def planes(kind: str) -> Mapping[str, np.ndarray]:
         return read_exr(folder / f"{stem}_{kind}.exr")

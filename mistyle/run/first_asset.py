@@ -11,8 +11,8 @@ from typing import Any
 
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps
-from mistyle.files.own import read_own
-from mistyle.files.store import DONE, digest
+from mistyle.io.store.atomic import DONE, digest
+from mistyle.io.store.trusted_json import read_own
 from mistyle.run import asset_files
 from mistyle.run.edits import UNEDITED
 from mistyle.run.made import Atlas, Baked

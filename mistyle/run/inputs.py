@@ -3,7 +3,7 @@
 from pathlib import Path
 
 from mistyle.core.errors import InputRefused
-from mistyle.files.bounds import USD
+from mistyle.io.sandbox.bounds import USD
 
 
 def input_files(path: Path) -> tuple[Path, ...]:
@@ -14,9 +14,9 @@ def input_files(path: Path) -> tuple[Path, ...]:
             f"{path}: found {found}, expected a mesh file (.obj .ply .stl .off .glb .gltf .usd); check the path"
         )
     if path.suffix.lower() in USD:
-        from mistyle.files.read_mesh import read_usd_files
+        from mistyle.io.read_mesh import read_usd_files
 
         return (path, *sorted(p for p in read_usd_files(path) if p != path.resolve()))
-    from mistyle.files.read_mesh import read_references
+    from mistyle.io.read_mesh import read_references
 
     return (path, *read_references(path))

@@ -20,8 +20,8 @@ from mistyle import __version__
 from mistyle.core.asset import Asset
 from mistyle.core.errors import MistyleError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
-from mistyle.files.output import claim, replace_files
-from mistyle.files.store import atomic_write, sha256_file
+from mistyle.io.store.atomic import atomic_write, sha256_file
+from mistyle.io.store.output import claim, replace_files
 from mistyle.run.progress import Progress
 from mistyle.run.report_overlays import MAGENTA, viridis
 from mistyle.run.sheet_canvas import PANEL, Panel, PanelRow, Sheet, beside, compose, measures, panel_widths
@@ -72,7 +72,7 @@ def lookdev(
     `hdri` is an .hdr or .exr environment map for the third light; `date` stands in the burn-in (else the day on which
     the asset's file was last changed, UTC). The same asset, settings and thread count give the same pictures.
     """
-    from mistyle.files.read import read_radiance
+    from mistyle.io.read import read_radiance
     from mistyle.render import sheet as drawing
     from mistyle.run.start import start_engines
     from mistyle.run.turntable import encoder
@@ -113,7 +113,7 @@ def lookdev(
 
 def write_sheet(folder: Path, picture: np.ndarray) -> None:
     """Write the linear sheet (h w 3) as lookdev.png (sRGB, clipped) and lookdev.exr (half floats)."""
-    from mistyle.files.images import write_exr, write_png
+    from mistyle.io.images.write import write_exr, write_png
 
     write_png(folder / "lookdev.png", srgb_from_linear(np.clip(picture, 0, 1)))
     write_exr(folder / "lookdev.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)), half=True)
@@ -150,7 +150,7 @@ def files_of_sheet(settings: LookSettings) -> list[str]:
 
 def read_subject(place: Path) -> SheetSubject:
     """A mesh file, or the asset of a run folder with what the run knows of its texels. Raises InputRefused."""
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
     from mistyle.run.renderers import finished_asset
 
     path = finished_asset(place) if place.is_dir() else place
@@ -161,7 +161,7 @@ def read_subject(place: Path) -> SheetSubject:
 
 def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
     """Coverage, confidence and repair of a run folder's texels as sRGB colours, one picture per texture set."""
-    from mistyle.files.records import load_record
+    from mistyle.io.store.records import load_record
 
     def record(stage: str) -> Any:
         place = folder / "work" / stage / "record"

@@ -18,7 +18,7 @@ from mistyle.core.capture import Captures, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights
 from mistyle.core.maps import Maps, Texels
-from mistyle.files.textures import part_stems
+from mistyle.io.images.textures import part_stems
 from mistyle.run import checkpoint
 from mistyle.run.budget import size_of, with_setting
 from mistyle.run.edits import asset_stage, tell_edits
@@ -82,7 +82,7 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
 
     Raises a MistyleError for everything that a user can mend; what was finished before stays.
     """
-    from mistyle.files.captures import read_shots, reading_notes
+    from mistyle.io.cameras.captures import read_shots, reading_notes
     from mistyle.run.colour import in_working_space, key_of
     from mistyle.run.deliver import check, deliver
     from mistyle.run.material_report import material_report, write_summary
@@ -144,7 +144,7 @@ def inputs_of(job: MaterialJob) -> list[Path]:
 
 def references_of(job: MaterialJob) -> Captures:
     """The job's pictures; cameras, lights and headers are read now, pixels one picture at a time."""
-    from mistyle.files.captures import read_captures
+    from mistyle.io.cameras.captures import read_captures
 
     captures = read_captures(
         job.references,
@@ -184,8 +184,8 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
 def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Placed:
     """The cameras in working space: as they are, through the mesh's own units, or aligned and refined on request; and
     whether the mesh's outlines are where the pictures have them."""
-    from mistyle.files.captures import camera_space, outline_of, silhouette, sparse_points
     from mistyle.geometry.similarity import moved
+    from mistyle.io.cameras.captures import camera_space, outline_of, silhouette, sparse_points
     from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
     from mistyle.stages.outline_check import check_outlines, overlap_notes
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mistyle.core.capture import Captures, Loaded, shrunk
 from mistyle.core.maps import Texels
-from mistyle.files.records import load_record, save_record
+from mistyle.io.store.records import load_record, save_record
 from mistyle.process import memory
 from mistyle.run.progress import Report
 
@@ -31,7 +31,7 @@ class Looked:
 
 def look_through(folder: Path, texels: Sequence[Texels], captures: Captures, average: int, report: Report) -> None:
     """Write into `folder` what `looked` reads. InputRefused where no picture says anything."""
-    from mistyle.files.captures import check_pixels
+    from mistyle.io.cameras.captures import check_pixels
     from mistyle.stages.recover_check import downsampling_factors
 
     by = [average] * len(captures) if average else downsampling_factors(texels, captures.cameras)

@@ -41,7 +41,7 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
 def material_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
     """Draw the pictures and write `index.html` and `overview.png` into `folder`; for a full report `beauty.png` and the
     turntable too."""
-    from mistyle.files.images import write_png
+    from mistyle.io.images.write import write_png
 
     settings, maps = made.job.settings, made.recovered.maps
     full = settings.report.detail == "full"

@@ -32,7 +32,7 @@ UNFITTED = (
 def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
     """Draw the pictures and write `index.html` and `overview.png` (mesh, style, result) into `folder`; for a full
     report `beauty.png` (path-traced) and the turntable's frames, `turntable/*.png` and `turntable.webp`, too."""
-    from mistyle.files.images import write_png
+    from mistyle.io.images.write import write_png
 
     settings = made.job.settings
     full = settings.report.detail == "full"

@@ -196,7 +196,7 @@ def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> Style
 def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View], after: str) -> list[View]:
     """The stylized views, drawn from the painted texture so that all agree by construction;
     `after` is the stage that made it."""
-    from mistyle.files.views import read_views, write_views
+    from mistyle.io.cameras.views import read_views, write_views
 
     def write(folder: Path, report: Report) -> None:
         drawn = unlit_views(asset, baked.maps, views, report)

@@ -14,7 +14,7 @@ import numpy as np
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
-from mistyle.files.textures import part_stems
+from mistyle.io.images.textures import part_stems
 from mistyle.measure.baked_light import BakedLight
 from mistyle.run import asset_files
 from mistyle.run.budget import Look, kept, size_of
@@ -222,7 +222,7 @@ def painted_stages(
 
 def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:
     """Section 4.1.1: the views of the mesh with its own material, drawn or taken over."""
-    from mistyle.files.views import read_views
+    from mistyle.io.cameras.views import read_views
 
     s = run.job.settings
     inputs = [s.rig, s.rig.file, s.draw, s.draw.scene, s.seed]

@@ -11,7 +11,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
-from mistyle.files.raw import Extent
+from mistyle.io.meshes.parsed_mesh import Extent
 from mistyle.run.budget import Counts, Need, must_tile, peaks, within_gb
 from mistyle.run.inputs import input_files
 from mistyle.run.settings import thread_count
@@ -49,7 +49,7 @@ def extent_of(mesh: Path, settings: Any) -> Extent:
 @lru_cache(maxsize=64)  # a batch names few meshes many times
 def _extent(mesh: Path, uv: Literal["keep", "new", "auto"], max_faces: int, size: int, stamps: object) -> Extent:
     """`stamps` tells a file that was changed from what it was."""
-    from mistyle.files.read_mesh import read_extent
+    from mistyle.io.read_mesh import read_extent
 
     return read_extent(mesh, uv=uv, max_faces=max_faces, size=size)
 

@@ -104,7 +104,7 @@ def painted_maps(asset: Asset, style: Picture, atlas: Atlas, settings: Settings,
 
 def write(path: Path, asset: Asset, maps: Sequence[Maps], seed: int) -> None:
     """The sheet: four views in a row, and below them the maps of each texture set."""
-    from mistyle.files.images import write_png
+    from mistyle.io.images.write import write_png
     from mistyle.run.report_parts import map_shots
 
     cameras = [orbit(azimuth, ELEVATION, distance=4, fov=30, size=(SIDE, SIDE)) for azimuth in VIEWS]

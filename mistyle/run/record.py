@@ -3,8 +3,8 @@
 import json
 from typing import Any
 
-from mistyle.files.output import write_file
-from mistyle.files.own import read_own
+from mistyle.io.store.output import write_file
+from mistyle.io.store.trusted_json import read_own
 from mistyle.run.progress import Progress
 from mistyle.run.stages import Run
 

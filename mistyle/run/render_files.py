@@ -71,7 +71,7 @@ def as_glb(found: Subject) -> Path:
 
 def write_asset_glb(path: Path, asset: Any) -> None:
     """An asset with its own material as our writers write it: a glTF patched, anything else new."""
-    from mistyle.files.gltf import patch_glb, write_glb
+    from mistyle.io.gltf.write import patch_glb, write_glb
     from mistyle.render.lookdev import material_maps
 
     maps = [_of_one_size(material_maps(m)) for m in asset.materials]
@@ -103,7 +103,7 @@ def scene_for(found: Subject, shot: RenderView, spp: int, seed: int) -> Path:
     equal Mitsuba scene file."""
     if found.asset is None or shot.camera is None:
         return found.path.resolve()
-    from mistyle.files.images import write_exr
+    from mistyle.io.images.write import write_exr
     from mistyle.render import lookdev
 
     xml = exported(found, shot)

@@ -99,7 +99,7 @@ def subject(path: Path, folder: Path, renderers: Sequence[Renderer], threads: in
         if any(r.kind == "blender" for r in renderers):
             raise UsageError(f"{path}: Cycles reads no Mitsuba scenes; give a GLB, or leave out blender:cycles")
         return Subject(path, folder, threads=threads)
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     asset = read_mesh(path, uv="auto")
     return Subject(path, folder, asset, any(r.kind == "other mitsuba" for r in renderers), threads)
@@ -117,7 +117,7 @@ def left_out(found: Subject) -> list[str]:
     """What a glTF asks for that Mitsuba's side does not draw: emission, transparency, material extensions."""
     if found.path.suffix.lower() not in (".glb", ".gltf"):
         return []
-    from mistyle.files.read_mesh import load_gltf
+    from mistyle.io.read_mesh import load_gltf
 
     names: set[str] = set()
     for material in load_gltf(found.path)[0].get("materials", []):
@@ -137,7 +137,7 @@ def shots(found: Subject, lights: Sequence[str], views: int, size: int) -> list[
         names = [s.id() for s in file_scene(found.path).sensors()]
         usable = [n if n and not n.startswith(("__", "object_")) else f"sensor{k}" for k, n in enumerate(names)]
         return [RenderView(name, sensor=k) for k, name in enumerate(usable)]
-    from mistyle.files.read import read_radiance
+    from mistyle.io.read import read_radiance
     from mistyle.render.lookdev import light_rig
 
     cameras = [orbit(35 + 360 * k / views, 15, distance=4, fov=30, size=(size, size)) for k in range(views)]
@@ -193,7 +193,7 @@ def _shapes(found: Subject) -> Any:
 
 
 def _worker(python: str, integrator: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
-    from mistyle.files.read import read_npy
+    from mistyle.io.read import read_npy
     from mistyle.render import lookdev
     from mistyle.render.scene import passes
 
@@ -215,8 +215,8 @@ def _worker(python: str, integrator: str, found: Subject, shot: RenderView, spp:
 
 
 def _cycles(python: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
-    from mistyle.files.images import write_exr
-    from mistyle.files.read import read_frame
+    from mistyle.io.images.write import write_exr
+    from mistyle.io.read import read_frame
     from mistyle.render import lookdev
 
     if shot.camera is None or found.asset is None:
@@ -245,7 +245,7 @@ def _cycles(python: str, found: Subject, shot: RenderView, spp: int, seeds: Sequ
 
 
 def _command(name: str, template: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
-    from mistyle.files.read import read_frame
+    from mistyle.io.read import read_frame
 
     pictures, seconds = [], []
     for seed in seeds:

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from mistyle.files.html import csp_hash, template
-from mistyle.files.store import atomic_write
+from mistyle.io.store.atomic import atomic_write
 from mistyle.run.charts import Chart, svg
 from mistyle.run.report_model import PageModel, TooLarge, packed, viewer_script
 from mistyle.run.report_pictures import Encoder, Sizes, accents, kind_in_step, kind_of_maps, palette

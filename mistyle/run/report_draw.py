@@ -92,7 +92,7 @@ def close_up(settings: Any) -> Camera:
 def studio_light() -> Float[np.ndarray, "h w 3"]:
     """The softboxes of scenes/studio.xml."""
     from mistyle.core.paths import scenes
-    from mistyle.files.read import read_exr
+    from mistyle.io.read import read_exr
 
     planes = read_exr(scenes() / "studio_lights.exr")
     return np.stack([planes[c] for c in "RGB"], axis=-1).astype(np.float32)

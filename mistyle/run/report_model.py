@@ -36,7 +36,7 @@ class TooLarge:
 
 def page_model(glb: Path) -> PageModel | TooLarge:
     """The asset for a page, unless its vertices and faces alone would take more than MOST_GEOMETRY bytes there."""
-    from mistyle.files.read_mesh import load_gltf
+    from mistyle.io.read_mesh import load_gltf
 
     tree, buffers = load_gltf(glb)
     model = PageModel(glb.name, tree, buffers)
@@ -57,8 +57,8 @@ def packed(model: PageModel, longest: int) -> str:
 
     Textures become JPEG, those with transparency PNG. The same asset gives the same text.
     """
-    from mistyle.files.glb import Builder
-    from mistyle.files.read import shrink_picture
+    from mistyle.io.gltf.glb import Builder
+    from mistyle.io.read import shrink_picture
 
     builder = Builder(copy.deepcopy(model.tree), model.buffers)
     tree = builder.tree

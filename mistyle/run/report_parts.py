@@ -8,7 +8,7 @@ from pydantic import BaseModel
 
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps, Texels
-from mistyle.files.own import read_own
+from mistyle.io.store.trusted_json import read_own
 from mistyle.run.report import File, ReportPicture, Setting
 from mistyle.run.report_pictures import in_bands
 

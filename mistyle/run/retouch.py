@@ -38,7 +38,7 @@ def retouch(
     `views` are those of `folder` as they stand there now, `edited` names its edited files. A texel takes the colour of
     the edited view that faces it most, if it shows a pixel that differs from what was drawn there.
     """
-    from mistyle.files.cameras import read_cameras
+    from mistyle.io.cameras.camera_files import read_cameras
     from mistyle.run.painting import with_geometry
     from mistyle.stages.backproject import backproject
     from mistyle.stages.texels import pad
@@ -99,7 +99,7 @@ def _file(view: View, edited: Mapping[str, str]) -> str | None:
 
 def _as_written(folder: Path, view: View, drawn: View) -> View:
     """The view as its EXR has it; as `drawn` where the picture has another size."""
-    from mistyle.files.read import read_exr
+    from mistyle.io.read import read_exr
 
     planes = read_exr(folder / f"{view.camera.name}.exr")
     if planes["R"].shape != view.coverage.shape:

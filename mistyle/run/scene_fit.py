@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.files.keeper import Keeper
-from mistyle.files.output import claim, keep_folder
-from mistyle.files.store import atomic_write, digest
+from mistyle.io.store.atomic import atomic_write, digest
+from mistyle.io.store.keeper import Keeper
+from mistyle.io.store.output import claim, keep_folder
 from mistyle.process import stopping
 from mistyle.run import checkpoint
 from mistyle.run.progress import Progress
@@ -96,7 +96,7 @@ def _fit(
     paths: Sequence[Path],
     progress: Progress,
 ) -> dict[str, Any]:
-    from mistyle.files.images import write_exr
+    from mistyle.io.images.write import write_exr
     from mistyle.render.scene_draw import values
     from mistyle.render.scene_xml import write_scene
 
@@ -208,7 +208,7 @@ def every_name(scene: Any, k: int) -> str:
 
 def write_pictures(folder: Path, scene: Any, numbers: Sequence[int], drawn: Sequence[np.ndarray]) -> None:
     from mistyle.core.image import srgb_from_linear
-    from mistyle.files.images import write_exr, write_png
+    from mistyle.io.images.write import write_exr, write_png
 
     for k, picture in zip(numbers, drawn, strict=True):
         name = every_name(scene, k)

@@ -43,7 +43,7 @@ def read_reference(
 
     `channels` chooses in an EXR: a prefix ("image" for image.R, …) or three names with commas.
     """
-    from mistyle.files.read import read_exr, read_picture
+    from mistyle.io.read import read_exr, read_picture
 
     if path.suffix.lower() == ".exr":
         planes = read_exr(path)

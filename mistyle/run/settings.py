@@ -90,7 +90,7 @@ def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
 
 def read_config(path: Path) -> dict[str, Any]:
     """A job file in TOML; its keys are those that `--print-config` prints."""
-    from mistyle.files.read import read_toml
+    from mistyle.io.read import read_toml
 
     if not path.is_file():
         raise UsageError(f"{path}: no such file; --config wants a TOML file")

@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import MistyleError, Stopped
-from mistyle.files import lock
-from mistyle.files.output import claim, keep_folder
-from mistyle.files.own import read_own
-from mistyle.files.store import LOCK, atomic_write, digest, sha256_file
+from mistyle.io.store import lock
+from mistyle.io.store.atomic import LOCK, atomic_write, digest, sha256_file
+from mistyle.io.store.output import claim, keep_folder
+from mistyle.io.store.trusted_json import read_own
 from mistyle.process.disk_errors import unexpected
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan

@@ -9,10 +9,10 @@ from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
 
 from mistyle.core.errors import UsageError
 from mistyle.core.paths import PACKAGE
-from mistyle.files import output, store
-from mistyle.files.keeper import Keeper
-from mistyle.files.records import load_record, save_record
-from mistyle.files.store import digest
+from mistyle.io.store import atomic, output
+from mistyle.io.store.atomic import digest
+from mistyle.io.store.keeper import Keeper
+from mistyle.io.store.records import load_record, save_record
 from mistyle.process import memory, stopping
 from mistyle.run import edits
 from mistyle.run.progress import Progress, Report
@@ -166,9 +166,9 @@ class Run(Generic[Work]):
             return
         taken_up, changed = edits.found(keeper.root / name, name)
         if taken_up | changed:
-            done = store.done(keeper.root / name)
+            done = atomic.done(keeper.root / name)
             place = output.move_aside(
-                keeper.root / name, "edited", {store.DONE, *done[1], *changed} if done else changed
+                keeper.root / name, "edited", {atomic.DONE, *done[1], *changed} if done else changed
             )
             files = ", ".join(sorted(taken_up | changed))
             text = f"{name}/ is made anew, as what it stands on has changed; your edited {files} now lies in {place}."

@@ -27,7 +27,7 @@ def start_engines(settings: Any) -> str:
 
 def read(path: Path, chosen: ReadSettings, size: int, report: Report) -> Asset:
     """The mesh, normalised and with UVs usable for an atlas of `size`."""
-    from mistyle.files.read_mesh import read_mesh
+    from mistyle.io.read_mesh import read_mesh
 
     how: dict[str, Any] = dict(uv=chosen.uv, up=chosen.up, max_faces=chosen.max_faces, lit=chosen.lit)
     return read_mesh(path, **how, size=size, progress=report)

@@ -98,7 +98,7 @@ def rig_pixels(settings: Settings) -> list[int]:
     if settings.rig.kind != "file" or settings.rig.file is None:
         side = settings.rig.resolution**2
         return [side] * (view_pixels(settings) // side)
-    from mistyle.files.cameras import read_cameras
+    from mistyle.io.cameras.camera_files import read_cameras
 
     return [camera.size[0] * camera.size[1] for camera in read_cameras(settings.rig.file)]
 

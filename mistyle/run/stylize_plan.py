@@ -108,7 +108,7 @@ def plan_render(mesh: Path, out: Path, settings: Settings) -> dict[str, Any]:
 
 def plan_bake(mesh: Path, views: Path, out: Path, settings: Settings, name: str) -> dict[str, Any]:
     """The same for `mistyle bake`, whose views' cameras are read."""
-    from mistyle.files.views import view_cameras
+    from mistyle.io.cameras.views import view_cameras
 
     extent = extent_of(mesh, settings)
     sizes = [camera.size[0] * camera.size[1] for camera in view_cameras(views)]

@@ -57,7 +57,7 @@ def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> li
         return list(planned.cameras)
     if settings.rig.kind != "file":
         return rig(settings.rig)
-    from mistyle.files.cameras import read_cameras
+    from mistyle.io.cameras.camera_files import read_cameras
 
     assert settings.rig.file is not None
     return read_cameras(settings.rig.file)
@@ -75,7 +75,7 @@ def draw(
     """Render the views and write them with their cameras and lights; `read` says whether anything reads their
     colours."""
     from mistyle.core.light import lights
-    from mistyle.files.views import write_views
+    from mistyle.io.cameras.views import write_views
     from mistyle.render.draw import draw_views
 
     template = settings.draw.scene or "paper_views"

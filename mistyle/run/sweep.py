@@ -22,7 +22,7 @@ def swept_stages(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
 ) -> tuple[Baked, list[View]]:
     """The stages 'surface', 'bake' and 'stylized' of a stylizer that paints view by view (paper 4.1.3 and 4.1.4)."""
-    from mistyle.files.views import read_views, write_views
+    from mistyle.io.cameras.views import read_views, write_views
     from mistyle.run.generative import fit_settings
     from mistyle.run.painting import paint_files
 

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from mistyle.core.errors import EnvironmentMissing
-from mistyle.files.images import write_png
-from mistyle.files.store import atomic_write
+from mistyle.io.images.write import write_png
+from mistyle.io.store.atomic import atomic_write
 
 SECONDS = 6.0  # once round
 GROUND = (0.115, 0.115, 0.12)  # sRGB, behind the asset where a file has no transparency

@@ -11,7 +11,7 @@ from jaxtyping import Float
 
 from mistyle.core.camera import rig
 from mistyle.core.rig_settings import RigSettings
-from mistyle.files.output import claim, replace_files
+from mistyle.io.store.output import claim, replace_files
 from mistyle.run.preview import ATLAS, lit_views, painted_maps, reduced, rows_of
 from mistyle.run.progress import Progress
 from mistyle.run.stylize_settings import Settings
@@ -77,6 +77,6 @@ def sheet(
 
 
 def _write_sheet(tiles: list[Float[np.ndarray, "h w 3"]], folder: Path) -> None:
-    from mistyle.files.images import write_png
+    from mistyle.io.images.write import write_png
 
     write_png(folder / SHEET, rows_of(tiles, min(COLUMNS // len(VIEWS), len(tiles))))

@@ -12,7 +12,7 @@ from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.files.output import claim, read_written, replace_files
+from mistyle.io.store.output import claim, read_written, replace_files
 from mistyle.run.budget import kept, size_of
 from mistyle.run.inputs import input_files
 from mistyle.run.job_settings import LEAST_OVERLAP
@@ -64,8 +64,8 @@ def claim_baked(mesh: Path, views: Path, out: Path, name: str, overwrite: bool) 
 def files_of_views(settings: Settings) -> list[str]:
     """What a folder of views will consist of; of a rig made for the mesh, of all views that it may choose from."""
     from mistyle.core.camera import rig
-    from mistyle.files.views import file_names, read_cameras
     from mistyle.geometry.next_best_view import candidate_cameras
+    from mistyle.io.cameras.views import file_names, read_cameras
 
     chosen = settings.rig
     if chosen.kind == "file":
@@ -80,7 +80,7 @@ def bake_views(
     mesh: Path, views: Path, out: Path, settings: Settings, name: str, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
     """`mistyle bake`: anyone's pictures of known cameras projected onto the texture (section 4.1.4)."""
-    from mistyle.files.views import read_views, view_cameras
+    from mistyle.io.cameras.views import read_views, view_cameras
     from mistyle.stages.export import asset_names
 
     inputs = claim_baked(mesh, views, out, name, overwrite)

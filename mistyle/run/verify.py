@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, MistyleError
-from mistyle.files.images import write_exr, write_png
-from mistyle.files.output import claim, replace_files
-from mistyle.files.store import DONE
+from mistyle.io.images.write import write_exr, write_png
+from mistyle.io.store.atomic import DONE
+from mistyle.io.store.output import claim, replace_files
 from mistyle.run.blender import BLENDER, find_blender
 from mistyle.run.verify_checks import MODELS, READERS, Check, by_blender, exr, listed_files, png
 from mistyle.run.verify_surfaces import surface_checks

@@ -14,8 +14,8 @@ from typing import Any, Literal
 import numpy as np
 
 from mistyle.core.errors import InputRefused, MistyleError
-from mistyle.files.bounds import USD
-from mistyle.files.store import sha256_file
+from mistyle.io.sandbox.bounds import USD
+from mistyle.io.store.atomic import sha256_file
 from mistyle.run.blender import BLENDER, OPEN_WORKER, blender_command
 
 Outcome = Literal["passed", "failed", "not checked"]
@@ -50,7 +50,7 @@ def row(file: str, check: str, complaints: Sequence[str], fine: str) -> Check:
 def listed_files(listing: Path, name: str) -> Check | None:
     """The files that a list of ours (an asset's, a delivery's, a stage's) names, by their sha256; None for a JSON file
     that is no list."""
-    from mistyle.files.read import read_json
+    from mistyle.io.read import read_json
 
     try:
         content = read_json(listing)
@@ -134,7 +134,7 @@ def by_trimesh(path: Path, name: str) -> Iterator[Check]:
 def usd(path: Path, name: str) -> Iterator[Check]:
     """USD's own validators, and whether every texture that it names is there."""
     try:
-        from mistyle.files.usd import complaints, heard, library
+        from mistyle.io.usd.write import complaints, heard, library
 
         pxr = library()
     except MistyleError as error:

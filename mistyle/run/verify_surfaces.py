@@ -9,7 +9,7 @@ from xml.etree import ElementTree
 
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.core.names import folded
-from mistyle.files.bounds import USD
+from mistyle.io.sandbox.bounds import USD
 from mistyle.run.verify_checks import MODELS, Check, row
 
 CHECK = "materials and their maps"
@@ -47,7 +47,7 @@ def surface_checks(files: Sequence[Path], name: Callable[[Path], str]) -> Iterat
 
 
 def _list(path: Path) -> List | None:
-    from mistyle.files.read import read_json
+    from mistyle.io.read import read_json
 
     try:
         content = read_json(path)
@@ -153,7 +153,7 @@ def _materialx(path: Path) -> dict[str, list[str]]:
 
 def _usd(path: Path) -> dict[str, list[str]]:
     """The textures of every material that is bound to faces."""
-    from mistyle.files.usd import heard, library
+    from mistyle.io.usd.write import heard, library
 
     pxr = library()
     api, found = pxr.UsdShade.MaterialBindingAPI, {}

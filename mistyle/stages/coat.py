@@ -38,7 +38,7 @@ def masked_style(style: Picture, mask: Path | None) -> Picture:
     """The style with the dark parts of a mask picture (of any size) taken out."""
     if mask is None:
         return style
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     light = resize(read_picture(mask).rgb.mean(axis=2), style.rgb.shape[:2])
     if not (light > 0.5).any():
@@ -104,7 +104,7 @@ def slot_masks(
 
 def painted_mask(path: Path, texels: Texels) -> Bool[np.ndarray, "h w"]:
     """A picture in the mesh's UVs (row 0 is v = 1) as a mask at the atlas's size: light (and opaque) is True."""
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     mask = read_picture(path)
     light = mask.rgb.mean(axis=2) * (1 if mask.alpha is None else mask.alpha)
@@ -156,7 +156,7 @@ def painted_direction(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -
     """
     if path is None:
         return None
-    from mistyle.files.read import read_picture
+    from mistyle.io.read import read_picture
 
     flow_map = read_picture(path)
     alpha = np.ones(flow_map.rgb.shape[:2], np.float32) if flow_map.alpha is None else flow_map.alpha

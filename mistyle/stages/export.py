@@ -21,14 +21,14 @@ from mistyle.core.asset import Asset
 from mistyle.core.image import nearest_fill
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.names import checked
-from mistyle.files.gltf import patch_glb, write_glb
-from mistyle.files.gltf_alpha import Cutout, cutouts
-from mistyle.files.images import write_exr, write_png
-from mistyle.files.output import put_folder
-from mistyle.files.own import read_own
-from mistyle.files.store import atomic_write, sha256_file
-from mistyle.files.textures import Pictures, encode_pictures, normal_colours, orm_colours, part_stems
 from mistyle.geometry.retexture import fetch
+from mistyle.io.gltf.alpha import Cutout, cutouts
+from mistyle.io.gltf.write import patch_glb, write_glb
+from mistyle.io.images.textures import Pictures, encode_pictures, normal_colours, orm_colours, part_stems
+from mistyle.io.images.write import write_exr, write_png
+from mistyle.io.store.atomic import atomic_write, sha256_file
+from mistyle.io.store.output import put_folder
+from mistyle.io.store.trusted_json import read_own
 from mistyle.stages.texels import corner_weights
 
 NORMAL_CONVENTION = {

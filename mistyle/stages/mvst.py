@@ -22,7 +22,7 @@ from mistyle.core.image import (
     srgb_from_linear,
 )
 from mistyle.core.view import Prior, View
-from mistyle.files.store import atomic_write, digest
+from mistyle.io.store.atomic import atomic_write, digest
 from mistyle.stages.lift import PURE, Lifted, lift
 from mistyle.stages.outline import follow
 from mistyle.stages.sweep_settings import SweepSettings

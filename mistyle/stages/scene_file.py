@@ -32,7 +32,7 @@ from mistyle.core.light import (
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.names import STEM, safe_name
-from mistyle.files.images import write_exr
+from mistyle.io.images.write import write_exr
 from mistyle.render.scene import mitsuba_mesh
 
 MOST_CAMERAS = 64

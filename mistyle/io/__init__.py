@@ -1,0 +1,1 @@
+"""Files of every format, read through the sandbox and written atomically."""

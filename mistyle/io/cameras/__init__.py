@@ -1,0 +1,1 @@
+"""Cameras, captures and folders of views."""

@@ -1,0 +1,401 @@
+"""Photographs or renders with known cameras, as others keep them, read as the references of a fit.
+
+A folder with our `camera.json` (io/cameras/camera_files.py), a NeRF/Blender `transforms.json` with its pictures, or a
+COLMAP model with its `images`. EXR pictures are linear and, where they have an A channel, premultiplied by it; all
+others are sRGB-encoded with straight alpha, 8 or 16 bits. Every picture becomes linear Rec.709 radiance seen by a
+pinhole camera with square pixels: encoded values go through the exact sRGB curve, a lens's distortion and unequal focal
+lengths are resampled away.
+
+A camera describes either stored pixels or upright ones (EXIF orientation, see io/cameras/camera_files.py): the picture
+and the mask of a view are both read so, `CapturedPicture.pixels`.
+
+Which pixels count: finite, not saturated (an encoded channel at its maximum), wholly inside the alpha (a pixel that the
+object covers in part shows the background too) and inside the user's mask.
+
+The exposures' file is `{"ev": {picture: stops, ...}}` (the picture is 2^stops times as bright as the radiance),
+`{"factor": {picture: factor, ...}}`, or the names and stops alone.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.core.asset import Picture, Pixels
+from mistyle.core.camera import Camera
+from mistyle.core.capture import Captures, Loaded
+from mistyle.core.errors import InputRefused
+from mistyle.core.image import linear_from_srgb
+from mistyle.core.light import Lights, lights_of_views
+from mistyle.geometry.lens import Lens, pinhole, resample
+from mistyle.io.cameras.camera_files import PIXELS, SPACE, CameraFrame, ViewEntry, read_entries, read_frames
+from mistyle.io.cameras.colmap import SparsePoints, find_model
+from mistyle.io.cameras.picture_files import (
+    COPY,
+    HAND_IN,
+    check_different,
+    find,
+    find_elsewhere,
+    images_folder,
+    mask_of_view,
+    named_mask,
+    picture_folder,
+)
+from mistyle.io.cameras.views import standing_picture
+from mistyle.io.read import (
+    read_colmap,
+    read_colmap_points,
+    read_exr,
+    read_json,
+    read_picture,
+    read_radiance,
+    read_size,
+    read_stored_size,
+)
+from mistyle.io.sandbox.bounds import inside, refuse
+
+EXPECTED = "a folder with camera.json, transforms.json or a COLMAP model (sparse/0), or one of these files"
+KEPT = 2  # pictures held decoded
+TRANSFORMS = ("transforms.json", "transforms_train.json")
+
+
+@dataclass(frozen=True)
+class CapturedPicture:
+    """One picture on disk.
+
+    camera       the pinhole camera that it is resampled to
+    lens         what it was taken with
+    pixels       which pixels of the picture and the mask these two describe (io/cameras/camera_files.py)
+    factor       what its radiance was multiplied by
+    alpha_of     an EXR whose A is the alpha of a picture that has none of its own
+    orientation  the EXIF orientations 1..8 of picture and mask (1: none)
+    """
+
+    camera: Camera
+    lens: Lens
+    picture: Path
+    pixels: Pixels
+    mask: Path | None = None
+    factor: float = 1.0
+    alpha_of: Path | None = None
+    orientation: tuple[int, int] = (1, 1)
+
+
+def read_captures(
+    path: Path,
+    *,
+    lights: Path | Literal["unknown"] | None = None,
+    masks: Path | None = None,
+    exposure: Path | Mapping[str, float] | None = None,
+    pictures: Path | None = None,
+    saturation: float = 1.0,
+    coverage: float = 0.999,
+) -> Captures:
+    """The references of a fit, in the space of `camera_space`; headers are read now, pixels one picture at a time.
+
+    path        a folder or file as the module says
+    lights      a lights.json (core/light.py) for these views; None takes the one beside the cameras; "unknown" gives
+                every view an empty list
+    masks       a folder with a picture per view, by the view's name or its picture's: what is brighter than half counts
+    exposure    a file as the module says, or stops by view
+    pictures    the folder of the pictures, where they are elsewhere; of the folders that a camera file names before a
+                picture, those that are not there are left out
+    saturation  encoded value 0..1 from which a channel is taken as saturated (JPEGs often stop short of 1)
+    coverage    least alpha 0..1 of a pixel that counts; its colour is freed of the premultiplication
+
+    Refused: cameras without pictures, pictures or masks of another size than their camera, views without lights,
+    masks or exposures for some views only. What the pixels themselves say is `check_pixels`'s business.
+    """
+    shots = read_shots(path, masks=masks, exposure=exposure, pictures=pictures)
+    names = [shot.camera.name for shot in shots]
+    rig = tuple(() for _ in names) if lights == "unknown" else _lights(_home(path), lights, names)
+
+    @lru_cache(maxsize=KEPT)
+    def load(k: int) -> Loaded:
+        rgb, counts = load_shot(shots[k], saturation, coverage)
+        for array in (rgb, counts):
+            array.setflags(write=False)  # shared with whoever asks next
+        return rgb, counts
+
+    return Captures(tuple(shot.camera for shot in shots), rig, load)
+
+
+def read_shots(
+    path: Path,
+    *,
+    masks: Path | None = None,
+    exposure: Path | Mapping[str, float] | None = None,
+    pictures: Path | None = None,
+) -> tuple[CapturedPicture, ...]:
+    """The pictures of a folder with cameras, masks and exposures; sizes are checked, see `read_captures`."""
+    kind, file = _source(Path(path))
+    elsewhere = None if pictures is None else picture_folder(Path(pictures))
+    if kind == "camera.json":
+        shots = [_own(file, camera, entry, elsewhere) for camera, entry in read_entries(file)]
+    else:
+        folder = images_folder(Path(path), file) if kind == "colmap" and elsewhere is None else file.parent
+
+        def place(name: str) -> Path:
+            return find(folder, name, file) if elsewhere is None else find_elsewhere(elsewhere, name)
+
+        def size(name: str) -> tuple[int, int]:
+            return read_size(place(name), "stored")
+
+        frames = read_colmap(file) if kind == "colmap" else read_frames(file, size)
+        # Masks that the user hands in take the place of those that frames name.
+        homes = [file.parent] if elsewhere is None else [elsewhere, file.parent]
+        named = [None if f.mask is None or masks is not None else named_mask(homes, f.mask, file) for f in frames]
+        shots = [_shot(frame, place(frame.picture), mask) for frame, mask in zip(frames, named, strict=True)]
+    if elsewhere is not None:
+        check_different({shot.camera.name: shot.picture for shot in shots}, elsewhere)
+    factors = _factors(exposure, [shot.camera.name for shot in shots])
+    result = []
+    for shot, factor in zip(shots, factors, strict=True):
+        mask = shot.mask if masks is None else mask_of_view(Path(masks), shot.camera.name, shot.picture)
+        tags = _checked(shot.picture, shot), 1 if mask is None else _checked(mask, shot)
+        result.append(replace(shot, mask=mask, factor=factor, orientation=tags))
+    return tuple(result)
+
+
+def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ...]:
+    """Sentences about how the pictures and cameras of `read_shots` were understood."""
+    notes = []
+    tagged = [sum(shot.orientation[k] > 1 for shot in shots) for k in (0, 1)]
+    if any(tagged):
+        done = (
+            "It was ignored: COLMAP models and transforms.json describe the pixels as they are stored."
+            if shots[0].pixels == "stored"
+            else "They were turned upright: camera.json describes upright pictures."
+        )
+        notes.append(
+            f"Files with an EXIF orientation: {tagged[0]} pictures, {tagged[1]} masks (of {len(shots)} views). {done}"
+        )
+    unused = _home(Path(path)) / "masks"
+    if unused.is_dir() and not any(shot.mask for shot in shots):
+        notes.append(f"The folder {unused} was not used; --masks {unused} hands it in.")
+    kind, file = _source(Path(path))
+    if kind == "transforms":
+        applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
+        if applied:
+            notes.append(
+                f"{' and '.join(applied)} of {file.name} were undone: the cameras stand in the space of the "
+                "reconstruction. A mesh in nerfstudio's own space needs --align."
+            )
+    return tuple(notes)
+
+
+def camera_space(path: Path) -> Literal["working", "own"]:
+    """Whether the cameras stand about the mesh in its bounding sphere of radius 1 (camera.json, and a transforms.json
+    of ours), or in a space of their maker's: the mesh's own units, or one that alignment must find."""
+    kind, file = _source(Path(path))
+    ours = kind == "camera.json" or (kind == "transforms" and read_json(file).get("space") == SPACE)
+    return "working" if ours else "own"
+
+
+def sparse_points(path: Path) -> SparsePoints | None:
+    """The points of a COLMAP model, in the cameras' space; None for other references."""
+    kind, file = _source(Path(path))
+    return read_colmap_points(file) if kind == "colmap" else None
+
+
+def load_shot(shot: CapturedPicture, saturation: float = 1.0, coverage: float = 0.999) -> Loaded:
+    """Linear radiance as the shot's pinhole camera sees it, and which pixels count; 0 where one does not."""
+    rgb, alpha, usable = _decoded(shot, saturation)
+    if alpha is not None:
+        usable = usable & (alpha >= coverage)
+        if shot.picture.suffix.lower() == ".exr":
+            rgb = rgb / np.maximum(alpha, 1e-6)[..., None]
+    if shot.mask is not None:
+        usable = usable & _inside(shot.mask, shot.pixels)
+    rgb = np.where(usable[..., None], rgb / np.float32(shot.factor), 0).astype(np.float32)
+    return resample(shot.lens, rgb, usable)
+
+
+def silhouette(shot: CapturedPicture) -> Bool[np.ndarray, "h w"]:
+    """Where the object is, by the user's mask, else by the picture's alpha (at least half), in the pinhole camera.
+
+    Refused: a picture without either.
+    """
+    found = outline_of(shot)
+    if found is None:
+        fix = "Hand in masks (a folder with a picture of the same name per view)"
+        raise refuse(shot.picture, "neither an alpha channel nor a mask", "to know where the object is", fix)
+    return found
+
+
+def outline_of(shot: CapturedPicture) -> Bool[np.ndarray, "h w"] | None:
+    """As `silhouette`; None for a picture that has neither alpha nor mask."""
+    if shot.mask is not None:
+        covered = _inside(shot.mask, shot.pixels)
+    else:
+        alpha = _alpha(shot)
+        if alpha is None:
+            return None
+        covered = alpha >= 0.5
+    everywhere = np.ones_like(covered)
+    return resample(shot.lens, covered[..., None].astype(np.float32), everywhere)[0][..., 0] >= 0.5
+
+
+def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda done: None) -> tuple[str, ...]:
+    """Sentences about pictures that say nothing, each by name; decodes every picture once.
+
+    InputRefused when no picture says anything: all are black, or no pixel of any of them counts.
+    """
+    notes: list[str] = []
+    black = empty = 0
+    for k, camera in enumerate(captures.cameras):
+        rgb, counts = captures.load(k)
+        if not counts.any():
+            empty += 1
+            notes.append(f"{camera.name}: no pixel counts; all are saturated, masked out or see no object.")
+        elif not rgb[counts].any():
+            black += 1
+            notes.append(f"{camera.name}: black wherever it counts.")
+        progress((k + 1) / len(captures))
+    if len(captures) and black + empty == len(captures):
+        raise InputRefused(
+            f"the references: found {black} pictures that are black and {empty} without a pixel that counts, of "
+            f"{len(captures)}; expected pictures of the object. Check exposure, masks and the light."
+        )
+    if len(captures) < 3:
+        notes.append(f"{len(captures)} views: fewer than 3 do not determine normal, roughness and albedo together.")
+    return tuple(notes)
+
+
+def _source(path: Path) -> tuple[Literal["camera.json", "transforms", "colmap"], Path]:
+    """What kind of references `path` is, and the file (COLMAP: the model's folder) that holds the cameras."""
+    if path.is_dir():
+        named = [path / name for name in ("camera.json", *TRANSFORMS) if (path / name).is_file()]
+        model = find_model(path)
+        if not named and model is not None:
+            return "colmap", model
+        if not named:
+            raise refuse(path, "neither of these in the folder", EXPECTED, "Hand in the folder with the cameras")
+        path = named[0]
+    elif not path.is_file():
+        raise refuse(path, "nothing", EXPECTED, "Check the path")
+    if path.suffix.lower() != ".json":
+        raise refuse(path, f"a file ending in '{path.suffix}'", EXPECTED, "Hand in the folder with the cameras")
+    return ("transforms" if "frames" in read_json(path) else "camera.json"), path
+
+
+def _home(path: Path) -> Path:
+    return Path(path) if Path(path).is_dir() else Path(path).parent
+
+
+def _own(file: Path, camera: Camera, entry: ViewEntry, elsewhere: Path | None) -> CapturedPicture:
+    """A view of our camera.json: its EXR, or the picture that was edited or added (as io/cameras/views.py has it)."""
+    folder = file.parent
+    if elsewhere is not None:
+        folder = elsewhere
+        files = {
+            key: name and PurePosixPath(name.replace("\\", "/")).name for key, name in entry if key in ("exr", "png")
+        }
+        entry = entry.model_copy(update=files)
+    exr = folder / f"{camera.name}.exr" if entry.exr is None else inside(folder, entry.exr, file, HAND_IN)
+    picture = standing_picture(folder, camera, entry, exr if exr.is_file() else None, HAND_IN)
+    lens = Lens((camera.focal, camera.focal), camera.centre, camera.size)
+    alpha_of = exr if picture is not None and exr.is_file() else None
+    return CapturedPicture(camera, lens, picture or exr, PIXELS, alpha_of=alpha_of)
+
+
+def _shot(frame: CameraFrame, picture: Path, mask: Path | None) -> CapturedPicture:
+    focal, centre, size = pinhole(frame.lens)
+    camera = Camera(frame.world_from_cam, focal, centre, size, frame.name)
+    return CapturedPicture(camera, frame.lens, picture, frame.pixels, mask)
+
+
+def _checked(picture: Path, shot: CapturedPicture) -> int:
+    """The EXIF orientation of a picture or mask that has the size of its view's camera; refused where it has not."""
+    height, width, orientation = read_stored_size(picture)
+    if shot.pixels == "upright" and orientation > 4:
+        height, width = width, height
+    if (height, width) != shot.lens.size:
+        expected = f"{shot.lens.size[1]} x {shot.lens.size[0]}, the size of its camera (view '{shot.camera.name}')"
+        fix = "Hand in the pictures that the cameras were made for, neither scaled nor cropped"
+        if (width, height) == shot.lens.size:
+            fix = (
+                "The sides are swapped, as an EXIF rotation does that was applied to some files only: the cameras "
+                f"describe {shot.pixels} pixels, this file's orientation is {orientation} (1: none). {fix} nor turned"
+            )
+        raise refuse(picture, f"{width} x {height} pixels", expected, fix)
+    return orientation
+
+
+def _lights(home: Path, file: Path | None, names: list[str]) -> tuple[Lights, ...]:
+    found = Path(file) if file is not None else home / "lights.json"
+    if not found.is_file():
+        fix = (
+            'Write one, such as {"lights": [{"type": "environment", "file": "studio.hdr"}]} or {"views": {"'
+            f'{names[0]}": [{{"type": "directional", "direction": [0, 1, 0], "irradiance": [3, 3, 3]}}], ...}}}}'
+        )
+        raise refuse(found, "no file", "the light of each picture", fix)
+    maps: dict[str, np.ndarray] = {}
+
+    def load(name: str) -> Float[np.ndarray, "h w 3"]:
+        if name not in maps:
+            maps[name] = read_radiance(inside(found.parent, name, found, COPY))
+        return maps[name]
+
+    return lights_of_views(read_json(found), names, str(found), load)
+
+
+def _factors(exposure: Path | Mapping[str, float] | None, names: list[str]) -> list[float]:
+    """What each picture's radiance was multiplied by."""
+    if exposure is None:
+        return [1.0] * len(names)
+    where = exposure if isinstance(exposure, Path | str) else "exposure"
+    tree: Mapping[str, Any] = read_json(Path(where)) if isinstance(exposure, Path | str) else exposure
+    table = tree.get("factor", tree.get("ev", tree))
+    if not isinstance(table, Mapping):
+        raise refuse(where, f"a {type(table).__name__}", "an object: picture -> number", "Correct the file")
+    factors = []
+    for name in names:
+        value = table.get(name)
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            raise refuse(where, f"{value!r} for the view '{name}'", "a number for every view", "Add it")
+        factor = float(value) if "factor" in tree else 2.0**value if abs(value) < 100 else 0.0
+        if factor <= 0:
+            raise refuse(where, f"{value!r} for the view '{name}'", "a factor > 0, or stops below 100", "Correct it")
+        factors.append(factor)
+    return factors
+
+
+def _decoded(
+    shot: CapturedPicture, saturation: float
+) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"] | None, Bool[np.ndarray, "h w"]]:
+    """Linear colours (still premultiplied in an EXR), alpha, and where they are finite and not saturated."""
+    if shot.picture.suffix.lower() == ".exr":
+        planes = read_exr(shot.picture)
+        if not {"R", "G", "B"} <= set(planes):
+            found = f"channels {', '.join(sorted(planes))[:200]}"
+            raise refuse(shot.picture, found, "R, G and B", "Write the colours as R, G, B")
+        rgb = np.stack([planes[c] for c in "RGB"], axis=-1)
+        return rgb, planes.get("A"), np.asarray(np.isfinite(rgb).all(axis=-1))
+    picture = read_picture(shot.picture, shot.pixels)
+    alpha = _alpha(shot, picture)
+    return linear_from_srgb(picture.rgb), alpha, np.asarray((picture.rgb < saturation).all(axis=-1))
+
+
+def _alpha(shot: CapturedPicture, decoded: Picture | None = None) -> Float[np.ndarray, "h w"] | None:
+    """The alpha of the picture (`decoded`, where it is at hand), or of the EXR that it took the place of."""
+    if shot.picture.suffix.lower() == ".exr":
+        return read_exr(shot.picture).get("A")
+    picture = read_picture(shot.picture, shot.pixels) if decoded is None else decoded
+    if picture.alpha is not None or shot.alpha_of is None:
+        return picture.alpha
+    return read_exr(shot.alpha_of).get("A")
+
+
+def _inside(mask: Path, pixels: Pixels) -> Bool[np.ndarray, "h w"]:
+    if mask.suffix.lower() == ".exr":
+        planes = read_exr(mask)
+        return next((planes[c] for c in ("A", "Y", "R") if c in planes), np.zeros(read_size(mask), np.float32)) > 0.5
+    picture = read_picture(mask, pixels)
+    bright = picture.rgb.mean(axis=-1) > 0.5
+    return bright if picture.alpha is None else bright & (picture.alpha > 0.5)

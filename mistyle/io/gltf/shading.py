@@ -1,0 +1,88 @@
+"""What a glTF material says besides its base colour, metalness, roughness and normal map; every number is checked."""
+
+import math
+from typing import Any
+
+from mistyle.core.asset import Shading
+from mistyle.io.gltf.infos import shadeless
+
+Tree = dict[str, Any]
+Triple = tuple[float, float, float]
+MAX_RADIANCE = 1e6
+GLOSSY = "KHR_materials_pbrSpecularGlossiness"
+
+
+def shading_of(entry: Tree, through: bool) -> Shading:
+    """The factors of a material of the file's checked JSON; `through`: its alpha counts (gltf_infos `sees_through`).
+
+    F0 and F90 are those of KHR_materials_ior and KHR_materials_specular, or the specular colour of
+    KHR_materials_pbrSpecularGlossiness.
+    """
+    said = entry.get("extensions", {})
+    glossy, pbr = extension(said, GLOSSY), entry.get("pbrMetallicRoughness", {})
+    unlit = "KHR_materials_unlit" in said
+    named = GLOSSY in said or unlit or "pbrMetallicRoughness" in entry
+    ior = number(extension(said, "KHR_materials_ior"), "ior", 1.5, 0.0, 10.0)
+    specular, edge = _reflectance(said, ior)
+    alpha = (glossy.get("diffuseFactor") if GLOSSY in said else pbr.get("baseColorFactor")) or [1, 1, 1, 1]
+    masked = through and entry["alphaMode"] == "MASK"
+    coat, glass = extension(said, "KHR_materials_clearcoat"), extension(said, "KHR_materials_transmission")
+    volume = extension(said, "KHR_materials_volume")
+    return Shading(
+        opacity=_bounded(alpha[3] if len(alpha) == 4 else 1.0, 1.0, 0.0, 1.0) if through else 1.0,
+        cutoff=number(entry, "alphaCutoff", 0.5, 0.0, MAX_RADIANCE) if masked else None,
+        emission=_emission(entry, said),
+        specular=specular,
+        edge=edge,
+        coat=number(coat, "clearcoatFactor", 0.0, 0.0, 1.0),
+        coat_roughness=number(coat, "clearcoatRoughnessFactor", 0.0, 0.0, 1.0) if coat else 0.0,
+        # A texture says which parts are glass; without reading it, none is.
+        transmission=0.0 if "transmissionTexture" in glass else number(glass, "transmissionFactor", 0.0, 0.0, 1.0),
+        ior=ior,
+        thin=number(volume, "thicknessFactor", 0.0, 0.0, math.inf) == 0,
+        unlit=unlit,
+        black=shadeless(entry) and not unlit,
+        stated="surface" if named else "colour",
+    )
+
+
+def _reflectance(said: Tree, ior: float) -> tuple[Triple, float]:
+    if GLOSSY in said:
+        return triple(extension(said, GLOSSY), "specularFactor", (1.0, 1.0, 1.0), 1.0), 1.0
+    specular = extension(said, "KHR_materials_specular")
+    weight = number(specular, "specularFactor", 1.0, 0.0, 1.0)
+    normal = 1.0 if ior == 0 else round(((ior - 1) / (ior + 1)) ** 2, 12)  # 0.04 for 1.5, as the default is
+    red, green, blue = triple(specular, "specularColorFactor", (1.0, 1.0, 1.0), MAX_RADIANCE)
+    return (min(normal * red, 1) * weight, min(normal * green, 1) * weight, min(normal * blue, 1) * weight), weight
+
+
+def _emission(entry: Tree, said: Tree) -> Triple:
+    strength = number(extension(said, "KHR_materials_emissive_strength"), "emissiveStrength", 1.0, 0.0, MAX_RADIANCE)
+    red, green, blue = triple(entry, "emissiveFactor", (0.0, 0.0, 0.0), MAX_RADIANCE)
+    return red * strength, green * strength, blue * strength
+
+
+def extension(said: Tree, name: str) -> Tree:
+    """An extension's object; empty where it is not there or of another kind."""
+    found = said.get(name)
+    return found if isinstance(found, dict) else {}
+
+
+def number(place: Tree, name: str, otherwise: float, low: float, high: float) -> float:
+    """A number of the JSON between bounds; `otherwise` where it is not there or of another kind."""
+    return _bounded(place.get(name), otherwise, low, high)
+
+
+def triple(place: Tree, name: str, otherwise: Triple, high: float) -> Triple:
+    """Three numbers of the JSON from 0 to `high`."""
+    found = place.get(name)
+    if not isinstance(found, list) or len(found) < 3:
+        return otherwise
+    red, green, blue = (_bounded(c, o, 0.0, high) for c, o in zip(found[:3], otherwise, strict=True))
+    return red, green, blue
+
+
+def _bounded(value: Any, otherwise: float, low: float, high: float) -> float:
+    if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
+        return otherwise
+    return min(max(float(value), low), high)

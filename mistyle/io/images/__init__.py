@@ -1,0 +1,1 @@
+"""Pictures and textures: decoding, colour profiles, encoding, packing."""

@@ -1,0 +1,77 @@
+"""MaterialX 1.39: one OpenPBR surface per material, its images beside it. Written as XML, without the library.
+
+Nodes and inputs are those of the specification (`ND_open_pbr_surface_surfaceshader`, `ND_normalmap_float`); colours
+are given as "srgb_texture" in 8-bit files and by their linear space in EXR, data as none.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from xml.etree import ElementTree
+from xml.etree.ElementTree import Element, SubElement
+
+from mistyle.core.names import distinct
+from mistyle.io.images.ocio import ColourSpace, materialx_space
+from mistyle.io.store.atomic import atomic_write
+
+
+@dataclass(frozen=True)
+class TexturedMaterial:
+    """A material and its images: file names as the document names them. The albedo is sRGB, or light in `space` (None:
+    linear Rec.709). `name` is an identifier (core/names.py); `title` is the user's name for it, or ""."""
+
+    name: str
+    albedo: str
+    normal: str
+    roughness: str
+    metallic: str
+    srgb: bool = True
+    space: ColourSpace | None = None
+    title: str = ""
+
+
+def write_materialx(path: Path, looks: Sequence[TexturedMaterial]) -> None:
+    """Write the document; texture coordinates have v up, as MaterialX has them. Normal maps are tangent space, +Y."""
+    root = Element("materialx", version="1.39", colorspace="lin_rec709")
+    names = [look.name for look in looks]
+    # Siblings of one document: a material may itself be called SR_….
+    every = distinct([*names, *(f"NG_{n}" for n in names), *(f"SR_{n}" for n in names)])
+    rows = zip(looks, every[len(names) : 2 * len(names)], every[2 * len(names) :], strict=True)
+    for look, graph_name, surface_name in rows:
+        graph = SubElement(root, "nodegraph", name=graph_name)
+        colour = _image(graph, "albedo", "color3", look.albedo)
+        colour.set("colorspace", "srgb_texture" if look.srgb else materialx_space(look.space))
+        _image(graph, "roughness", "float", look.roughness)
+        _image(graph, "metallic", "float", look.metallic)
+        _image(graph, "normal", "vector3", look.normal)
+        bump = SubElement(graph, "normalmap", name="normal_in_world", type="vector3")
+        SubElement(bump, "input", name="in", type="vector3", nodename="image_normal")
+        outputs = (
+            ("albedo", "color3", "image_albedo"),
+            ("roughness", "float", "image_roughness"),
+            ("metallic", "float", "image_metallic"),
+            ("normal", "vector3", "normal_in_world"),
+        )
+        for name, kind, node in outputs:
+            SubElement(graph, "output", name=f"out_{name}", type=kind, nodename=node)
+        surface = SubElement(root, "open_pbr_surface", name=surface_name, type="surfaceshader")
+        inputs = (
+            ("base_color", "color3", "albedo"),
+            ("specular_roughness", "float", "roughness"),
+            ("base_metalness", "float", "metallic"),
+            ("geometry_normal", "vector3", "normal"),
+        )
+        for name, kind, source in inputs:
+            SubElement(surface, "input", name=name, type=kind, nodegraph=graph_name, output=f"out_{source}")
+        material = SubElement(root, "surfacematerial", name=look.name, type="material")
+        if look.title not in ("", look.name):
+            material.set("doc", look.title)
+        SubElement(material, "input", name="surfaceshader", type="surfaceshader", nodename=surface_name)
+    ElementTree.indent(root, "  ")
+    text = ElementTree.tostring(root, encoding="unicode")
+    atomic_write(path, f'<?xml version="1.0"?>\n{text}\n'.encode())
+
+
+def _image(graph: Element, name: str, kind: str, file: str) -> Element:
+    node = SubElement(graph, "image", name=f"image_{name}", type=kind)
+    return SubElement(node, "input", name="file", type="filename", value=file)

@@ -1,0 +1,1 @@
+"""Mesh files of plain formats, and the way from a parsed mesh to an asset."""

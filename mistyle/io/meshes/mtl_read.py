@@ -1,0 +1,255 @@
+"""Material libraries of Wavefront OBJ (MTL, with its extension for physically based materials)."""
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from mistyle.geometry.retexture import REPEAT
+from mistyle.io.images.quantisation import Kind, fractions, linear_rows
+from mistyle.io.images.read import Budget, named_texture
+from mistyle.io.meshes.parsed_mesh import Maps, RawMap, RawMaterial, no_textures
+from mistyle.io.sandbox.bounds import read_bytes
+from mistyle.io.sandbox.nearby import decoded, unmarked
+
+MAX_LIBRARY_BYTES = 16 << 20
+TEXTURES = {"map_kd": "albedo", "map_pr": "roughness", "map_pm": "metallic", "norm": "normal"}
+BUMPS = ("map_bump", "bump")
+NAMING = {*TEXTURES, *BUMPS}  # statements whose pictures are opened
+# Options of a texture statement and how many values follow; the file name is what comes after them.
+OPTIONS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3, "-blendu": 1, "-blendv": 1, "-boost": 1, "-texres": 1}
+OPTIONS |= {"-clamp": 1, "-bm": 1, "-imfchan": 1, "-type": 1, "-cc": 1, "-colorspace": 1}
+# Statements without a note: read, without a meaning for a surface that is lit by rays, or at a value that does nothing.
+READ = {*NAMING, "kd", "pr", "pm", "ka", "ni", "illum", "sharpness", "map_aat"}
+OPACITY = {"d": 1.0, "tr": 0.0}
+NEUTRAL = {"tf": 1.0, "ks": 0.0, "ke": 0.0, "ps": 0.0, "pc": 0.0, "pcr": 0.0, "aniso": 0.0, "anisor": 0.0} | OPACITY
+# A linear file says so by these names of colour spaces; all others are taken as sRGB, with a note if they are not.
+LINEAR = ("linear", "raw", "lin_rec709", "lin_srgb", "non-color", "data", "none")
+SRGB = ("srgb", "srgb_texture", "auto", "gamma22", "rec709")
+FLAT_GREY = 8  # of 255: how far the channels of a grey picture lie apart (JPEG)
+
+
+@dataclass(frozen=True)
+class Statement:
+    """A texture statement: (u, v) -> scale * (u, v) + offset, then value -> base + gain * value."""
+
+    file: str
+    scale: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+    turbulence: bool = False
+    clamp: bool = False
+    strength: float = 1.0
+    base: float = 0.0
+    gain: float = 1.0
+    channel: str = ""
+    space: str = ""
+
+    @property
+    def transform(self) -> Float[np.ndarray, "3 3"] | None:
+        """For coordinates with v up; None where they stay."""
+        if self.scale == (1, 1) and self.offset == (0, 0):
+            return None
+        return np.array([[self.scale[0], 0, self.offset[0]], [0, self.scale[1], self.offset[1]], [0, 0, 1.0]])
+
+
+@dataclass(frozen=True)
+class MtlEntry:
+    """One material as its library has it: the last value of every statement by its keyword in small letters.
+
+    roots    folders that texture names are relative to: the library's, then the mesh's
+    spelled  the keywords as the file spells them
+    """
+
+    name: str
+    library: Path
+    roots: tuple[Path, ...]
+    values: dict[str, str]
+    spelled: dict[str, str]
+
+
+def read_library(library: Path, mesh: Path) -> tuple[dict[str, MtlEntry], tuple[str, ...]]:
+    """The materials by name, and notes. A file that is not UTF-8 is read as Windows-1252 (or Latin-1)."""
+    lines = unmarked(read_bytes(library, MAX_LIBRARY_BYTES)).splitlines()
+    texts, plain = decoded(*lines)
+    roots = tuple(dict.fromkeys((library.parent.resolve(), mesh.parent.resolve())))
+    entries: dict[str, MtlEntry] = {}
+    current = MtlEntry("", library, roots, {}, {})
+    for line in texts:
+        keyword, *rest = line.split(None, 1)[:2] or ("#",)
+        if keyword.startswith("#") or not rest:
+            continue
+        if keyword.lower() == "newmtl":
+            name = rest[0].strip()
+            current = entries.setdefault(name, MtlEntry(name, library, roots, {}, {}))
+        else:
+            current.values[keyword.lower()] = rest[0].strip()
+            current.spelled[keyword.lower()] = keyword
+    notes = () if plain else (f"{library.name} is not UTF-8; its names were read as Windows-1252.",)
+    return entries, notes
+
+
+def material(entry: MtlEntry, budget: Budget) -> RawMaterial:
+    """Kd counts where there is no map_Kd (many exporters write Kd 0 or 0.8 beside a texture), Pr and Pm likewise."""
+    named = {TEXTURES[k]: statement(v) for k, v in entry.values.items() if k in TEXTURES}
+    bump = next((statement(entry.values[k]) for k in BUMPS if k in entry.values), None)
+    textures = named | ({"bump": bump} if bump is not None else {})
+    colour = [1.0, 1.0, 1.0] if "albedo" in named else _colour(entry)
+    rough = 1.0 if "roughness" in named else _numbers(entry, "pr", [0.5])[0]
+    metal = 1.0 if "metallic" in named else _numbers(entry, "pm", [0.0])[0]
+    tiled = any(tile_name(texture.file, 1001) is not None for texture in textures.values())
+    red, green, blue = (float(np.clip(c, 0, 1)) for c in colour)
+    return RawMaterial(
+        entry.name,
+        partial(_load, textures, entry, budget) if textures else no_textures,
+        (tiled or False) if textures else None,
+        (red, green, blue),
+        float(np.clip(rough, 0, 1)),
+        float(np.clip(metal, 0, 1)),
+    )
+
+
+def unread(entries: Sequence[MtlEntry]) -> list[str]:
+    """Notes on the statements of materials that change how they look and were not read."""
+    notes, left = [], {}
+    for entry in entries:
+        if "map_d" in entry.values or any(_changes(entry, key) for key in OPACITY):
+            notes.append(f"The opacity of material '{entry.name}' was not read.")
+        for key in entry.values:
+            ignored = key not in READ and key not in OPACITY and key != "map_d" and _changes(entry, key)
+            odd = key == "kd" and "map_kd" not in entry.values and np.isnan(_numbers(entry, key, [np.nan])[0])
+            if ignored or odd:  # odd: a spectrum
+                left.setdefault(entry.library.name, {})[entry.spelled[key]] = None
+    said = (f"{library}: these statements were not read: {', '.join(keys)}." for library, keys in left.items())
+    return [*notes, *said]
+
+
+def _changes(entry: MtlEntry, key: str) -> bool:
+    if key not in entry.values:
+        return False
+    if key == "ns":  # the exponent of Ks; Pr says it better
+        return _changes(entry, "ks")
+    if key == "ks" and {"pr", "map_pr", "pm", "map_pm"} & set(entry.values):
+        return False
+    if key == "map_ka":
+        return entry.values[key] != entry.values.get("map_kd")
+    try:
+        return any(float(word) != NEUTRAL[key] for word in entry.values[key].split())
+    except (KeyError, ValueError):
+        return True
+
+
+def _colour(entry: MtlEntry) -> list[float]:
+    """Kd: three numbers, or one for all."""
+    grey = _numbers(entry, "kd", [1.0])
+    return grey * 3 if len(entry.values.get("kd", "").split()) == 1 else _numbers(entry, "kd", [1.0] * 3)
+
+
+def _numbers(entry: MtlEntry, key: str, default: list[float]) -> list[float]:
+    try:
+        found = [float(x) for x in entry.values.get(key, "").split()[: len(default)]]
+    except ValueError:
+        return default
+    return found if len(found) == len(default) and np.isfinite(found).all() else default
+
+
+def statement(text: str) -> Statement:
+    """A texture statement's options, and the file name behind them, which may hold spaces."""
+    rest, given = text, {}
+    while (parts := rest.split(None, 1)) and parts[0].lower() in OPTIONS and len(parts) == 2:
+        option, rest = parts[0].lower(), parts[1]
+        values: list[str] = []
+        for k in range(OPTIONS[option]):
+            pieces = rest.split(None, 1)
+            if len(pieces) < 2 or (k > 0 and not re.fullmatch(r"[-+.\deE]+", pieces[0])):
+                break
+            values.append(pieces[0])
+            rest = pieces[1]
+        given[option] = values
+
+    def numbers(option: str, default: tuple[float, ...]) -> tuple[float, ...]:
+        try:
+            found = [float(x) for x in given.get(option, ())][: len(default)]
+        except ValueError:
+            return default
+        return (*found, *default[len(found) :]) if np.isfinite(found).all() else default
+
+    scale, offset, mm = numbers("-s", (1.0, 1.0)), numbers("-o", (0.0, 0.0)), numbers("-mm", (0.0, 1.0))
+    word = {option: (given.get(option) or [""])[0].lower() for option in ("-clamp", "-imfchan", "-colorspace")}
+    return Statement(
+        rest.strip(), (scale[0], scale[1]), (offset[0], offset[1]), any(numbers("-t", (0.0, 0.0, 0.0))),
+        word["-clamp"] == "on", numbers("-bm", (1.0,))[0], mm[0], mm[1], word["-imfchan"], word["-colorspace"],
+    )  # fmt: skip
+
+
+def tile_name(file: str, tile: int) -> str | None:
+    """The file of a UDIM tile, where the name marks tiles (<UDIM>, or 1001 between dots or underscores); else None."""
+    if "<UDIM>" in file:
+        return file.replace("<UDIM>", str(tile))
+    marked = r"(?<=[._])1001(?=[._][^/\\]*$)"
+    return re.sub(marked, str(tile), file) if re.search(marked, file) else None
+
+
+def _load(textures: dict[str, Statement], entry: MtlEntry, budget: Budget, tile: int) -> tuple[Maps, tuple[str, ...]]:
+    maps: dict[str, RawMap] = {}
+    notes: list[str] = []
+    for name, said in textures.items():
+        wanted = tile_name(said.file, tile) or said.file
+        if name == "bump" and "normal" in maps:
+            if said.file != textures["normal"].file:
+                notes.append(f"Bump map {wanted} was left out beside the normal map of material '{entry.name}'.")
+            continue
+        pixels = named_texture(entry.library, entry.roots, wanted, budget, notes)
+        if pixels is None:
+            continue
+        found = _meant("normal" if name == "bump" else name, said, *pixels, notes)
+        if name == "bump" and not _is_normal_map(pixels[0]):
+            notes.append(f"Bump map {wanted} holds heights, not normals, and was left out.")
+            continue
+        maps["normal" if name == "bump" else name] = found
+    return maps, tuple(notes)
+
+
+def _meant(name: str, said: Statement, pixels: np.ndarray, linear: bool, notes: list[str]) -> RawMap:
+    """One map as its statement's options have it."""
+    if said.turbulence:
+        notes.append(f"The turbulence (-t) of texture {said.file} was not read.")
+    if said.space and said.space not in (*LINEAR, *SRGB):
+        notes.append(f"The colour space {said.space} of texture {said.file} is not known and was not read.")
+    kind: Kind = "colour" if name == "albedo" else "normal" if name == "normal" else "data"
+    if name == "albedo" and (linear or said.space in LINEAR):
+        kind, pixels = "data", np.clip(fractions(pixels), 0, 1)
+    elif kind == "data":
+        pixels = np.clip(pixels, 0, 1) if linear else pixels
+        pixels = _channel(linear_rows(pixels) if said.space in SRGB and said.space != "auto" else pixels, said, notes)
+    if (said.base, said.gain) != (0, 1) and kind != "normal":
+        pixels = np.clip(fractions(pixels) * np.float32(said.gain) + np.float32(said.base), 0, 1)
+    return RawMap(
+        pixels,
+        transform=said.transform,
+        kind=kind,
+        scale=said.strength if kind == "normal" else 1.0,
+        wrap=("clamp", "clamp") if said.clamp else REPEAT,
+    )
+
+
+def _channel(pixels: Shaped[np.ndarray, "h w 3"], said: Statement, notes: list[str]) -> Shaped[np.ndarray, "h w"]:
+    """The channel that `-imfchan` names; red where it names none."""
+    if said.channel in ("m", "z"):
+        notes.append(f"Channel {said.channel} of texture {said.file} is not read; red was taken.")
+    if said.channel == "l":
+        return fractions(pixels) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
+    return np.ascontiguousarray(pixels[..., {"g": 1, "b": 2}.get(said.channel, 0)])
+
+
+def _is_normal_map(pixels: Shaped[np.ndarray, "h w 3"]) -> bool:
+    """Whether the colours of a picture are unit vectors that point outwards; heights are grey."""
+    colours = fractions(pixels[:: max(1, len(pixels) // 512), :: max(1, pixels.shape[1] // 512)])
+    apart = colours.max(axis=2) - colours.min(axis=2)
+    if np.quantile(apart, 0.99) <= FLAT_GREY / 255:
+        return False
+    length = np.linalg.norm(colours * 2 - 1, axis=2)
+    return bool(colours[..., 2].mean() > 0.5 and np.median(np.abs(length - 1)) < 0.2)

@@ -1,0 +1,125 @@
+"""The only reader of pictures and tables that a user or a stranger hands in; `read_mesh.py` is that of meshes.
+
+What cannot be used is refused (core/errors.py InputRefused) with the file, what was found, what was expected and the
+fix. Nothing is fetched from a network, and nothing is repaired in silence: what was changed on the way in is in
+`Picture.notes`.
+
+Files are opened and decoded in the reader process (io/sandbox/reader_process.py), which has limits on memory and time
+and cannot write; here only the numbers that it found are put together. A Mitsuba scene of the user's (`--scene`) is not
+read here: it can name any file and plugin and is trusted like code.
+"""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.asset import Picture, Pixels
+from mistyle.io.images.layers import LayeredPicture, frame_of
+from mistyle.io.images.read import picture_of
+from mistyle.io.sandbox.reader_process import ask
+
+__all__ = [
+    "LayeredPicture",
+    "Picture",
+    "read_colmap",
+    "read_colmap_points",
+    "read_exr",
+    "read_frame",
+    "read_hdr",
+    "read_json",
+    "read_npy",
+    "read_picture",
+    "read_radiance",
+    "read_size",
+    "read_stored_size",
+    "read_toml",
+    "read_yaml",
+    "shrink_picture",
+]
+
+
+def read_exr(path: Path) -> dict[str, Float[np.ndarray, "h w"]]:
+    """The channels of an OpenEXR file by full name ("R", "normal.X"), float32, display window, row 0 at the top.
+
+    The header is checked before anything is decoded: windows, number of channels, texels. Of a file with several parts
+    all are read, their names before the channels'. Deep files and subsampled channels are refused.
+    """
+    return {name: np.asarray(plane, np.float32) for name, plane in ask("exr", Path(path)).items()}
+
+
+def read_frame(path: Path) -> LayeredPicture:
+    """A picture to compare: the layers of an .exr (of all its parts, whatever their windows) by name, or the one layer
+    of an .hdr, PNG, JPEG, WebP or TIFF; linear Rec.709, premultiplied, NaN and infinities kept.
+
+    Checked like `read_exr` and `read_picture`: header first, bounded. Two layers of one name are refused.
+    """
+    path = Path(path)
+    return ask("frame", path) if path.suffix.lower() in (".exr", ".hdr") else frame_of(read_picture(path))
+
+
+def read_hdr(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """A Radiance .hdr file: linear Rec.709 radiance, float32, row 0 at the top."""
+    return ask("hdr", Path(path))
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """A JSON object from a file of at most 64 MiB, nested at most 128 deep, without NaN or Infinity."""
+    return ask("json", Path(path))
+
+
+def shrink_picture(path: Path, data: bytes, longest: int, quality: int) -> tuple[bytes, str]:
+    """The picture in `data`, embedded in the file at `path`, as a JPEG (PNG with transparency) of at most `longest`
+    pixels on a side: its bytes and MIME type."""
+    return ask("shrink", Path(path), data, longest, quality)
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """A TOML file of at most 4 MiB; dates and times, which no setting has, are refused."""
+    return ask("toml", Path(path))
+
+
+def read_yaml(path: Path) -> Any:
+    """The numbers, texts, lists and tables of a YAML file of at most 4 MiB; objects and dates are refused."""
+    return ask("yaml", Path(path))
+
+
+def read_npy(path: Path) -> np.ndarray:
+    """The array of numbers in an .npy file; files of objects and damaged ones are refused."""
+    return ask("npy", Path(path))
+
+
+def read_picture(path: Path, pixels: Pixels = "upright") -> Picture:
+    """A style or any other picture file as sRGB-encoded float32 0..1; see io/images/read.py."""
+    return picture_of(Path(path), ask("picture", Path(path), pixels))
+
+
+def read_radiance(path: Path) -> Float[np.ndarray, "h w 3"]:
+    """An environment map: linear Rec.709 radiance >= 0 of an .exr (its R, G, B) or .hdr, row 0 at the top."""
+    return ask("radiance", Path(path))
+
+
+def read_size(path: Path, pixels: Pixels = "upright") -> tuple[int, int]:
+    """Height and width of a picture (EXIF orientation applied unless "stored") or an .exr (display window), from its
+    header alone."""
+    height, width, orientation = read_stored_size(path)
+    return (width, height) if pixels == "upright" and orientation > 4 else (height, width)
+
+
+def read_stored_size(path: Path) -> tuple[int, int, int]:
+    """Height and width of the pixels that a picture file stores, and its EXIF orientation 1..8 (1: none)."""
+    height, width, orientation = ask("size", Path(path))
+    return height, width, orientation
+
+
+def read_colmap(folder: Path) -> list[Any]:
+    """The registered images of a COLMAP model as io/cameras/camera_files.py Frames; see io/cameras/colmap.py
+    `read_model`.
+    """
+    return ask("colmap_model", Path(folder))
+
+
+def read_colmap_points(folder: Path) -> Any:
+    """The points of a COLMAP model (io/cameras/colmap.py SparsePoints), or None where it has no points3D file."""
+    return ask("colmap_points", Path(folder))

@@ -1,0 +1,113 @@
+"""Text and file names as other machines wrote them: byte-order marks, other encodings, paths of another disk."""
+
+import os
+import re
+import unicodedata
+from collections.abc import Sequence
+from itertools import islice
+from pathlib import Path
+
+from mistyle.core.errors import InputRefused
+from mistyle.io.sandbox.bounds import inside
+
+TEXTURES = "textures"  # the folder that archives of models have, in the mesh's folder or beside it
+MARKS = ((b"\xef\xbb\xbf", "utf-8"), (b"\xff\xfe", "utf-16-le"), (b"\xfe\xff", "utf-16-be"))
+MAX_ENTRIES = 20_000  # of a folder that are looked at
+FIX = "Copy the file into the mesh's folder and name it relative to the mesh"
+
+
+def unmarked(data: bytes) -> bytes:
+    """A text's bytes without a byte-order mark, which is not a letter; UTF-16 becomes UTF-8."""
+    for mark, encoding in MARKS:
+        if data.startswith(mark):
+            text = data[len(mark) :]
+            return text if encoding == "utf-8" else text.decode(encoding, "replace").encode()
+    return data
+
+
+def decoded(*texts: bytes) -> tuple[list[str], bool]:
+    """Names from one file, and whether they are UTF-8: else all of them are taken as Windows-1252 or Latin-1."""
+    for encoding in ("utf-8", "cp1252"):
+        try:
+            return [text.decode(encoding) for text in texts], encoding == "utf-8"
+        except UnicodeDecodeError:
+            continue
+    return [text.decode("latin-1") for text in texts], False
+
+
+def mesh_folders(path: Path) -> tuple[Path, ...]:
+    """Where a mesh file's own names lead: its folder, then that of the file behind a link."""
+    return tuple(dict.fromkeys((path.parent.resolve(), path.resolve().parent)))
+
+
+def named_file(
+    where: Path, roots: Sequence[Path], name: str, *, picture: bool = True
+) -> tuple[Path | None, str | None]:
+    """The file that `where` names, and the place where it was found if it was not where the name says.
+
+    The name counts as it stands, relative to each folder of `roots`. Else its last parts are looked for there, upper
+    and lower case alike, and for a `picture` its last part in the folder `textures` of a root or beside it: the only
+    folder outside the roots that is ever opened. None where there is no such file. Raises InputRefused where there is
+    none and the name leads out of the roots.
+    """
+    name = name.strip().strip('"')
+    refused: InputRefused | None = None
+    for root in roots:
+        try:
+            target = inside(root, name, where, FIX)
+        except InputRefused as error:
+            refused = error
+            continue
+        if target.is_file():
+            return target, None
+    for root in roots:
+        found = _found(root.resolve(), name, picture)
+        if found is not None:
+            return found, os.path.relpath(found, where.parent.resolve()).replace("\\", "/")
+    if refused is not None:
+        raise refused
+    return None, None
+
+
+def _found(root: Path, name: str, picture: bool) -> Path | None:
+    parts = [part for part in re.split(r"[/\\]", name) if part not in ("", ".", "..") and not part.endswith(":")]
+    if not parts or "\0" in name:
+        return None
+    places = [(root, parts[k:]) for k in range(len(parts))]
+    if picture:
+        folders = [_entry(root, TEXTURES), _entry(root.parent, TEXTURES)]
+        places += [(folder, parts[-1:]) for folder in folders if folder is not None]
+    for folder, tail in places:
+        # A link to a file outside is not followed: the folder itself was reached without one.
+        target = _walk(folder, tail)
+        if target is not None and target.resolve().is_relative_to(folder) and target.is_file():
+            return target.resolve()
+    return None
+
+
+def _walk(folder: Path, parts: Sequence[str]) -> Path | None:
+    here: Path | None = folder
+    for part in parts:
+        here = _entry(here, part) if here is not None else None
+    return here
+
+
+def _entry(folder: Path, name: str) -> Path | None:
+    """The entry of that name, else the only one that differs in case or Unicode form alone."""
+    names = _names(folder)
+    if name in names:
+        return folder / name
+    alike = [n for n in names if _folded(n) == _folded(name)]
+    return folder / alike[0] if len(alike) == 1 else None
+
+
+def _folded(name: str) -> str:
+    return unicodedata.normalize("NFC", name).casefold()
+
+
+def _names(folder: Path) -> set[str]:
+    try:
+        with os.scandir(folder) as entries:
+            return {entry.name for entry in islice(entries, MAX_ENTRIES)}
+    except OSError:
+        return set()

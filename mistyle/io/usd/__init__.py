@@ -1,0 +1,1 @@
+"""USD: checked, read, written, and overlaid with new materials."""

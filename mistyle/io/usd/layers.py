@@ -1,0 +1,180 @@
+"""What a USD file stands on, checked before USD composes it: every layer and package in the file's own folder."""
+
+import posixpath
+import re
+import zipfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import InputRefused
+from mistyle.io.sandbox.bounds import MAX_FILE_BYTES, USD, refuse
+
+MAX_LAYERS = 2_000
+MAX_ENTRIES = 20_000
+COPY = "Copy it into the mesh's folder, or flatten the stage (usdcat --flatten)"
+
+
+@dataclass(frozen=True)
+class PackagedFile:
+    """A file, or a file inside a package (`inner`, its path there)."""
+
+    file: Path
+    inner: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.file}[{self.inner}]" if self.inner else str(self.file)
+
+
+def place_of(layer: Any) -> PackagedFile:
+    """Where an opened layer lies."""
+    outer, bracket, inner = str(layer.identifier).partition("[")
+    return _inside(PackagedFile(Path(outer).resolve(), inner.removesuffix("]") if bracket else ""))
+
+
+def _inside(place: PackagedFile) -> PackagedFile:
+    """A package by itself is the first file in it."""
+    if place.inner or place.file.suffix.lower() != ".usdz":
+        return place
+    with zipfile.ZipFile(place.file) as package:
+        return PackagedFile(place.file, package.namelist()[0])
+
+
+def locate(root: Path, anchor: PackagedFile, reference: str) -> PackagedFile:
+    """The file that a layer at `anchor` names. Raises InputRefused where it is outside `root` or no plain file name."""
+    found = f"a reference to {reference[:120]!r}"
+    name = reference.replace("\\", "/")
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name) or name.startswith(("//", "`")) or not name or "\0" in name:
+        raise refuse(anchor.file, found, "a relative file name (nothing is fetched)", COPY)
+    outer, bracket, inner = name.partition("[")
+    inner = inner.removesuffix("]")
+    if anchor.inner:
+        whole = posixpath.normpath(posixpath.join(posixpath.dirname(anchor.inner), outer))
+        if whole.startswith(("/", "..")) or bracket:
+            raise refuse(anchor.file, found, "a file inside the package", "Package the asset again")
+        return PackagedFile(anchor.file, whole)
+    try:
+        target = (anchor.file.parent / outer).resolve()
+    except (OSError, RuntimeError) as error:  # a loop of links
+        raise refuse(anchor.file, found, "a file name", COPY) from error
+    if not target.is_relative_to(root):
+        raise refuse(anchor.file, found, "a file inside the mesh's own folder", COPY)
+    return PackagedFile(target, inner if bracket else "")
+
+
+def check_layers(pxr: Any, path: Path) -> list[Path]:
+    """Open the file and all layers that it is composed of, one by one, each only after its name and size passed.
+
+    Returns the files. Refused: names that lead out of the folder or to a network, layers of other formats, packages
+    that are compressed or nested, value clips (which would be opened later), too many or too large files.
+    """
+    root, start = path.resolve().parent, PackagedFile(path.resolve())
+    waiting, seen = [start], {str(start)}
+    files: dict[Path, int] = {}
+    while waiting:
+        here = waiting.pop()
+        if here.file not in files:
+            files[here.file] = _size(here, path)
+        if len(seen) > MAX_LAYERS or sum(files.values()) > MAX_FILE_BYTES:
+            found = f"{len(seen)} layers of {sum(files.values()) / 2**20:.0f} MiB"
+            raise refuse(path, found, f"at most {MAX_LAYERS} and {MAX_FILE_BYTES >> 20} MiB", "Flatten the stage")
+        for reference in _named(pxr, here, path):
+            there = locate(root, _inside(here), reference)
+            if Path(there.inner or there.file).suffix.lower() not in USD:
+                raise refuse(path, f"a layer {reference[:120]!r}", f"layers of kind {' '.join(USD)}", COPY)
+            if there.inner and there.inner.lower().endswith(".usdz"):
+                raise refuse(path, f"a package in a package ({reference[:120]!r})", "one package", "Package it again")
+            if str(there) not in seen:
+                seen.add(str(there))
+                waiting.append(there)
+    return list(files)
+
+
+def _named(pxr: Any, here: PackagedFile, path: Path) -> Iterator[str]:
+    """The layers that one layer names, in every variant."""
+    try:
+        layer = pxr.Sdf.Layer.FindOrOpen(str(here))
+    except pxr.Tf.ErrorException as error:
+        raise refuse(path, f"a layer that USD cannot read ({said(error)})", "a USD file", "Export it again") from None
+    if layer is None:
+        raise refuse(path, f"no USD layer at {str(here)[-120:]}", "a USD file", "Export it again")
+    clips: list[Any] = []
+    layer.Traverse("/", lambda p: clips.append(p) if _has_clips(layer, p) else None)
+    if clips:
+        raise refuse(path, f"value clips at {clips[0]}", "values in the layers themselves", "Export a single frame")
+    yield from (name for name in layer.GetCompositionAssetDependencies() if name)
+
+
+def _has_clips(layer: Any, path: Any) -> bool:
+    prim = layer.GetPrimAtPath(path) if path.IsPrimPath() or path.IsPrimVariantSelectionPath() else None
+    return prim is not None and (prim.HasInfo("clips") or prim.HasInfo("clipSets"))
+
+
+def _size(here: PackagedFile, path: Path) -> int:
+    if not here.file.is_file():
+        raise refuse(path, f"no file at {here.file}, which it stands on", "all its layers", "Copy the whole asset")
+    size = here.file.stat().st_size
+    if size > MAX_FILE_BYTES:
+        raise refuse(path, f"{size >> 20} MiB", f"at most {MAX_FILE_BYTES >> 20} MiB", "Reduce the file")
+    if here.file.suffix.lower() == ".usdz":
+        _check_package(here.file, size)
+    return size
+
+
+def _check_package(path: Path, size: int) -> None:
+    """A USDZ package by its specification: a ZIP of files that are stored as they are, all inside it."""
+    again = "Package it again (usdzip)"
+    try:
+        with zipfile.ZipFile(path) as package:
+            entries = package.infolist()
+    except (OSError, zipfile.BadZipFile, ValueError, NotImplementedError, RuntimeError) as error:
+        raise refuse(path, f"no package that can be opened ({str(error)[:100]})", "a .usdz file", again) from error
+    if not 0 < len(entries) <= MAX_ENTRIES:
+        raise refuse(path, f"{len(entries)} files in the package", f"1 to {MAX_ENTRIES}", again)
+    for entry in entries:
+        name = entry.filename
+        if entry.compress_type != zipfile.ZIP_STORED or entry.file_size != entry.compress_size or entry.flag_bits & 1:
+            raise refuse(path, f"a compressed or encrypted file ({name[:80]!r})", "files stored as they are", again)
+        if name.startswith(("/", "\\")) or ".." in re.split(r"[/\\]", name) or ":" in name:
+            raise refuse(path, f"a file named {name[:80]!r}", "names inside the package", again)
+        if name.lower().endswith(".usdz"):
+            raise refuse(path, f"a package in a package ({name[:80]!r})", "one package", again)
+    if sum(entry.file_size for entry in entries) > size:
+        raise refuse(path, "files that lie on top of each other in the package", "each in its own place", again)
+
+
+def textures_named(pxr: Any, files: list[Path], root: Path) -> list[Path]:
+    """The other files in `root` that layers name, tiles spelled out: textures, mostly."""
+    found: set[Path] = set()
+    for file in files:
+        if file.suffix.lower() == ".usdz":
+            continue
+        for name in {n for kind in pxr.UsdUtils.ExtractExternalReferences(str(file)) for n in kind}:
+            try:
+                there = locate(root, PackagedFile(file), name).file
+            except InputRefused:
+                continue
+            tiles = there.parent.glob(there.name.replace("<UDIM>", "1???")) if "<UDIM>" in there.name else [there]
+            found |= {tile for tile in tiles if tile.is_file()}
+    return sorted(found - set(files))
+
+
+def said(error: Exception) -> str:
+    """USD's own words, without where in its sources they were said."""
+    words = re.findall(r": '(.*?)'?\s*$", str(error), flags=re.MULTILINE)
+    return (words[0] if words else str(error).strip().splitlines()[-1])[:160]
+
+
+def bytes_of(place: PackagedFile, limit: int) -> bytes | None:
+    """The content of a texture; None where it is not there."""
+    from mistyle.io.sandbox.bounds import read_bytes
+
+    if not place.inner:
+        return read_bytes(place.file, limit) if place.file.is_file() else None
+    with zipfile.ZipFile(place.file) as package:
+        if place.inner not in package.namelist():
+            return None
+        if package.getinfo(place.inner).file_size > limit:
+            raise refuse(place.file, f"a large {place.inner}", f"at most {limit >> 20} MiB", "Scale it down")
+        return package.read(place.inner)

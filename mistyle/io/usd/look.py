@@ -1,0 +1,230 @@
+"""A look layer: new materials for a USD file that stays as it is.
+
+    #usda 1.0                    sublayers the source
+    over "Chair" (               bindings (and, where a mesh was unwrapped, its new UVs) as overs on the source's prims
+        variantSets = "look"     one variant per style: the materials that the bindings name
+    )
+
+The bindings lie outside the variants on purpose: opinions of the source itself are local ones, which are stronger than
+any variant's. The variants therefore hold what only they say: the materials in the scope `look` of the root prim.
+"""
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.asset import Asset
+from mistyle.core.errors import InputRefused, MistyleError, UsageError
+from mistyle.io.materialx import TexturedMaterial
+from mistyle.io.usd.mesh import Polygons, polygons, uv_primvar
+from mistyle.io.usd.shapes import is_shape
+from mistyle.io.usd.stage import mesh_prims, open_stage
+from mistyle.io.usd.write import define_material, library
+
+SET = "look"
+
+
+@dataclass(frozen=True)
+class _SourceMesh:
+    """A mesh prim of the source: its path, its faces in the asset, its polygons, whether its place mirrors it."""
+
+    name: str
+    faces: slice
+    shape: Polygons
+    mirrored: bool
+
+
+def write_look(
+    path: Path, before: str | None, asset: Asset, looks: Sequence[TexturedMaterial], variant: str, *, beside: Path
+) -> None:
+    """Write the layer `path` (.usda): `before` with one variant more, or a new one; the new variant is selected.
+
+    `asset` is the USD file as it was read, `looks` its materials by part, `beside` the folder that the layer will lie
+    in. Raises InputRefused where the file is no longer as it was read, UsageError where `before` lies over another one.
+    """
+    pxr = library()
+    source = open_stage(pxr, asset.source.path)
+    path.write_text(before or "#usda 1.0\n", encoding="utf-8")
+    stage = _opened(pxr, path, source, os.path.relpath(asset.source.path, beside))
+    shapes = _shapes(pxr, source, asset)
+    root = "/" + shapes[0].name.strip("/").split("/")[0]
+    given = source.GetDefaultPrim()
+    root = str(given.GetPath()) if given else root
+    if not stage.GetRootLayer().HasDefaultPrim():
+        stage.SetDefaultPrim(stage.GetPrimAtPath(root))
+    prim = stage.OverridePrim(root)
+    sets = prim.GetVariantSets().AddVariantSet(SET)
+    sets.AddVariant(variant)
+    sets.SetVariantSelection(variant)
+    used = sorted({int(k) for mesh in shapes for k in np.unique(asset.mesh.part[mesh.faces])})
+    names = {part: f"{root}/{SET}/{looks[part].name}" for part in used}
+    primvars = {_kept(pxr, source, asset, mesh) for mesh in shapes}
+    primvar = primvars.pop() if len(primvars) == 1 else None
+    if primvar is None:
+        primvar = f"st_{variant}"
+        for mesh in shapes:
+            _author(pxr, stage, asset, mesh, primvar)
+    for mesh in shapes:
+        _editable(stage, mesh.name)
+    with sets.GetVariantEditContext():
+        pxr.UsdGeom.Scope.Define(stage, f"{root}/{SET}")
+        for part, place in names.items():
+            define_material(pxr, stage, place, looks[part], primvar)
+    for mesh in shapes:
+        _bind(pxr, stage, mesh, asset.mesh.part[mesh.faces], names, looks)
+    stage.GetRootLayer().Save()
+
+
+def _opened(pxr: Any, path: Path, source: Any, relative: str) -> Any:
+    """The layer over the source, with the stage metadata that only a root layer can say."""
+    layer = pxr.Sdf.Layer.FindOrOpen(str(path))
+    over = Path(relative).as_posix()
+    over = over if over.startswith("..") else f"./{over}"
+    if list(layer.subLayerPaths) not in ([], [over]):
+        raise UsageError(
+            f"{path.name}: this layer lies over {layer.subLayerPaths[0]}, not over {over}; deliver into another folder"
+        )
+    layer.subLayerPaths = [over]
+    stage = pxr.Usd.Stage.Open(layer)
+    pxr.UsdGeom.SetStageUpAxis(stage, pxr.UsdGeom.GetStageUpAxis(source))
+    pxr.UsdGeom.SetStageMetersPerUnit(stage, pxr.UsdGeom.GetStageMetersPerUnit(source))
+    if source.HasAuthoredTimeCodeRange():
+        stage.SetStartTimeCode(source.GetStartTimeCode())
+        stage.SetEndTimeCode(source.GetEndTimeCode())
+        stage.SetTimeCodesPerSecond(source.GetTimeCodesPerSecond())
+    return stage
+
+
+def _shapes(pxr: Any, source: Any, asset: Asset) -> list[_SourceMesh]:
+    """Every mesh prim of the asset in the source. InputRefused where the file has other meshes than the asset."""
+    path = asset.source.path
+    there = {str(prim.GetPath()): (prim, matrix) for prim, _, matrix in mesh_prims(pxr, source, path, [])}
+    result: dict[str, _SourceMesh] = {}
+    for one in asset.source.primitives:
+        prim, matrix = there.get(one.name, (None, None))
+        if prim is not None and is_shape(prim):
+            kind = str(prim.GetTypeName())
+            raise InputRefused(
+                f"{path}: {one.name} is a {kind}, which has no faces for a look to name; expected meshes. Turn it into "
+                "a mesh, or deliver another format"
+            )
+        shape = None if prim is None else polygons(pxr, prim, path)
+        if shape is None or matrix is None or len(shape.corner) != one.stop - one.start:
+            raise InputRefused(f"{path}: {one.name} is no longer the mesh that the run read; run the job again")
+        mirrored = bool(np.linalg.det(matrix[:3, :3]) < 0)
+        result[one.name] = _SourceMesh(one.name, slice(one.start, one.stop), shape, mirrored)
+    return list(result.values())
+
+
+def _kept(pxr: Any, source: Any, asset: Asset, mesh: _SourceMesh) -> str | None:
+    """The primvar at which the asset's UVs stand in the file already; None where it has others."""
+    found = uv_primvar(pxr, pxr.UsdGeom.Mesh(source.GetPrimAtPath(mesh.name)), [])
+    if asset.source.old_uvs is None or not found or "2" not in str(found.GetTypeName()):  # readers of two components
+        return None
+    step = asset.mesh.corner_uvs[mesh.faces] - asset.source.old_uvs[mesh.faces]
+    # Moved by whole tiles: the texture repeats, the file's own UVs do.
+    same = np.abs(step - np.round(step[:, :1])).max(initial=0) < 1e-4
+    return str(found.GetPrimvarName()) if same else None
+
+
+def _author(pxr: Any, stage: Any, asset: Asset, mesh: _SourceMesh, primvar: str) -> None:
+    """Author the UVs that a mesh has in the asset as `primvar`."""
+    prim, shape, mirrored = _editable(stage, mesh.name), mesh.shape, mesh.mirrored
+    new = asset.mesh.corner_uvs[mesh.faces]
+    corner = shape.corner[:, [0, 2, 1]] if mirrored else shape.corner
+    values = np.zeros((len(shape.vertices), 2), np.float32)
+    values[corner.reshape(-1)] = new.reshape(-1, 2)
+    api = pxr.UsdGeom.PrimvarsAPI(prim)
+    if np.abs(values[corner] - new).max() > 1e-6 or _is_cut(stage, mesh.name):
+        # A chart ends inside a polygon: its triangles become the faces.
+        _cut(pxr, stage, prim, shape)
+        values = new.reshape(-1, 2) if shape.turned == mirrored else new[:, [0, 2, 1]].reshape(-1, 2)
+    st = api.CreatePrimvar(primvar, pxr.Sdf.ValueTypeNames.TexCoord2fArray, pxr.UsdGeom.Tokens.faceVarying)
+    st.Set(pxr.Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(values, np.float32)))
+
+
+def _editable(stage: Any, name: str) -> Any:
+    """The prim, its instances dissolved: what lies inside an instance cannot be overridden."""
+    parts = name.strip("/").split("/")
+    for count in range(1, len(parts) + 1):
+        prim = stage.GetPrimAtPath("/" + "/".join(parts[:count]))
+        if prim.IsInstance():
+            prim.SetInstanceable(False)
+    return stage.GetPrimAtPath(name)
+
+
+def _is_cut(stage: Any, name: str) -> bool:
+    spec = stage.GetRootLayer().GetAttributeAtPath(f"{name}.faceVertexCounts")
+    return spec is not None
+
+
+def _cut(pxr: Any, stage: Any, prim: Any, shape: Polygons) -> None:
+    """Override a mesh's topology by its triangles, and bring along what is said per face or corner."""
+    if _is_cut(stage, str(prim.GetPath())):
+        return
+    corner = shape.corner[:, [0, 2, 1]] if shape.turned else shape.corner
+    mesh = pxr.UsdGeom.Mesh(prim)
+    taken = {"faceVarying": corner.reshape(-1), "uniform": np.repeat(shape.polygon, 3)}
+    for primvar in pxr.UsdGeom.PrimvarsAPI(prim).GetPrimvarsWithValues():
+        if primvar.GetInterpolation() in taken:
+            values = primvar.ComputeFlattened()
+            rows = taken[primvar.GetInterpolation()].tolist()
+            primvar.BlockIndices() if primvar.IsIndexed() else None
+            primvar.Set(type(values)([values[k] for k in rows]))
+            primvar.SetInterpolation(pxr.UsdGeom.Tokens.faceVarying)
+    normals, how = mesh.GetNormalsAttr().Get(), mesh.GetNormalsInterpolation()
+    if normals and how in taken:
+        mesh.GetNormalsAttr().Set(type(normals)([normals[k] for k in taken[how].tolist()]))
+        mesh.SetNormalsInterpolation(pxr.UsdGeom.Tokens.faceVarying)
+    mesh.GetFaceVertexCountsAttr().Set(pxr.Vt.IntArray.FromNumpy(np.full(len(corner), 3, np.int32)))
+    indices = shape.vertices[corner].reshape(-1).astype(np.int32)
+    mesh.GetFaceVertexIndicesAttr().Set(pxr.Vt.IntArray.FromNumpy(indices))
+    if mesh.GetHoleIndicesAttr().Get():
+        mesh.GetHoleIndicesAttr().Set(pxr.Vt.IntArray())
+
+
+def _bind(
+    pxr: Any, stage: Any, source: _SourceMesh, part: np.ndarray, names: Any, looks: Sequence[TexturedMaterial]
+) -> None:
+    """Bind a mesh, or a subset per part in the place of the source's own subsets."""
+    api = pxr.UsdShade.MaterialBindingAPI
+    prim = stage.GetPrimAtPath(source.name)
+    parts = np.unique(part)
+    for subset in api(prim).GetMaterialBindSubsets():
+        if not subset.GetPrim().GetName().startswith(f"{SET}_"):
+            subset.GetPrim().SetActive(False)
+    _bound(pxr, stage, prim, names[parts[0]])
+    if len(parts) == 1:
+        return
+    face = np.arange(len(part)) if _is_cut(stage, source.name) else source.shape.polygon
+    mesh, taken = pxr.UsdGeom.Mesh(prim), np.zeros(0, np.int64)
+    for k in parts:
+        rows = np.setdiff1d(np.unique(face[part == k]), taken)
+        taken = np.union1d(taken, rows)
+        indices = pxr.Vt.IntArray.FromNumpy(rows.astype(np.int32))
+        label = f"{SET}_{looks[k].name}"
+        subset = pxr.UsdGeom.Subset.CreateGeomSubset(mesh, label, pxr.UsdGeom.Tokens.face, indices, "materialBind")
+        _bound(pxr, stage, subset.GetPrim(), names[k])
+    whole = len(taken) == len(mesh.GetFaceVertexCountsAttr().Get())
+    kind = pxr.UsdGeom.Tokens.partition if whole else pxr.UsdGeom.Tokens.nonOverlapping
+    api(mesh).SetMaterialBindSubsetsFamilyType(kind)
+
+
+def _bound(pxr: Any, stage: Any, prim: Any, place: str) -> None:
+    """Bind, for every purpose that the source binds a material for."""
+    material = pxr.UsdShade.Material.Get(stage, place)
+    api = pxr.UsdShade.MaterialBindingAPI.Apply(prim)
+    api.Bind(material)
+    for purpose in ("full", "preview"):
+        if prim.GetRelationship(f"material:binding:{purpose}"):
+            api.Bind(material, materialPurpose=purpose)
+    found = api.ComputeBoundMaterial()[0]
+    if not found or str(found.GetPath()) != place:
+        raise MistyleError(
+            f"{prim.GetPath()}: a stronger binding in the source keeps {found.GetPath() if found else 'no material'}; "
+            "remove its strongerThanDescendants or collection binding"
+        )
