@@ -45,7 +45,7 @@ from mistyle.core.errors import UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.io.images.write import write_png
 from mistyle.io.read import read_json
-from mistyle.measure.compare_metrics import measure_colour
+from mistyle.measure.pictures.metrics import measure_colour
 from mistyle.run.blender import find_blender
 
 REASONS = Path(__file__).with_name("gallery_reasons.json")

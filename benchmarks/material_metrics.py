@@ -14,9 +14,9 @@ from jaxtyping import Bool, Float
 from mistyle.core.image import erode, srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
-from mistyle.measure.compare_metrics import PPD, ssim
-from mistyle.measure.flip_bands import flip_map
 from mistyle.measure.metrics import psnr
+from mistyle.measure.pictures.flip_bands import flip_map
+from mistyle.measure.pictures.metrics import PPD, ssim
 
 HDR_CLIP = 4.0
 

@@ -133,7 +133,7 @@ def draw_helmet(data: Path, size: tuple[int, int], spp: int) -> np.ndarray:
 def cycles(data: Path, blender: str, quick: bool, pictures: Path | None, only: str | None = None) -> dict[str, float]:
     """Mean LDR-FLIP between Mitsuba and Cycles on GLBs that we wrote."""
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.measure.compare_metrics import measure_colour
+    from mistyle.measure.pictures.metrics import measure_colour
     from mistyle.run.render_files import write_asset_glb
     from mistyle.run.renderers import renderer, shots, subject
 

@@ -69,7 +69,7 @@ ALLOWED = {
     "io/images/write": "writes EXR",
     "io/usd/write": "the package that it has just written",
     "io/usd/look": "the USD file that the reader process has read in the same run, to lay materials over it",
-    "measure/flip_bands": "what its parent wrote into a folder of its own",
+    "measure/pictures/flip_bands": "what its parent wrote into a folder of its own",
     "render/cycles_worker": "the job that mistyle wrote for it",
     "render/mitsuba_worker": "the job that mistyle wrote for it, or the user's scene, trusted like code",
     "render/lookdev": "the user's scene (--scene), trusted like code",

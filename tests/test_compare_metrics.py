@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 
 from mistyle.core.image import gaussian
-from mistyle.measure import compare_metrics as metrics
-from mistyle.measure import compare_protocols as protocols
-from mistyle.measure import flip_bands
-from mistyle.measure.compare_metrics import COLOUR, Viewing, measure_colour, measure_data
+from mistyle.measure.pictures import flip_bands, metrics, protocols
+from mistyle.measure.pictures.metrics import COLOUR, Viewing, measure_colour, measure_data
 
 WHOLE = np.ones((40, 40), bool)
 

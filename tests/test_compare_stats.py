@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mistyle.measure.compare_stats import interval, same_picture, slope
+from mistyle.measure.pictures.statistics import interval, same_picture, slope
 
 
 def renders(rng, count, mean, noise=0.2):

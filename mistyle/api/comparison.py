@@ -42,7 +42,7 @@ class Comparison(Mapping[str, float]):
         return len(self.values_by_metric)
 
     def _repr_html_(self) -> str:
-        from mistyle.measure.compare_metrics import METRICS
+        from mistyle.measure.pictures.metrics import METRICS
 
         rows = [(n, v, METRICS[n].unit, METRICS[n].better) for n, v in self.items()]
         most = {name: float(m.max()) or 1.0 for name, m in self.maps.items()}
@@ -76,7 +76,7 @@ def compare(
     do not exist.
     """
     from mistyle.core.errors import UsageError
-    from mistyle.measure import compare_metrics as measure
+    from mistyle.measure.pictures import metrics as measure
     from mistyle.run.compare_inputs import planes
 
     frames = [_frame(given, who, kind, layer) for given, who in ((reference, "reference"), (test, "test"))]

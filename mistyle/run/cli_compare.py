@@ -231,8 +231,8 @@ def _compare_renders(options: argparse.Namespace) -> int:
 
 
 def _list() -> int:
-    from mistyle.measure.compare_metrics import METRICS, Viewing, definitions
-    from mistyle.measure.compare_protocols import PROTOCOLS
+    from mistyle.measure.pictures.metrics import METRICS, Viewing, definitions
+    from mistyle.measure.pictures.protocols import PROTOCOLS
 
     for name, text in definitions(Viewing(), list(METRICS)).items():
         print(f"{name} ({METRICS[name].better} is better): {text}\n")
@@ -253,7 +253,7 @@ def _approve(options: argparse.Namespace) -> int:
 
 def job_of(options: argparse.Namespace, reference: Path | None = None, tests: tuple[Path, ...] = ()) -> Any:
     """The job that the command line describes; with `reference`, of those pictures instead of the given ones."""
-    from mistyle.measure.compare_metrics import COLOUR, DATA, METRICS
+    from mistyle.measure.pictures.metrics import COLOUR, DATA, METRICS
     from mistyle.run.compare_limits import checked, parse, read_limits
     from mistyle.run.compare_records import CompareJob
 
@@ -327,7 +327,7 @@ def safe(out: Path, inputs: list[Path]) -> None:
 
 
 def _viewing(options: argparse.Namespace) -> Any:
-    from mistyle.measure.compare_metrics import PPD, Viewing
+    from mistyle.measure.pictures.metrics import PPD, Viewing
 
     if options.ppd is not None and not 1 <= options.ppd <= 1000:
         raise UsageError(f"--ppd {options.ppd}: expected 1 to 1000 pixels per degree")

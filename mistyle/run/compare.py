@@ -21,9 +21,8 @@ from mistyle.core.errors import InputRefused
 from mistyle.io.images.layers import BEAUTY, LayeredPicture
 from mistyle.io.store.atomic import atomic_write
 from mistyle.io.store.output import claim, replace_files
-from mistyle.measure import compare_metrics as metrics
-from mistyle.measure import compare_protocols as protocols
-from mistyle.measure.compare_metrics import METRICS, MetricValues
+from mistyle.measure.pictures import metrics, protocols
+from mistyle.measure.pictures.metrics import METRICS, MetricValues
 from mistyle.run.compare_inputs import Match, Planes, alpha_mask, chosen_layers, matches, planes, read_mask, reduced
 from mistyle.run.compare_limits import broken, without_effect
 from mistyle.run.compare_pictures import PairPictures, thumbnail, worst_regions, write_pictures

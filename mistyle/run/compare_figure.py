@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 
 from mistyle.core.errors import UsageError
 from mistyle.io.store.atomic import atomic_write
-from mistyle.measure.flip_bands import flip_map
+from mistyle.measure.pictures.flip_bands import flip_map
 from mistyle.run.compare_inputs import Match, Planes, chosen_layers, planes
 from mistyle.run.compare_pictures import shown
 from mistyle.run.compare_records import CompareJob

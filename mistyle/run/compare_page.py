@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.files.html import csp_hash, template
-from mistyle.measure.compare_metrics import METRICS
-from mistyle.measure.compare_protocols import PROTOCOL_BETTER
+from mistyle.measure.pictures.metrics import METRICS
+from mistyle.measure.pictures.protocols import PROTOCOL_BETTER
 from mistyle.run.compare_pictures import GREY, STOPS, WIDE, PairPictures
 
 

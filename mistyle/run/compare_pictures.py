@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from mistyle.core.image import luminance
-from mistyle.measure.compare_metrics import encoded
+from mistyle.measure.pictures.metrics import encoded
 from mistyle.run.charts import Chart, svg
 from mistyle.run.compare_inputs import Planes
 from mistyle.run.false_colour import DIVERGING, RAINBOW, heat, mapped

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
 
-from mistyle.measure.compare_metrics import COLOUR, DATA, Viewing
+from mistyle.measure.pictures.metrics import COLOUR, DATA, Viewing
 from mistyle.run.compare_limits import Limit
 
 Protocol = Literal["stanford-orb", "tensoir", "idiff"]
@@ -19,7 +19,7 @@ Protocol = Literal["stanford-orb", "tensoir", "idiff"]
 class CompareJob:
     """One comparison.
 
-    metrics   names of measure/compare_metrics.py; of a protocol, its own are measured instead
+    metrics   names of measure/pictures/metrics.py; of a protocol, its own are measured instead
     layers    layers to compare; empty: all that both pictures have
     window    "display" or "overlap" (run/compare_inputs.py)
     mask      None, "alpha" (the reference's alpha above one half) or a mask file

@@ -17,7 +17,7 @@ from mistyle.core.names import safe_name
 from mistyle.io.images.write import write_exr
 from mistyle.io.store.atomic import atomic_write
 from mistyle.io.store.output import claim
-from mistyle.measure.compare_stats import Tested, same_picture
+from mistyle.measure.pictures.statistics import Tested, same_picture
 from mistyle.run.compare import FILES, compare
 from mistyle.run.compare_pictures import webp
 from mistyle.run.compare_records import CompareJob

@@ -21,8 +21,8 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.files.html import csp_hash, template
 from mistyle.io.store.atomic import atomic_write
 from mistyle.io.store.output import claim, replace_files
-from mistyle.measure.compare_metrics import definitions, measure_colour
-from mistyle.measure.compare_stats import interval, slope
+from mistyle.measure.pictures.metrics import definitions, measure_colour
+from mistyle.measure.pictures.statistics import interval, slope
 from mistyle.run.charts import Chart
 from mistyle.run.progress import Progress
 from mistyle.run.render_files import RenderView, Subject
@@ -225,7 +225,7 @@ def summary(found: Sequence[Measurement], names: Sequence[str], counts: Sequence
 
 
 def definitions_of() -> dict[str, str]:
-    from mistyle.measure.compare_metrics import Viewing
+    from mistyle.measure.pictures.metrics import Viewing
 
     return definitions(Viewing(), METRICS) | {
         "slope": "least squares of log error over log samples, per seed; mean and 95 % interval over seeds (Student's "

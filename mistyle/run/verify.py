@@ -174,7 +174,7 @@ def compared(
 ) -> tuple[Difference, Float[np.ndarray, "h w"]]:
     """The difference of two renders (linear Rec.709, premultiplied, alpha), and the FLIP map."""
     from mistyle.core.image import luminance, overlap
-    from mistyle.measure.compare_metrics import measure_colour
+    from mistyle.measure.pictures.metrics import measure_colour
 
     a, b = (np.nan_to_num(p[..., :3]).astype(np.float32) for p in (reference, test))
     inside = [p[..., 3] > 0.5 for p in (reference, test)]

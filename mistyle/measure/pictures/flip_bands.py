@@ -1,8 +1,9 @@
 """FLIP of large pictures: in bands of rows, which bounds its memory, part of them in a second process.
 
-FLIP's filters reach a fraction of a degree, so that a band with its margin gives the same map as the whole picture.
-The package holds Python's lock while it works, hence a process and not a thread. `python -m mistyle.measure.flip_bands
-FOLDER` is that process: it reads the pictures and the order there, and writes its rows of the maps.
+FLIP's filters reach a fraction of a degree, so that a band with its margin gives the same map as the whole picture. The
+package holds Python's lock while it works, hence a process and not a thread. `python -m
+mistyle.measure.pictures.flip_bands FOLDER` is that process: it reads the pictures and the order there, and writes its
+rows of the maps.
 """
 
 import json
@@ -83,7 +84,7 @@ def _start(folder: Path, pairs: Mapping[str, FlipPair], ppd: float, cut: int) ->
             np.save(folder / f"{name}{n}.npy", np.ascontiguousarray(picture[low:], np.float32))
         order.append({"exposures": pair.exposures, "start": cut - low, "stop": len(pair.reference) - low})
     (folder / "order.json").write_text(json.dumps({"ppd": ppd, "pairs": order}))
-    command = [sys.executable, "-m", "mistyle.measure.flip_bands", str(folder)]
+    command = [sys.executable, "-m", "mistyle.measure.pictures.flip_bands", str(folder)]
     paths = os.pathsep.join(p for p in sys.path if p)
     return subprocess.Popen(command, env=os.environ | {"PYTHONPATH": paths}, stderr=subprocess.PIPE)
 

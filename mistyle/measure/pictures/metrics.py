@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.measure.colour_difference import delta_e, lab
-from mistyle.measure.flip_bands import FlipPair, flip_maps
+from mistyle.measure.pictures.flip_bands import FlipPair, flip_maps
 
 PPD = 3840 * math.pi / 180  # 0.7 m from a display of 3840 pixels and 0.7 m
 SMALL = 1e-2  # keeps relative errors of black pixels finite

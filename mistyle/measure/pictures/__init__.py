@@ -1,0 +1,1 @@
+"""Metrics between two pictures, as rendering people quote them."""
