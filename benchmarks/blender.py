@@ -77,10 +77,10 @@ def draw(asset: Asset, camera: Camera, samples: int) -> np.ndarray:
     """Our side: linear rgb and alpha."""
     import mitsuba as mi
 
-    from mistyle.render import device
-    from mistyle.render.lookdev import material_maps
-    from mistyle.render.scene import object_shapes, sensor_dict
-    from mistyle.render.scene import samples as allowed
+    from mistyle.render.lookdev.scenes import material_maps
+    from mistyle.render.mitsuba import device
+    from mistyle.render.mitsuba.scene import object_shapes, sensor_dict
+    from mistyle.render.mitsuba.scene import samples as allowed
 
     device.use()
     scene = {

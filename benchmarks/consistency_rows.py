@@ -51,8 +51,8 @@ def without_atlas(scene: Scene, solution: Any) -> list[np.ndarray]:
     """Views of a painted surface that asks it for the colour of every hit, as many a pixel as `unlit` has rays."""
     from mistyle.backends.embedded import surface_colour
     from mistyle.core.camera import resized
-    from mistyle.render.draw import gbuffer, tracer
-    from mistyle.render.unlit import FINE
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
+    from mistyle.render.mitsuba.unlit import FINE
 
     traced, pictures = tracer(scene.asset.mesh), []
     for view in scene.views:

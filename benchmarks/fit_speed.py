@@ -32,10 +32,10 @@ from mistyle.core.capture import Captures, in_memory
 from mistyle.core.light import Directional, direction_in_world, lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.render import device, draw
-from mistyle.render import scene as scenery
-from mistyle.render.material_table import pack
-from mistyle.render.shade import MaterialRenderer, RenderOptions
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+from mistyle.render.mitsuba import device, draw
+from mistyle.render.mitsuba import scene as scenery
 from mistyle.stages.recover_settings import RecoverSettings
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
@@ -288,7 +288,7 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     import mitsuba as mi
     import scipy.sparse as sparse
 
-    from mistyle.render import shading
+    from mistyle.render.deferred import kernels
 
     device.use()
     size, repeats = (128, 5) if quick else (512, 15)
@@ -312,7 +312,7 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
     dr.eval(places, weights)
 
     def gather(table, packed, transpose):
-        return shading._to_texels(table, packed, transpose)
+        return kernels._to_texels(table, packed, transpose)
 
     def atomic(gradient, packed, places, weights, order):
         values = dr.gather(mi.ArrayXf, packed, order, shape=(8, width))
@@ -322,7 +322,7 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
         return gradient
 
     def alone(textures, samples, lights, at):
-        return shading._derivatives(ours._terms, textures, samples, lights, at)
+        return kernels._derivatives(ours._terms, textures, samples, lights, at)
 
     def empty():
         gradient = dr.zeros(mi.Float, rows)
@@ -334,7 +334,7 @@ def transposes(figures: dict[str, float], mesh: Mesh, quick: bool) -> None:
 
     def by_texel():
         gradient = empty()
-        shading.add_rows(gradient, frozen(table, packed, h.transpose), h.transpose)
+        kernels.add_rows(gradient, frozen(table, packed, h.transpose), h.transpose)
         return gradient
 
     figures["transpose_gather_seconds"] = seconds(by_texel, repeats)

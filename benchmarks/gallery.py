@@ -46,7 +46,7 @@ from mistyle.core.image import srgb_from_linear
 from mistyle.io.images.write import write_png
 from mistyle.io.read import read_json
 from mistyle.measure.pictures.metrics import measure_colour
-from mistyle.run.blender import find_blender
+from mistyle.render.external.blender import find_blender
 
 REASONS = Path(__file__).with_name("gallery_reasons.json")
 KINDS = (".glb", ".gltf", ".usd", ".usda", ".usdc", ".usdz")

@@ -21,7 +21,7 @@ from mistyle.core.light import Ambient, SphericalGaussian
 from mistyle.io.images.write import write_exr
 from mistyle.io.read import read_exr
 from mistyle.io.read_mesh import read_mesh
-from mistyle.run.blender import blender_command
+from mistyle.render.external.blender import blender_command
 
 # A sky without edges: what differs is the model then, not the noise of two ways to sample small lamps.
 LIGHTS = (
@@ -40,7 +40,7 @@ class Drawn:
 
     notes     the reader's sentences, or the one that refuses the file
     refused   whether mistyle refused it
-    job       Blender's job (see mistyle/render/cycles_worker.py); None where there is no camera for it
+    job       Blender's job (see mistyle/render/external/cycles_worker.py); None where there is no camera for it
     trouble   why Blender made no picture
     """
 
@@ -56,7 +56,7 @@ class Drawn:
 
 def draw_ours(folder: Path, names: Sequence[str], out: Path, size: int, samples: int) -> list[Drawn]:
     """Read and draw every model; a refusal is a result."""
-    from mistyle.render import lookdev
+    from mistyle.render.lookdev import scenes as lookdev
 
     camera = orbit(35.0, 15.0, distance=4.0, fov=30.0, size=(size, size))
     environment = out / "environment.exr"
@@ -70,7 +70,7 @@ def draw_ours(folder: Path, names: Sequence[str], out: Path, size: int, samples:
 
 
 def _ours(path: Path, name: str, camera: Camera, samples: int, environment: Path) -> Drawn:
-    from mistyle.render import lookdev
+    from mistyle.render.lookdev import scenes as lookdev
 
     slug = re.sub(r"[^A-Za-z0-9]+", "_", name)
     try:
@@ -85,8 +85,8 @@ def _ours(path: Path, name: str, camera: Camera, samples: int, environment: Path
 
 def _job(path: Path, asset: Asset, camera: Camera, samples: int, environment: Path) -> dict[str, Any]:
     """What Blender needs. The reader has glTF and USD in metres and Y up; Blender turns both as cycles_worker says."""
-    from mistyle.render import lookdev
-    from mistyle.run.render_files import user_camera
+    from mistyle.render.external.render_files import user_camera
+    from mistyle.render.lookdev import scenes as lookdev
 
     matrix, scale = user_camera(asset, camera)
     return {
@@ -105,7 +105,7 @@ def _job(path: Path, asset: Asset, camera: Camera, samples: int, environment: Pa
 
 def draw_cycles(drawn: Sequence[Drawn], out: Path, blender: str) -> list[Drawn]:
     """Blender's pictures, kept in out/cycles under the contents of their jobs and files."""
-    from mistyle.render.lookdev import CYCLES_WORKER
+    from mistyle.render.lookdev.scenes import CYCLES_WORKER
 
     folder = out / "cycles"
     folder.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,5 @@
-"""Runs inside Blender's Python: draws models one after another in Cycles, by jobs of mistyle/render/cycles_worker.py.
+"""Runs inside Blender's Python: draws models one after another in Cycles, by jobs of
+mistyle/render/external/cycles_worker.py.
 
 Takes a JSON file: `settings` (the folder of cycles_worker.py) and `jobs`, of which each names its model (`glb`, a glTF
 or a USD file) and one shot. A model whose picture is there already is skipped, so that the same command goes on after

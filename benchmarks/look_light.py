@@ -23,8 +23,8 @@ ATLAS = 1024
 def sky(name: str) -> Any:
     """An environment, exposed so that a grey ball in it has a mean luminance of 0.18."""
     from mistyle.io.read import read_radiance
-    from mistyle.render.lookdev import light_rig
-    from mistyle.render.sheet import LightRig, exposed
+    from mistyle.render.lookdev.scenes import light_rig
+    from mistyle.render.lookdev.sheet import LightRig, exposed
 
     return exposed(LightRig(name, light_rig(str(DATA / "hdri" / name), read_radiance)[0])).light
 
@@ -34,7 +34,7 @@ def lit(glb: Path, size: int = SIZE, spp: int = SPP) -> list[np.ndarray]:
     kept = glb.with_name(f"{glb.name}.lit-{size}-{spp}.npy")
     if not kept.exists():
         from mistyle.io.read_mesh import read_mesh
-        from mistyle.render.lookdev import asset_scene, asset_shapes, drawn
+        from mistyle.render.lookdev.scenes import asset_scene, asset_shapes, drawn
 
         asset, pictures = read_mesh(glb), []
         shapes = asset_shapes(asset)
@@ -65,7 +65,7 @@ def close_camera(positions: np.ndarray, azimuth: float, elevation: float, size: 
 def encoded(picture: np.ndarray) -> np.ndarray:
     """A linear premultiplied picture with alpha, over GROUND, as uint8 sRGB."""
     from mistyle.core.image import srgb_from_linear
-    from mistyle.render.sheet import over
+    from mistyle.render.lookdev.sheet import over
 
     return np.round(255 * srgb_from_linear(np.clip(over(picture, GROUND), 0, 1))).astype(np.uint8)
 
@@ -119,9 +119,9 @@ def piece_of_asset(glb: Path, unit: float, pixels: int, seed: int) -> np.ndarray
     from mistyle.core.maps import flat_maps
     from mistyle.core.mesh import face_areas, face_normals
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.render.draw import gbuffer, tracer
-    from mistyle.render.lookdev import material_maps
-    from mistyle.render.unlit import unlit
+    from mistyle.render.lookdev.scenes import material_maps
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
+    from mistyle.render.mitsuba.unlit import unlit
 
     asset, rng, distance = read_mesh(glb), np.random.default_rng(seed), 4.0
     mesh, traced, tries = asset.mesh, tracer(asset.mesh), []

@@ -54,7 +54,7 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     from mistyle.io.cameras.views import write_views
     from mistyle.io.read import read_picture
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.render.draw import draw_views as drawn
+    from mistyle.render.mitsuba.draw import draw_views as drawn
     from mistyle.run.stylize_settings import resolve
     from mistyle.stages.lift import lift
     from mistyle.stages.sweep_settings import WarpSettings

@@ -34,7 +34,7 @@ from benchmarks.recovery_rivals import naive, write_job
 from benchmarks.recovery_truth import ASSETS, UV, Truth, data_folder, find_asset, seen, truth
 from mistyle.core.errors import MistyleError, UsageError
 from mistyle.core.maps import Maps
-from mistyle.render.scene import Frame
+from mistyle.render.mitsuba.scene import Frame
 
 LEAST_VIEWS = 3
 RELIT_SPP = 128  # least samples of relit pictures: their own noise counts as an error of the maps

@@ -41,9 +41,9 @@ from mistyle.geometry.lens import Lens, distort
 from mistyle.io.cameras.camera_files import transforms
 from mistyle.io.cameras.captures import read_captures
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render.draw import tracer
-from mistyle.render.material_table import pack
-from mistyle.render.shade import MaterialRenderer, RenderOptions
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+from mistyle.render.mitsuba.draw import tracer
 from mistyle.run.material_budget import material_gb
 from mistyle.run.material_settings import MaterialSettings
 from mistyle.stages.recover import recover

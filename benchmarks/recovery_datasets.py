@@ -25,7 +25,7 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps
 from mistyle.geometry.similarity import moved
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render.scene import Frame
+from mistyle.render.mitsuba.scene import Frame
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.texels import rasterise

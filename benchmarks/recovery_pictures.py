@@ -28,8 +28,8 @@ from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
 from mistyle.io.read import read_hdr
-from mistyle.render import device
-from mistyle.render.scene import Frame, object_shapes, passes, sensor_dict
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.scene import Frame, object_shapes, passes, sensor_dict
 
 DEPTH = 6
 DISTANCE, FOV = 4.0, 30.0

@@ -18,7 +18,7 @@ from benchmarks.recovery_truth import Truth
 from mistyle.core.light import Directional, direction_in_world
 from mistyle.core.maps import Maps
 from mistyle.io.images.write import write_exr
-from mistyle.render.scene import mitsuba_mesh
+from mistyle.render.mitsuba.scene import mitsuba_mesh
 
 NAIVE = Path(__file__).with_name("naive_fit.py")
 

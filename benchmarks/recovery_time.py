@@ -18,7 +18,7 @@ from benchmarks.recovery_ours import ours
 from benchmarks.recovery_rivals import naive, write_job
 from benchmarks.recovery_truth import truth
 from mistyle.core.maps import Maps
-from mistyle.render.scene import Frame
+from mistyle.render.mitsuba.scene import Frame
 
 # From the quickest to the defaults.
 EFFORTS: tuple[dict[str, Any], ...] = (

@@ -182,7 +182,7 @@ def seen(truth: Truth, cameras: Sequence[Camera]) -> tuple[np.ndarray, ...]:
     import mitsuba
 
     from mistyle.core.mesh import face_normals
-    from mistyle.render.draw import tracer
+    from mistyle.render.mitsuba.draw import tracer
 
     scene = tracer(truth.mesh).scene
     mi: Any = mitsuba  # its type stubs know one variant only

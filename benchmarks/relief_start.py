@@ -36,7 +36,7 @@ def silent(done: float) -> None:
 
 def views_of(asset: Any, maps: Any, resolution: int) -> list[View]:
     """The unlit views that the fit aims at."""
-    from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
 
     traced, blank = tracer(asset.mesh), []
     for camera in rig(RigSettings(resolution=resolution)):
@@ -48,8 +48,8 @@ def views_of(asset: Any, maps: Any, resolution: int) -> list[View]:
 
 def lit(asset: Any, maps: Any, resolution: int) -> np.ndarray:
     """The object in the studio from two sides, as it is and as clay."""
-    from mistyle.render.draw import pictures
-    from mistyle.render.scene import Staging
+    from mistyle.render.mitsuba.draw import pictures
+    from mistyle.render.mitsuba.scene import Staging
 
     cameras = rig(RigSettings(resolution=resolution))[:2]
     clay = [replace(m, albedo=np.full_like(m.albedo, 0.5)) for m in maps]

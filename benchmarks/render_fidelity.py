@@ -115,7 +115,7 @@ def draw_helmet(data: Path, size: tuple[int, int], spp: int) -> np.ndarray:
     """Linear picture."""
     from mistyle.io.read import read_radiance
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.render import lookdev
+    from mistyle.render.lookdev import scenes as lookdev
 
     path = data / "meshes/pbr/DamagedHelmet/DamagedHelmet.glb"
     asset = read_mesh(path, uv="keep")
@@ -134,8 +134,8 @@ def cycles(data: Path, blender: str, quick: bool, pictures: Path | None, only: s
     """Mean LDR-FLIP between Mitsuba and Cycles on GLBs that we wrote."""
     from mistyle.io.read_mesh import read_mesh
     from mistyle.measure.pictures.metrics import measure_colour
-    from mistyle.run.render_files import write_asset_glb
-    from mistyle.run.renderers import renderer, shots, subject
+    from mistyle.render.external.render_files import write_asset_glb
+    from mistyle.render.external.renderers import renderer, shots, subject
 
     sources = {
         "demo": scenes() / "demo.obj",

@@ -43,9 +43,9 @@ def main(argv: list[str] | None = None) -> None:
 def measure(name: str, path: Path) -> dict[str, float]:
     """All rigs on one mesh."""
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.render.draw import tracer
-    from mistyle.render.visible import face_on
-    from mistyle.stages.rigs import face_fronts, next_best_views, sample_surface
+    from mistyle.render.mitsuba.draw import tracer
+    from mistyle.render.mitsuba.rigs import face_fronts, next_best_views, sample_surface
+    from mistyle.render.mitsuba.visible import face_on
     from mistyle.stages.texels import rasterise
 
     mesh = read_mesh(path, size=ATLAS).mesh

@@ -151,7 +151,7 @@ def included(steps: int, size: int, spp: int) -> dict[str, float]:
 
 def refused(size: int) -> dict[str, float]:
     """1 where the opacity of a mask is not offered."""
-    from mistyle.render.scene_keys import parameters
+    from mistyle.render.live.parameters import parameters
 
     case = next(c for c in cases() if c.name == "mask")
     found = {p.name: p.reason for p in parameters(case.make(case.true, size))}
@@ -184,7 +184,7 @@ def least(spp: int, pictures: int, size: int, wanted: np.ndarray) -> float:
 
 def main(argv: list[str] | None = None) -> int:
     options = arguments((__doc__ or "").splitlines()[0], argv)
-    from mistyle.render import device
+    from mistyle.render.mitsuba import device
 
     device.use()
     steps, size, spp = (64, 32, 1024) if options.quick else (STEPS, SIZE, REFERENCE_SPP)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.render import device
+from mistyle.render.mitsuba import device
 
 Values = Mapping[str, Any]
 

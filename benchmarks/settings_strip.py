@@ -19,7 +19,7 @@ from mistyle.core.rig_settings import RigSettings
 from mistyle.io.images.write import write_png
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render.unlit import unlit
+from mistyle.render.mitsuba.unlit import unlit
 from mistyle.run import painting, start, stylize_start
 from mistyle.run.stylize_settings import Settings
 

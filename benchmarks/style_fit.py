@@ -60,7 +60,7 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
     from mistyle.backends.embedded import surface_colour
     from mistyle.core.image import linear_from_srgb
     from mistyle.io.read import read_picture
-    from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
     from mistyle.run import painting, start, stylize_start
 
     def silent(done: float) -> None:
@@ -139,7 +139,8 @@ def watched(run: Any, spent: dict[str, float]) -> Iterator[None]:
     """Adds up the seconds of the parts of a step."""
     import torch
 
-    from mistyle.render import deferred, seam, split
+    from mistyle.render.deferred import integrator as deferred
+    from mistyle.render.deferred import split, torch_bridge
     from mistyle.stages import fit_table
 
     def clocked(name: str, function: Callable) -> Callable:
@@ -152,8 +153,8 @@ def watched(run: Any, spent: dict[str, float]) -> Iterator[None]:
 
         return work
 
-    places = [("surface", deferred, "trace"), ("surface", run, "_light"), ("surface", seam, "taps")]
-    places += [("picture", seam, "fetch"), ("picture", run, "shader"), ("backward", torch.Tensor, "backward")]
+    places = [("surface", deferred, "trace"), ("surface", run, "_light"), ("surface", torch_bridge, "taps")]
+    places += [("picture", torch_bridge, "fetch"), ("picture", run, "shader"), ("backward", torch.Tensor, "backward")]
     places += [("pull", split.Split, "pull")]
     places += [("texels", fit_table, name) for name in ("pairs", "variation", "step")]
     features = clocked("features", run.scene.features)
@@ -193,16 +194,17 @@ def _shading(run: Any) -> float:
     import torch
 
     from mistyle.core.camera import zoom
-    from mistyle.render import deferred, seam
+    from mistyle.render.deferred import integrator as deferred
+    from mistyle.render.deferred import torch_bridge
     from mistyle.stages import fit_run
 
     scene, size = run.scene, run.settings.crop_size
     cameras = [zoom(scene.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in run._crops()]
     surface = deferred.trace(scene.traced, cameras, scene.tangents)
     lit, _ = run._light(surface)
-    where = seam.taps(surface, run.table.sizes)
+    where = torch_bridge.taps(surface, run.table.sizes)
     leaves = {n: torch.from_numpy(v[where.texels]) for n, v in run.table.values.items()}
-    pixels = seam.fetch(fit_run.materials(leaves, run.phase.clay), where).requires_grad_()
+    pixels = torch_bridge.fetch(fit_run.materials(leaves, run.phase.clay), where).requires_grad_()
     moving = ["normal" if name == "tilt" else name for name in run.phase.rates]
     start = time.perf_counter()
     run.shader(lit, pixels, moving).square().mean().backward()
@@ -241,7 +243,7 @@ def lights(where: Problem, figures: dict[str, float]) -> None:
     """Phase 1 under all lights together, and one a crop."""
     from mistyle.core.light import lights as scene_lights
     from mistyle.geometry.tangents import corner_tangents
-    from mistyle.render.draw import tracer
+    from mistyle.render.mitsuba.draw import tracer
     from mistyle.stages import fit_judge
     from mistyle.stages.fit import FitStart, FitTargets, two_phase
 

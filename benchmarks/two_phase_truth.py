@@ -97,7 +97,7 @@ def true_maps(
 
 def blank_views(asset: Asset, cameras: Sequence[Camera]) -> list[View]:
     """What the cameras see of the mesh, without colours."""
-    from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
 
     traced, views = tracer(asset.mesh), []
     for camera in cameras:

@@ -88,7 +88,7 @@ def paint(mesh: str, style: str, preset: str) -> Painted:
     from mistyle.core.view import View
     from mistyle.io.read import read_picture
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
     from mistyle.run import painting, stylize_start
 
     chosen = settings_of(preset, {})
@@ -132,8 +132,8 @@ def pictures(asset: Any, maps: Sequence[Any], front: tuple[float, float]) -> lis
     """SMALL pictures of the turned asset and of the turned environment, then LARGE ones under the moving key light."""
     from mistyle.core.camera import zoom
     from mistyle.core.light import Ambient, Directional
-    from mistyle.render.lookdev import asset_scene, drawn
-    from mistyle.render.scene import object_shapes
+    from mistyle.render.lookdev.scenes import asset_scene, drawn
+    from mistyle.render.mitsuba.scene import object_shapes
 
     shapes = object_shapes(asset.mesh, list(maps), flip_invalid=True, model="gltf", frame="mikkt")
     light = sky("venice_sunset_1k.hdr")

@@ -37,7 +37,7 @@ def left(baked: Any, truth: Any, seen: np.ndarray) -> float:
 
 def measured(asset: Any, style: Picture, settings: Settings, shown: str) -> tuple[float, float, float]:
     """`light` before and after, and the share taken, of views that are `lit` or show none."""
-    from mistyle.render.draw import draw_views
+    from mistyle.render.mitsuba.draw import draw_views
 
     atlas = stylize_start.lay_out(asset, settings, silent)
     truth = painting.painted(asset, painting.paint_layers(asset, style, atlas, settings, silent), atlas, settings)

@@ -62,8 +62,8 @@ def drawn(asset: Any, maps: list[Any], azimuth: float, lamp: float | None) -> np
     """One picture (SIDE, SIDE, 3), sRGB 0..1: in the studio, or under the lamp at `lamp` degrees from the camera."""
     from mistyle.core.camera import orbit
     from mistyle.core.image import srgb_from_linear
-    from mistyle.render.draw import picture
-    from mistyle.render.scene import Staging
+    from mistyle.render.mitsuba.draw import picture
+    from mistyle.render.mitsuba.scene import Staging
 
     camera = orbit(azimuth, ELEVATION, distance=DISTANCE, fov=30, size=(SIDE, SIDE))
     if lamp is None:

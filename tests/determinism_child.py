@@ -94,7 +94,7 @@ def style_job(made: Stages, settings: Any) -> None:
     from mistyle.core.light import lights
     from mistyle.io.cameras.views import read_views, write_views
     from mistyle.io.read import read_picture
-    from mistyle.render.draw import draw_views
+    from mistyle.render.mitsuba.draw import draw_views
     from mistyle.run import painting, start, stylize_start
     from mistyle.stages.fit import FitStart, FitTargets, two_phase
 
@@ -216,9 +216,9 @@ def photographs(mesh: Any, size: int) -> tuple[Any, Any]:
     from mistyle.core.capture import in_memory
     from mistyle.core.light import Directional
     from mistyle.core.maps import Maps
-    from mistyle.render.draw import tracer
-    from mistyle.render.material_table import pack
-    from mistyle.render.shade import MaterialRenderer, RenderOptions
+    from mistyle.render.deferred.material_table import pack
+    from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+    from mistyle.render.mitsuba.draw import tracer
     from mistyle.stages.texels import rasterise
 
     texels = rasterise(mesh, 0, size)

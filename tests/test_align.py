@@ -30,7 +30,7 @@ from mistyle.io.cameras.camera_files import transforms
 from mistyle.io.cameras.captures import read_captures
 from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render.draw import gbuffer, tracer
+from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
 
 SCALE = 3.7

@@ -23,9 +23,9 @@ from mistyle import api
 from mistyle.api import html
 from mistyle.api.settings import FitSettings, LookdevSettings, StylizeSettings
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.render import device
-from mistyle.render import scene as scenery
-from mistyle.render.emitters import emitters
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.emitters import emitters
 
 KEY = mistyle.Directional((-0.5, -0.5, -0.7071), (2.0, 1.5, 1.0), "camera")
 LAMP = mistyle.Point((-2.5, 1.5, 2.0), (12.0, 9.0, 6.0))

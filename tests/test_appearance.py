@@ -16,8 +16,9 @@ from mistyle.core.camera import orbit
 from mistyle.core.light import Ambient
 from mistyle.io.gltf.write import patch_glb
 from mistyle.io.read_mesh import load_gltf, read_mesh
-from mistyle.render import appearance, lookdev
-from mistyle.render.lookdev import material_maps
+from mistyle.render.lookdev import scenes as lookdev
+from mistyle.render.lookdev.scenes import material_maps
+from mistyle.render.mitsuba import appearance
 
 WHITE = (Ambient((1.0, 1.0, 1.0)),)
 DARK = (Ambient((0.0, 0.0, 0.0)),)
@@ -204,7 +205,8 @@ def test_a_coat_shines_on_a_black_surface(tmp_path: Path) -> None:
 def test_the_layered_surface_is_gltfs_own_where_nothing_is_added() -> None:
     import mitsuba as mi
 
-    from mistyle.render import bsdf, device
+    from mistyle.render.deferred import bsdf
+    from mistyle.render.mitsuba import device
 
     device.use()
     rng = np.random.default_rng(0)

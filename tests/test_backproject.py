@@ -411,7 +411,7 @@ def test_spot_keeps_its_own_texture():
     # Mitsuba says where each pixel's ray meets the real mesh; its unlit texture goes into the views and comes back.
     from mistyle.io.read import read_picture
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
 
     mesh = read_mesh(data("meshes/plain/spot.obj")).mesh
     texture = linear_from_srgb(read_picture(data("meshes/plain/spot_texture.png")).rgb)

@@ -173,7 +173,7 @@ def test_benchmarks_know_the_llvm_before_they_import_dr_jit():
 def test_dr_jit_that_came_too_early_is_said(monkeypatch):
     import drjit  # noqa: F401  # with its LLVM, before the variable that names it goes
 
-    from mistyle.render import device
+    from mistyle.render.mitsuba import device
 
     monkeypatch.delenv("DRJIT_LIBLLVM_PATH", raising=False)
     monkeypatch.setattr(device, "known_llvm", lambda: "/l/libLLVM.so.19.1")

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from mistyle.core.drjit_arrays import aligned
-from mistyle.render import bsdf, device
+from mistyle.render.deferred import bsdf
+from mistyle.render.mitsuba import device
 
 COUNT = 8000
 UP = np.array([0, 0, 1], np.float32)

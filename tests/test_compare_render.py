@@ -13,11 +13,11 @@ from mistyle.core.light import Ambient, Directional, Environment, environment_di
 from mistyle.core.paths import scenes
 from mistyle.io.read import read_exr, read_radiance
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render import lookdev
-from mistyle.render.draw import gbuffer
+from mistyle.render.external.render_files import Subject, write_asset_glb
+from mistyle.render.external.renderers import left_out, renderer, shots, subject
+from mistyle.render.lookdev import scenes as lookdev
+from mistyle.render.mitsuba.draw import gbuffer
 from mistyle.run.cli import main
-from mistyle.run.render_files import Subject, write_asset_glb
-from mistyle.run.renderers import left_out, renderer, shots, subject
 
 CORNER = """<scene version="3.9.0">
   <integrator type="path"><integer name="max_depth" value="4"/></integrator>

@@ -16,7 +16,8 @@ from mistyle.core.errors import UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import flat_maps
 from mistyle.measure.features import TORCHVISION_CONVOLUTIONS, TORCHVISION_POOLS, load_features
-from mistyle.render import device, pyramid
+from mistyle.render.deferred import pyramid
+from mistyle.render.mitsuba import device
 from mistyle.run import pipeline
 from mistyle.run.cli import main
 from mistyle.run.finishing import check_finish
@@ -131,12 +132,12 @@ def test_the_gradient_is_that_of_finite_differences(painted, weights, statistic)
 @pytest.mark.parametrize("bridge", ["frozen", "wrap"])
 def test_the_film_shows_the_albedo_alone(painted, weights, bridge):
     """By either bridge: the bilinear albedo, and the gradient of what is seen."""
-    from mistyle.render import seam
+    from mistyle.render.deferred import torch_bridge
 
     run = Finishing(painted, load_features(weights, 3), QUICK, 0)
     crops, film = run.crops(run.rng, run.seen), Film(QUICK.crops, QUICK.crop_size, bridge)
     texels = torch.from_numpy(run.table.values["albedo"][crops.taps.texels]).requires_grad_()
-    pixels = seam.fetch(texels, crops.taps)
+    pixels = torch_bridge.fetch(texels, crops.taps)
     shown = film(crops.lit, pixels, True)
     target = pixels.detach().reshape(2, 64, 64, 3).permute(0, 3, 1, 2) * crops.on
     assert torch.allclose(shown * crops.on, target, atol=2e-3)

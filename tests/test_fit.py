@@ -13,7 +13,9 @@ from mistyle.core.light import Directional
 from mistyle.core.maps import Maps, Texels, flat_maps
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.render import deferred, device, draw, seam
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred import torch_bridge
+from mistyle.render.mitsuba import device, draw
 from mistyle.stages import fit_judge, fit_table
 from mistyle.stages.fit import FitStart, FitTargets, shrinkage, two_phase
 from mistyle.stages.fit_settings import FitSettings
@@ -69,11 +71,11 @@ def clay(scene, maps: Maps, direction) -> np.ndarray:
     lit = deferred.light(
         traced, surface, (Directional(tuple(vector.tolist()), (2.0, 2.0, 2.0), "camera"),), shadows=False
     )
-    where = seam.taps(surface, [maps.roughness.shape])
+    where = torch_bridge.taps(surface, [maps.roughness.shape])
     tables = {"albedo": np.full((SIZE * SIZE, 3), 0.25, np.float32), "normal": maps.normal.reshape(-1, 3)}
     tables |= {"roughness": maps.roughness.reshape(-1, 1), "metallic": maps.metallic.reshape(-1, 1)}
-    pixels = torch.from_numpy(seam.bilinear(np.concatenate(list(tables.values()), axis=1), where))
-    return seam.Shader(camera.size)(lit, pixels).numpy()[..., 0]
+    pixels = torch.from_numpy(torch_bridge.bilinear(np.concatenate(list(tables.values()), axis=1), where))
+    return torch_bridge.Shader(camera.size)(lit, pixels).numpy()[..., 0]
 
 
 def relief_shading(scene, maps, direction):

@@ -14,7 +14,7 @@ from mistyle.core.light import Directional
 from mistyle.core.maps import flat_maps
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.render import device, draw
+from mistyle.render.mitsuba import device, draw
 from mistyle.run.stylize_settings import PRESETS
 from mistyle.stages import fit as fitting
 from mistyle.stages import fit_run, fit_table

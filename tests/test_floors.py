@@ -102,7 +102,7 @@ def test_no_import_cycles():
 @pytest.mark.parametrize(
     ("where", "source"),
     [
-        (("core", "mesh"), "from mistyle.render import draw"),
+        (("core", "mesh"), "from mistyle.render.mitsuba import draw"),
         (("core", "mesh"), "def f():\n    from ..render.draw import draw_views"),
         (("files", "views"), "import mistyle.surface.lookup"),
         (("stages", "fit"), "from mistyle import backends"),

@@ -10,7 +10,9 @@ from mistyle.core.light import Directional
 from mistyle.core.maps import flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.geometry.tangents import corner_tangents
-from mistyle.render import deferred, draw, seam
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred import torch_bridge
+from mistyle.render.mitsuba import draw
 from mistyle.stages.frames import mitsuba_normals
 from mistyle.stages.texels import pad, rasterise
 
@@ -48,12 +50,12 @@ def shaded(mesh: Mesh, normal: np.ndarray, tangents) -> np.ndarray:
     surface = deferred.trace(traced, [camera], tangents)
     light = Directional((0.6, 0.5, 0.62), (2.0, 2.0, 2.0), "world")
     lit = deferred.light(traced, surface, (light,), shadows=False)
-    where = seam.taps(surface, [normal.shape[:2]])
+    where = torch_bridge.taps(surface, [normal.shape[:2]])
     maps = flat_maps(SIZE)
     tables = {"albedo": maps.albedo.reshape(-1, 3), "normal": normal.reshape(-1, 3)}
     tables |= {"roughness": maps.roughness.reshape(-1, 1), "metallic": maps.metallic.reshape(-1, 1)}
-    pixels = torch.from_numpy(seam.bilinear(np.concatenate(list(tables.values()), axis=1), where))
-    return seam.Shader(camera.size)(lit, pixels).numpy()[..., 0]
+    pixels = torch.from_numpy(torch_bridge.bilinear(np.concatenate(list(tables.values()), axis=1), where))
+    return torch_bridge.Shader(camera.size)(lit, pixels).numpy()[..., 0]
 
 
 def check(mirrored: bool) -> None:

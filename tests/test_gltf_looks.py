@@ -22,7 +22,7 @@ from mistyle.geometry.retexture import Wraps, fetch
 from mistyle.io.gltf.write import patch_glb
 from mistyle.io.meshes import lookups
 from mistyle.io.read_mesh import read_extent, read_mesh
-from mistyle.render.draw import draw_views
+from mistyle.render.mitsuba.draw import draw_views
 from mistyle.stages.export import write_asset
 from mistyle.stages.texels import rasterise, start_maps
 

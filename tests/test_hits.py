@@ -7,10 +7,11 @@ from test_seam import KEY, SIZES, crop, random_maps, torus
 
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Ambient, Directional, Environment, Point, SceneLights, SphericalGaussian
-from mistyle.render import device, draw, hits, shade
-from mistyle.render import scene as scenery
-from mistyle.render import sky as skies
-from mistyle.render.material_table import pack
+from mistyle.render.deferred import image_samples, renderer
+from mistyle.render.deferred import sky as skies
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.mitsuba import device, draw
+from mistyle.render.mitsuba import scene as scenery
 
 
 @pytest.fixture(scope="module")
@@ -19,10 +20,10 @@ def traced():
     return draw.tracer(torus())
 
 
-def collected(traced, camera, lights, mask=None, **options) -> list[hits.SampleBlock]:
+def collected(traced, camera, lights, mask=None, **options) -> list[image_samples.SampleBlock]:
     mask = np.ones(camera.size, bool) if mask is None else mask
-    soft, sampling = options.pop("soft", None), hits.Sampling(**options)
-    return list(hits.collect(hits.TexturedMesh(traced, SIZES), camera, lights, mask, sampling, soft))
+    soft, sampling = options.pop("soft", None), image_samples.Sampling(**options)
+    return list(image_samples.collect(image_samples.TexturedMesh(traced, SIZES), camera, lights, mask, sampling, soft))
 
 
 def test_only_samples_on_the_mesh_inside_the_mask_and_lit_are_kept(traced, rng):
@@ -47,7 +48,7 @@ def test_the_transpose_lists_every_fetch_once(traced):
     (block,) = collected(traced, crop(24), (KEY,), subsamples=4)
     n, _, t = block.counts
     texel, step = np.array(block.samples.texel)[:n].astype(int), np.array(block.samples.step)[:n]
-    right, down = hits.steps(SIZES)[step].T
+    right, down = image_samples.steps(SIZES)[step].T
     read = np.stack([texel, texel + right, texel + down, texel + right + down], axis=1)
     assert read.min() >= 0 and read.max() < sum(a * b for a, b in SIZES)
     back = block.transpose
@@ -63,18 +64,18 @@ def test_the_transpose_lists_every_fetch_once(traced):
 
 def test_cells_repeat_at_the_borders():
     uv = np.array([[0.0, 1.0], [0.999, 0.001], [1.25, -0.3]], np.float32)
-    texel, step, place = hits.bilinear_footprint(uv, np.array([1, 1, 0]), [(4, 8), (2, 3)])
+    texel, step, place = image_samples.bilinear_footprint(uv, np.array([1, 1, 0]), [(4, 8), (2, 3)])
     # In the first texel's own corner the fetch begins at the last texel of the set, which has 2 rows of 3.
-    assert texel[0] == 32 + 5 and hits.steps([(4, 8), (2, 3)])[step[0]].tolist() == [-2, -3]
+    assert texel[0] == 32 + 5 and image_samples.steps([(4, 8), (2, 3)])[step[0]].tolist() == [-2, -3]
     assert texel[1] == 32 + 5 and texel[2] == 1
-    assert hits.steps([(4, 8), (2, 3)])[step[2]].tolist() == [1, 8]
+    assert image_samples.steps([(4, 8), (2, 3)])[step[2]].tolist() == [1, 8]
     np.testing.assert_allclose(place[2], [0.5, 0.7], atol=1e-5)
 
 
 @pytest.mark.parametrize("lights", [(KEY,), (KEY, Point((1, 2, 3), (1, 1, 1))), (Ambient((1, 1, 1)), KEY)])
 def test_the_docstring_says_the_bytes(traced, lights):
     (block,) = collected(traced, crop(32), lights, subsamples=4, soft=skies.sky(lights, 32))
-    n, p, t = (hits.padded(c) for c in block.counts)
+    n, p, t = (image_samples.padded(c) for c in block.counts)
 
     def held(value) -> int:
         if isinstance(value, tuple):
@@ -103,8 +104,8 @@ def test_delta_lights_arrive_as_mitsubas_do(traced, rng, light):
 
     camera, maps = crop(), random_maps(rng, SIZES)
     captures = in_memory([camera], [(light,)], [np.zeros((*camera.size, 3), np.float32)])
-    options = shade.RenderOptions(frame="mitsuba", subsamples=1)
-    ours = shade.MaterialRenderer(traced, captures, SIZES, options)
+    options = renderer.RenderOptions(frame="mitsuba", subsamples=1)
+    ours = renderer.MaterialRenderer(traced, captures, SIZES, options)
     sensor = scenery.sensor_dict(camera)
     sensor["film"]["pixel_format"] = "rgb"
     sensor["sampler"] = {"type": "stratified", "sample_count": 1, "jitter": False}
@@ -127,9 +128,9 @@ def test_delta_lights_arrive_as_mitsubas_do(traced, rng, light):
 
 
 def test_a_grid_of_samples_is_square():
-    np.testing.assert_allclose(hits.grid(4), [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
+    np.testing.assert_allclose(image_samples.grid(4), [[0.25, 0.25], [0.75, 0.25], [0.25, 0.75], [0.75, 0.75]])
     with pytest.raises(ValueError, match="square number"):
-        hits.grid(8)
+        image_samples.grid(8)
 
 
 def test_what_cannot_be_collected_is_refused(traced):

@@ -10,10 +10,10 @@ from test_recover import LIGHTS, QUICK, SIZE, directional, hollow, strong_maps
 from mistyle.core.camera import look_at
 from mistyle.core.capture import in_memory
 from mistyle.core.image import gaussian
-from mistyle.render import device, draw
-from mistyle.render import hits as collecting
+from mistyle.render.deferred import image_samples as collecting
+from mistyle.render.deferred.material_table import pack, unpack
 from mistyle.render.indirect import Indirect
-from mistyle.render.material_table import pack, unpack
+from mistyle.render.mitsuba import device, draw
 from mistyle.stages import joint_pixels
 from mistyle.stages.fit_context import FitContext
 from mistyle.stages.recover_table import linked

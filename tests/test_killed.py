@@ -116,7 +116,7 @@ def test_a_native_crash_leaves_its_stack_and_is_tried_on_the_plain_path(tmp_path
         "if not plain:\n    os.abort()\n"
         "cache = os.environ['DRJIT_CACHE_DIR']\n"
         "assert os.path.isdir(cache) and not os.listdir(cache)\n"
-        "from mistyle.render import device\n"
+        "from mistyle.render.mitsuba import device\n"
         "device.use(threads=1)\n"
         "import drjit as dr, mitsuba as mi\n"
         "twice = device.Frozen(lambda x: x * 2)\n"

@@ -15,8 +15,8 @@ from mistyle.core.image import linear_from_srgb, luminance, srgb_from_linear
 from mistyle.core.light import Ambient, Environment, bake_environment
 from mistyle.io.read import read_exr
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render import sheet
-from mistyle.render.sheet_aovs import aovs, density
+from mistyle.render.lookdev import sheet
+from mistyle.render.lookdev.aovs import aovs, density
 from mistyle.run import sheet_canvas
 from mistyle.run.cli import main
 from mistyle.run.sheet_canvas import Panel, PanelRow, Sheet, compose, fitted
@@ -189,8 +189,8 @@ def test_density_is_told_against_the_median(tmp_path):
     lines += ["f " + " ".join(f"{i + 1}/{i + 1}" for i in face) for face in faces]
     (tmp_path / "row.obj").write_text("\n".join(lines))
     asset = read_mesh(tmp_path / "row.obj", uv="keep")
-    from mistyle.render.draw import gbuffer
-    from mistyle.render.lookdev import material_maps
+    from mistyle.render.lookdev.scenes import material_maps
+    from mistyle.render.mitsuba.draw import gbuffer
 
     maps = [material_maps(m) for m in asset.materials]
     hits = gbuffer(asset.mesh, sheet.asset_camera(0, 0, 96))

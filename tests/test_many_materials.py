@@ -18,8 +18,10 @@ from mistyle.core.paths import scenes
 from mistyle.core.rig_settings import RigSettings
 from mistyle.io.read_mesh import read_extent, read_mesh
 from mistyle.process import memory
-from mistyle.render import device, draw, lookdev, pages
-from mistyle.render import scene as scenery
+from mistyle.render.lookdev import scenes as lookdev
+from mistyle.render.mitsuba import device, draw
+from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba import texture_pages as pages
 from mistyle.run import budget, stylize_budget, verbs
 from mistyle.run.cli import main
 from mistyle.run.progress import Progress

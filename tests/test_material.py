@@ -19,9 +19,9 @@ from mistyle.core.view import View
 from mistyle.io.cameras.views import read_views, write_views
 from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render import draw
-from mistyle.render.material_table import pack
-from mistyle.render.shade import MaterialRenderer
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.deferred.renderer import MaterialRenderer
+from mistyle.render.mitsuba import draw
 from mistyle.run.charts import Chart, svg
 from mistyle.run.cli import main
 from mistyle.run.material import hold_out, lights_in_order, place, references_of

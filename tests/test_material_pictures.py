@@ -12,8 +12,10 @@ from mistyle.core.camera import Camera, look_at
 from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render import draw, hits, shade, texel_views
-from mistyle.render.material_table import pack
+from mistyle.render import texel_views
+from mistyle.render.deferred import image_samples, renderer
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.mitsuba import draw
 from mistyle.run.material_pictures import look_through, looked
 from mistyle.stages.recover_check import LEAST_PIXELS, downsampling_factors
 from mistyle.stages.texels import rasterise
@@ -94,7 +96,7 @@ def test_a_picture_that_is_not_kept_is_the_same_picture(rng, memory):
     table = pack(random_maps(rng, SIZES))
     traced = draw.tracer(torus())
     kept, lost = (
-        shade.MaterialRenderer(traced, captures, SIZES, shade.RenderOptions(subsamples=4, memory=m))
+        renderer.MaterialRenderer(traced, captures, SIZES, renderer.RenderOptions(subsamples=4, memory=m))
         for m in (1e9, memory)
     )
     first = kept.image(table, 0)
@@ -109,17 +111,17 @@ def test_a_picture_that_is_not_kept_is_the_same_picture(rng, memory):
 def test_rays_beside_the_mesh_are_not_traced():
     """Samples of a mesh that fills little of the picture are those of a crop about it, wherever the mesh is."""
     traced, camera = draw.tracer(torus()), look_at((0.5, 3, 14), fov=40, size=(60, 90))
-    down, across = hits.window(traced.mesh, camera)
+    down, across = image_samples.window(traced.mesh, camera)
     seen = draw.gbuffer(traced, camera).mask
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     assert down.start <= rows[0] <= down.start + 3 and down.stop - 4 <= rows[-1] < down.stop
     assert across.start <= columns[0] <= across.start + 3 and across.stop - 4 <= columns[-1] < across.stop
     near = look_at((0.5, 0.3, 0.2), fov=120, size=(60, 90))
-    assert hits.window(traced.mesh, near) == (slice(0, 60), slice(0, 90))
+    assert image_samples.window(traced.mesh, near) == (slice(0, 60), slice(0, 90))
     away = look_at((0, 0, 9), target=(0, 0, 20), fov=20, size=(60, 90))
-    mask, surface = np.ones(away.size, bool), hits.TexturedMesh(traced, SIZES)
-    assert not list(hits.collect(surface, away, (KEY,), mask))
-    blocks = hits.collect(surface, camera, (KEY,), mask, hits.Sampling(subsamples=1))
+    mask, surface = np.ones(away.size, bool), image_samples.TexturedMesh(traced, SIZES)
+    assert not list(image_samples.collect(surface, away, (KEY,), mask))
+    blocks = image_samples.collect(surface, camera, (KEY,), mask, image_samples.Sampling(subsamples=1))
     assert sum(b.covered.sum() for b in blocks) == seen.sum()
 
 

@@ -85,7 +85,7 @@ def test_what_is_not_ours_is_refused_before_any_work(verb_inputs, tmp_path, monk
     def works(*_: object) -> None:
         raise AssertionError("work began")
 
-    monkeypatch.setattr("mistyle.render.device.use", works)
+    monkeypatch.setattr("mistyle.render.mitsuba.device.use", works)
     assert main(words) == 2
     said = capsys.readouterr().err
     assert name.split("/")[0] in said and "-o" in said and "mistyle: " in said and "Traceback" not in said

@@ -5,7 +5,7 @@ import pytest
 from helpers import fixed_surface
 from test_surface import plain_cost, plane_level, small_search
 
-from mistyle.render import device
+from mistyle.render.mitsuba import device
 from mistyle.surface import field, guides, kernels, pieces, style, synthesis
 
 

@@ -10,8 +10,10 @@ from test_seam import KEY, Path, crop, random_maps, tables, torus
 from mistyle.core.light import direction_in_world
 from mistyle.core.mesh import Mesh, weld
 from mistyle.geometry.tangents import mikktspace
-from mistyle.render import bsdf, deferred, device, draw, plugins
-from mistyle.render import scene as scenery
+from mistyle.render.deferred import bsdf
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.mitsuba import device, draw, plugins
+from mistyle.render.mitsuba import scene as scenery
 
 SIZE = (32, 32)
 

@@ -11,9 +11,9 @@ from mistyle.core.image import gaussian
 from mistyle.core.light import Ambient, Directional, Environment, Point, SceneLights, SphericalGaussian
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.render import device
-from mistyle.render import scene as scenery
-from mistyle.render.emitters import emitters
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.emitters import emitters
 from mistyle.render.polish import PolishSettings, polish
 
 SIZE, RESOLUTION = 24, 48
@@ -136,9 +136,9 @@ def test_what_is_not_fitted_stays_and_a_worse_result_is_dropped(room):
 )
 def test_emitters_light_a_surface_as_the_records_say(lights):
     """The same picture as the deferred renderer, which sums the records themselves."""
-    from mistyle.render.draw import tracer
-    from mistyle.render.material_table import pack
-    from mistyle.render.shade import MaterialRenderer, RenderOptions
+    from mistyle.render.deferred.material_table import pack
+    from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+    from mistyle.render.mitsuba.draw import tracer
 
     device.use()
     mesh, maps = corner(), coloured()

@@ -13,11 +13,12 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import erode, gaussian
 from mistyle.core.light import Directional, Environment, Point
 from mistyle.core.maps import Maps
-from mistyle.render import device, draw, indirect
-from mistyle.render import hits as collecting
-from mistyle.render import scene as scenery
-from mistyle.render.emitters import emitters
+from mistyle.render import indirect
+from mistyle.render.deferred import image_samples as collecting
 from mistyle.render.indirect import FIREFLY, MOST, Indirect, averaged, enlarged, in_proportion
+from mistyle.render.mitsuba import device, draw
+from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.emitters import emitters
 from mistyle.render.texel_views import GBuffer, trace_gbuffer
 from mistyle.stages import recover_observe, recover_pictures
 from mistyle.stages.frames import texel_frames
@@ -593,7 +594,7 @@ def test_texel_frames_are_those_of_the_rays(world, frame):
     mesh, _, texels, captures = world
     tangents = collecting.tangents_of(mesh, frame)
     traced = draw.tracer(mesh)
-    from mistyle.render import deferred
+    from mistyle.render.deferred import integrator as deferred
 
     surface = deferred.trace(traced, [captures.cameras[0]], tangents)
     on = np.flatnonzero(surface.mask)

@@ -11,10 +11,10 @@ from test_recover_smooth import atlas
 from mistyle.core.capture import subset
 from mistyle.core.image import gaussian
 from mistyle.core.light import Ambient
-from mistyle.render import draw
-from mistyle.render import hits as collecting
-from mistyle.render.material_table import pack
-from mistyle.render.shade import MaterialRenderer
+from mistyle.render.deferred import image_samples as collecting
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.deferred.renderer import MaterialRenderer
+from mistyle.render.mitsuba import draw
 from mistyle.stages import joint_algebra as algebra
 from mistyle.stages import recover_joint as joint
 from mistyle.stages.fit_context import DirectCaptures, FitContext

@@ -25,8 +25,8 @@ from mistyle.core.light import (
 )
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
-from mistyle.render import device, draw, scene
-from mistyle.render.scene import Staging
+from mistyle.render.mitsuba import device, draw, scene
+from mistyle.render.mitsuba.scene import Staging
 
 # Ray tracing in float32 about four units away.
 TRACED = 2e-5
@@ -398,7 +398,7 @@ def test_an_unknown_variant_is_an_environment_error() -> None:
 def test_a_scene_with_an_exr_loads_on_one_thread():
     """In a process of its own, with a limit: on one thread Mitsuba's EXR reader waits for ever."""
     code = (
-        "from mistyle.render import device, scene; device.use(threads=1);"
+        "from mistyle.render.mitsuba import device; from mistyle.render.mitsuba import scene; device.use(threads=1);"
         "import drjit as dr; scene.read_template('studio', turn=0, floor=-1); assert dr.thread_count() == 1"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

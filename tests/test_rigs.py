@@ -11,11 +11,11 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
 from mistyle.geometry import next_best_view as rigs
-from mistyle.render.draw import tracer
-from mistyle.render.visible import face_on
+from mistyle.render.mitsuba.draw import tracer
+from mistyle.render.mitsuba.rigs import next_best_views, sample_surface
+from mistyle.render.mitsuba.visible import face_on
 from mistyle.run.stylize_settings import resolve
 from mistyle.run.stylize_start import cameras_of
-from mistyle.stages.rigs import next_best_views, sample_surface
 
 
 def as_mesh(solid: trimesh.Trimesh, inward: bool = False) -> Mesh:

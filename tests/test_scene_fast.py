@@ -7,7 +7,9 @@ import pytest
 from test_scene_fit import bitmap, smooth
 
 from mistyle.core.drjit_arrays import aligned
-from mistyle.render import device, scene_fit, scene_grad, scene_job, scene_keys
+from mistyle.render import scene_fit, scene_grad, scene_job
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.mitsuba import device
 from mistyle.render.scene_fast import DeferredRenderer, Unsupported
 
 KEYS = ["wall.bsdf.base_color.data", "wall.bsdf.roughness.data", "wall.bsdf.normalmap.data", "ball.bsdf.base_color"]

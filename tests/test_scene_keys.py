@@ -5,7 +5,9 @@ import pytest
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.io.images.write import write_exr, write_png
-from mistyle.render import device, scene_keys, scene_xml
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.live import xml as scene_xml
+from mistyle.render.mitsuba import device
 
 SCENE = """<?xml version="1.0" encoding="utf-8"?>
 <!-- the user's own words -->

@@ -8,7 +8,10 @@ from test_scene_fit import CAMERAS, COLOUR, TRUE_COLOUR, flat, references, root_
 
 import mistyle
 from mistyle.core.errors import UsageError
-from mistyle.render import device, pyramid, scene_fit, scene_grad, scene_job, scene_keys, scene_newton
+from mistyle.render import scene_fit, scene_grad, scene_job, scene_newton
+from mistyle.render.deferred import pyramid
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.mitsuba import device
 
 WHITE, GREEN, RED = (f"{name}.reflectance.value" for name in ("white", "green", "red"))
 TRUE = {WHITE: [0.88, 0.7, 0.66], GREEN: [0.11, 0.38, 0.08], RED: [0.57, 0.05, 0.05]}

@@ -7,7 +7,11 @@ import pytest
 
 from mistyle.core.errors import InputRefused, Stopped, UsageError
 from mistyle.process import stopping
-from mistyle.render import device, scene_fit, scene_grad, scene_keys, scene_source, scene_xml
+from mistyle.render import scene_fit, scene_grad
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.live import source as scene_source
+from mistyle.render.live import xml as scene_xml
+from mistyle.render.mitsuba import device
 from mistyle.run import cli
 from mistyle.run.scene_references import choose_channels
 

@@ -9,8 +9,10 @@ from mistyle.core.light import Ambient, Directional
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.geometry.tangents import mikktspace
-from mistyle.render import deferred, device, draw, seam
-from mistyle.render import scene as scenery
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred import torch_bridge
+from mistyle.render.mitsuba import device, draw
+from mistyle.render.mitsuba import scene as scenery
 
 KEY = Directional((-0.5, -0.5, -0.7071), (2.0, 1.5, 1.0), "camera")
 SIZES = [(24, 40), (32, 32)]
@@ -66,7 +68,7 @@ def random_maps(rng, sizes, tilt=0.3, roughness=(0.3, 0.9)) -> list[Maps]:
 def tables(maps) -> dict[str, np.ndarray]:
     return {
         name: np.concatenate([getattr(m, name).reshape(-1, channels) for m in maps])
-        for name, channels in seam.CHANNELS.items()
+        for name, channels in torch_bridge.CHANNELS.items()
     }
 
 
@@ -77,8 +79,8 @@ class Path:
         traced = draw.tracer(mesh)
         surface = deferred.trace(traced, cameras, tangents)
         self.lit = deferred.light(traced, surface, lights, shadows=shadows)
-        self.taps = seam.taps(surface, sizes)
-        self.shader = seam.Shader(self.lit.size, **options)
+        self.taps = torch_bridge.taps(surface, sizes)
+        self.shader = torch_bridge.Shader(self.lit.size, **options)
 
     def leaves(self, tables, moving=("albedo", "normal", "roughness")):
         return {
@@ -87,7 +89,7 @@ class Path:
         }
 
     def draw(self, leaves):
-        pixels = seam.fetch(torch.cat(list(leaves.values()), dim=1), self.taps)
+        pixels = torch_bridge.fetch(torch.cat(list(leaves.values()), dim=1), self.taps)
         return self.shader(self.lit, pixels, [name for name, leaf in leaves.items() if leaf.requires_grad])
 
 
@@ -116,7 +118,7 @@ BOTH = pytest.mark.parametrize("bridge", ["frozen", "wrap"])
 
 
 @pytest.mark.parametrize("gloss", [True, False])
-@pytest.mark.parametrize("moving", [("albedo", "normal", "roughness"), ("normal",), tuple(seam.CHANNELS)])
+@pytest.mark.parametrize("moving", [("albedo", "normal", "roughness"), ("normal",), tuple(torch_bridge.CHANNELS)])
 def test_the_frozen_split_equals_its_twin_behind_wrap(rng, gloss, moving):
     """Same loss, same gradients, replayed and not recorded again for other values."""
     device.use()
@@ -150,7 +152,7 @@ def test_picture_and_gradient_equal_mitsubas_own(rng, bridge):
 
     mesh, maps, camera = torus(), random_maps(rng, SIZES), crop()
     ours = Path(mesh, [camera], (KEY,), bridge=bridge)
-    leaves = ours.leaves(tables(maps), tuple(seam.CHANNELS))
+    leaves = ours.leaves(tables(maps), tuple(torch_bridge.CHANNELS))
     picture = ours.draw(leaves)
     adjoint = rng.normal(size=picture.shape).astype(np.float32)
     (picture * torch.from_numpy(adjoint)).sum().backward()
@@ -171,7 +173,7 @@ def test_picture_and_gradient_equal_mitsubas_own(rng, bridge):
     # A ray may fall on the other side of a shadow's edge when the light is spelled with other roundings.
     different = np.abs(picture.detach().numpy() - theirs).max(-1) > 2e-4
     assert different.mean() < 1e-3
-    for name, channels in seam.CHANNELS.items():
+    for name, channels in torch_bridge.CHANNELS.items():
         scale = 2 if name == "normal" else 1  # their texture holds (n + 1) / 2
         full = np.concatenate([np.array(dr.grad(parameters[names[p, name]])).reshape(-1, channels) for p in (0, 1)])
         mine = np.zeros_like(full)
@@ -324,9 +326,9 @@ def test_fetch_is_bilinear_with_repeat_and_its_gradient_is_the_transpose(rng):
     mask = np.arange(50) % 5 > 0
     part, zeros = np.where(mask, 0, -1).astype(np.int32), np.zeros((50, 3), np.float32)
     surface = deferred.Surface((), uv, part, mask, np.ones(50, np.float32), zeros, zeros, None, None, None)
-    where = seam.taps(surface, [(rows, columns)])
+    where = torch_bridge.taps(surface, [(rows, columns)])
     leaf = torch.from_numpy(table[where.texels]).requires_grad_()
-    pixels = seam.fetch(leaf, where)
+    pixels = torch_bridge.fetch(leaf, where)
     for channel in (0, 1):
         texture = mi.load_dict(scenery.texture_dict(table[:, channel].reshape(rows, columns, 1)))
         point = mi.SurfaceInteraction3f()
@@ -342,4 +344,4 @@ def test_a_film_of_another_size_is_refused():
     device.use()
     path = Path(torus(8, 8), [crop(8)], (KEY,))
     with pytest.raises(ValueError, match="film has"):
-        seam.Shader((4, 4))(path.lit, torch.zeros(64, 8))
+        torch_bridge.Shader((4, 4))(path.lit, torch.zeros(64, 8))

@@ -12,9 +12,11 @@ from test_seam import KEY, SIZES, crop, plain_scene, random_maps, torus
 from mistyle.core.camera import orbit
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Ambient, Directional, Environment, Point
-from mistyle.render import device, draw, hits, shade
-from mistyle.render import scene as scenery
-from mistyle.render.material_table import pack, unpack
+from mistyle.render.deferred import image_samples
+from mistyle.render.deferred import renderer as shade
+from mistyle.render.deferred.material_table import pack, unpack
+from mistyle.render.mitsuba import device, draw
+from mistyle.render.mitsuba import scene as scenery
 
 RIM = Directional((0.8, 0.36, 0.48), (0.6, 1.2, 2.0))
 LAMP = Point((1.5, 1.0, 1.5), (3.0, 2.5, 2.0))
@@ -270,7 +272,7 @@ def test_gradient_equals_mitsubas_average(traced, rng, lights):
 
 @pytest.mark.parametrize("lights, subsamples", [((KEY, LAMP), 1), ((KEY, LAMP), 4), ((Ambient((1, 1, 1)),), 4)])
 def test_same_bytes_frozen_kept_recomputed_and_again(traced, lights, subsamples, monkeypatch):
-    monkeypatch.setattr(hits, "BLOCK_RAYS", 40 * 8 * subsamples)  # five blocks a picture
+    monkeypatch.setattr(image_samples, "BLOCK_RAYS", 40 * 8 * subsamples)  # five blocks a picture
     cameras, results = [crop(40), orbit(200, 10, distance=4, fov=30, size=(40, 40))], []
     for options in ({}, {}, {"memory": 0}, {"freeze": False}):
         rng = np.random.default_rng(1)
@@ -319,7 +321,7 @@ def test_the_loop_traces_nothing_waits_for_nothing_and_records_rarely(traced, rn
     ours = made(traced, rng, cameras, (KEY, LAMP), 4)
     adjoint = mi.TensorXf(rng.normal(size=(32, 32, 3)).astype(np.float32))
     collected = [ours.image(k) for k in range(6)]
-    monkeypatch.setattr(hits, "collect", None)
+    monkeypatch.setattr(image_samples, "collect", None)
     counts, start, table = [], ours.renderer.recordings, ours.table
     uploaded = ours.renderer.upload(table)
     with dr.scoped_set_flag(dr.JitFlag.ForbidSynchronization, True):
@@ -364,7 +366,7 @@ def test_arrays_let_go_while_a_function_is_recorded_do_no_harm():
     code = """
 import gc
 import numpy as np
-from mistyle.render import device
+from mistyle.render.mitsuba import device
 device.use()
 import drjit as dr
 import mitsuba as mi

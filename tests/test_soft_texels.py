@@ -10,8 +10,9 @@ from test_seam import sphere
 from mistyle.core.camera import look_at
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Ambient, Directional, Environment, SphericalGaussian
-from mistyle.render import device, sky
-from mistyle.render.draw import tracer
+from mistyle.render.deferred import sky
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.draw import tracer
 from mistyle.render.texel_lm import Observations, Options, Points, Problem
 from mistyle.render.texel_views import SKY_CELLS, open_sky, rig
 from mistyle.stages.recover import recover
@@ -89,7 +90,7 @@ def values(rng: np.random.Generator, texels=40) -> np.ndarray:
 def test_the_model_is_the_sum_over_cells(rng, model):
     import mitsuba as mi
 
-    from mistyle.render import bsdf
+    from mistyle.render.deferred import bsdf
 
     solver, points, own, seen = problem(Options(model, metallic=True), rng)
     x = values(rng)

@@ -7,7 +7,7 @@ import trimesh
 from mistyle.core.camera import orbit
 from mistyle.core.maps import flat_maps
 from mistyle.core.mesh import Mesh
-from mistyle.render import settle
+from mistyle.render.mitsuba import settle
 
 
 @pytest.fixture(scope="module")
@@ -19,8 +19,8 @@ def ball() -> Mesh:
 
 
 def drawn(mesh, radiance, azimuth=30.0, **maps):
-    from mistyle.render.draw import tracer
-    from mistyle.render.studio import Studio, StudioSky, prefiltered
+    from mistyle.render.lookdev.studio import Studio, StudioSky, prefiltered
+    from mistyle.render.mitsuba.draw import tracer
 
     traced, page = tracer(mesh), np.zeros((1, 64, 64, 4), np.float32)
     rows = np.arcsin(np.linspace(1 - 1 / 64, -1 + 1 / 64, 64))[:, None]
@@ -32,7 +32,7 @@ def drawn(mesh, radiance, azimuth=30.0, **maps):
 
 
 def test_constant_light_stays_constant_and_a_furnace_gives_the_albedo(ball):
-    from mistyle.render.studio import prefiltered
+    from mistyle.render.lookdev.studio import prefiltered
 
     light = np.full((32, 64, 3), (0.5, 1.0, 2.0), np.float32)
     np.testing.assert_allclose(prefiltered(light)[..., :3], np.broadcast_to((0.5, 1, 2), (6, 64, 128, 3)), rtol=1e-3)
@@ -56,7 +56,7 @@ def test_the_light_turns_with_the_camera_and_falls_where_it_comes_from(ball):
 def test_cosine_weighted_irradiance():
     """Light of radiance max(0, y): irradiance / pi towards +Y is the mean of y under the cosine, 2/3."""
     from mistyle.core.light import environment_directions
-    from mistyle.render.studio import prefiltered
+    from mistyle.render.lookdev.studio import prefiltered
 
     sky = np.repeat(np.maximum(environment_directions(64, 128)[..., 1:2], 0), 3, axis=-1).astype(np.float32)
     np.testing.assert_allclose(prefiltered(sky)[-1, 0, :, :3], 2 / 3, rtol=0.01)
@@ -64,7 +64,7 @@ def test_cosine_weighted_irradiance():
 
 def test_open_sky_of_a_wedge():
     """Between a floor and a wall that meet at a right angle, half of the sky is open and its mean leans away."""
-    from mistyle.render.occlusion import ambient_occlusion, open_sky
+    from mistyle.render.mitsuba.occlusion import ambient_occlusion, open_sky
 
     corners = [[-9, 0, -9], [9, 0, -9], [9, 0, 9], [-9, 0, 9], [0, 0, -9], [0, 0, 9], [0, 9, 9], [0, 9, -9]]
     points = np.array(corners, np.float32)

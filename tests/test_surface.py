@@ -13,8 +13,8 @@ from mistyle.core.asset import Picture
 from mistyle.core.errors import InputRefused
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.io.store.records import load_record, save_record
-from mistyle.render import device
-from mistyle.render.occlusion import ambient_occlusion
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.occlusion import ambient_occlusion
 from mistyle.surface import creases, field, guides, kernels, linefield, lookup, samples, style, synthesis
 from mistyle.surface.settings import SurfaceSettings
 

@@ -20,8 +20,8 @@ from mistyle.core.mesh import face_areas
 from mistyle.core.rig_settings import RigSettings
 from mistyle.geometry.tangents import corner_tangents
 from mistyle.io.images.write import write_png
-from mistyle.render.draw import gbuffer, tracer
-from mistyle.render.unlit import unlit
+from mistyle.render.mitsuba.draw import gbuffer, tracer
+from mistyle.render.mitsuba.unlit import unlit
 from mistyle.run import options, painting, preview, stylize_start, variations
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages import coat

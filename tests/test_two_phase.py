@@ -15,10 +15,10 @@ from mistyle.core.asset import Asset, Picture, Source
 from mistyle.core.light import Directional, lights
 from mistyle.core.maps import flat_maps
 from mistyle.core.paths import scenes
-from mistyle.render import device
-from mistyle.render.draw import tracer
-from mistyle.render.material_table import pack
-from mistyle.render.shade import MaterialRenderer, RenderOptions
+from mistyle.render.deferred.material_table import pack
+from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.draw import tracer
 from mistyle.run import pipeline
 from mistyle.run.generative import lights_of_views
 from mistyle.run.made import Atlas, Baked

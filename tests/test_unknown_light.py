@@ -13,8 +13,8 @@ from mistyle.core.image import luminance, resize
 from mistyle.core.light import Environment, environment_directions
 from mistyle.core.maps import flat_maps
 from mistyle.io.read_mesh import read_mesh
-from mistyle.render.draw import tracer
-from mistyle.render.sky import bin_environment, even_directions
+from mistyle.render.deferred.sky import bin_environment, even_directions
+from mistyle.render.mitsuba.draw import tracer
 from mistyle.render.texel_lm import Options
 from mistyle.stages import light_cells, light_solve, recover_prior, unknown_light
 from mistyle.stages.recover_observe import ObservationOptions, collect_observations

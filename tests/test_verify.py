@@ -12,8 +12,8 @@ from gltf_cases import bumpy_sphere, no_texels, quarters
 from node_tools import modules
 
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.render.external.blender import blender_command, find_blender
 from mistyle.run import verify_checks
-from mistyle.run.blender import blender_command, find_blender
 from mistyle.run.cli import main
 from mistyle.run.deliver import DeliveryRequest, export
 from mistyle.run.verify import Rendering, compared, file_checks, table, verify
@@ -45,7 +45,7 @@ def run(good, tmp_path) -> Path:
 def no_blender(monkeypatch):
     """Whether this machine has one must not matter."""
     monkeypatch.delenv("MISTYLE_BLENDER_PYTHON", raising=False)
-    monkeypatch.setattr("mistyle.run.blender.which", lambda name: None)
+    monkeypatch.setattr("mistyle.render.external.blender.which", lambda name: None)
 
 
 def outcomes(told: dict, *words: str) -> set[str]:
@@ -265,7 +265,7 @@ def test_the_validator_finds_what_trimesh_lets_pass(run, monkeypatch):
 def test_blender_is_asked_as_the_program_or_as_a_python(run, monkeypatch, tmp_path):
     assert blender_command("/x/bin/python", "s.py") == ["/x/bin/python", "s.py"]
     assert blender_command("/opt/blender-5/blender", "s.py")[-3:] == ["--python", "s.py", "--"]
-    monkeypatch.setattr("mistyle.run.blender.which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr("mistyle.render.external.blender.which", lambda name: f"/usr/bin/{name}")
     assert find_blender(None, {}) == "/usr/bin/blender" and find_blender("p", {}) == "p"
     # A program that answers as our worker does: a mesh in the GLB, nothing in the OBJ, a missing image in the USD.
     program = tmp_path / "blender"

@@ -17,7 +17,7 @@ from mistyle.core.light import Ambient, Directional, Environment, Point, Spheric
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.render.renderer import Renderer
+from mistyle.render.deferred.differentiable import Renderer
 
 __all__ = [
     "Ambient",

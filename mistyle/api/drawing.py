@@ -16,7 +16,7 @@ from mistyle.core.light import Light, Lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.render.renderer import lights_of_cameras
+from mistyle.render.deferred.differentiable import lights_of_cameras
 
 WHOLE = 0.999  # coverage from which a pixel shows nothing but the mesh
 
@@ -81,8 +81,8 @@ def render_views(
     are not seen. Equal inputs, seed and threads give equal bytes. Opacity, emission, coats and transmission of an asset
     are not shown (`mistyle.lookdev` shows them). Raises ValueError for light that only a scene file describes.
     """
-    from mistyle.render.lit_views import draw_lit_views
-    from mistyle.render.lookdev import material_maps
+    from mistyle.render.lookdev.scenes import material_maps
+    from mistyle.render.mitsuba.lit_views import draw_lit_views
 
     seen_from = [cameras] if isinstance(cameras, Camera) else list(cameras)
     if maps is None and isinstance(mesh, Asset):

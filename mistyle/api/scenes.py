@@ -89,8 +89,8 @@ def fit_scene(
     from dataclasses import replace
     from pathlib import Path
 
+    from mistyle.render.live.parameters import merged
     from mistyle.render.scene_fit import fit_scene as run
-    from mistyle.render.scene_keys import merged
     from mistyle.run.scene_references import read_reference
 
     notes: list[str] = []

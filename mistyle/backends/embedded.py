@@ -15,15 +15,15 @@ from mistyle.surface.settings import ResolvedSettings, SurfaceSettings
 
 def array_module() -> str:
     """Dr.Jit's array module for the Mitsuba variant in use: "llvm", "cuda" or "metal"."""
-    from mistyle.render import device
+    from mistyle.render.mitsuba import device
 
     return device.use().split("_")[0]
 
 
 def open_sky(mesh: Mesh, seed: int) -> Occlusion:
     """The share of open sky at points of a mesh, as the guides ask for it; the mesh is made ready for tracing once."""
-    from mistyle.render.draw import tracer
-    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.render.mitsuba.draw import tracer
+    from mistyle.render.mitsuba.occlusion import ambient_occlusion
 
     traced = tracer(mesh)
     return lambda positions, normals: ambient_occlusion(traced, positions, normals, seed=seed)

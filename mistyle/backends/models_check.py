@@ -171,7 +171,7 @@ def empty(device: str) -> None:
 
     gc.collect()
     if "drjit" in sys.modules:
-        from mistyle.render.device import give_back
+        from mistyle.render.mitsuba.device import give_back
 
         give_back()
     if device in ("cuda", "mps"):

@@ -94,12 +94,12 @@ def rig(settings: RigSettings) -> list[Camera]:
     """The cameras of a job in visiting order; 'paper' gives the 16 views of section 4.1.1, 'turntable' a ring.
 
     Cameras of kind 'file' are read by `io/cameras/camera_files.py`, since this floor opens no files; those of kind
-    'nbv' hang on the mesh (`stages/rigs.py`).
+    'nbv' hang on the mesh (`render/mitsuba/rigs.py`).
     """
     if settings.kind == "file":
         raise ValueError("cameras from a file are read by mistyle.io.cameras.camera_files.read_cameras")
     if settings.kind == "nbv":
-        raise ValueError("cameras of kind 'nbv' are chosen for a mesh by mistyle.stages.rigs.next_best_views")
+        raise ValueError("cameras of kind 'nbv' are chosen for a mesh by mistyle.render.mitsuba.rigs.next_best_views")
     size = (settings.resolution, settings.resolution)
     angles = (
         PAPER_ANGLES

@@ -1,4 +1,5 @@
-"""Adam on the table of texels (`render/shade.py`), preconditioned by an image pyramid, without ever waiting for it.
+"""Adam on the table of texels (`render/deferred/renderer.py`), preconditioned by an image pyramid, without ever waiting
+for it.
 
 A texture moves by the sum of what every level of its pyramid moves by: level 0 is the texture, each further level has
 half the rows and columns and sees the sum of the gradients of its texels. Adam's step has the same length on every
@@ -17,8 +18,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.core.drjit_arrays import aligned
-from mistyle.render import device
-from mistyle.render.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT_X, TILT_Y
+from mistyle.render.deferred.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT_X, TILT_Y
+from mistyle.render.mitsuba import device
 
 CHANNELS = ("albedo", "albedo", "albedo", "normal", "normal", "roughness", "metallic")
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12

@@ -18,9 +18,9 @@ from mistyle.core.image import gaussian, nearest_fill, resize
 from mistyle.core.light import Lights
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.render import device
-from mistyle.render import scene as scenery
-from mistyle.render.emitters import emitters
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba import scene as scenery
+from mistyle.render.mitsuba.emitters import emitters
 
 MOST = 512  # pixels along the longer side of the estimate at most; it is as large as the picture where that is smaller
 TOGETHER = 6  # pictures of one camera that share their paths; more make the kernel long

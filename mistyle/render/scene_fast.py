@@ -1,4 +1,5 @@
-"""Gradients of a live Mitsuba scene without Monte Carlo, where that is the same picture (`render/shade.py`).
+"""Gradients of a live Mitsuba scene without Monte Carlo, where that is the same picture
+(`render/deferred/renderer.py`).
 
 It is where only points and directions light the scene, the integrator follows no light from surface to surface, films
 have a box filter, and what is fitted are the maps (or literals) of plain `principled` materials on meshes. Other shapes
@@ -17,10 +18,12 @@ from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Directional, Point
 from mistyle.core.mesh import Mesh
-from mistyle.render import scene_grad, scene_keys, scene_walk
-from mistyle.render.draw import Tracer, gbuffer, tracer
-from mistyle.render.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT
-from mistyle.render.scene_keys import Parameter
+from mistyle.render import scene_grad
+from mistyle.render.deferred.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.live import walk as scene_walk
+from mistyle.render.live.parameters import Parameter
+from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
 
 ROLES = {
     "base_color": ALBEDO,
@@ -132,7 +135,7 @@ class DeferredRenderer:
 
     def _agreeing(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
         """The renderer whose pictures are the scene's, of the variants of a normal map that Mitsuba has."""
-        from mistyle.render.shade import MaterialRenderer, RenderOptions
+        from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
         sizes = [(2, 2) if m is None else m.size for m in self.materials]
         bumped = any("normalmap" in m.roles for m in self.materials if m is not None)

@@ -13,8 +13,10 @@ from typing import Any
 import numpy as np
 
 from mistyle.process import stopping
-from mistyle.render import device, scene_grad, scene_job, scene_keys, scene_newton, scene_result
-from mistyle.render import pyramid as laplacian
+from mistyle.render import scene_grad, scene_job, scene_newton, scene_result
+from mistyle.render.deferred import pyramid as laplacian
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.mitsuba import device
 from mistyle.render.scene_job import Bad, Regularizer
 from mistyle.render.scene_result import FittedScene, Residual
 

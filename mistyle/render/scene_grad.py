@@ -18,9 +18,9 @@ from jaxtyping import Bool, Float
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
-from mistyle.render import scene as scenery
-from mistyle.render import scene_walk
-from mistyle.render.scene_keys import Parameter
+from mistyle.render.live import walk as scene_walk
+from mistyle.render.live.parameters import Parameter
+from mistyle.render.mitsuba import scene as scenery
 
 # (picture, reference) -> number; both Mitsuba tensors (h, w, 3), linear
 Loss = Callable[[Any, Any], Any]

@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.errors import UsageError
-from mistyle.render import pyramid as laplacian
-from mistyle.render import scene_grad, scene_keys, scene_newton
-from mistyle.render.scene_keys import Parameter
+from mistyle.render import scene_grad, scene_newton
+from mistyle.render.deferred import pyramid as laplacian
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.live.parameters import Parameter
 
 FEWEST_VIEWS = 3
 SOLVERS = ("auto", "adam", "gauss-newton")

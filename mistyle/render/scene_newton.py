@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.process import stopping
-from mistyle.render import scene_grad, scene_keys
-from mistyle.render.scene_keys import Parameter
+from mistyle.render import scene_grad
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.live.parameters import Parameter
 
 MOST_NUMBERS = 32
 MOST_BYTES = 2.5e8  # of the derivatives that are kept, in checkpoints too

@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.render import scene_grad, scene_keys, scene_newton
+from mistyle.render import scene_grad, scene_newton
+from mistyle.render.live import parameters as scene_keys
+from mistyle.render.live.parameters import Parameter
 from mistyle.render.scene_job import Bad, FitState, SceneProblem
-from mistyle.render.scene_keys import Parameter
 
 BATCHES = 8  # of the last steps, whose means' spread is the standard error
 DRIFT = 0.02  # relative change over the last steps that counts as not converged

@@ -1,10 +1,10 @@
 """Material of every texel by itself, by a batched Levenberg–Marquardt solver: texels are the lanes.
 
-Where geometry, cameras and lights are known and light arrives from deltas, a texel's own observations determine its
-own unknowns x = (albedo r, g, b, tilt x, tilt y, roughness, metallic), and no picture has to be rendered. Soft light is
+Where geometry, cameras and lights are known and light arrives from deltas, a texel's own observations determine its own
+unknowns x = (albedo r, g, b, tilt x, tilt y, roughness, metallic), and no picture has to be rendered. Soft light is
 taken for as many directional lights as the sky has cells, each of which widens the lobe by its own width. With the
-reflectance albedo · linear + constant of `render/bsdf.py` and irradiance E the model of an observation is, per channel
-c, with q = (tilt, roughness, metallic),
+reflectance albedo · linear + constant of `render/deferred/bsdf.py` and irradiance E the model of an observation is, per
+channel c, with q = (tilt, roughness, metallic),
 
     f_c(x) = sum over its lights of E_c (albedo_c linear(q) + constant(q))
 
@@ -25,7 +25,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.core.drjit_arrays import aligned
-from mistyle.render import device
+from mistyle.render.mitsuba import device
 from mistyle.render.texel_algebra import Sums, flat_of, nothing, spread_of, step, triangle, unflat
 from mistyle.render.texel_records import UNKNOWNS, Observations, Options, Points, Rig, Solution
 from mistyle.render.texel_response import derivatives, differences, terms

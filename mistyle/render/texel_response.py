@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from mistyle.render import bsdf
+from mistyle.render.deferred import bsdf
 from mistyle.render.texel_records import Options
 
 STEP = 1e-3  # of central differences, the twin of the derivatives by AD

@@ -10,10 +10,11 @@ from jaxtyping import Bool, Float, UInt32
 from mistyle.core.camera import Camera
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.light import SOFT, Directional, Light, Lights, Point, direction_in_world, position_in_world
-from mistyle.render import deferred, device
-from mistyle.render.draw import Tracer
-from mistyle.render.hits import BLOCK_RAYS, camera_rays
-from mistyle.render.sky import bin_environment, even_directions
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred.image_samples import BLOCK_RAYS, camera_rays
+from mistyle.render.deferred.sky import bin_environment, even_directions
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba.draw import Tracer
 from mistyle.render.texel_lm import Rig
 
 SKY_CELLS = 128

@@ -23,10 +23,10 @@ from mistyle.io.store.atomic import atomic_write
 from mistyle.io.store.output import claim, replace_files
 from mistyle.measure.pictures.metrics import definitions, measure_colour
 from mistyle.measure.pictures.statistics import interval, slope
+from mistyle.render.external.render_files import RenderView, Subject
+from mistyle.render.external.renderers import Renderer, left_out, renderer, shots, subject
 from mistyle.run.charts import Chart
 from mistyle.run.progress import Progress
-from mistyle.run.render_files import RenderView, Subject
-from mistyle.run.renderers import Renderer, left_out, renderer, shots, subject
 from mistyle.run.versions import versions
 
 FILES = ("converge.json", "converge.csv", "index.html")
@@ -122,7 +122,7 @@ def _defined(scene: Path, defines: Mapping[str, str], work: Path) -> Path:
     """The scene file with its parameters as given, for every renderer; itself without any."""
     if not defines:
         return scene
-    from mistyle.render.scene_source import resolved
+    from mistyle.render.live.source import resolved
 
     if scene.suffix.lower() != ".xml":
         name, value = next(iter(defines.items()))

@@ -104,7 +104,7 @@ def laid(baked: Baked, made: StyleFinish) -> Baked:
 
 def finish_pair(asset: Asset, finishing: FinishRecord, camera: Camera) -> BeforeAfter:
     """The painting before and after, without light, for the report."""
-    from mistyle.render.unlit import unlit
+    from mistyle.render.mitsuba.unlit import unlit
     from mistyle.run.report_draw import shown
 
     shots = []

@@ -73,7 +73,7 @@ def lookdev(
     the asset's file was last changed, UTC). The same asset, settings and thread count give the same pictures.
     """
     from mistyle.io.read import read_radiance
-    from mistyle.render import sheet as drawing
+    from mistyle.render.lookdev import sheet as drawing
     from mistyle.run.start import start_engines
     from mistyle.run.turntable import encoder
 
@@ -151,7 +151,7 @@ def files_of_sheet(settings: LookSettings) -> list[str]:
 def read_subject(place: Path) -> SheetSubject:
     """A mesh file, or the asset of a run folder with what the run knows of its texels. Raises InputRefused."""
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.run.renderers import finished_asset
+    from mistyle.render.external.renderers import finished_asset
 
     path = finished_asset(place) if place.is_dir() else place
     asset = read_mesh(path)
@@ -190,8 +190,8 @@ def sheet(
     subject: SheetSubject, stage: Any, lights: Sequence[Any], settings: LookSettings, day: str, report: Callable
 ) -> tuple[Sheet, int, float]:
     """What `compose` wants: the sheet with all its pictures drawn, the width of its rows, and the scale of its type."""
-    from mistyle.render import sheet as drawing
-    from mistyle.render.sheet_aovs import aovs
+    from mistyle.render.lookdev import sheet as drawing
+    from mistyle.render.lookdev.aovs import aovs
 
     scale = settings.size / USUAL
     column = drawing.column_camera(scale).size[1]

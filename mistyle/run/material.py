@@ -312,8 +312,8 @@ def measure(
     """Every picture predicted by the fitted maps and compared with what it shows."""
     from mistyle.core.image import srgb_from_linear
     from mistyle.measure.metrics import psnr
-    from mistyle.render.draw import tracer
-    from mistyle.render.material_table import pack
+    from mistyle.render.deferred.material_table import pack
+    from mistyle.render.mitsuba.draw import tracer
 
     chosen, sizes = settings.recover, [m.roughness.shape for m in maps]
     traced, table = tracer(asset.mesh), pack(maps)
@@ -352,7 +352,7 @@ def measure(
 
 def picture_of(traced: Any, captures: Captures, sizes, table, model: str, chosen: Any) -> tuple[np.ndarray, np.ndarray]:
     """The one picture of `captures` as the maps predict it, and its coverage."""
-    from mistyle.render.shade import MaterialRenderer, RenderOptions
+    from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
     options = RenderOptions(model, chosen.frame, chosen.subsamples, memory=0)
     return MaterialRenderer(traced, captures, sizes, options).image_and_coverage(table, 0)

@@ -32,8 +32,8 @@ def write(
 
 def scene(folder: Path, job: Any, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures) -> None:
     """A Mitsuba scene of the result that renders where mistyle is not installed."""
+    from mistyle.render.mitsuba.scene_folder import write_scene
     from mistyle.stages.frames import mitsuba_normals
-    from mistyle.stages.scene_file import write_scene
     from mistyle.stages.texels import pad, pad_maps
 
     padding, turned = job.settings.atlas.padding, list(recovered.maps)

@@ -207,7 +207,7 @@ def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View], 
 
 def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report) -> list[View]:
     """Each view with its rgb replaced by the albedo seen there, premultiplied."""
-    from mistyle.render.unlit import unlit
+    from mistyle.render.mitsuba.unlit import unlit
 
     drawn = unlit(asset.mesh, maps, [view.camera for view in views], progress=report)
     return [replace(view, rgb=rgb, coverage=share) for view, (rgb, share) in zip(views, drawn, strict=True)]
@@ -215,7 +215,7 @@ def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], repor
 
 def with_geometry(asset: Asset, views: Sequence[View]) -> list[View]:
     """Pictures with the depth and normals of the mesh where the files brought none: the mesh itself is the truth."""
-    from mistyle.render.draw import gbuffer, tracer
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
 
     traced = tracer(asset.mesh)
     result = []

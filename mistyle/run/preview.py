@@ -119,8 +119,8 @@ def lit_views(
 ) -> Callable[[Sequence[Maps], Sequence[Camera]], list[Float[np.ndarray, "h w 3"]]]:
     """A function that draws maps from cameras under the studio's light, on white, sRGB; what all such pictures share
     (rays, light, open sky) is made once."""
-    from mistyle.render.draw import tracer
-    from mistyle.render.studio import Studio, prefiltered
+    from mistyle.render.lookdev.studio import Studio, prefiltered
+    from mistyle.render.mitsuba.draw import tracer
     from mistyle.run.report_draw import sky, studio_light
 
     traced, light = tracer(asset.mesh), prefiltered(studio_light())

@@ -1,7 +1,7 @@
 """The pictures of the asset that a report shows: all round it, close up, and one that is path-traced.
 
-All but the last come from `render/studio.py`, which knows no noise and traces each frame once for all looks (the
-asset with one set of maps or another). The close-up stands before the path-traced picture's own backdrop.
+All but the last come from `render/lookdev/studio.py`, which knows no noise and traces each frame once for all looks
+(the asset with one set of maps or another). The close-up stands before the path-traced picture's own backdrop.
 """
 
 from collections.abc import Callable, Sequence
@@ -47,8 +47,8 @@ def draw(
     path_traced: bool = True,
 ) -> Drawn:
     """Draw every look close up, the first `turning` of them all round, and the first one path-traced too."""
-    from mistyle.render.draw import as_fine_as, tracer
-    from mistyle.render.studio import Studio, prefiltered
+    from mistyle.render.lookdev.studio import Studio, prefiltered
+    from mistyle.render.mitsuba.draw import as_fine_as, tracer
 
     chosen, close = settings.report, close_up(settings)
     fine = [[as_fine_as(m, max(close.size)) for m in look] for look in looks]
@@ -100,8 +100,8 @@ def studio_light() -> Float[np.ndarray, "h w 3"]:
 
 def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
     """Open sky over every texture set; it has no finer detail than the mesh."""
-    from mistyle.render.occlusion import open_sky
-    from mistyle.render.studio import StudioSky
+    from mistyle.render.lookdev.studio import StudioSky
+    from mistyle.render.mitsuba.occlusion import open_sky
     from mistyle.stages.texels import rasterise
 
     pages = np.zeros((len(mesh.parts), SKY_TEXELS, SKY_TEXELS, 4), np.float32)
@@ -118,10 +118,10 @@ def path_trace(
     asset: Asset, maps: Sequence[Maps], camera: Camera, settings: Any, guide: Float[np.ndarray, "h w 4"]
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
     """The asset on its backdrop, linear, with as many samples as its noise needs, and the backdrop alone."""
-    from mistyle.render.device import give_back
-    from mistyle.render.draw import passes
-    from mistyle.render.scene import Staging
-    from mistyle.render.settle import settled
+    from mistyle.render.mitsuba.device import give_back
+    from mistyle.render.mitsuba.draw import passes
+    from mistyle.render.mitsuba.scene import Staging
+    from mistyle.render.mitsuba.settle import settled
 
     most = max(2, settings.report.spp * MOST // PASS)
     drawn = passes(asset.mesh, maps, camera, Staging("studio", PASS, settings.seed))

@@ -52,8 +52,8 @@ class SceneJob:
 
 def loaded(scene: Path, defines: Mapping[str, str], settings: SceneSettings) -> Any:
     """The scene file, ready for a fit (`SceneFile`)."""
-    from mistyle.render import device
-    from mistyle.render.scene_xml import load_scene_for_fit
+    from mistyle.render.live.xml import load_scene_for_fit
+    from mistyle.render.mitsuba import device
 
     if not scene.is_file():
         raise InputRefused(f"{scene}: found nothing, expected a Mitsuba scene file; check the path")
@@ -63,15 +63,15 @@ def loaded(scene: Path, defines: Mapping[str, str], settings: SceneSettings) -> 
 
 def listed(file: Any) -> list[Any]:
     """Every parameter of a loaded scene, as the integrator that would be used sees it."""
+    from mistyle.render.live.parameters import parameters
     from mistyle.render.scene_grad import ad_integrator
-    from mistyle.render.scene_keys import parameters
 
     return parameters(file.scene, ad_integrator(file.scene)[0])
 
 
 def fit_scene(job: SceneJob, progress: Progress) -> dict[str, Any]:
     """Fit and write; returns the summary."""
-    from mistyle.render.scene_keys import choose
+    from mistyle.render.live.parameters import choose
 
     inputs = (job.scene, job.references)
     claim(job.out, ["run.json"], FOLDERS, inputs, aside=True, overwrite=job.overwrite)
@@ -97,8 +97,8 @@ def _fit(
     progress: Progress,
 ) -> dict[str, Any]:
     from mistyle.io.images.write import write_exr
-    from mistyle.render.scene_draw import values
-    from mistyle.render.scene_xml import write_scene
+    from mistyle.render.live.draw import values
+    from mistyle.render.live.xml import write_scene
 
     read = [read_reference(path, job.settings.channels) for path in paths]
     progress.note(*file.notes, *(note for _, _, notes in read for note in notes))
@@ -190,7 +190,7 @@ def list_row(p: Any) -> dict[str, Any]:
 
 def draw(scene: Any, numbers: Sequence[int], seed: int, report: Any) -> list[Float[np.ndarray, "h w 3"]]:
     """The scene as it is now from its sensors, linear, by the integrator of the fit."""
-    from mistyle.render.scene_draw import sensor_picture
+    from mistyle.render.live.draw import sensor_picture
     from mistyle.render.scene_grad import ad_integrator
 
     result = []

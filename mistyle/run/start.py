@@ -18,7 +18,7 @@ def start_engines(settings: Any) -> str:
 
     `settings` is the root record of any kind of job: its `threads` and `variant` count.
     """
-    from mistyle.render import device
+    from mistyle.render.mitsuba import device
 
     threads = thread_count(settings)
     use_threads(threads)
@@ -44,7 +44,7 @@ def mesh_stage(run: Any, files: Sequence[Path]) -> Asset:
 def ambient(asset: Asset, part: int, size: int, seed: int, report: Report) -> np.ndarray:
     """Ambient occlusion of a texture set, computed at a quarter of the atlas: it has no finer detail than the mesh."""
     from mistyle.core.image import resize
-    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.render.mitsuba.occlusion import ambient_occlusion
     from mistyle.stages.texels import pad, rasterise
 
     coarse = rasterise(asset.mesh, part, max(size // 4, 64))

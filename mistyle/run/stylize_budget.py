@@ -105,7 +105,7 @@ def rig_pixels(settings: Settings) -> list[int]:
 
 def render_counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> Counts:
     """The counts of `render`, which draws from the file's own maps however many sets they are."""
-    from mistyle.render.scene import passes
+    from mistyle.render.mitsuba.scene import passes
 
     pictures = rig_pixels(settings)
     lanes = max(pictures, default=0) * passes(settings.draw.samples())[1]

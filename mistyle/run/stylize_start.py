@@ -41,7 +41,7 @@ def lay_out_one(asset: Asset, part: int, settings: Settings) -> tuple[Texels, Ma
 
 def own_maps(asset: Asset, settings: Settings) -> list[OwnMaps]:
     """The asset's own material as its file has it, for pictures that need no atlas: each map at its own resolution."""
-    from mistyle.render.lookdev import material_maps
+    from mistyle.render.lookdev.scenes import material_maps
 
     metallic = "zero" if settings.fit.metallic == "zero" else "keep"
     return [material_maps(material, metallic) for material in asset.materials]
@@ -50,7 +50,7 @@ def own_maps(asset: Asset, settings: Settings) -> list[OwnMaps]:
 def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> list[Camera]:
     """The rig in visiting order, from the settings, from a file, or made for the mesh (then it says what it sees)."""
     if settings.rig.kind == "nbv":
-        from mistyle.stages.rigs import next_best_views
+        from mistyle.render.mitsuba.rigs import next_best_views
 
         planned = next_best_views(mesh, settings.rig)
         say(planned.sentence())
@@ -76,7 +76,7 @@ def draw(
     colours."""
     from mistyle.core.light import lights
     from mistyle.io.cameras.views import write_views
-    from mistyle.render.draw import draw_views
+    from mistyle.render.mitsuba.draw import draw_views
 
     template = settings.draw.scene or "paper_views"
     cameras = cameras_of(settings, asset.mesh, say)

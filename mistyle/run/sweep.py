@@ -151,7 +151,7 @@ def bare_shape(asset: Asset, views: Sequence[View], settings: Settings) -> list[
     """Luminance of the white, matt mesh from every camera under the light that the views were drawn in."""
     from mistyle.core.image import luminance
     from mistyle.core.maps import flat_maps
-    from mistyle.render.draw import draw_views
+    from mistyle.render.mitsuba.draw import draw_views
 
     white = [flat_maps(2, albedo=0.8, roughness=1.0) for _ in asset.mesh.parts]
     cameras = [view.camera for view in views]

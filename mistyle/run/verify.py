@@ -19,7 +19,7 @@ from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.store.atomic import DONE
 from mistyle.io.store.output import claim, replace_files
-from mistyle.run.blender import BLENDER, find_blender
+from mistyle.render.external.blender import BLENDER, find_blender
 from mistyle.run.verify_checks import MODELS, READERS, Check, by_blender, exr, listed_files, png
 from mistyle.run.verify_surfaces import surface_checks
 
@@ -148,7 +148,7 @@ def _rendered(
     if blender is None:
         checks.append(Check(name, check, "not checked", f"no Blender here (name it with --blender or {BLENDER})"))
         return
-    from mistyle.run.renderers import left_out, renderer, shots, subject
+    from mistyle.render.external.renderers import left_out, renderer, shots, subject
 
     both = [renderer("blender:cycles", blender), renderer("mitsuba:path")]
     with TemporaryDirectory(prefix="mistyle-") as work:

@@ -16,7 +16,7 @@ import numpy as np
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
-from mistyle.run.blender import BLENDER, OPEN_WORKER, blender_command
+from mistyle.render.external.blender import BLENDER, OPEN_WORKER, blender_command
 
 Outcome = Literal["passed", "failed", "not checked"]
 MODELS = (".glb", ".gltf", *USD, ".obj")
@@ -221,7 +221,7 @@ def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None)
         told = f"no Blender here (name it with --blender or {BLENDER})"
         yield from (Check(name, "Blender", "not checked", told) for name in names)
         return
-    from mistyle.run.render_files import run_job
+    from mistyle.render.external.render_files import run_job
 
     try:
         with TemporaryDirectory(prefix="mistyle-") as folder:

@@ -20,7 +20,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.geometry.contours import block_means, contour_distance, rim_of, signed_distance, slope_of
 from mistyle.geometry.icp import align_points, in_masks, visual_hull
 from mistyle.geometry.similarity import moved_camera, similarity
-from mistyle.render.draw import Tracer, gbuffer, tracer
+from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
 
 LEVELS = (96, 256)  # pixels along the longer side, coarse to fine
 WAYS = 3  # of laying the visual hull on the mesh that the silhouettes are asked about

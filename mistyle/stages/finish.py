@@ -2,8 +2,8 @@
 
 Each step looks straight at a few places of the surface, at the scale at which the painting lies on it. Mitsuba renders
 the crops without light (`Film`), and the statistics of their features are compared with those of the unbroken painting
-at the same places (`finish_style.py`). Pixels count by the angle and the distance at which they are seen. The
-gradient moves a Laplacian pyramid of the texture (`render/pyramid.py`). The painter's own features hold the content,
+at the same places (`finish_style.py`). Pixels count by the angle and the distance at which they are seen. The gradient
+moves a Laplacian pyramid of the texture (`render/deferred/pyramid.py`). The painter's own features hold the content,
 most along the edges of the shape; no shading appears anywhere. Changes broader than a stroke, and changes of colour
 that the painting does not have, are taken out at the end: neither do colours drift, nor is light painted in.
 """
@@ -115,8 +115,8 @@ class Finishing:
     def __init__(
         self, painted: PaintedAsset, features: "Features", settings: FinishSettings, seed: int, bridge: Any = "frozen"
     ) -> None:
-        from mistyle.render import pyramid
-        from mistyle.render.draw import tracer
+        from mistyle.render.deferred import pyramid
+        from mistyle.render.mitsuba.draw import tracer
 
         self.painted, self.settings, self.features = painted, settings, features
         self.rng = np.random.default_rng(seed)
@@ -135,7 +135,7 @@ class Finishing:
         """One step against the gradient of style and content."""
         import torch
 
-        from mistyle.render import pyramid
+        from mistyle.render.deferred import pyramid
 
         crops = self.crops(self.rng, self.seen)
         values = self.table.values["albedo"]
@@ -190,9 +190,9 @@ class Finishing:
 
         from mistyle.measure.losses import linear_from_srgb as linear
         from mistyle.measure.losses import srgb_from_linear as encoded
-        from mistyle.render import seam
+        from mistyle.render.deferred import torch_bridge
 
-        picture = self.film(crops.lit, seam.fetch(linear(texels), crops.taps), moving)
+        picture = self.film(crops.lit, torch_bridge.fetch(linear(texels), crops.taps), moving)
         mean = torch.from_numpy(self.painted.solution.painting.mean(axis=(0, 1))).view(1, 3, 1, 1)
         return encoded(picture) * crops.on + mean * (1 - crops.on)
 
@@ -200,7 +200,8 @@ class Finishing:
         """Crops of the least seen of places drawn at random; `seen` counts the painter's samples."""
         import torch
 
-        from mistyle.render import deferred, seam
+        from mistyle.render.deferred import integrator as deferred
+        from mistyle.render.deferred import torch_bridge
 
         n, size, solution = self.settings.crops, self.settings.crop_size, self.painted.solution
         cameras = []
@@ -222,7 +223,7 @@ class Finishing:
         on = image(surface.mask)
         lit = deferred.light(self.traced, surface, (Ambient((1.0, 1.0, 1.0)),), shadows=False)
         held = on * (1 + image(shape_edges(surface.normal.reshape(n, size, size, 3))))
-        return Crops(lit, seam.taps(surface, self.table.sizes), places, image(counts), on, held)
+        return Crops(lit, torch_bridge.taps(surface, self.table.sizes), places, image(counts), on, held)
 
     def judged(self) -> float:
         """The style loss as the texture is, on crops of a generator of their own."""
@@ -272,7 +273,7 @@ class Film:
     over what a white one does. A class because the renderer behind it is built once."""
 
     def __init__(self, crops: int, size: int, bridge: Any) -> None:
-        from mistyle.render.seam import Shader
+        from mistyle.render.deferred.torch_bridge import Shader
 
         self.shape = crops, size
         self.shader = Shader((crops * size, size), gloss=False, bridge=bridge)

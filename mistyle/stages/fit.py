@@ -241,7 +241,7 @@ def _pictures(targets: Sequence[View]) -> tuple[Any, ...]:
 
 def _scene(mesh: Mesh, targets: Sequence[View], settings: FitSettings) -> SceneContext:
     from mistyle.measure.features import load_features
-    from mistyle.render.draw import tracer
+    from mistyle.render.mitsuba.draw import tracer
 
     return SceneContext(
         traced=tracer(mesh),

@@ -9,13 +9,13 @@ from jaxtyping import Float
 
 from mistyle.core.capture import Captures, Loaded
 from mistyle.core.maps import Texels
-from mistyle.render.draw import Tracer
 from mistyle.render.indirect import enlarged
+from mistyle.render.mitsuba.draw import Tracer
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.recover_table import Atlas
 
 if TYPE_CHECKING:
-    from mistyle.render.shade import MaterialRenderer
+    from mistyle.render.deferred.renderer import MaterialRenderer
 
 DISTRUST = 10.0  # of indirect light: what a pixel counts is halved by one tenth of the direct light
 
@@ -47,7 +47,7 @@ class FitContext:
         self, subsamples: int | None = None, memory: float | None = None, gradients: bool = False
     ) -> "MaterialRenderer":
         """Pictures of tables of this atlas; `memory` in bytes. Without either, those of the settings."""
-        from mistyle.render.shade import MaterialRenderer, RenderOptions
+        from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
         s = self.settings
         options = RenderOptions(

@@ -58,8 +58,8 @@ def build_evaluation(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets:
     """Windows of up to VIEWS evenly chosen targets, about the middle of what they see; WINDOW pixels at most."""
     from mistyle.measure import metrics
     from mistyle.measure.overlap import overlap
-    from mistyle.render import deferred
-    from mistyle.render.seam import Shader
+    from mistyle.render.deferred import integrator as deferred
+    from mistyle.render.deferred.torch_bridge import Shader
 
     count = min(VIEWS, len(targets))
     size = min(WINDOW, *(min(view.camera.size) for view in targets))
@@ -161,7 +161,7 @@ def _window(view: View, centre: Float[np.ndarray, "2"], size: int) -> View:
 
 
 def _tables(maps: Sequence[Maps]) -> tuple[list[tuple[int, int]], Float[np.ndarray, "t 8"]]:
-    from mistyle.render.seam import CHANNELS
+    from mistyle.render.deferred.torch_bridge import CHANNELS
 
     sizes = [m.roughness.shape for m in maps]
     parts = rows_of(sizes)
@@ -177,10 +177,11 @@ def _tables(maps: Sequence[Maps]) -> tuple[list[tuple[int, int]], Float[np.ndarr
 def _draw(where: EvaluationSet, table: tuple, surface: Any, lights: Lights, gloss: bool) -> Float[np.ndarray, "h w 3"]:
     import torch
 
-    from mistyle.render import deferred, seam
+    from mistyle.render.deferred import integrator as deferred
+    from mistyle.render.deferred import torch_bridge
 
     sizes, values = table
-    pixels = torch.from_numpy(seam.bilinear(values, seam.taps(surface, sizes)))
+    pixels = torch.from_numpy(torch_bridge.bilinear(values, torch_bridge.taps(surface, sizes)))
     lit = deferred.light(where.traced, surface, lights, shadows=False)
     return where.shaders[gloss](lit, pixels).numpy()
 

@@ -179,10 +179,10 @@ def _explained(
     mesh: Mesh, captures: Captures, both: tuple[Sequence[Maps], Sequence[Maps]], targets: Sequence[View]
 ) -> tuple[tuple[float, float], list[View]]:
     """The residuals of two solutions, and the views without their light by the second one."""
-    from mistyle.render.draw import tracer
-    from mistyle.render.material_table import pack
-    from mistyle.render.shade import MaterialRenderer, RenderOptions
-    from mistyle.render.unlit import unlit
+    from mistyle.render.deferred.material_table import pack
+    from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
+    from mistyle.render.mitsuba.draw import tracer
+    from mistyle.render.mitsuba.unlit import unlit
 
     traced, sizes = tracer(mesh), [m.roughness.shape for m in both[0]]
     options = RenderOptions(subsamples=SUBSAMPLES, gradients=False)

@@ -135,17 +135,18 @@ class PhaseRunner:
         import torch
 
         from mistyle.measure.losses import crop_picture
-        from mistyle.render import deferred, seam
+        from mistyle.render.deferred import integrator as deferred
+        from mistyle.render.deferred import torch_bridge
 
         size, count = self.settings.crop_size, self.settings.crops
         cameras = [zoom(self.scene.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in crops]
         surface = deferred.trace(self.scene.traced, cameras, self.scene.tangents)
         lit, towards = self._light(surface)
-        where = seam.taps(surface, self.table.sizes)
+        where = torch_bridge.taps(surface, self.table.sizes)
 
         def picture(values: Mapping[str, np.ndarray], moving: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
             leaves = {n: torch.from_numpy(v[where.texels]).requires_grad_(n in moving) for n, v in values.items()}
-            pixels = seam.fetch(materials(leaves, self.phase.clay), where)
+            pixels = torch_bridge.fetch(materials(leaves, self.phase.clay), where)
             names = tuple("normal" if name == "tilt" else name for name in moving)
             return self.shader(lit, pixels, names).reshape(count, size, size, 3).permute(0, 3, 1, 2), leaves
 
@@ -173,7 +174,7 @@ class PhaseRunner:
     def _light(self, surface: Any) -> "tuple[Any, torch.Tensor | None]":
         import torch
 
-        from mistyle.render import deferred
+        from mistyle.render.deferred import integrator as deferred
 
         beams = [light for light in self.phase.lights if isinstance(light, Directional)]
         if not self.phase.one_by_one:
@@ -224,7 +225,7 @@ def _mean_direction(beams: Sequence[Directional], camera: Camera) -> Float[np.nd
 
 def shader(settings: FitSettings, gloss: bool) -> Any:
     """The film of one step's crops, one below the other."""
-    from mistyle.render.seam import Shader
+    from mistyle.render.deferred.torch_bridge import Shader
 
     return Shader((settings.crops * settings.crop_size, settings.crop_size), gloss=gloss, bridge=settings.bridge)
 

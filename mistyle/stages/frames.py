@@ -36,7 +36,7 @@ def texel_frames(
     normal: Float[np.ndarray, "t 3"],
     tangents: Float[np.ndarray, "f 3 4"] | None,
 ) -> Float[np.ndarray, "t 3 3"]:
-    """Tangent, bitangent and normal at surface points, as `render/deferred.py` builds them at samples.
+    """Tangent, bitangent and normal at surface points, as `render/deferred/integrator.py` builds them at samples.
 
     With `tangents` (MikkTSpace, per corner) the interpolated tangent made perpendicular to the normal; without them
     Mitsuba's own frame, the face's dp/du made perpendicular.

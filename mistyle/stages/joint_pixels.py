@@ -17,16 +17,16 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.camera import Camera, by_camera
 from mistyle.core.light import Point
-from mistyle.render.hits import SampleBlock, Sampling, TexturedMesh, bilinear_taps, collect
+from mistyle.render.deferred.image_samples import SampleBlock, Sampling, TexturedMesh, bilinear_taps, collect
+from mistyle.render.deferred.material_table import ALBEDO, METALLIC, TILT
 from mistyle.render.indirect import PALE, enlarged
-from mistyle.render.material_table import ALBEDO, METALLIC, TILT
 from mistyle.stages.fit_context import FitContext
 from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover_observe import covered_rows, points_of
 from mistyle.stages.recover_table import fill
 
 if TYPE_CHECKING:
-    from mistyle.render.shade import MaterialRenderer
+    from mistyle.render.deferred.renderer import MaterialRenderer
 
 PIXEL, WEIGHT = 240, 8  # bytes of a pixel, and of a bilinear weight
 LEAST_Z = 0.2  # of a mapped normal

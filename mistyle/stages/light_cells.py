@@ -9,7 +9,7 @@ from scipy.spatial import KDTree
 
 from mistyle.core.image import luminance
 from mistyle.core.light import Environment, environment_directions
-from mistyle.render.sky import even_directions
+from mistyle.render.deferred.sky import even_directions
 
 CELLS = 128
 FINE = 64  # more of them go where the light is, once that is roughly known

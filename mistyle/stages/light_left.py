@@ -16,7 +16,7 @@ def light_left(
 ) -> BakedLight | None:
     """The albedo's dependence on the surface's direction and openness, from about `most` texels; None where nothing is
     covered."""
-    from mistyle.render.occlusion import ambient_occlusion
+    from mistyle.render.mitsuba.occlusion import ambient_occlusion
 
     covered = sum(int(texels.covered.sum()) for texels in sets)
     if covered == 0:

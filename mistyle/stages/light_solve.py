@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.render.draw import Tracer
-from mistyle.render.material_table import ALBEDO, ROUGHNESS, TILT
+from mistyle.render.deferred.material_table import ALBEDO, ROUGHNESS, TILT
+from mistyle.render.mitsuba.draw import Tracer
 from mistyle.render.texel_lm import Options, Points, Problem, Rig
 from mistyle.render.texel_shares import light_transport_matrix
 from mistyle.render.texel_views import open_sky

@@ -16,7 +16,7 @@ from mistyle.core.camera import Camera
 from mistyle.core.image import overlap
 from mistyle.core.mesh import Mesh
 from mistyle.geometry.similarity import moved_camera, similarity
-from mistyle.render.draw import gbuffer, tracer
+from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.stages.align import shrunk
 
 SIDE = 160  # pixels of the longer side that is looked at: some 1 % of the overlap

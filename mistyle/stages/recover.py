@@ -2,7 +2,8 @@
 
 1. `recover_texels.py` solves each texel alone by Levenberg-Marquardt. It renders nothing: cameras and lights are known.
    Twenty such steps reach what hundreds of gradient steps on pictures do not.
-2. `recover_pictures.py` minimises the loss of whole pictures by Adam, through `render/shade.py`, which models pixels
+2. `recover_pictures.py` minimises the loss of whole pictures by Adam, through `render/deferred/renderer.py`, which
+models pixels
    and interpolation exactly.
 3. `recover_joint.py` ends with a joint Gauss-Newton over all texels and pictures, under delta lights only.
 
@@ -21,7 +22,7 @@ from mistyle.core.capture import Captures
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.stage_progress import StageProgress
-from mistyle.render.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
+from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
 from mistyle.stages.fit_context import DirectCaptures, FitContext
 from mistyle.stages.recover_check import validate_captures
 from mistyle.stages.recover_joint import joint_gauss_newton, where_possible
@@ -85,8 +86,8 @@ def recover(
     needs to end with the same bytes. Raises InputRefused where no picture can be used; a picture that cannot is left
     out, and a note says so.
     """
-    from mistyle.render.draw import tracer
-    from mistyle.render.hits import tangents_of
+    from mistyle.render.deferred.image_samples import tangents_of
+    from mistyle.render.mitsuba.draw import tracer
 
     settings, notes = where_possible(settings, captures), []
     usable, traced = validate_captures(mesh, captures, notes), tracer(mesh)
@@ -124,7 +125,7 @@ def polished(context: FitContext, table: MaterialTable, progress: Callable[[floa
 
     A result that explains the pictures no better is dropped, with a note.
     """
-    from mistyle.render.material_table import pack, unpack
+    from mistyle.render.deferred.material_table import pack, unpack
     from mistyle.render.polish import PolishSettings, polish
 
     s = context.settings
@@ -150,7 +151,7 @@ def _residual(direct: DirectCaptures, drawn: tuple[np.ndarray, np.ndarray], k: i
 def _recovered(
     context: FitContext, estimate: TexelEstimate, table: MaterialTable, residuals: dict[str, float]
 ) -> Recovered:
-    from mistyle.render.material_table import unpack
+    from mistyle.render.deferred.material_table import unpack
 
     grid, settings = context.atlas, context.settings
     names = [n for n in CHANNELS if n != "metallic" or settings.metallic]

@@ -30,7 +30,7 @@ from jaxtyping import Float, Int
 from mistyle.core.capture import Captures
 from mistyle.core.light import has_soft
 from mistyle.core.stage_progress import StageProgress
-from mistyle.render.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, TILT_X, TILT_Y, MaterialTable
+from mistyle.render.deferred.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, TILT_X, TILT_Y, MaterialTable
 from mistyle.stages.fit_context import DirectCaptures, FitContext
 from mistyle.stages.joint_algebra import LinearisedImage, Unknowns, diagonal_blocks, normal_matvec, pcg, rhs
 from mistyle.stages.joint_pixels import (
@@ -49,7 +49,7 @@ from mistyle.stages.recover_table import Atlas, with_seam_weights
 from mistyle.stages.recover_texels import estimate_indirect
 
 if TYPE_CHECKING:
-    from mistyle.render.shade import MaterialRenderer
+    from mistyle.render.deferred.renderer import MaterialRenderer
 
 # By which the pictures' derivatives are taken: columns of the table that move together, and how far to either side. A
 # channel of a picture knows its own channel of the albedo only.

@@ -18,7 +18,7 @@ from mistyle.core.capture import Captures
 from mistyle.core.image import erode
 from mistyle.core.light import DELTA, has_soft
 from mistyle.core.maps import Texels
-from mistyle.render.draw import Tracer
+from mistyle.render.mitsuba.draw import Tracer
 from mistyle.render.texel_lm import Observations, Points, Rig
 from mistyle.render.texel_views import GBuffer, open_sky, rig, trace_gbuffer
 from mistyle.stages.frames import texel_frames

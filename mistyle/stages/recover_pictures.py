@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from mistyle.core.maps import place_of
 from mistyle.core.stage_progress import StageProgress
 from mistyle.process import stopping
-from mistyle.render.material_table import COLUMNS, SOLVED, TILT, MaterialTable
+from mistyle.render.deferred.material_table import COLUMNS, SOLVED, TILT, MaterialTable
 from mistyle.stages.fit_context import DirectCaptures, FitContext
 from mistyle.stages.recover_prior import NOTHING
 from mistyle.stages.recover_settings import RecoverSettings, passes
@@ -25,8 +25,8 @@ from mistyle.stages.recover_table import Atlas, fill
 from mistyle.stages.recover_texels import TexelEstimate, estimate_indirect
 
 if TYPE_CHECKING:
+    from mistyle.render.deferred.renderer import MaterialRenderer
     from mistyle.render.descent import Descent
-    from mistyle.render.shade import MaterialRenderer
 
 JUDGES = 48  # pictures that say whether the steps helped
 SEEDS = 7907  # between the seeds of two estimates: more than there are rounds

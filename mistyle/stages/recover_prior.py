@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from mistyle.render.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
+from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
 from mistyle.render.texel_lm import UNKNOWNS, Solution
 from mistyle.stages.recover_observe import TexelObservations
 from mistyle.stages.recover_table import OVER_SEAMS, Atlas, Values, neighbourhood

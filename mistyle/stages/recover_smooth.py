@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from mistyle.render.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT_X, TILT_Y
+from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT_X, TILT_Y
 from mistyle.stages.neighbours import Links, within
 from mistyle.stages.recover_prior import METAL_SPREAD
 from mistyle.stages.recover_table import OVER_SEAMS, Atlas, diffused, fill, with_seam_weights

@@ -1,10 +1,11 @@
 """Rounds of the per-texel solver, with priors from neighbours, and defect correction by rendered pictures.
 
 The solver takes a texel's radiance for that of the picture at one place, but a pixel is a mean over its area of
-interpolated texels. So after each solve the pictures are rendered as they are really made (`render/shade.py`), and
-what they still differ by is added to what the texels should reach (defect correction): at the end the pictures agree.
-Where a texel's radiance is far from that of the picture drawn there, as where highlights are narrower than pixels and
-normals still vary, what is added is far off too, and the observation counts for less.
+interpolated texels. So after each solve the pictures are rendered as they are really made
+(`render/deferred/renderer.py`), and what they still differ by is added to what the texels should reach (defect
+correction): at the end the pictures agree. Where a texel's radiance is far from that of the picture drawn there, as
+where highlights are narrower than pixels and normals still vary, what is added is far off too, and the observation
+counts for less.
 """
 
 from collections.abc import Callable, Sequence
@@ -13,7 +14,7 @@ from dataclasses import fields
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from mistyle.render.material_table import METALLIC, ROUGHNESS
+from mistyle.render.deferred.material_table import METALLIC, ROUGHNESS
 from mistyle.render.texel_lm import Problem, Solution
 from mistyle.stages.recover_observe import TexelObservations, sample_image, with_extra_std
 from mistyle.stages.recover_prior import (

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels, rows_of
 from mistyle.core.mesh import Mesh
-from mistyle.render.material_table import COLUMNS, ROUGHNESS, SOLVED
+from mistyle.render.deferred.material_table import COLUMNS, ROUGHNESS, SOLVED
 from mistyle.stages.neighbours import Links, links, weighted_seams
 from mistyle.stages.recover_observe import TexelObservations
 

@@ -12,7 +12,7 @@ from mistyle.core.image import resize
 from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps
 from mistyle.core.stage_progress import StageProgress
-from mistyle.render.material_table import METALLIC, SOLVED, MaterialTable
+from mistyle.render.deferred.material_table import METALLIC, SOLVED, MaterialTable
 from mistyle.render.texel_lm import Options, Problem, Solution
 from mistyle.stages import recover_prior, recover_solve
 from mistyle.stages.fit_context import DirectCaptures, FitContext, Radiance
@@ -28,7 +28,7 @@ from mistyle.stages.recover_table import PRIOR_MEAN, Atlas, Values, linked, scat
 from mistyle.stages.texels import rasterise
 
 if TYPE_CHECKING:
-    from mistyle.render.shade import MaterialRenderer
+    from mistyle.render.deferred.renderer import MaterialRenderer
 
 SOFT_COST = 64  # times as long as under one light a texel takes under a sky, nearly
 INDIRECT_STD = 0.5  # standard deviation of an estimate of indirect light, relative to it
@@ -116,7 +116,7 @@ def solve_texels(
     With each estimate it begins anew: roughness and metallic that light between surfaces made look right would else
     stay where they are, minima of another cost.
     """
-    from mistyle.render.material_table import pack
+    from mistyle.render.deferred.material_table import pack
 
     settings, atlas = context.settings, context.atlas
     options = ObservationOptions(settings.facing, settings.noise, settings.relative, settings.solver != "pictures")
@@ -232,8 +232,8 @@ def estimate_indirect(
 ) -> Iterator[tuple[int, Radiance, Float[np.ndarray, "h w 9"] | None]]:
     """Each picture's number, its indirect light under the maps of `table`, and with `vectors` its vector irradiance
     (`Indirect.pictures_and_vectors`); camera by camera. `sampling`: samples a pixel, and the seed."""
+    from mistyle.render.deferred.material_table import unpack
     from mistyle.render.indirect import Indirect, in_proportion
-    from mistyle.render.material_table import unpack
 
     settings, captures, done, (samples, seed) = context.settings, context.captures, 0, sampling
     uploaded, maps = renderer.upload(table), unpack(table, context.atlas.sizes)

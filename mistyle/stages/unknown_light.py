@@ -20,8 +20,8 @@ from mistyle.core.image import luminance
 from mistyle.core.light import Ambient, Environment
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
-from mistyle.render.draw import Tracer
-from mistyle.render.material_table import ALBEDO
+from mistyle.render.deferred.material_table import ALBEDO
+from mistyle.render.mitsuba.draw import Tracer
 from mistyle.stages import light_cells, light_solve, recover_prior
 from mistyle.stages.light_solve import Bundle, State
 from mistyle.stages.recover_observe import ObservationOptions, TexelObservations, collect_observations
@@ -59,7 +59,7 @@ def find_light(
     Needs views from around the object; one without highlights shows the light only blurred. Direct light and shadows
     are modelled, light between surfaces is not. Raises InputRefused where no texel is seen.
     """
-    from mistyle.render.draw import tracer
+    from mistyle.render.mitsuba.draw import tracer
     from mistyle.render.texel_lm import Options
 
     traced = tracer(mesh)
@@ -93,7 +93,7 @@ def _observations(
     traced: Tracer, captures: Captures, settings: RecoverSettings
 ) -> tuple[list[Texels], TexelObservations]:
     """What small pictures say of a coarse atlas, as fine as OBSERVATIONS allows."""
-    from mistyle.render.hits import tangents_of
+    from mistyle.render.deferred.image_samples import tangents_of
 
     chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
     cameras, pictures, masks = zip(*(_small(captures, int(k)) for k in chosen), strict=True)
@@ -148,7 +148,7 @@ def _conventional(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
 
 
 def _maps(state: State, observed: TexelObservations, texels: Sequence[Texels]) -> tuple[Maps, ...]:
-    from mistyle.render.material_table import unpack
+    from mistyle.render.deferred.material_table import unpack
 
     atlas = atlas_of(texels)
     known = scatter(observed.seen > 0, observed, atlas, False)

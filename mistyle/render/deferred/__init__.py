@@ -1,0 +1,1 @@
+"""The deferred renderer: surface samples traced once, shaded by differentiable kernels."""

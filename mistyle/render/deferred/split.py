@@ -1,0 +1,154 @@
+"""The frozen split: a lit film's picture, and what a loss on it says about the materials, without tracing anew.
+
+Dr.Jit replays a recorded function several times faster than it traces it, but no gradient flows through a replay. So
+the way from materials to loss is cut at the picture: a frozen forward makes it, torch gives the loss and dL/dI, and a
+frozen backward turns dL/dI into gradients of each pixel's own material. The reflectance is the closed form of
+`render/deferred/bsdf.py`, as in `render/deferred/renderer.py`; the sum over lights is the one of `deferred.Deferred`,
+its plain twin.
+
+Materials are packed, 8 floats a pixel: albedo 3 (linear), normal 3 (tangent space, any length), roughness, metallic.
+"""
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.render.deferred import bsdf
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred.image_samples import own
+from mistyle.render.deferred.material_table import ALBEDO, FETCHED_METALLIC, FETCHED_ROUGHNESS, NORMAL
+from mistyle.render.mitsuba import device
+
+COLUMNS = {
+    "albedo": ALBEDO,
+    "normal": NORMAL,
+    "roughness": slice(FETCHED_ROUGHNESS, FETCHED_ROUGHNESS + 1),
+    "metallic": slice(FETCHED_METALLIC, FETCHED_METALLIC + 1),
+}
+
+
+class Split:
+    """Pictures of lit films and their gradients; a recording per kind of light and per set of maps that move.
+
+    `gloss` False leaves out the reflection at the surface. One object is for one thread.
+    """
+
+    def __init__(self, *, gloss: bool = True) -> None:
+        device.use()
+        self._terms = partial(bsdf.terms, bsdf.Reflectance("principled", specular=0.5 if gloss else 0.0))
+        self._frozen: dict[Any, device.Frozen] = {}
+
+    def image(self, lit: deferred.Lit, materials: Float[np.ndarray, "n 8"]) -> Float[np.ndarray, "n 3"]:
+        """Linear radiance of the film's pixels in order."""
+        run = self._function("image", lit, _image)
+        return np.array(run(*_arrays(lit, materials))).reshape(-1, 3)
+
+    def pull(
+        self,
+        lit: deferred.Lit,
+        materials: Float[np.ndarray, "n 8"],
+        adjoint: Float[np.ndarray, "n 3"],
+        moving: tuple[str, ...],
+    ) -> Float[np.ndarray, "n 8"]:
+        """Gradient by the materials of a loss whose derivative by the picture is `adjoint`; 0 for maps not `moving`."""
+        import mitsuba as mi
+
+        run = self._function(("pull", moving), lit, _pull, moving)
+        return np.array(run(*_arrays(lit, materials), own(mi.Float, adjoint.ravel()))).reshape(-1, 8)
+
+    @property
+    def recordings(self) -> int:
+        """How many times a frozen function has been recorded so far."""
+        return sum(f.n_recordings for f in self._frozen.values())
+
+    def _function(self, name: Any, lit: deferred.Lit, function: Callable, *fixed: Any) -> device.Frozen:
+        key = (name, lit.size, len(lit.directional), lit.ambient is None)
+        if key not in self._frozen:
+            terms = self._terms
+            self._frozen[key] = device.Frozen(lambda *arguments: function(terms, *fixed, *arguments))
+        return self._frozen[key]
+
+
+def radiance(lit: deferred.Lit, packed: Any) -> Any:
+    """`Split.image` traced anew, for Dr.Jit's own gradients: packed materials (8n floats) to radiance (3n floats).
+
+    Both are Dr.Jit arrays, pixel after pixel. Each pixel reads its own material: the gradient adds nothing up.
+    """
+    return _image(partial(bsdf.terms, bsdf.Reflectance("principled", specular=0.5)), _film(lit), packed)
+
+
+def _arrays(lit: deferred.Lit, materials: Float[np.ndarray, "n 8"]) -> tuple[Any, ...]:
+    import mitsuba as mi
+
+    return _film(lit), own(mi.Float, np.ascontiguousarray(materials, np.float32).ravel())
+
+
+def _film(lit: deferred.Lit) -> tuple[Any, Any, Any, Any]:
+    """(wi, mask, directional lights, ambient light) of a lit film."""
+    import drjit as dr
+    import mitsuba as mi
+
+    # Opaque, for a literal would be a constant of the recording.
+    ambient = None if lit.ambient is None else mi.Color3f(*(dr.opaque(mi.Float, c) for c in lit.ambient))
+    return lit.wi, lit.mask, list(lit.directional), ambient
+
+
+def _lights(wi: Any, directional: list[Any], ambient: Any) -> Iterator[tuple[Any, Any]]:
+    """(direction, irradiance) of every light, ambient light as its fixed directions."""
+    yield from directional
+    if ambient is not None:
+        yield from ((wo, ambient * weight) for wo, weight in deferred.ambient_directions(wi))
+
+
+def _image(terms: Callable, film: tuple, packed) -> Any:
+    """`film` is (wi, mask, directional lights, ambient light), as in `deferred.Lit`."""
+    import drjit as dr
+    import mitsuba as mi
+
+    wi, mask, directional, ambient = film
+    v = _values(packed, wi)
+    linear, constant = mi.Color3f(0), mi.Color3f(0)
+    for wo, light in _lights(wi, directional, ambient):
+        p, g = terms(wi, wo, mi.Vector3f(*v[NORMAL]), v[FETCHED_ROUGHNESS], v[FETCHED_METALLIC])
+        linear, constant = linear + light * p, constant + light * g
+    return dr.ravel(dr.select(mask, mi.Color3f(*v[ALBEDO]) * linear + constant, 0))
+
+
+def _pull(terms: Callable, moving: tuple[str, ...], film: tuple, packed, adjoint) -> Any:
+    """Light by light, so that each has a short gradient of its own; the directions are held fast."""
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba  # its stubs do not know ArrayXf
+    wi, mask, directional, ambient = film
+    v = _values(packed, wi)
+    albedo, lane = mi.Color3f(*v[ALBEDO]), dr.arange(mi.UInt32, dr.width(wi))
+    at = dr.select(mask, dr.gather(mi.Color3f, adjoint, lane), 0)
+    by_albedo, by_rest = mi.Color3f(0), [mi.Float(0)] * 5
+    for wo, light in _lights(wi, directional, ambient):
+        rest, here = [mi.Float(x) for x in v[3:]], at * light
+        for name in moving:
+            if name != "albedo":
+                dr.enable_grad(rest[COLUMNS[name].start - 3 : COLUMNS[name].stop - 3])
+        p, g = terms(wi, wo, mi.Vector3f(*rest[:3]), rest[3], rest[4])
+        by_albedo += here * dr.detach(p)
+        value = p * dr.sum(here * albedo) + g * dr.sum(here)
+        if dr.grad_enabled(value):
+            dr.backward(value)
+            by_rest = [total + dr.grad(x) for total, x in zip(by_rest, rest, strict=True)]
+    result = [*(by_albedo if "albedo" in moving else mi.Color3f(0)), *by_rest]
+    width = dr.width(wi)
+    return dr.ravel(mi.ArrayXf([x + dr.zeros(mi.Float, width) for x in result]))
+
+
+def _values(packed: Any, wi: Any) -> list[Any]:
+    import drjit as dr
+    import mitsuba
+
+    mi: Any = mitsuba  # its stubs do not know ArrayXf
+    lane = dr.arange(mi.UInt32, dr.width(wi))
+    row = dr.gather(mi.ArrayXf, packed, lane, shape=(8, dr.width(wi)))
+    return [row[k] for k in range(8)]

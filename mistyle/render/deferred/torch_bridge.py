@@ -1,0 +1,223 @@
+"""Where torch's gradients meet Dr.Jit's: maps (torch) ⇄ image (torch), by a frozen split or through one `dr.wrap`.
+
+Torch owns the maps of every texture set, as one table of texels. A picture is made in two steps, each with a
+gradient whose bytes are the same in every run at any thread count:
+
+1. `taps` finds, once per traced surface, the four texels and weights of every pixel's bilinear fetch; `fetch` is a
+   sparse matrix product, its gradient the product with the transpose, summed in a fixed order.
+2. A `Shader` shades the pixels' own materials, one texel per pixel: by the recorded functions of
+`render/deferred/split.py`,
+   or as textures as large as the film on the BSDF of `render/mitsuba/scene.py`, by the integrator of
+   `render/deferred/integrator.py`.
+
+Mitsuba's own gradient of a shared texture adds up with atomics, in another order each run.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import scipy.sparse as sparse
+from jaxtyping import Float, Int
+
+from mistyle.core.drjit_arrays import LANES, aligned
+from mistyle.core.maps import flat_maps
+from mistyle.render.deferred import integrator as deferred
+from mistyle.render.deferred import split
+from mistyle.render.mitsuba import device
+from mistyle.render.mitsuba import scene as scenery
+
+CHANNELS = {"albedo": 3, "normal": 3, "roughness": 1, "metallic": 1}
+Bridge = Literal["frozen", "wrap"]
+
+
+@dataclass(frozen=True)
+class Taps:
+    """A bilinear fetch by n pixels from a table of texels (all texture sets one after the other, row by row).
+
+    `texels` (sorted, each once) are the rows of the table that are touched at all; `matrix` (n, texels) holds the
+    weights, at most four per row, none for pixels off the mesh.
+    """
+
+    texels: Int[np.ndarray, " t"]
+    matrix: Any
+
+
+def taps(surface: deferred.Surface, sizes: Sequence[tuple[int, int]]) -> Taps:
+    """The bilinear fetch of every pixel of `surface` from texture sets of `sizes` (rows, columns).
+
+    Texel centres at +0.5, row 0 is v = 1, textures repeat: exactly what Mitsuba's bitmap texture does.
+    """
+    offsets = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in sizes])])
+    on = np.flatnonzero(surface.mask)
+    part = surface.part[on]
+    rows, columns = np.asarray(sizes, np.int64)[part].T
+    x = surface.uv[on, 0].astype(np.float64) * columns - 0.5
+    y = (1 - surface.uv[on, 1].astype(np.float64)) * rows - 0.5
+    x0, y0 = np.floor(x), np.floor(y)
+    fx, fy = x - x0, y - y0
+    left, top = x0.astype(np.int64) % columns, y0.astype(np.int64) % rows
+    right, bottom = (left + 1) % columns, (top + 1) % rows
+    start = offsets[part]
+    index = np.stack([start + r * columns + c for r in (top, bottom) for c in (left, right)], axis=1)
+    weight = np.stack([a * b for a in (1 - fy, fy) for b in (1 - fx, fx)], axis=1).astype(np.float32)
+    touched = np.zeros(offsets[-1], bool)
+    touched[index] = True
+    texels = np.flatnonzero(touched)
+    local = np.zeros(offsets[-1], np.int32)
+    local[texels] = np.arange(len(texels), dtype=np.int32)
+    pointer = np.concatenate([[0], np.cumsum(np.where(surface.mask, 4, 0))])
+    shape = (len(surface.mask), len(texels))
+    return Taps(texels, sparse.csr_matrix((weight.ravel(), local[index].ravel(), pointer), shape=shape))
+
+
+def fetch(values: Any, where: Taps) -> Any:
+    """Texel values (t, c), in the order of `where.texels`, to pixel values (n, c), torch to torch with a gradient."""
+    return _functions()["sparse"].apply(values, where.matrix)
+
+
+class Shader:
+    """Shades a film of `size` pixels by one of two bridges between torch and Dr.Jit that give the same numbers.
+
+    "frozen" replays a recorded forward and a recorded backward (`render/deferred/split.py`); "wrap" is its plain twin,
+    Mitsuba's own BSDF and `mi.render` behind one `dr.wrap`, traced anew at each call. Reused, because building one
+    costs more than rendering it. One picture at a time: its gradient must be taken before the next call.
+    """
+
+    def __init__(self, size: tuple[int, int], *, gloss: bool = True, bridge: Bridge = "frozen") -> None:
+        """`gloss` False leaves out the reflection at the surface of dielectrics: what remains is the paint's colour."""
+        if bridge not in ("frozen", "wrap"):
+            raise ValueError(f"bridge is {bridge!r}; expected 'frozen' or 'wrap'")
+        self.size = size
+        self._bridge: Any = _Wrapped(size, gloss) if bridge == "wrap" else split.Split(gloss=gloss)
+
+    def __call__(self, lit: deferred.Lit, pixels: Any, moving: Sequence[str] = ()) -> Any:
+        """Linear radiance (rows, columns, 3) of the lit film, a torch tensor, with a gradient for the maps `moving`.
+
+        `pixels` (n, 8) holds the maps of CHANNELS side by side: albedo 3 and metallic linear 0..1, normal 3 a
+        tangent-space vector of any length, roughness.
+        """
+        if lit.size != self.size:
+            raise ValueError(f"the film has {self.size} pixels, the lit surface {lit.size}")
+        if isinstance(self._bridge, _Wrapped):
+            return self._bridge(lit, pixels, moving)
+        if not moving:
+            pixels = pixels.detach()
+        return _functions()["shaded"].apply(pixels, self._bridge, lit, tuple(moving)).reshape(*self.size, 3)
+
+
+class _Wrapped:
+    """A Mitsuba scene with textures as large as the film, differentiated through `dr.wrap`."""
+
+    def __init__(self, size: tuple[int, int], gloss: bool) -> None:
+        import drjit as dr
+        import mitsuba as mi
+
+        device.use()
+        deferred.register()
+        bsdf = scenery.bsdf_dict(flat_maps(2))
+        _each(bsdf, "bitmap", {"filter_type": "nearest"})
+        if not gloss:
+            _each(bsdf, "principled", {"specular": 0.0})
+        film = {"type": "hdrfilm", "width": size[1], "height": size[0], "pixel_format": "rgb"}
+        film |= {"component_format": "float32", "rfilter": {"type": "box"}}
+        self.size = size
+        self.scene = mi.load_dict(
+            {
+                "type": "scene",
+                "integrator": {"type": deferred.INTEGRATOR},
+                "sensor": {"type": "perspective", "film": film, "sampler": {"type": "independent", "sample_count": 1}},
+                "part0": {"type": "rectangle", "bsdf": bsdf},
+            }
+        )
+        self.integrator = self.scene.integrator()
+        self.names = scenery.parameters(0)
+        self.parameters = mi.traverse(self.scene)
+        self.parameters.keep(list(self.names.values()))
+        self._render = dr.wrap(source="torch", target="drjit")(self._draw)
+
+    def __call__(self, lit: deferred.Lit, pixels: Any, moving: Sequence[str]) -> Any:
+        import mitsuba as mi
+        import torch
+
+        self.integrator.lit = lit
+        wanted = {}
+        for name, values in zip(CHANNELS, pixels.split(list(CHANNELS.values()), dim=1), strict=True):
+            image = values.reshape(*self.size, -1)
+            if name == "normal":
+                image = image * 0.5 + 0.5
+            if name in moving:
+                # A fresh tensor: Dr.Jit works on torch's memory, beyond its end too (core/drjit_arrays.py), and does
+                # not recognise nn.Parameter.
+                wanted[name] = torch.nn.functional.pad(image.reshape(-1), (0, LANES))[: image.numel()].view_as(image)
+            else:
+                self.parameters[self.names[name]] = mi.TensorXf(aligned(image.detach().numpy()))
+        if not wanted:
+            return self._still()
+        # Dr.Jit's wrapper makes every float argument ask for gradients, so only those that move are arguments.
+        return self._render(wanted).clone()
+
+    def _draw(self, moving: dict[str, Any]) -> Any:
+        import mitsuba as mi
+
+        for name, values in moving.items():
+            self.parameters[self.names[name]] = mi.TensorXf(values)
+        self.parameters.update()
+        return mi.render(self.scene, self.parameters, spp=1, seed=mi.UInt32(0))
+
+    def _still(self) -> Any:
+        import mitsuba as mi
+        import torch
+
+        self.parameters.update()
+        return torch.from_numpy(np.array(mi.render(self.scene, spp=1, seed=mi.UInt32(0))))
+
+
+def bilinear(maps: Float[np.ndarray, "t c"], where: Taps) -> Float[np.ndarray, "n c"]:
+    """`fetch` without gradient, from the whole table."""
+    return where.matrix @ maps[where.texels]
+
+
+def _each(description: Any, plugin: str, changes: Mapping[str, Any]) -> None:
+    """Change every plugin of one type inside a nested scene description."""
+    if isinstance(description, dict):
+        if description.get("type") == plugin:
+            description.update(changes)
+        for value in description.values():
+            _each(value, plugin, changes)
+
+
+def _functions() -> dict[str, Any]:
+    """torch's Functions for `matrix @ values` and for the frozen split; built at the first use, because importing torch
+    takes seconds."""
+    if not _made:
+        import torch
+
+        class SparseProduct(torch.autograd.Function):
+            @staticmethod
+            def forward(ctx: Any, values: Any, matrix: Any) -> Any:
+                ctx.matrix = matrix
+                return torch.from_numpy(matrix @ values.detach().numpy())
+
+            @staticmethod
+            def backward(ctx: Any, *grads: Any) -> Any:
+                return torch.from_numpy(ctx.matrix.T @ grads[0].numpy()), None
+
+        class Shaded(torch.autograd.Function):
+            @staticmethod
+            def forward(ctx: Any, packed: Any, split: Any, lit: Any, moving: Any) -> Any:
+                ctx.arguments = split, lit, packed.detach().numpy(), moving
+                return torch.from_numpy(split.image(lit, ctx.arguments[2]))
+
+            @staticmethod
+            def backward(ctx: Any, *grads: Any) -> Any:
+                split, lit, packed, moving = ctx.arguments
+                gradient = split.pull(lit, packed, grads[0].contiguous().numpy(), moving)
+                return torch.from_numpy(gradient), None, None, None
+
+        _made.update(sparse=SparseProduct, shaded=Shaded)
+    return _made
+
+
+_made: dict[str, Any] = {}

@@ -1,0 +1,1 @@
+"""Other renderers behind one call: Cycles, Blender, another Mitsuba."""

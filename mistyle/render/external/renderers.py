@@ -1,0 +1,287 @@
+"""Renderers by name, all behind one call: (shot, spp, seeds) -> linear pictures and their seconds.
+
+    mitsuba:path  mitsuba:direct  mitsuba:scene   this Mitsuba with that integrator (a scene file: with its defaults);
+                                                  "scene" is the scene file's own
+    mitsuba@VENV:path                             the Mitsuba of another environment, by its Python
+    blender:cycles                                Cycles in the Python that --blender or MISTYLE_BLENDER_PYTHON names
+    NAME=command {scene} {out} …                  anything else; also {spp} {seed} {sensor}; no shell is involved
+
+A mesh is drawn with glTF's own reflectance model; where a mitsuba@… takes part, every Mitsuba reads the same exported
+scene file instead, whose material is Mitsuba's `principled`, so that versions are compared and not materials.
+"""
+
+import os
+import shlex
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from mistyle.core.camera import orbit
+from mistyle.core.errors import EnvironmentMissing, InputRefused, MistyleError, UsageError
+from mistyle.render.external.blender import BLENDER, blender_command
+from mistyle.render.external.render_files import (
+    RenderView,
+    Subject,
+    as_glb,
+    exported,
+    finished,
+    run_job,
+    scene_for,
+    user_camera,
+)
+
+MITSUBA_VARIANTS = ("cuda_ad_rgb", "metal_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """Pictures (h w 3 or 4, linear, premultiplied), the seconds of each, and what drew them."""
+
+    pictures: tuple[np.ndarray, ...]
+    seconds: tuple[float, ...]
+    version: str = ""
+
+
+Draw = Callable[[Subject, RenderView, int, Sequence[int]], Rendered]
+
+
+@dataclass(frozen=True)
+class Renderer:
+    """A renderer's name as it is shown, its kind, and the call."""
+
+    name: str
+    kind: Literal["mitsuba", "other mitsuba", "blender", "command"]
+    draw: Draw
+
+
+def renderer(text: str, blender: str | None = None) -> Renderer:
+    """The renderer that a --with names. UsageError says what there is, EnvironmentMissing what is not installed."""
+    name, equals, command = text.partition("=")
+    if equals and name.replace("_", "").replace("-", "").isalnum():
+        if "{scene}" not in command or "{out}" not in command:
+            raise UsageError(f"--with {text}: expected a command with {{scene}} and {{out}} in it")
+        return Renderer(name, "command", lambda *a: _command(name, command, *a))
+    who, colon, how = text.rpartition(":")
+    if colon and who == "mitsuba" and how.isidentifier():
+        return Renderer(text, "mitsuba", lambda *a: _mitsuba(how, *a))
+    if colon and who.startswith("mitsuba@") and how.isidentifier():
+        python = _python(Path(who.removeprefix("mitsuba@")))
+        return Renderer(text, "other mitsuba", lambda *a: _worker(python, how, *a))
+    if text == "blender:cycles":
+        found = blender or os.environ.get(BLENDER)
+        if not found:
+            raise EnvironmentMissing(
+                f"blender:cycles needs a Python in which `import bpy` works: pip install bpy into an environment of "
+                f"its own and name its python with --blender or {BLENDER}"
+            )
+        return Renderer(text, "blender", lambda *a: _cycles(found, *a))
+    raise UsageError(
+        f"--with {text}: expected mitsuba:path, mitsuba:direct, mitsuba:scene, mitsuba@VENV:path, blender:cycles, or "
+        "NAME='command {scene} {out}'"
+    )
+
+
+def _python(venv: Path) -> str:
+    """The Python of an environment; a path to the program itself will do too."""
+    candidates = [venv] if venv.is_file() else [venv / "bin" / "python", venv / "Scripts" / "python.exe"]
+    for path in candidates:
+        if path.is_file():
+            return str(path)
+    raise EnvironmentMissing(
+        f"mitsuba@{venv}: found no python there; expected a virtual environment with mitsuba in it"
+    )
+
+
+def subject(path: Path, folder: Path, renderers: Sequence[Renderer], threads: int = 0) -> Subject:
+    """Read FILE: a scene file, a mesh, or a run folder of ours with one GLB in `asset/`.
+
+    A scene file (.xml) is trusted like code, as Mitsuba opens whatever it names.
+    """
+    path = finished_asset(path) if path.is_dir() else path
+    if path.suffix.lower() == ".xml":
+        if not path.is_file():
+            raise InputRefused(f"{path}: found nothing; expected a Mitsuba scene file. Check the path.")
+        if any(r.kind == "blender" for r in renderers):
+            raise UsageError(f"{path}: Cycles reads no Mitsuba scenes; give a GLB, or leave out blender:cycles")
+        return Subject(path, folder, threads=threads)
+    from mistyle.io.read_mesh import read_mesh
+
+    asset = read_mesh(path, uv="auto")
+    return Subject(path, folder, asset, any(r.kind == "other mitsuba" for r in renderers), threads)
+
+
+def finished_asset(folder: Path) -> Path:
+    """The GLB of a run folder, or of its `asset` folder."""
+    found = sorted(folder.glob("*.glb")) or sorted((folder / "asset").glob("*.glb"))
+    if len(found) != 1:
+        raise InputRefused(f"{folder}: found {len(found)} .glb files; expected one, or one in asset/. Name the file.")
+    return found[0]
+
+
+def left_out(found: Subject) -> list[str]:
+    """What a glTF asks for that Mitsuba's side does not draw: emission, transparency, material extensions."""
+    if found.path.suffix.lower() not in (".glb", ".gltf"):
+        return []
+    from mistyle.io.read_mesh import load_gltf
+
+    names: set[str] = set()
+    for material in load_gltf(found.path)[0].get("materials", []):
+        if any(material.get("emissiveFactor", [0, 0, 0])):
+            names.add("emission")
+        if material.get("alphaMode", "OPAQUE") != "OPAQUE":
+            names.add("transparency")
+        names |= {n for n in material.get("extensions", {}) if n.startswith("KHR_materials_")}
+    return sorted(names)
+
+
+def shots(found: Subject, lights: Sequence[str], views: int, size: int) -> list[RenderView]:
+    """Cameras all round a mesh under every light, or the sensors of a scene file."""
+    if found.asset is None:
+        from mistyle.render.lookdev.scenes import file_scene
+
+        names = [s.id() for s in file_scene(found.path).sensors()]
+        usable = [n if n and not n.startswith(("__", "object_")) else f"sensor{k}" for k, n in enumerate(names)]
+        return [RenderView(name, sensor=k) for k, name in enumerate(usable)]
+    from mistyle.io.read import read_radiance
+    from mistyle.render.lookdev.scenes import light_rig
+
+    cameras = [orbit(35 + 360 * k / views, 15, distance=4, fov=30, size=(size, size)) for k in range(views)]
+    result = []
+    for name in lights:
+        rig = light_rig(name, read_radiance)
+        called = Path(name).stem
+        result += [RenderView(f"{called}_{k}" if views > 1 else called, c, rig) for k, c in enumerate(cameras)]
+    return result
+
+
+def _mitsuba(integrator: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
+    from importlib.metadata import version
+
+    from mistyle.render.lookdev import scenes as lookdev
+
+    own = _integrator(integrator, found)
+    if found.asset is None or found.export:
+        path = found.path if found.asset is None else exported(found, shot)
+        scene, sensor = lookdev.file_scene(path), shot.sensor
+    elif shot.camera is not None:
+        scene = lookdev.asset_scene(_shapes(found), shot.camera, shot.lights, integrator)
+        sensor, own = 0, None
+    else:
+        raise ValueError("a mesh needs a camera")
+    pictures, seconds = [], []
+    for seed in seeds:
+        start = time.perf_counter()
+        pictures.append(lookdev.drawn(scene, sensor, spp, seed, own))
+        seconds.append(time.perf_counter() - start)
+    return Rendered(tuple(pictures), tuple(seconds), f"mitsuba {version('mitsuba')}")
+
+
+def _integrator(name: str, found: Subject) -> dict[str, Any] | None:
+    """A scene file gets the plugin with its defaults (None: its own); a mesh one that does not show its lights."""
+    if name == "scene":
+        return None
+    from mistyle.render.lookdev.scenes import integrator_dict
+
+    return {"type": name} if found.asset is None else integrator_dict(name)
+
+
+# The asset in hand and its shapes: loading textures takes longer than many a render.
+_KEPT: list[tuple[Any, Any]] = []
+
+
+def _shapes(found: Subject) -> Any:
+    from mistyle.render.lookdev.scenes import asset_shapes
+
+    if not _KEPT or _KEPT[0][0] is not found.asset:
+        _KEPT[:] = [(found.asset, asset_shapes(found.asset))]
+    return _KEPT[0][1]
+
+
+def _worker(python: str, integrator: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
+    from mistyle.io.read import read_npy
+    from mistyle.render.lookdev import scenes as lookdev
+    from mistyle.render.mitsuba.scene import passes
+
+    path = found.path if found.asset is None else exported(found, shot)
+    times, each = passes(spp)
+    folder = found.folder / f"worker_{abs(hash((python, integrator, shot.name, spp))):x}"
+    folder.mkdir(parents=True, exist_ok=True)
+    outs = [folder / f"{seed}.npy" for seed in seeds]
+    job = {
+        "scene": str(path.resolve()),
+        "sensor": shot.sensor,
+        "integrator": _integrator(integrator, found),
+        "variants": list(MITSUBA_VARIANTS),
+        "shots": [{"out": str(o), "passes": times, "spp": each, "seed": s} for o, s in zip(outs, seeds, strict=True)],
+    }
+    done = run_job([python, lookdev.MITSUBA_WORKER], folder / "job.json", job, "mitsuba@")
+    pictures = tuple(np.asarray(read_npy(o), np.float32) for o in outs)
+    return Rendered(pictures, tuple(done["seconds"]), f"mitsuba {done['mitsuba']} ({done['variant']})")
+
+
+def _cycles(python: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
+    from mistyle.io.images.write import write_exr
+    from mistyle.io.read import read_frame
+    from mistyle.render.lookdev import scenes as lookdev
+
+    if shot.camera is None or found.asset is None:
+        raise UsageError(f"{found.path}: Cycles reads no Mitsuba scenes; give a GLB")
+    folder = found.folder / f"cycles_{shot.name}_{spp}"
+    folder.mkdir(parents=True, exist_ok=True)
+    sky = lookdev.blender_environment(shot.lights)
+    write_exr(folder / "environment.exr", dict(zip("RGB", np.moveaxis(sky, -1, 0), strict=True)))
+    outs = [folder / f"{seed}.exr" for seed in seeds]
+    matrix, scale = user_camera(found.asset, shot.camera)
+    job = {
+        "glb": str(as_glb(found).resolve()),
+        "size": list(shot.camera.size[::-1]),
+        "fov_x": shot.camera.fov,
+        "camera": matrix.tolist(),
+        "distance": 4.0 * scale,
+        "depth": lookdev.DEPTH,
+        "threads": found.threads or os.cpu_count() or 1,
+        "suns": lookdev.suns(shot.lights, shot.camera),
+        "environment": str((folder / "environment.exr").resolve()),
+        "shots": [{"out": str(o.resolve()), "spp": spp, "seed": s} for o, s in zip(outs, seeds, strict=True)],
+    }
+    done = run_job(blender_command(python, lookdev.CYCLES_WORKER), folder / "job.json", job, "blender:cycles")
+    pictures = tuple(_rgba(read_frame(o)) for o in outs)
+    return Rendered(pictures, tuple(done["seconds"]), f"blender {done['blender']}")
+
+
+def _command(name: str, template: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
+    from mistyle.io.read import read_frame
+
+    pictures, seconds = [], []
+    for seed in seeds:
+        folder = found.folder / f"command_{shot.name}_{spp}_{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        out = folder / f"{name}.exr"
+        fields = {"scene": str(scene_for(found, shot, spp, seed)), "out": str(out), "spp": spp, "seed": seed}
+        words = [_filled(word, fields | {"sensor": shot.sensor}) for word in shlex.split(template)]
+        start = time.perf_counter()
+        finished(words, name)
+        seconds.append(time.perf_counter() - start)
+        if not out.is_file():
+            raise MistyleError(f"{name}: the command ended well but wrote no {out.name}; expected an EXR at {{out}}")
+        pictures.append(_rgba(read_frame(out)))
+    return Rendered(tuple(pictures), tuple(seconds), name)
+
+
+def _filled(word: str, fields: Mapping[str, Any]) -> str:
+    """Plain replacement: braces that mean something else to the command stay."""
+    for key, value in fields.items():
+        word = word.replace(f"{{{key}}}", str(value))
+    return word
+
+
+def _rgba(frame: Any) -> np.ndarray:
+    beauty, alpha = frame.layer("beauty"), frame.layer("alpha")
+    if beauty is None:
+        raise InputRefused(f"{frame.path}: found no R, G and B; expected the finished picture.")
+    rgb = beauty.values()
+    return rgb if alpha is None else np.concatenate([rgb, alpha.values()], axis=2)

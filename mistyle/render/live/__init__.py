@@ -1,0 +1,1 @@
+"""Live Mitsuba scenes of users: their parameters, their XML text, drawing."""

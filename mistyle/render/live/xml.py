@@ -1,0 +1,262 @@
+"""Mitsuba scene files: loading one so that it can be fitted, and writing the fitted one beside float textures.
+
+Mitsuba's own parser reads the file (includes, defaults and paths are its business). What is written is the user's own
+text with the fitted elements replaced, not a new file: comments, ids and structure stay.
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mistyle.core.errors import InputRefused
+from mistyle.core.names import WRITTEN, distinct, safe_name
+from mistyle.process import stopping
+from mistyle.render.live import source as scene_source
+from mistyle.render.live import text as scene_text
+from mistyle.render.live.parameters import Parameter
+from mistyle.render.mitsuba import device
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """A loaded scene file.
+
+    scene    the live `mi.Scene`, its textures stored as 32-bit floats
+    state    what Mitsuba's parser made of the file
+    path     the file
+    defines  the parameters it was loaded with
+    notes    sentences about what was changed while loading
+    """
+
+    scene: Any
+    state: Any
+    path: Path
+    defines: dict[str, str]
+    notes: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class WrittenScene:
+    """What `write_scene` wrote: the scene file (None where no element could be replaced), and every texture by key."""
+
+    xml: Path | None
+    textures: dict[str, Path]
+    notes: tuple[str, ...]
+
+
+def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = None) -> SceneFile:
+    """Load a scene file as `mi.load_file(path, **defines)` does, ready for a fit.
+
+    Three things differ. Bitmaps of 8 and 16 bits without a `format` are stored as 32-bit floats, because 8 bits have no
+    gradient; the picture stays the same to 2e-7 (8 bits) or half a unit of the 16-bit float that Mitsuba would use.
+    Equal materials and meshes are not merged, so ids stay. What has no id gets one ("sphere1"), and top-level textures
+    are known by who uses them, because Mitsuba names both by an address. The file is trusted: Mitsuba opens whatever it
+    names. Raises InputRefused when it cannot be loaded, with Mitsuba's own words.
+    """
+    import mitsuba as mi
+
+    file = Path(path)
+    if not file.is_file():
+        raise InputRefused(f"{file}: no such scene file.")
+    given = {name: str(value) for name, value in (defines or {}).items()}
+    config: Any = mi.parser.ParserConfig(device.use())
+    config.merge_equivalent = config.merge_meshes = False
+    try:
+        with _found_beside(file), device.file_threads():
+            state, converted = _parsed(config, file, given)
+            # Loading empties what was parsed, and `write_scene` needs it.
+            made = mi.parser.instantiate(config, _parsed(config, file, given)[0])
+    except RuntimeError as error:
+        stopping.check()
+        raise InputRefused(f"{file}: Mitsuba cannot load this scene. {error}") from error
+    scene: Any = made[0] if isinstance(made, list) else made
+    if not isinstance(scene, mi.Scene):
+        raise InputRefused(f"{file}: holds a {type(scene).__name__}, not a scene.")
+    notes = []
+    if converted:
+        shown = ", ".join(sorted(set(converted))[:5]) + (", …" if len(set(converted)) > 5 else "")
+        notes.append(f"{len(converted)} bitmaps were loaded as 32-bit floats, which have gradients ({shown}).")
+    return SceneFile(scene, state, file, given, tuple(notes))
+
+
+def _parsed(config: Any, file: Path, defines: dict[str, str]) -> tuple[Any, list[str]]:
+    """The parsed file, prepared, and the bitmaps that were converted."""
+    import mitsuba as mi
+
+    state = mi.parser.parse_file(config, str(file), **defines)
+    mi.parser.transform_all(config, state)
+    converted = _as_floats(state)
+    _named(state)
+    return state, converted
+
+
+@contextmanager
+def _found_beside(file: Path) -> Iterator[None]:
+    """Relative paths are looked up beside the file, as `mi.load_file` does."""
+    import mitsuba as mi
+
+    door: Any = mi
+    resolver = door.file_resolver()
+    inner = door.FileResolver(resolver)
+    inner.prepend(str(file.parent.resolve()))
+    door.set_file_resolver(inner)
+    try:
+        yield
+    finally:
+        door.set_file_resolver(resolver)
+
+
+def _as_floats(state: Any) -> list[str]:
+    """Ask for 32-bit floats wherever a bitmap says nothing; returns the files."""
+    changed = []
+    for node in state.nodes:
+        if node.props.plugin_name() == "bitmap" and "format" not in node.props and "filename" in node.props:
+            node.props["format"] = "variant"
+            changed.append(Path(str(node.props["filename"])).name)
+    return changed
+
+
+def _named(state: Any) -> None:
+    """Give what stands in the scene an id, and let its textures be reached only by way of their users."""
+    import mitsuba as mi
+
+    root = state.nodes[0]
+    used = {index for node in state.nodes[1:] for _, index in scene_text.children(node)}
+    taken = {node.props.id() for node in state.nodes}
+    for name, index in scene_text.children(root):
+        props = state.nodes[index].props
+        if state.nodes[index].type == mi.ObjectType.Texture and index in used:
+            del root.props[name]
+        elif not props.id():
+            number = next(k for k in range(1, len(state.nodes) + 2) if f"{props.plugin_name()}{k}" not in taken)
+            taken.add(f"{props.plugin_name()}{number}")
+            props.set_id(f"{props.plugin_name()}{number}")
+
+
+def write_scene(
+    path: Path | str,
+    scene: SceneFile | Any,
+    fitted: Any,
+    write_exr: Callable[..., None],
+    write_file: Callable[[Path, bytes], Any] = Path.write_bytes,
+) -> WrittenScene:
+    """Write the fitted values (a `FittedScene`) as float EXR textures, and the scene file that uses them at `path`.
+
+    The scene file is a copy of the one that was loaded: the fitted bitmaps' file names and the fitted literals' values
+    are replaced (in copies of the files that it includes too), `<default>`s hold the values it was loaded with, and a
+    `<path>` leads to the folder of the original, where its meshes and other files stay. A mesh with fitted attributes
+    is written as PLY. It needs no mistyle. It is loaded once and its values are compared with the
+    fitted ones; where that fails it is not kept and a note says why. From a live `mi.Scene` only textures are written.
+    `write_exr` is that of `io/images/write.py`, `write_file` may be `atomic_write` of `io/store/atomic.py`.
+    """
+    out = Path(path)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    textures: dict[str, Path] = {}
+    room = max(WRITTEN - len(f"{out.stem}_.exr".encode()), 16)
+    stems = distinct([safe_name(p.name.removesuffix(".data"), room) for p in fitted.parameters], limit=room)
+    live = scene.scene if isinstance(scene, SceneFile) else scene
+    for p, stem in zip(fitted.parameters, stems, strict=True):
+        textures |= _write_value(out, stem, p, fitted.values[p.key], write_exr, live)
+    if not isinstance(scene, SceneFile):
+        return WrittenScene(None, textures, ("The scene does not come from a file: only its textures were written.",))
+    sources = [Path(str(file)).read_bytes() for file in scene.state.files]
+    edits: dict[int, list[scene_source.Edit]] = {0: []}
+    notes = []
+    for p in fitted.parameters:
+        found = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
+        if isinstance(found, str):
+            notes.append(f"{p.name} is not in {out.name}: {found} Its value stands in run.json and in the report.")
+        else:
+            edits.setdefault(found[0], []).extend(found[1])
+    if not any(edits.values()):
+        return WrittenScene(None, textures, tuple(notes))
+    notes += _rewrite_includes(scene, sources, edits, out, write_file)
+    edits[0] += scene_source.surroundings(sources[0], scene.path, scene.defines, out)
+    write_file(out, scene_source.spliced(sources[0], edits[0]))
+    wrong = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
+    if wrong:
+        out.unlink()
+        return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {wrong}"))
+    if out.parent.resolve() != scene.path.parent.resolve():
+        notes.append(f"{out.name} takes its other files from {scene.path.parent}.")
+    return WrittenScene(out, textures, tuple(notes))
+
+
+def _rewrite_includes(
+    scene: SceneFile,
+    sources: Sequence[bytes],
+    edits: dict[int, list[scene_source.Edit]],
+    out: Path,
+    write_file: Callable[[Path, bytes], Any],
+) -> list[str]:
+    """Write included files with fitted values beside the scene, from the innermost outwards, and include those."""
+    notes = []
+    for k in range(len(sources) - 1, 0, -1):
+        if not edits.get(k):
+            continue
+        included = Path(str(scene.state.files[k]))
+        new = out.with_name(f"{out.stem}_{k}_{included.name}")
+        for parent in range(len(sources)):
+            change = scene_source.include_edit(sources[parent], included, scene.defines, new.name)
+            if change and parent != k:
+                edits.setdefault(parent, []).extend(change)
+                write_file(new, scene_source.spliced(sources[k], edits[k]))
+                notes.append(f"{out.name} includes {new.name}, a copy of {included.name} with the fitted values.")
+                break
+    return notes
+
+
+def _write_value(
+    out: Path, stem: str, p: Parameter, values: np.ndarray, write_exr: Callable[..., None], scene: Any
+) -> dict[str, Path]:
+    """An image as EXR, a mesh's attribute as PLY in world space, nothing for a number or a colour."""
+    import mitsuba as mi
+
+    if p.kind == "texture" and values.ndim == 3 and values.shape[2] <= 4:
+        file = out.with_name(f"{out.stem}_{stem}.exr")
+        shown = _without_seam(values) if p.owner == "EnvironmentMapEmitter" else values
+        names = "Y" if shown.shape[2] == 1 else "RGBA"[: shown.shape[2]]
+        data = {"colorInteropID": "data"} if p.owner == "NormalMap" or shown.shape[2] == 1 else None
+        write_exr(file, {name: shown[..., k] for k, name in enumerate(names)}, attributes=data)
+        return {p.key: file}
+    if p.kind == "value":
+        return {}
+    if p.kind == "attribute":
+        file = out.with_name(f"{out.stem}_{stem}.ply")
+        node: Any = mi.traverse(scene).properties[p.key][2]
+        with device.file_threads():
+            node.write_ply(str(file))
+        return {p.key: file}
+    file = out.with_name(f"{out.stem}_{stem}.npy")
+    np.save(file, values)
+    return {p.key: file}
+
+
+def _without_seam(values: np.ndarray) -> np.ndarray:
+    """An environment map as its file holds it: Mitsuba repeats a column at either end."""
+    return np.ascontiguousarray(values[:, 1:-1, :3])
+
+
+def _differences(out: Path, fitted: Any, left_out: set[str]) -> str:
+    """Load what was written; say what is not as it should be, or nothing."""
+    import mitsuba as mi
+
+    try:
+        loaded = load_scene_for_fit(out)
+    except InputRefused as error:
+        return str(error)
+    table = mi.traverse(loaded.scene)
+    for p in fitted.parameters:
+        if p.name in left_out:
+            continue
+        if p.key not in table:
+            return f"it has no {p.key}."
+        value, wanted = np.array(table[p.key], dtype=np.float32).ravel(), fitted.values[p.key].ravel()
+        # A light's single number comes back as a grey colour.
+        if len(wanted) not in (1, len(value)) or not np.allclose(value, wanted, rtol=1e-6, atol=1e-7):
+            return f"it holds another {p.key}."
+    return ""

@@ -1,0 +1,1 @@
+"""Look-dev pictures: turntables, reference balls, AOVs, the studio."""

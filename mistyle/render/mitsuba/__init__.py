@@ -1,0 +1,1 @@
+"""Mitsuba scenes of meshes with maps: plugins, drawing, visibility."""

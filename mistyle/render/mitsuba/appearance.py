@@ -1,0 +1,396 @@
+"""An asset drawn as its file says: glTF's surface with F0, F90 and a clear coat, opacity, emission, unlit materials.
+
+Four plugins of ours for Mitsuba, in Python; plain materials do without them (`object_shapes`):
+
+- a BSDF `LayeredSurface`: `mistyle_gltf` with F0 as a texture, F90, and a clear coat (`bsdf.layered`);
+- a texture `Cut`: 1 where another one reaches a cutoff, else 0 (glTF's MASK);
+- an emitter `Glow`: what a mesh radiates from either side, times its opacity. Light paths find it by chance, emitter
+  sampling does not: it is seen without noise, and no sample of the surroundings is lost to it;
+- an integrator `Path`: as Mitsuba's `path` with hidden emitters, but it hides the surroundings alone, and surfaces
+  that are passed do not count as bounces.
+"""
+
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.asset import Asset, Material, Shading
+from mistyle.core.maps import OwnMaps
+from mistyle.geometry.tangents import corner_tangents
+from mistyle.render.deferred import bsdf
+from mistyle.render.mitsuba import device, plugins
+from mistyle.render.mitsuba import scene as scenery
+
+PASSED = 32  # surfaces that a path passes through at most
+LABELS = ("sampler", "ray", "active", "depth", "passed", "result", "throughput", "before", "pdf", "delta", "valid")
+LEAST_INDEX = 1.001  # Mitsuba refuses a solid of the index of air
+BARE = 0.8  # albedo of what has no material at all, as in Blender
+
+
+def is_plain(material: Material) -> bool:
+    """Whether albedo, normal, roughness and metalness say all of a material."""
+    maps = (material.opacity, material.emission, material.specular)
+    return material.shading == Shading() and all(m is None for m in maps)
+
+
+def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
+    """A loaded Mitsuba mesh of one texture set whose material is not plain."""
+    import mitsuba as mi
+
+    device.use()
+    plugins.register()
+    material = asset.materials[part]
+    shading, made = material.shading, classes(mi.variant())
+    if shading.stated == "nothing":
+        maps = replace(maps, albedo=np.full((2, 2, 3), BARE, np.float32))
+    elif shading.stated == "colour":
+        maps = replace(maps, roughness=np.ones((2, 2), np.float32), metallic=np.ones((2, 2), np.float32))
+    glow = _radiance(material, maps)
+    if shading.unlit or shading.black:
+        maps = replace(maps, albedo=np.zeros((2, 2, 3), np.float32))
+    described: dict[str, Any] = {"type": "twosided", "bsdf": _relief(material, maps, made)}
+    if shading.transmission > 0:
+        described = _glass(shading, maps)
+    opacity = _opacity(material, made)
+    if opacity is not None:
+        described = {"type": "mask", "opacity": opacity, "nested": described}
+    emitter = None if glow is None else made["Glow"](_loaded(glow), opacity)
+    return scenery.mitsuba_mesh(
+        asset.mesh, part, mi.load_dict(described), f"part{part}", tangents=tangents, emitter=emitter
+    )
+
+
+def shapes(asset: Asset, maps: list[OwnMaps]) -> dict[str, Any]:
+    """Every texture set as one loaded shape, by name."""
+    device.use()
+    tangents = corner_tangents(asset.mesh)
+    there = [p for p in range(len(asset.mesh.parts)) if (asset.mesh.part == p).any()]
+    plain = [p for p in there if is_plain(asset.materials[p])]
+    result = {f"part{p}": scenery.object_shape(asset.mesh, p, maps[p], tangents) for p in plain}
+    result |= {f"part{p}": shape_of(asset, p, maps[p], tangents) for p in there if p not in plain}
+    return {f"part{p}": result[f"part{p}"] for p in there}
+
+
+def needs_path(shapes: dict[str, Any]) -> bool:
+    """Whether Mitsuba's own integrators would not show some shape as it is: it radiates, or is seen through."""
+    import mitsuba as mi
+
+    loaded = [s for s in shapes.values() if isinstance(s, mi.Shape)]
+    return any(s.is_emitter() or mi.has_flag(s.bsdf().flags(), mi.BSDFFlags.Null) for s in loaded)
+
+
+def integrator(depth: int) -> Any:
+    """A `Path` of `depth` vertices at most, the light's included."""
+    import mitsuba as mi
+
+    return classes(mi.variant())["Path"](depth)
+
+
+def _relief(material: Material, maps: OwnMaps, made: dict[str, type]) -> dict[str, Any]:
+    """The normal map over the surface."""
+    shading = material.shading
+    bare = shading.unlit or shading.stated == "nothing"
+    f0 = np.zeros(3, np.float32) if bare else np.array(shading.specular, np.float32)
+    specular = np.broadcast_to(f0, (2, 2, 3)) if material.specular is None else material.specular * f0
+    surface = made["Surface"](
+        {
+            "base_color": _loaded(maps.albedo),
+            "roughness": _loaded(maps.roughness[..., None]),
+            "metallic": _loaded(maps.metallic[..., None]),
+            "specular": _loaded(np.ascontiguousarray(specular, np.float32)),
+        },
+        0.0 if bare else shading.edge,
+        0.0 if bare else shading.coat,
+        shading.coat_roughness,
+    )
+    normal = scenery.texture_dict(scenery.encoded(maps.normal))
+    return {"type": plugins.NORMALMAP, "normalmap": normal, "flip_invalid_normals": True, "bsdf": surface}
+
+
+def _glass(shading: Shading, maps: OwnMaps) -> dict[str, Any]:
+    """What lets light through, by Mitsuba's own material: with a volume a solid that refracts, else a thin sheet."""
+    told: dict[str, Any] = {
+        "base_color": scenery.texture_dict(maps.albedo),
+        "roughness": scenery.texture_dict(maps.roughness[..., None]),
+        "spec_trans": shading.transmission,
+        "eta": max(shading.ior, LEAST_INDEX),
+    }
+    if shading.thin:
+        return {"type": "principledthin", **told}
+    metallic = scenery.texture_dict(maps.metallic[..., None])
+    normal = scenery.texture_dict(scenery.encoded(maps.normal))
+    inner = {"type": "principled", "metallic": metallic, **told}
+    return {"type": plugins.NORMALMAP, "normalmap": normal, "bsdf": inner}
+
+
+def _radiance(material: Material, maps: OwnMaps) -> Float[np.ndarray, "h w 3"] | None:
+    """What a material radiates, linear; None where nothing."""
+    shading = material.shading
+    if shading.unlit:
+        return maps.albedo
+    factor = np.array(shading.emission, np.float32)
+    if not factor.any():
+        return None
+    texture = material.albedo if shading.black else material.emission
+    return np.broadcast_to(factor, (2, 2, 3)) if texture is None else texture * factor
+
+
+def _opacity(material: Material, made: dict[str, type]) -> Any:
+    """The opacity as a texture; None where all is opaque."""
+    shading = material.shading
+    if shading.opacity == 1 and material.opacity is None and (shading.cutoff or 0) <= 1:
+        return None
+    values = np.full((2, 2), shading.opacity, np.float32)
+    if material.opacity is not None:
+        values = np.clip(material.opacity * np.float32(shading.opacity), 0, 1)
+    texture = _loaded(values[..., None])
+    return texture if shading.cutoff is None else made["Cut"](texture, shading.cutoff)
+
+
+def _loaded(values: Float[np.ndarray, "h w c"]) -> Any:
+    import mitsuba as mi
+
+    return mi.load_dict(scenery.texture_dict(np.ascontiguousarray(values)))
+
+
+@cache
+def classes(variant: str) -> dict[str, type]:
+    """The plugins as classes of the bases of Mitsuba's current variant."""
+    import mitsuba as mi
+
+    return {"Surface": _surface_class(mi), "Cut": _cut_class(mi), "Glow": _glow_class(mi), "Path": _path_class(mi)}
+
+
+def _cut_class(mi: Any) -> type:
+    import drjit as dr
+
+    class Cut(mi.Texture):
+        def __init__(self, nested, cutoff):
+            super().__init__(mi.Properties())
+            self.nested, self.cutoff = nested, cutoff
+
+        def eval_1(self, si, active=True):
+            return dr.select(self.nested.eval_1(si, active) >= self.cutoff, mi.Float(1), mi.Float(0))
+
+        def eval(self, si, active=True):
+            return mi.Color3f(self.eval_1(si, active))
+
+        def mean(self):
+            return self.nested.mean()
+
+        def is_spatially_varying(self):
+            return True
+
+        def to_string(self):
+            return f"Cut[{self.nested}, {self.cutoff}]"
+
+    return Cut
+
+
+def _glow_class(mi: Any) -> type:
+    import drjit as dr
+
+    class Glow(mi.Emitter):
+        def __init__(self, radiance, opacity):
+            props = mi.Properties()
+            props["sampling_weight"] = 0.0
+            super().__init__(props)
+            self.radiance, self.opacity = radiance, opacity
+            self.m_flags = mi.EmitterFlags.Surface | mi.EmitterFlags.SpatiallyVarying
+
+        def eval(self, si, active=True):
+            value = self.radiance.eval(si, active)
+            return value if self.opacity is None else value * self.opacity.eval_1(si, active)
+
+        def sample_direction(self, it, sample, active=True):
+            return dr.zeros(mi.DirectionSample3f), mi.Color3f(0)
+
+        def pdf_direction(self, it, ds, active=True):
+            return mi.Float(0)
+
+        def eval_direction(self, it, ds, active=True):
+            return mi.Color3f(0)
+
+        def to_string(self):
+            return f"Glow[{self.radiance}]"
+
+    return Glow
+
+
+def _path_class(mi: Any) -> type:
+    import drjit as dr
+
+    class Path(mi.SamplingIntegrator):
+        def __init__(self, depth):
+            super().__init__(mi.Properties())
+            self.depth = depth
+
+        def sample(self, scene, sampler, ray, medium=None, active=True):
+            state = (
+                sampler,
+                mi.Ray3f(ray),
+                mi.Bool(active),
+                mi.UInt32(0),  # bounces
+                mi.UInt32(0),  # surfaces passed
+                mi.Color3f(0),
+                mi.Color3f(1),
+                dr.zeros(mi.Interaction3f),
+                mi.Float(1),
+                mi.Bool(True),
+                mi.Bool(False),
+            )
+
+            def going(*state):
+                return state[2]
+
+            def step(*state):
+                return _next_surface(mi, scene, self.depth, state)
+
+            state = dr.while_loop(state, going, step, labels=LABELS)
+            return state[5], state[10], []
+
+        def to_string(self):
+            return f"Path[{self.depth}]"
+
+    return Path
+
+
+def _balanced(a: Any, b: Any) -> Any:
+    """Veach's power heuristic for a sample of density a that b could have made as well."""
+    import drjit as dr
+
+    total = dr.fma(a, a, b * b)
+    return dr.select(total > 0, a * a / dr.select(total > 0, total, 1), 0)
+
+
+def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tuple[Any, ...]:
+    """A path of at most `most` vertices one surface further: what is radiated there, what lights reach it, where it
+    goes on."""
+    import drjit as dr
+
+    sampler, ray, active, depth, passed, result, throughput, before, pdf, delta, valid = state
+    ctx = mi.BSDFContext()
+    si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
+    # The surroundings light the asset and are not seen.
+    lit = active & (si.is_valid() | (depth > 0))
+    ds = mi.DirectionSample3f(scene, si, before)
+    found = scene.pdf_emitter_direction(before, ds, lit & ~delta)
+    share = dr.select(delta, 1, _balanced(pdf, found))
+    result = result + dr.select(lit, throughput * share * ds.emitter.eval(si, lit), 0)
+    here = active & si.is_valid()
+    goes = here & (depth + 1 < most) & (passed < PASSED)
+    surface = si.bsdf(ray)
+    direct = goes & mi.has_flag(surface.flags(), mi.BSDFFlags.Smooth)
+    ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(goes), True, direct)
+    direct = direct & (ds.pdf != 0)
+    value, at = surface.eval_pdf(ctx, si, si.to_local(ds.d), direct)
+    share = dr.select(ds.delta, 1, _balanced(ds.pdf, at))
+    result = result + dr.select(direct, throughput * value * weight * share, 0)
+    sampled, weight = surface.sample(ctx, si, sampler.next_1d(goes), sampler.next_2d(goes), goes)
+    null = goes & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)
+    valid = valid | (here & ~null)
+    throughput = dr.select(goes, throughput * weight, throughput)
+    return (
+        sampler,
+        si.spawn_ray(si.to_world(sampled.wo)),
+        goes & dr.any(throughput != 0),
+        depth + dr.select(null, mi.UInt32(0), mi.UInt32(1)),
+        passed + dr.select(null, mi.UInt32(1), mi.UInt32(0)),
+        result,
+        throughput,
+        mi.Interaction3f(si),
+        sampled.pdf,
+        mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Delta),
+        valid,
+    )
+
+
+def _surface_class(mi: Any) -> type:
+    import drjit as dr
+
+    class LayeredSurface(mi.BSDF):
+        def __init__(self, textures, edge, coat, coat_roughness):
+            super().__init__(mi.Properties())
+            self.textures, self.edge, self.coat, self.coat_roughness = textures, edge, coat, coat_roughness
+            front = mi.BSDFFlags.FrontSide
+            self.m_components = [mi.BSDFFlags.DiffuseReflection | front, mi.BSDFFlags.GlossyReflection | front]
+            self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def eval(self, ctx, si, wo, active=True):
+            return self._eval(si, wo, active, self._values(si, active))
+
+        def pdf(self, ctx, si, wo, active=True):
+            return _density(mi, self, si, wo, active, self._values(si, active))
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            values = self._values(si, active)
+            return self._eval(si, wo, active, values), _density(mi, self, si, wo, active, values)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            values = self._values(si, active)
+            shiny, coated, spread, coat = _strategy(mi, self, values)
+            above = mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z))
+            half, _ = spread.sample(above, sample2)
+            outer, _ = coat.sample(above, sample2)
+            glossy = sample1 < shiny + coated
+            half = dr.select(sample1 < coated, outer, half)
+            wo = dr.select(glossy, mi.reflect(si.wi, mi.Normal3f(half)), mi.warp.square_to_cosine_hemisphere(sample2))
+            sampled = plugins.reflected(mi, wo, glossy)
+            sampled.pdf = _density(mi, self, si, wo, active, values)
+            usable = active & (sampled.pdf > 0)
+            value = self._eval(si, wo, active, values)
+            return sampled, dr.select(usable, value / dr.select(usable, sampled.pdf, 1), 0)
+
+        def eval_diffuse_reflectance(self, si, active=True):
+            return self.textures["base_color"].eval(si, active)
+
+        def to_string(self):
+            return f"LayeredSurface[{self.textures}, {self.edge}, {self.coat}, {self.coat_roughness}]"
+
+        def _values(self, si, active) -> Any:
+            return (
+                self.textures["base_color"].eval(si, active),
+                self.textures["roughness"].eval_1(si, active),
+                self.textures["metallic"].eval_1(si, active),
+                self.textures["specular"].eval(si, active),
+            )
+
+        def _eval(self, si, wo, active, values):
+            angles = bsdf.upright(si.wi, wo)
+            albedo, roughness, metallic, f0 = values
+            coat = (self.coat, self.coat_roughness)
+            value = bsdf.layered(angles, albedo, roughness, metallic, f0, self.edge, coat)
+            return dr.select(active & angles.valid, value, 0)
+
+    return LayeredSurface
+
+
+def _strategy(mi: Any, layers: Any, values: Any) -> tuple[Any, Any, Any, Any]:
+    """The shares of samples that follow the visible normals of base and coat, and their distributions."""
+    import drjit as dr
+
+    _, roughness, metallic, specular = values
+    alpha = dr.maximum(dr.square(roughness), bsdf.ALPHA_FLOOR)
+    shine = dr.clip(dr.maximum(metallic, dr.max(specular)), 0, 1)
+    shine = 0.5 + 0.5 * shine if layers.edge > 0 else dr.clip(metallic, 0, 1)
+    coated = 0.3 * layers.coat
+    kind = mi.MicrofacetType.GGX
+    coat = mi.MicrofacetDistribution(kind, max(layers.coat_roughness**2, bsdf.ALPHA_FLOOR), sample_visible=True)
+    spread = mi.MicrofacetDistribution(kind, alpha, sample_visible=True)
+    return shine * (1 - coated), mi.Float(coated), spread, coat
+
+
+def _density(mi: Any, layers: Any, si: Any, wo: Any, active: Any, values: Any) -> Any:
+    """The density with which a LayeredSurface's `sample` draws a direction."""
+    import drjit as dr
+
+    shiny, coated, spread, coat = _strategy(mi, layers, values)
+    above = active & (si.wi.z > 0) & (wo.z > 0)
+    wi = dr.select(above, si.wi, mi.Vector3f(0, 0, 1))
+    half = dr.normalize(dr.select(above, si.wi + wo, mi.Vector3f(0, 0, 1)))
+    lobes = shiny * spread.pdf(wi, half) + coated * coat.pdf(wi, half)
+    lobes /= 4 * dr.select(above, dr.dot(wo, half), 1)
+    return dr.select(above, dr.fma(1 - shiny - coated, wo.z / dr.pi, lobes), 0)

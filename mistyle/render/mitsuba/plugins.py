@@ -1,0 +1,250 @@
+"""Two BSDFs of ours for Mitsuba, in Python: glTF's metallic-roughness model, and normal maps in MikkTSpace frames.
+
+`register` makes them known to the variant that is current. They stand where `principled` and `normalmap` stand, inside
+`twosided`, with the same names in `mi.traverse`, under any integrator and under AD:
+
+- `mistyle_gltf`: textures `base_color`, `roughness`, `metallic`, float `specular` (0.5: the specification; see
+  `bsdf.gltf`). The front side reflects, the back is black. Half of the samples or more follow GGX's visible normals,
+  the rest the cosine. A `BSDFContext` that asks for one component gets both.
+- `mistyle_normalmap`: texture `normalmap` holding (n + 1) / 2 and one nested BSDF. n is relative to the mesh attributes
+  `vertex_tangent` (3 floats, world space) and `vertex_handedness` (1 or -1): the tangent interpolated and made
+  perpendicular to the interpolated normal, bitangent = handedness · (normal x tangent). Where the mesh has none, or
+  there is no shape, the frame of the surface interaction is taken as it is. `flip_invalid_normals` (default False) as
+  in Mitsuba's `normalmap`; its shadowing function is left out, as glTF viewers leave it out.
+"""
+
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.mesh import Welded
+from mistyle.core.rows import corner_rows, distinct
+from mistyle.render.deferred import bsdf
+from mistyle.render.mitsuba import device
+
+GLTF, NORMALMAP = "mistyle_gltf", "mistyle_normalmap"
+TANGENT, HANDEDNESS = "vertex_tangent", "vertex_handedness"
+
+_registered: set[str] = set()
+
+
+def register() -> None:
+    """Make both plugins known to Mitsuba's current variant (any; where none is, the one of `device.use`)."""
+    import mitsuba as mi
+
+    variant = mi.variant() or device.use()
+    if variant not in _registered:
+        mi.register_bsdf(GLTF, _gltf_class(mi))
+        mi.register_bsdf(NORMALMAP, _normalmap_class(mi))
+        _registered.add(variant)
+
+
+def with_tangents(welded: Welded, tangents: Float[np.ndarray, "f 3 4"]) -> tuple[Welded, dict[str, np.ndarray]]:
+    """Split the indices whose corners differ in tangent; second, the attributes of the indices that result."""
+    index, corners = welded.faces.reshape(-1), tangents.reshape(-1, 4).astype(np.float32)
+    first, inverse = distinct(corner_rows(index, corners))
+    old, found = index[first], corners[first]
+    split = Welded(
+        positions=welded.positions[old],
+        normals=welded.normals[old],
+        uvs=welded.uvs[old],
+        faces=inverse.reshape(-1, 3).astype(np.int32),
+        vertex=welded.vertex[old],
+    )
+    return split, {TANGENT: found[:, :3], HANDEDNESS: np.sign(found[:, 3:])}
+
+
+def _gltf_class(mi: Any) -> type:
+    """The BSDF as a class of the base of `mi`'s current variant."""
+    import drjit as dr
+
+    class Gltf(mi.BSDF):
+        def __init__(self, props):
+            super().__init__(props)
+            self.base_color = props.get_texture("base_color", 0.5)
+            self.roughness = props.get_texture("roughness", 0.5)
+            self.metallic = props.get_texture("metallic", 0.0)
+            self.specular = float(props.get("specular", 0.5))
+            front = mi.BSDFFlags.FrontSide
+            self.m_components = [mi.BSDFFlags.DiffuseReflection | front, mi.BSDFFlags.GlossyReflection | front]
+            self.m_flags = self.m_components[0] | self.m_components[1]
+
+        def traverse(self, cb):
+            for name in ("base_color", "roughness", "metallic"):
+                cb.put(name, getattr(self, name), mi.ParamFlags.Differentiable)
+
+        def eval(self, ctx, si, wo, active=True):
+            return self._eval(si, wo, active, self.metallic.eval_1(si, active), self.roughness.eval_1(si, active))
+
+        def pdf(self, ctx, si, wo, active=True):
+            return _density(mi, si, wo, active, self.metallic.eval_1(si, active), self.roughness.eval_1(si, active))
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            metallic, roughness = self.metallic.eval_1(si, active), self.roughness.eval_1(si, active)
+            value = self._eval(si, wo, active, metallic, roughness)
+            return value, _density(mi, si, wo, active, metallic, roughness)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            metallic, roughness = self.metallic.eval_1(si, active), self.roughness.eval_1(si, active)
+            shiny, spread = _strategy(mi, metallic, roughness)
+            glossy = sample1 < shiny
+            half, _ = spread.sample(mi.Vector3f(si.wi.x, si.wi.y, dr.abs(si.wi.z)), sample2)
+            wo = dr.select(glossy, mi.reflect(si.wi, half), mi.warp.square_to_cosine_hemisphere(sample2))
+            sampled = reflected(mi, dr.detach(wo), glossy)
+            sampled.pdf = _density(mi, si, sampled.wo, active, metallic, roughness)
+            value = self._eval(si, sampled.wo, active, metallic, roughness)
+            usable = active & (sampled.pdf > 0)
+            return sampled, dr.select(usable, value / dr.select(usable, sampled.pdf, 1), 0)
+
+        def eval_diffuse_reflectance(self, si, active=True):
+            return self.base_color.eval(si, active)
+
+        def to_string(self):
+            parts = ", ".join(f"{name}={getattr(self, name)}" for name in ("base_color", "roughness", "metallic"))
+            return f"{GLTF}[{parts}, specular={self.specular}]"
+
+        def _eval(self, si, wo, active, metallic, roughness):
+            albedo = self.base_color.eval(si, active)
+            angles = bsdf.upright(si.wi, wo)
+            linear, constant = bsdf.MODELS["gltf"](angles, roughness, metallic, self.specular)
+            return dr.select(active & angles.valid, dr.fma(albedo, linear, constant), 0)
+
+    return Gltf
+
+
+def _strategy(mi: Any, metallic: Any, roughness: Any) -> tuple[Any, Any]:
+    """The share of samples that follow GGX's visible normals, and that distribution; the rest is cosine."""
+    import drjit as dr
+
+    alpha = dr.maximum(dr.square(dr.detach(roughness)), bsdf.ALPHA_FLOOR)
+    share = 0.5 + 0.5 * dr.clip(dr.detach(metallic), 0, 1)
+    return share, mi.MicrofacetDistribution(mi.MicrofacetType.GGX, alpha, sample_visible=True)
+
+
+def _density(mi: Any, si: Any, wo: Any, active: Any, metallic: Any, roughness: Any) -> Any:
+    """The density with which `sample` draws a direction."""
+    import drjit as dr
+
+    shiny, spread = _strategy(mi, metallic, roughness)
+    above = active & (si.wi.z > 0) & (wo.z > 0)
+    half = dr.normalize(dr.select(above, si.wi + wo, mi.Vector3f(0, 0, 1)))
+    visible = spread.pdf(dr.select(above, si.wi, mi.Vector3f(0, 0, 1)), half)
+    lobe = visible / (4 * dr.select(above, dr.dot(wo, half), 1))
+    return dr.select(above, dr.lerp(wo.z / dr.pi, lobe, shiny), 0)
+
+
+def reflected(mi: Any, wo: Any, glossy: Any) -> Any:
+    """A sample of reflection towards `wo`, of the glossy component or the diffuse one; its density is left open."""
+    import drjit as dr
+
+    sampled = dr.zeros(mi.BSDFSample3f)
+    sampled.wo = wo
+    sampled.eta = mi.Float(1)
+    diffuse, gloss = mi.UInt32(+mi.BSDFFlags.DiffuseReflection), mi.UInt32(+mi.BSDFFlags.GlossyReflection)
+    sampled.sampled_type = dr.select(glossy, gloss, diffuse)
+    sampled.sampled_component = dr.select(glossy, mi.UInt32(1), mi.UInt32(0))
+    return sampled
+
+
+def _normalmap_class(mi: Any) -> type:
+    """The BSDF as a class of the base of `mi`'s current variant."""
+    import drjit as dr
+
+    class NormalMap(mi.BSDF):
+        def __init__(self, props):
+            super().__init__(props)
+            nested = [child for _, child in props.objects() if isinstance(child, mi.BSDF)]
+            if len(nested) != 1:
+                raise RuntimeError(f"{NORMALMAP}: exactly one nested BSDF is needed, {len(nested)} came")
+            self.nested = nested[0]
+            self.normalmap = props.get_texture("normalmap")
+            self.flip = bool(props.get("flip_invalid_normals", False))
+            self.m_components = [self.nested.flags(k) for k in range(self.nested.component_count())]
+            self.m_flags = self.nested.flags()
+
+        def traverse(self, cb):
+            cb.put("nested_bsdf", self.nested, mi.ParamFlags.Differentiable)
+            cb.put("normalmap", self.normalmap, mi.ParamFlags.Differentiable | mi.ParamFlags.Discontinuous)
+
+        def eval(self, ctx, si, wo, active=True):
+            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
+            inner = frame.to_local(wo)
+            active = active & (wo.z * inner.z > 0)
+            return dr.select(active, self.nested.eval(ctx, tilted, inner, active), 0)
+
+        def pdf(self, ctx, si, wo, active=True):
+            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
+            inner = frame.to_local(wo)
+            active = active & (wo.z * inner.z > 0)
+            return dr.select(active, self.nested.pdf(ctx, tilted, inner, active), 0)
+
+        def eval_pdf(self, ctx, si, wo, active=True):
+            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
+            inner = frame.to_local(wo)
+            active = active & (wo.z * inner.z > 0)
+            value, pdf = self.nested.eval_pdf(ctx, tilted, inner, active)
+            return dr.select(active, value, 0), dr.select(active, pdf, 0)
+
+        def sample(self, ctx, si, sample1, sample2, active=True):
+            tilted, frame = _tilted(mi, self.normalmap, self.flip, si, active)
+            sampled, weight = self.nested.sample(ctx, tilted, sample1, sample2, active)
+            outer = frame.to_world(sampled.wo)
+            active = active & (sampled.wo.z * outer.z > 0)
+            sampled.pdf = dr.select(active, sampled.pdf, 0)
+            sampled.wo = outer
+            return sampled, dr.select(active, weight, 0)
+
+        def sh_frame(self, si, active=True):
+            return _tilted(mi, self.normalmap, self.flip, si, active)[0].sh_frame
+
+        def eval_diffuse_reflectance(self, si, active=True):
+            return self.nested.eval_diffuse_reflectance(si, active)
+
+        def to_string(self):
+            return f"{NORMALMAP}[nested_bsdf={self.nested}, normalmap={self.normalmap}]"
+
+    return NormalMap
+
+
+def _tilted(mi: Any, normalmap: Any, flip: bool, si: Any, active: Any) -> tuple[Any, Any]:
+    """The interaction in the bumped frame, and that frame relative to `si.sh_frame`."""
+    import drjit as dr
+
+    s, t = _tangents(mi, si, active)
+    encoded = normalmap.eval_3(si, active)
+    x, y, z = 2 * encoded.x - 1, 2 * encoded.y - 1, 2 * encoded.z - 1
+    x, y = x * s.x + y * t.x, x * s.y + y * t.y
+    if flip:
+        turn = dr.select(dr.dot(si.wi, mi.Vector3f(x, y, z)) * si.wi.z <= 0, -1.0, 1.0)
+        x, y = x * turn, y * turn
+    n = dr.normalize(mi.Normal3f(x, y, z))
+    along = mi.Vector3f(s.x, s.y, 0)
+    frame = mi.Frame3f()
+    frame.n = n
+    frame.s = dr.normalize(along - n * dr.dot(n, along))
+    frame.t = dr.cross(n, frame.s)
+    tilted = mi.SurfaceInteraction3f(si)
+    tilted.sh_frame = mi.Frame3f(si.to_world(frame.s), si.to_world(frame.t), si.to_world(frame.n))
+    tilted.wi = frame.to_local(si.wi)
+    return tilted, frame
+
+
+def _tangents(mi: Any, si: Any, active: Any) -> tuple[Any, Any]:
+    """The normal map's two axes in the tangent plane of `si.sh_frame`, 2D."""
+    import drjit as dr
+
+    # No `&=` here: Dr.Jit would change the caller's mask.
+    here = active
+    if dr.is_jit_v(mi.Float):
+        here = here & (si.shape != None)  # noqa: E711
+        here = here & si.shape.has_attribute(TANGENT, here)
+    elif not (active and si.shape is not None and si.shape.has_attribute(TANGENT)):
+        return mi.Vector2f(1, 0), mi.Vector2f(0, 1)
+    world = si.shape.eval_attribute_3(TANGENT, si, here)
+    hand = dr.mulsign(mi.Float(1), si.shape.eval_attribute_1(HANDEDNESS, si, here))
+    local = si.to_local(mi.Vector3f(world.x, world.y, world.z))
+    s = mi.Vector2f(local.x, local.y)
+    here = here & (dr.squared_norm(s) > 1e-12)
+    s = dr.select(here, dr.normalize(dr.select(here, s, 1)), mi.Vector2f(1, 0))
+    return s, mi.Vector2f(-s.y, s.x) * dr.select(here, hand, 1)

@@ -1,0 +1,136 @@
+"""One material for a mesh of many texture sets: their maps lie one behind the other, and each face names its page.
+
+A renderer compiles every BSDF of a scene, so that twenty materials cost twenty times the time of one before the first
+ray. Here the mesh is one shape with one BSDF whatever the number of its materials. The pictures are those of
+`scene.object_shapes` up to rounding; there are no parameters to optimise.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from mistyle.core.drjit_arrays import LANES, aligned
+from mistyle.core.maps import Maps
+from mistyle.core.mesh import Mesh
+from mistyle.geometry.tangents import corner_tangents
+from mistyle.process import memory
+from mistyle.render.mitsuba import device, plugins
+from mistyle.render.mitsuba import scene as scenery
+
+PAGE = "face_page"  # the attribute of a face that numbers its page
+
+
+def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -> dict[str, Any]:
+    """The mesh with all its texture sets as one loaded shape, normal maps in MikkTSpace frames; for pictures only."""
+    import mitsuba as mi
+
+    device.use()
+    if len(maps) != len(mesh.parts):
+        raise ValueError(f"{len(maps)} maps came for {len(mesh.parts)} texture sets ({', '.join(mesh.parts)})")
+    plugins.register()
+    made = _pages_class(mi)
+    textures = {name: _texture(made, [getattr(m, name) for m in maps]) for name in ("albedo", "roughness", "metallic")}
+    bsdf = {
+        "type": "principled",
+        "base_color": textures["albedo"],
+        "roughness": textures["roughness"],
+        "metallic": textures["metallic"],
+        "specular": 0.5,
+    }
+    relief = {
+        "type": plugins.NORMALMAP,
+        "normalmap": _texture(made, [m.normal for m in maps], scenery.encoded_into),
+        "flip_invalid_normals": flip_invalid,
+        "bsdf": bsdf,
+    }
+    loaded = mi.load_dict({"type": "twosided", "bsdf": relief})
+    shape = scenery.mitsuba_mesh(mesh, None, loaded, tangents=corner_tangents(mesh))
+    shape.add_attribute(PAGE, 1, aligned(mesh.part))
+    return {"part0": shape}
+
+
+def table(values: Sequence[Float[np.ndarray, "_h _w *c"]]) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, "p 2"]]:
+    """Where each map begins in the table of all their texels, and its height and width."""
+    sizes = np.array([v.shape[:2] for v in values], np.int64)
+    return np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]), sizes
+
+
+def _texture(
+    made: type,
+    values: Sequence[np.ndarray],
+    fill: Callable[[np.ndarray, np.ndarray], object] = lambda to, values: np.copyto(to, values),
+) -> Any:
+    """The texture of one kind of map; `fill(to, values)` writes the values as textures hold them."""
+    import mitsuba as mi
+
+    start, sizes = table(values)
+    channels = 1 if values[0].ndim == 2 else values[0].shape[2]
+    count = int(sizes.prod(axis=1).sum()) * channels
+    texels = memory.empty(-(-count // LANES) * LANES)  # whole vectors: Dr.Jit reads it in place
+    texels[count:] = 0
+    for first, (height, width), one in zip(start, sizes, values, strict=True):
+        page = texels[channels * first : channels * (first + height * width)]
+        fill(page.reshape(one.shape), one)
+    return made(mi.Float(texels), *(mi.UInt32(aligned(n, np.uint32)) for n in (start, *sizes.T)), channels)
+
+
+def _pages_class(mi: Any) -> type:
+    """The texture as a class of the base of `mi`'s current variant."""
+    import drjit as dr
+
+    class Pages(mi.Texture):
+        """Bilinear lookups in the page of the face that was hit; pages repeat."""
+
+        def __init__(self, texels, start, height, width, channels):
+            super().__init__(mi.Properties())
+            self.texels, self.start, self.height, self.width, self.channels = texels, start, height, width, channels
+
+        def eval(self, si, active=True):
+            return mi.Color3f(self._lookup(si, active))
+
+        def eval_3(self, si, active=True):
+            return mi.Color3f(self._lookup(si, active))
+
+        def eval_1(self, si, active=True):
+            return self._lookup(si, active)
+
+        def mean(self):
+            return dr.mean(self.texels)
+
+        def is_spatially_varying(self):
+            return True
+
+        def to_string(self):
+            return f"Pages[{len(self.start)}]"
+
+        def _lookup(self, si, active):
+            page = mi.UInt32(si.shape.eval_attribute_1(PAGE, si, active))
+            start = dr.gather(mi.UInt32, self.start, page, active)
+            height, width = (
+                dr.gather(mi.UInt32, self.height, page, active),
+                dr.gather(mi.UInt32, self.width, page, active),
+            )
+            left, right, tx = _neighbours(si.uv.x, width)
+            above, below, ty = _neighbours(si.uv.y, height)
+            kind = mi.Float if self.channels == 1 else mi.Color3f
+
+            def texel(row, column):
+                return dr.gather(kind, self.texels, start + row * width + column, active)
+
+            upper = dr.lerp(texel(above, left), texel(above, right), tx)
+            lower = dr.lerp(texel(below, left), texel(below, right), tx)
+            return dr.lerp(upper, lower, ty)
+
+    def _neighbours(place, count):
+        """The two texels of `count` around a coordinate, which repeats, and how far it is from the first one."""
+        at = place * mi.Float(count) - 0.5
+        low = dr.floor(at)
+        first = mi.Int32(low) - mi.Int32(dr.floor(low / mi.Float(count))) * mi.Int32(count)
+        # Rounding of the quotient may lead one row out.
+        first = mi.UInt32(dr.clip(first, 0, mi.Int32(count) - 1))
+        second = dr.select(first + 1 < count, first + 1, 0)
+        return first, second, at - low
+
+    return Pages
