@@ -8,13 +8,13 @@ padded albedo. Baking reads neither normal, uv nor part of a view: the views her
 import numpy as np
 
 from benchmarks.common import arguments, finish, peak_gb, timed
+from mistyle.atlas.bake import bake
+from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, pixel_centres, rig
 from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.stages.backproject import bake
-from mistyle.stages.bake_settings import BakeSettings
-from mistyle.stages.texels import rasterise
 
 # Centre and radius.
 SPHERES = np.array(

@@ -134,7 +134,7 @@ def run(name: str, folder: Path, work: Callable[[Scene], Row] | None = None) -> 
 def texture(scene: Scene, pictures: list[np.ndarray]) -> tuple[list[np.ndarray], list[np.ndarray], float]:
     """The pictures baked to the atlas, as the pipeline would: linear albedos, the view that painted each texel (-1:
     none), and the share of the texels that any view painted."""
-    from mistyle.stages.backproject import backproject, fill
+    from mistyle.atlas.bake import backproject, fill
 
     views = [
         # Whole coverage: rim pixels hold pure colour, they are not mixed with a background.

@@ -66,11 +66,11 @@ def cameras(resolution: int) -> list[Camera]:
 
 def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, atlas: int) -> Scene:
     """Read, draw and guide; the scene is left in `folder` for the rows, which run in processes of their own."""
+    from mistyle.atlas.texels import rasterise
     from mistyle.io.read import read_picture
     from mistyle.io.read_mesh import read_mesh
     from mistyle.render.mitsuba.draw import draw_views
     from mistyle.run.start import start_engines
-    from mistyle.stages.texels import rasterise
     from mistyle.surface.chosen import settled
     from mistyle.surface.settings import SurfaceSettings
 

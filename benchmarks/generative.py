@@ -253,10 +253,10 @@ def painted(made: Any, stylizer: str, resumed: bool, work: Path) -> bool:
 
 def filled(made: Any, recipe: str) -> bool:
     """A hole in the texture of a triangle, from models on disk; whether all colours are finite."""
+    from mistyle.atlas.texels import rasterise
     from mistyle.backends import paint3d
     from mistyle.backends.diffusion_settings import Paint3dSettings
     from mistyle.core.mesh import Mesh
-    from mistyle.stages.texels import rasterise
 
     corners = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32)
     flat = np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1))

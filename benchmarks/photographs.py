@@ -32,6 +32,7 @@ from benchmarks import recovery_pictures as drawing
 from benchmarks.common import finish
 from benchmarks.material_metrics import map_errors
 from benchmarks.recovery_truth import data_folder, find_asset, truth
+from mistyle.atlas.texels import rasterise, start_maps
 from mistyle.core.camera import Camera, pixel_centres
 from mistyle.core.capture import Captures, in_memory, shrunk
 from mistyle.core.image import srgb_from_linear
@@ -49,7 +50,6 @@ from mistyle.run.material_settings import MaterialSettings
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_check import downsampling_factors
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.texels import rasterise, start_maps
 
 RADIAL = (0.04, -0.02, 0.0)
 ATLAS = 1024

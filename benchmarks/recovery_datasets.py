@@ -19,6 +19,7 @@ from benchmarks.datasets import TENSOIR_LIGHTS, read_stanford_orb, read_tensoir
 from benchmarks.material_metrics import align_channels, orb_mask, psnr_hdr, psnr_ldr
 from benchmarks.recovery_pictures import Shot, render
 from benchmarks.recovery_truth import fitted_size
+from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Asset
 from mistyle.core.capture import Captures, shrunk, subset
 from mistyle.core.errors import InputRefused
@@ -28,7 +29,6 @@ from mistyle.io.read_mesh import read_mesh
 from mistyle.render.mitsuba.scene import Frame
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.texels import rasterise
 
 QUARTER = 4  # Stanford-ORB is scored at a quarter of its size
 Figures = dict[str, float]

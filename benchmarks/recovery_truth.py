@@ -20,6 +20,7 @@ from typing import Any, Literal
 import numpy as np
 
 from benchmarks.material_metrics import texel_areas
+from mistyle.atlas.texels import rasterise, start_maps
 from mistyle.core.camera import Camera, in_frame, px_from_world
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.errors import InputRefused
@@ -27,7 +28,6 @@ from mistyle.core.image import nearest_fill
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.io.read_mesh import read_mesh
-from mistyle.stages.texels import rasterise, start_maps
 
 UV = Literal["auto", "new"]
 # File below the folder of meshes, and whose UVs: the helmet's own lie on top of each other.

@@ -42,11 +42,11 @@ def main(argv: list[str] | None = None) -> None:
 
 def measure(name: str, path: Path) -> dict[str, float]:
     """All rigs on one mesh."""
+    from mistyle.atlas.texels import rasterise
     from mistyle.io.read_mesh import read_mesh
     from mistyle.render.mitsuba.draw import tracer
     from mistyle.render.mitsuba.rigs import face_fronts, next_best_views, sample_surface
     from mistyle.render.mitsuba.visible import face_on
-    from mistyle.stages.texels import rasterise
 
     mesh = read_mesh(path, size=ATLAS).mesh
     texels = [rasterise(mesh, part, ATLAS) for part in range(len(mesh.parts))]

@@ -15,6 +15,9 @@ from jaxtyping import Float
 
 from benchmarks.material_metrics import texel_areas
 from benchmarks.recovery_pictures import Shot, render
+from mistyle.atlas.bake import backproject, fill
+from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.texels import pad
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.camera import Camera, rig
 from mistyle.core.image import nearest_fill
@@ -26,10 +29,7 @@ from mistyle.geometry.tangents import corner_tangents
 from mistyle.run import painting
 from mistyle.run.made import Atlas
 from mistyle.run.stylize_settings import Settings
-from mistyle.stages.backproject import backproject, fill
-from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.coat import PaintRelief, TexelBand, lay_relief
-from mistyle.stages.texels import pad
 
 WET, DRY = 0.25, 0.7  # roughness of wet and of dry paint
 BRISTLES, PATCHES = (12.0, 32.0), (24.0, 64.0)  # wave lengths of the bristle marks and of the patches, texel sides

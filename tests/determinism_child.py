@@ -150,9 +150,9 @@ def repair(made: Stages, asset: Any, atlas: Any, baked: Any, fitted: Any, settin
 
 
 def export(made: Stages, asset: Any, atlas: Any, maps: list[Any], settings: Any) -> None:
+    from mistyle.atlas.texels import pad_maps
     from mistyle.run import deliver, start
     from mistyle.stages.export import write_asset
-    from mistyle.stages.texels import pad_maps
 
     open_sky = [start.ambient(asset, part, settings.atlas.size, 0, nothing) for part in range(len(maps))]
     made.note("occlusion", open_sky)
@@ -175,8 +175,8 @@ def usd_is_there() -> bool:
 
 def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any], settings: Any) -> None:
     """The stylizer of single views, the warp between them, and the bake from views."""
+    from mistyle.atlas.bake import bake
     from mistyle.run.sweep import stylizer_of
-    from mistyle.stages.backproject import bake
     from mistyle.stages.lift import lift
     from mistyle.stages.mvst import ViewPainter, sweep
     from mistyle.stages.sweep_settings import WarpSettings
@@ -212,6 +212,7 @@ def compared(made: Stages) -> None:
 
 def photographs(mesh: Any, size: int) -> tuple[Any, Any]:
     """Texels and captures of a ball with known maps, drawn without noise."""
+    from mistyle.atlas.texels import rasterise
     from mistyle.core.camera import look_at
     from mistyle.core.capture import in_memory
     from mistyle.core.light import Directional
@@ -219,7 +220,6 @@ def photographs(mesh: Any, size: int) -> tuple[Any, Any]:
     from mistyle.render.deferred.material_table import pack
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
     from mistyle.render.mitsuba.draw import tracer
-    from mistyle.stages.texels import rasterise
 
     texels = rasterise(mesh, 0, size)
     wave = 0.5 + 0.4 * np.sin(9 * texels.position)

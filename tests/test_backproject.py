@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from helpers import data
 
+from mistyle.atlas import bake as stage
+from mistyle.atlas.bake import Backprojection, backproject, bake, fill, pure_colours
+from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, look_at, orbit, pixel_centres, px_from_world, rig
 from mistyle.core.image import bilinear, linear_from_srgb
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.stages import backproject as stage
-from mistyle.stages.backproject import Backprojection, backproject, bake, fill, pure_colours
-from mistyle.stages.bake_settings import BakeSettings
-from mistyle.stages.texels import rasterise
 
 SETTINGS = BakeSettings()
 Paint = Callable[[np.ndarray, np.ndarray], np.ndarray]  # (points (n 3), uvs (n 2)) -> rgb (n 3)

@@ -12,6 +12,7 @@ import tiny_models
 import torch
 from test_surface_paint import asset_of
 
+from mistyle.atlas.texels import rasterise
 from mistyle.backends import consislora_make, diffusion, models_check, models_load, paint3d
 from mistyle.backends.diffusion_settings import ModelSettings
 from mistyle.core.asset import Picture
@@ -24,7 +25,6 @@ from mistyle.run.stages import Run
 from mistyle.run.stylize_job import STAGES, Job
 from mistyle.run.stylize_settings import resolve
 from mistyle.stages.fit import Fit
-from mistyle.stages.texels import rasterise
 
 torch.set_num_threads(1)
 

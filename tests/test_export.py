@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from gltf_cases import bumpy_sphere, from_gltf, glb_parts, no_texels, quad, quarters, strange_gltf
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import flat_maps
 from mistyle.io.gltf.write import write_glb
@@ -18,7 +19,6 @@ from mistyle.io.images.write import encode_png
 from mistyle.io.read_mesh import read_mesh
 from mistyle.stages import export
 from mistyle.stages.export import write_asset
-from mistyle.stages.texels import rasterise
 
 OPEN = np.ones((16, 16), np.float32)
 

@@ -12,6 +12,7 @@ from test_pipeline import TINY, hashes, inputs  # noqa: F401
 from test_seam import sphere
 from torch import nn
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.errors import UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import flat_maps
@@ -27,7 +28,6 @@ from mistyle.run.stylize_settings import resolve
 from mistyle.stages import finish_style
 from mistyle.stages.finish import Film, Finishing, PaintedAsset, finish, own_directions, shape_edges
 from mistyle.stages.finish_settings import FinishSettings
-from mistyle.stages.texels import rasterise
 from mistyle.surface.lookup import PaintedSurface, colour
 
 SIZE = 64

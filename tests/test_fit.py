@@ -7,6 +7,7 @@ import pytest
 import torch
 from test_seam import sphere
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import rig
 from mistyle.core.image import gaussian, linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Directional
@@ -19,7 +20,6 @@ from mistyle.render.mitsuba import device, draw
 from mistyle.stages import fit_judge, fit_table
 from mistyle.stages.fit import FitStart, FitTargets, shrinkage, two_phase
 from mistyle.stages.fit_settings import FitSettings
-from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION = 128, 112
 QUICK = FitSettings(

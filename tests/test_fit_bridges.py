@@ -8,6 +8,7 @@ from helpers import data
 from test_fit import QUICK, RESOLUTION, SIZE, correlation, painting
 from test_seam import sphere
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import rig
 from mistyle.core.image import gaussian, srgb_from_linear
 from mistyle.core.light import Directional
@@ -19,7 +20,6 @@ from mistyle.run.stylize_settings import PRESETS
 from mistyle.stages import fit as fitting
 from mistyle.stages import fit_run, fit_table
 from mistyle.stages.fit import FitStart, FitTargets, two_phase
-from mistyle.stages.texels import rasterise
 
 VGG = "weights/vgg19_normalised_relu3_1.pth"
 

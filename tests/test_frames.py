@@ -5,6 +5,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
+from mistyle.atlas.frames import mitsuba_normals
+from mistyle.atlas.texels import pad, rasterise
 from mistyle.core.camera import orbit
 from mistyle.core.light import Directional
 from mistyle.core.maps import flat_maps
@@ -13,8 +15,6 @@ from mistyle.geometry.tangents import corner_tangents
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred import torch_bridge
 from mistyle.render.mitsuba import draw
-from mistyle.stages.frames import mitsuba_normals
-from mistyle.stages.texels import pad, rasterise
 
 SIZE = 256
 

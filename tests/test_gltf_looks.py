@@ -14,6 +14,7 @@ from PIL import Image
 from test_read import check_asset
 from test_read_gltf import File, Tree, glb, shown, square, textured
 
+from mistyle.atlas.texels import rasterise, start_maps
 from mistyle.core.asset import Asset
 from mistyle.core.camera import orbit
 from mistyle.core.errors import InputRefused
@@ -24,7 +25,6 @@ from mistyle.io.meshes import lookups
 from mistyle.io.read_mesh import read_extent, read_mesh
 from mistyle.render.mitsuba.draw import draw_views
 from mistyle.stages.export import write_asset
-from mistyle.stages.texels import rasterise, start_maps
 
 SIDE = 8
 INNER = np.array([[x, y] for x in (0.13, 0.38, 0.61, 0.9) for y in (0.07, 0.3, 0.55, 0.84)])

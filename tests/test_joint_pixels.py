@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from test_recover import LIGHTS, QUICK, SIZE, directional, hollow, strong_maps
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import look_at
 from mistyle.core.capture import in_memory
 from mistyle.core.image import gaussian
@@ -17,7 +18,6 @@ from mistyle.render.mitsuba import device, draw
 from mistyle.stages import joint_pixels
 from mistyle.stages.fit_context import FitContext
 from mistyle.stages.recover_table import linked
-from mistyle.stages.texels import rasterise
 
 SAMPLES = 1024
 

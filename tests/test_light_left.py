@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from test_surface import dented_ball
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.maps import flat_maps
 from mistyle.stages.light_left import light_left
-from mistyle.stages.texels import rasterise
 
 
 @pytest.mark.parametrize(("lit", "ratio"), [(0.0, 1.0), (0.8, 3.0)])

@@ -84,7 +84,7 @@ def test_pages_draw_what_a_bsdf_for_each_texture_set_draws():
 
 def test_the_files_own_maps_are_those_of_the_atlas():
     """Where the atlas has the resolution of the file's maps, nothing is resampled and both are the same."""
-    from mistyle.stages.texels import start_maps
+    from mistyle.atlas.texels import start_maps
 
     rng = np.random.default_rng(0)
     grey = rng.random((16, 16), np.float32)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from benchmarks import material_metrics as mm
+from mistyle.atlas.texels import rasterise
 from mistyle.core.maps import Maps, flat_maps
 from mistyle.core.mesh import Mesh
-from mistyle.stages.texels import rasterise
 
 
 def tilted(size: int, degrees: np.ndarray) -> np.ndarray:

@@ -8,6 +8,7 @@ from test_material import QUICK, bowl, one_by_one, orbit
 from test_seam import KEY, SIZES, crop, random_maps, torus
 
 import mistyle
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, look_at
 from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
@@ -18,7 +19,6 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.mitsuba import draw
 from mistyle.run.material_pictures import look_through, looked
 from mistyle.stages.recover_check import LEAST_PIXELS, downsampling_factors
-from mistyle.stages.texels import rasterise
 
 
 @pytest.fixture(scope="module")

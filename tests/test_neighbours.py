@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mistyle.atlas.neighbours import STEPS, Links, links, weighted_seams, within
+from mistyle.atlas.texels import rasterise
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.stages.neighbours import STEPS, Links, links, weighted_seams, within
-from mistyle.stages.texels import rasterise
 
 Strip = tuple[list[tuple[float, float, float]], list[tuple[float, float]]]
 

@@ -84,7 +84,7 @@ def room():
 
 
 def seen(mesh) -> np.ndarray:
-    from mistyle.stages.texels import rasterise
+    from mistyle.atlas.texels import rasterise
 
     return rasterise(mesh, 0, SIZE).covered
 
@@ -164,9 +164,9 @@ def test_lights_of_a_scene_file_are_refused():
 
 def test_recover_ends_with_it_when_asked(room):
     """The fit of direct light first, then the steps through prb; what they lower is in the trace."""
+    from mistyle.atlas.texels import rasterise
     from mistyle.stages.recover import recover
     from mistyle.stages.recover_settings import RecoverSettings
-    from mistyle.stages.texels import rasterise
 
     mesh, truth, captures = room
     texels = rasterise(mesh, 0, SIZE)

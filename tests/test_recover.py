@@ -7,6 +7,9 @@ import numpy as np
 import pytest
 from test_seam import sphere
 
+from mistyle.atlas.frames import texel_frames
+from mistyle.atlas.neighbours import of_islands
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import by_camera, look_at, of_corners, pixel_centres, world_from_px
 from mistyle.core.capture import in_memory, subset
 from mistyle.core.errors import InputRefused
@@ -21,8 +24,6 @@ from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.emitters import emitters
 from mistyle.render.texel_views import GBuffer, trace_gbuffer
 from mistyle.stages import recover_observe, recover_pictures
-from mistyle.stages.frames import texel_frames
-from mistyle.stages.neighbours import of_islands
 from mistyle.stages.recover import Checkpoints, recover
 from mistyle.stages.recover_check import validate_captures
 from mistyle.stages.recover_observe import ObservationOptions, TexelObservations, VisibleTexels, collect_observations
@@ -31,7 +32,6 @@ from mistyle.stages.recover_prior import NOTHING
 from mistyle.stages.recover_settings import RecoverSettings, estimates, passes
 from mistyle.stages.recover_table import Atlas
 from mistyle.stages.recover_texels import TexelEstimate
-from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
 QUICK = RecoverSettings(rounds=3, iterations=300, bounces=0)

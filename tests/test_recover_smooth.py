@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mistyle.atlas.neighbours import NONE, Links, Seam, of_islands, within
 from mistyle.stages import recover_smooth as smoothing
-from mistyle.stages.neighbours import NONE, Links, Seam, of_islands, within
 from mistyle.stages.recover_table import Atlas
 
 FLOOR = 0.04

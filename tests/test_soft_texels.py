@@ -7,6 +7,7 @@ import pytest
 from test_recover import RESOLUTION, SIZE, errors, fibonacci, photographs, strong_maps
 from test_seam import sphere
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import look_at
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Ambient, Directional, Environment, SphericalGaussian
@@ -17,7 +18,6 @@ from mistyle.render.texel_lm import Observations, Options, Points, Problem
 from mistyle.render.texel_views import SKY_CELLS, open_sky, rig
 from mistyle.stages.recover import recover
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.texels import rasterise
 
 SUN = SphericalGaussian(axis=(0.0, 0.6, 0.8), sharpness=400.0, amplitude=(30.0, 20.0, 10.0))
 EVEN = Ambient((0.5, 1.0, 2.0))

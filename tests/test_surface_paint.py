@@ -11,6 +11,7 @@ from helpers import fixed_surface
 from scipy.spatial import KDTree
 from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, solved, spread_on, strokes  # noqa: F401
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Asset, Material, Picture, Source
 from mistyle.core.camera import resized, rig
 from mistyle.core.errors import InputRefused, UsageError
@@ -25,7 +26,6 @@ from mistyle.render.mitsuba.unlit import unlit
 from mistyle.run import options, painting, preview, stylize_start, variations
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages import coat
-from mistyle.stages.texels import rasterise
 from mistyle.surface import cells, guides, linefield, lookup, samples, style, synthesis
 from mistyle.surface import relief as reliefs
 from mistyle.surface.glaze import band, glaze

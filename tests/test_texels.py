@@ -6,13 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import Delaunay
 
+from mistyle.atlas import texels as atlas
+from mistyle.atlas.texels import pad, pad_maps, rasterise, sharpen_in_place, start_maps
 from mistyle.core.asset import Material
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps, Texels, place_of, rows_of
 from mistyle.core.mesh import Mesh
 from mistyle.geometry.raster import fragments
-from mistyle.stages import texels as atlas
-from mistyle.stages.texels import pad, pad_maps, rasterise, sharpen_in_place, start_maps
 
 # Float32 positions of size 1, interpolated from three corners.
 ROUNDING = 2e-6

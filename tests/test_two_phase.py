@@ -11,6 +11,7 @@ from benchmarks import two_phase_struggle as struggle
 from benchmarks import two_phase_truth as known
 from benchmarks.material_metrics import map_errors, texel_areas
 from benchmarks.two_phase import light_left
+from mistyle.atlas.texels import rasterise
 from mistyle.core.asset import Asset, Picture, Source
 from mistyle.core.light import Directional, lights
 from mistyle.core.maps import flat_maps
@@ -30,7 +31,6 @@ from mistyle.stages.fit import Fit, FitStart, FitTargets, two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.repair_settings import RepairSettings
-from mistyle.stages.texels import rasterise
 
 SIZE, RESOLUTION, SLOPE = 48, 56, 0.2
 IDENTITY = np.eye(4, dtype=np.float32)

@@ -7,6 +7,7 @@ import pytest
 from helpers import ROOT
 
 from benchmarks import recovery_pictures as drawing
+from mistyle.atlas.texels import rasterise
 from mistyle.core.capture import in_memory
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import luminance, resize
@@ -19,7 +20,6 @@ from mistyle.render.texel_lm import Options
 from mistyle.stages import light_cells, light_solve, recover_prior, unknown_light
 from mistyle.stages.recover_observe import ObservationOptions, collect_observations
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.texels import rasterise
 
 ALBEDO = (0.3, 0.45, 0.6)
 

@@ -83,10 +83,10 @@ def recover(
     of light and albedo cannot be told apart. Raises InputRefused where no picture can be used, UsageError for settings
     that do not exist.
     """
+    from mistyle.atlas.texels import rasterise
     from mistyle.run.settings import validate
     from mistyle.stages.recover import recover as solve
     from mistyle.stages.recover_check import downsampling_factors
-    from mistyle.stages.texels import rasterise
 
     shape = mesh.mesh if isinstance(mesh, Asset) else mesh
     given = {} if settings is None else settings

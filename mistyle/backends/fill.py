@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.atlas.gaps import island_boxes, nearest_in_space
 from mistyle.core.image import gaussian, nearest
 from mistyle.core.maps import Texels
-from mistyle.stages.gaps import island_boxes, nearest_in_space
 from mistyle.stages.inpaint import Inpainter
 
 # Standard deviation, as a share of the atlas's side, that parts the colour which flows into a hole from the detail

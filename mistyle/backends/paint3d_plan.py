@@ -3,10 +3,10 @@
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
 
+from mistyle.atlas.gaps import island_boxes
 from mistyle.core.image import nearest, resize
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.stages.gaps import island_boxes
 
 
 def position_map(

@@ -45,7 +45,7 @@ def _finished(
 def _finish(
     job: Any, asset: Asset, part: int, stem: str, given: tuple[Texels, Maps], report: Report, how: tuple[Edited, int]
 ) -> tuple[Maps, np.ndarray, Texels]:
-    from mistyle.stages.texels import pad_maps
+    from mistyle.atlas.texels import pad_maps
 
     (texels, maps), (edited, own), s = given, how, job.settings
     occlusion = ambient(asset, part, s.atlas.size, s.seed, report)

@@ -172,7 +172,7 @@ def refuse_scene_lights(captures: Captures, references: Path) -> None:
 
 def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[Texels, ...]:
     """Every texture set, rasterised."""
-    from mistyle.stages.texels import rasterise
+    from mistyle.atlas.texels import rasterise
 
     result = []
     for part in range(len(asset.mesh.parts)):
@@ -281,8 +281,8 @@ def pixels_of(captures: Captures) -> list[int]:
 
 def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, report: Report) -> Any:
     """The fit, with checkpoints in work/ under the stage's key: one of another job is not taken up."""
+    from mistyle.atlas.texels import start_maps
     from mistyle.stages.recover import Checkpoints, recover
-    from mistyle.stages.texels import start_maps
 
     s: MaterialSettings = run.job.settings
     start = None

@@ -32,9 +32,9 @@ def write(
 
 def scene(folder: Path, job: Any, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures) -> None:
     """A Mitsuba scene of the result that renders where mistyle is not installed."""
+    from mistyle.atlas.frames import mitsuba_normals
+    from mistyle.atlas.texels import pad, pad_maps
     from mistyle.render.mitsuba.scene_folder import write_scene
-    from mistyle.stages.frames import mitsuba_normals
-    from mistyle.stages.texels import pad, pad_maps
 
     padding, turned = job.settings.atlas.padding, list(recovered.maps)
     if job.settings.recover.frame == "mikkt":

@@ -4,9 +4,9 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mistyle.atlas.settings import AtlasSettings
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.run.job_settings import LEAST_OVERLAP, ReadSettings, ReportSettings
-from mistyle.stages.atlas_settings import AtlasSettings
 from mistyle.stages.recover_settings import RecoverSettings
 
 

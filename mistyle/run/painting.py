@@ -98,7 +98,7 @@ def bake(
     asset: Asset, layers: StyleLayers, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report
 ) -> Baked:
     """Section 4.1.4 for a painted surface: texels look the painting up directly; the views say who sees what."""
-    from mistyle.stages.backproject import accepted
+    from mistyle.atlas.bake import accepted
 
     maps, seen = painted(asset, layers, atlas, settings), []
     with_relief = raised(asset, layers, atlas, settings, maps)
@@ -120,9 +120,9 @@ def painted(asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, se
 
     A single solution paints everything.
     """
+    from mistyle.atlas.texels import pad_in_place, sharpen_in_place
     from mistyle.backends.embedded import surface_colour
     from mistyle.stages.coat import painted_mask, protected
-    from mistyle.stages.texels import pad_in_place, sharpen_in_place
 
     maps = []
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
@@ -173,7 +173,7 @@ def raised(
 
 def pieces(at: np.ndarray) -> Iterator[slice]:
     """Bands of rows with about LOOKED_UP chosen texels each: what is looked up at one time."""
-    from mistyle.stages.texels import bands
+    from mistyle.atlas.texels import bands
 
     share = max(float(at.mean()), 1e-3)
     return (rows for rows in bands(at.shape[0], at.shape[1], round(LOOKED_UP / share)) if at[rows].any())

@@ -100,9 +100,9 @@ def studio_light() -> Float[np.ndarray, "h w 3"]:
 
 def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
     """Open sky over every texture set; it has no finer detail than the mesh."""
+    from mistyle.atlas.texels import rasterise
     from mistyle.render.lookdev.studio import StudioSky
     from mistyle.render.mitsuba.occlusion import open_sky
-    from mistyle.stages.texels import rasterise
 
     pages = np.zeros((len(mesh.parts), SKY_TEXELS, SKY_TEXELS, 4), np.float32)
     for part, page in enumerate(pages):

@@ -38,10 +38,10 @@ def retouch(
     `views` are those of `folder` as they stand there now, `edited` names its edited files. A texel takes the colour of
     the edited view that faces it most, if it shows a pixel that differs from what was drawn there.
     """
+    from mistyle.atlas.bake import backproject
+    from mistyle.atlas.texels import pad
     from mistyle.io.cameras.camera_files import read_cameras
     from mistyle.run.painting import with_geometry
-    from mistyle.stages.backproject import backproject
-    from mistyle.stages.texels import pad
 
     asked = [camera.size for camera in read_cameras(folder / "camera.json")]
     touched = {k: file for k, view in enumerate(views) if (file := _file(view, edited)) is not None}

@@ -43,9 +43,9 @@ def mesh_stage(run: Any, files: Sequence[Path]) -> Asset:
 
 def ambient(asset: Asset, part: int, size: int, seed: int, report: Report) -> np.ndarray:
     """Ambient occlusion of a texture set, computed at a quarter of the atlas: it has no finer detail than the mesh."""
+    from mistyle.atlas.texels import pad, rasterise
     from mistyle.core.image import resize
     from mistyle.render.mitsuba.occlusion import ambient_occlusion
-    from mistyle.stages.texels import pad, rasterise
 
     coarse = rasterise(asset.mesh, part, max(size // 4, 64))
     values = np.ones(coarse.covered.shape, np.float32)

@@ -7,13 +7,13 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.settings import AtlasSettings
 from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, Paint3dSettings, TrainSettings
 from mistyle.core.rig_settings import RigSettings
 from mistyle.run import settings
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.run.job_settings import ReadSettings, ReportSettings
-from mistyle.stages.atlas_settings import AtlasSettings
-from mistyle.stages.bake_settings import BakeSettings
 from mistyle.stages.finish_settings import FinishSettings
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.repair_settings import RepairSettings

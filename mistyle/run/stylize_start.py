@@ -32,7 +32,7 @@ def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:
 
 def lay_out_one(asset: Asset, part: int, settings: Settings) -> tuple[Texels, Maps]:
     """One texture set of `lay_out`."""
-    from mistyle.stages.texels import rasterise, start_maps
+    from mistyle.atlas.texels import rasterise, start_maps
 
     texels = rasterise(asset.mesh, part, settings.atlas.size)
     metallic = "zero" if settings.fit.metallic == "zero" else "keep"

@@ -123,9 +123,9 @@ def bake(
 ) -> Baked:
     """Section 4.1.4: every texel takes the colour of the view that faces it most; what no view saw takes the nearest
     colour of its island. Of `lit` views the painted light is divided out first."""
-    from mistyle.stages.backproject import backproject, fill
+    from mistyle.atlas.bake import backproject, fill
+    from mistyle.atlas.texels import pad
     from mistyle.stages.coat import painted_mask, protected
-    from mistyle.stages.texels import pad
     from mistyle.stages.unlight import gain, share, unlit
 
     views = [replace(view, mask=view.mask & one.mask) for view, one in zip(stylized, painted, strict=True)]

@@ -121,7 +121,7 @@ def baked_set(
     asset: Asset, part: int, views: Sequence[View], settings: Settings, shares: list[float]
 ) -> tuple[Texels, Maps]:
     """One texture set of `baked_sets`."""
-    from mistyle.stages.backproject import backproject, fill
+    from mistyle.atlas.bake import backproject, fill
 
     texels, start = lay_out_one(asset, part, settings)
     baked = backproject(views, texels, settings.bake, mesh=asset.mesh)

@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.atlas.frames import texel_frames
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import resize, srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.geometry.tangents import corner_tangents
-from mistyle.stages.frames import texel_frames
 from mistyle.surface.linefield import DirectionConstraint
 from mistyle.surface.lookup import PaintedSurface
 from mistyle.surface.settings import SurfaceSettings

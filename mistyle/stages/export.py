@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle import __version__
+from mistyle.atlas.texels import corner_weights
 from mistyle.core.asset import Asset
 from mistyle.core.image import nearest_fill
 from mistyle.core.maps import Maps, Texels
@@ -29,7 +30,6 @@ from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.store.atomic import atomic_write, sha256_file
 from mistyle.io.store.output import put_folder
 from mistyle.io.store.trusted_json import read_own
-from mistyle.stages.texels import corner_weights
 
 NORMAL_CONVENTION = {
     "space": "tangent",

@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.atlas.texels import BAND_TEXELS
 from mistyle.core.camera import Camera, px_from_world, world_from_px, zoom
 from mistyle.core.image import luminance, srgb_from_linear
 from mistyle.core.light import Directional, Lights, direction_in_world
@@ -21,7 +22,6 @@ from mistyle.core.maps import Maps, rows_of
 from mistyle.core.view import View
 from mistyle.measure.overlap import Overlap
 from mistyle.process import memory
-from mistyle.stages.texels import BAND_TEXELS
 
 VIEWS = 6
 WINDOW = 256

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.capture import Captures, in_memory
 from mistyle.core.image import luminance, resize
 from mistyle.core.light import Lights, has_soft
@@ -25,7 +26,6 @@ from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.fit_table import ROUGHNESS_FLOOR
 from mistyle.stages.recover import Recovered, recover
 from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.texels import rasterise
 from mistyle.stages.unlight import BOUND, LEAST, STROKE, blurred
 
 # A stylized view is not a measurement: fewer steps and samples than for photographs.

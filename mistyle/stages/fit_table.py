@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.atlas.texels import bands, beside
 from mistyle.core.image import gaussian, nearest, resized_rows
 from mistyle.core.maps import Maps, Texels, rows_of
 from mistyle.process import memory
-from mistyle.stages.texels import bands, beside
 
 MAPS = ("albedo", "normal", "roughness", "metallic")
 CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.atlas.frames import texel_frames
 from mistyle.core.camera import Camera, by_camera
 from mistyle.core.light import Point
 from mistyle.render.deferred.image_samples import SampleBlock, Sampling, TexturedMesh, bilinear_taps, collect
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, TILT
 from mistyle.render.indirect import PALE, enlarged
 from mistyle.stages.fit_context import FitContext
-from mistyle.stages.frames import texel_frames
 from mistyle.stages.recover_observe import covered_rows, points_of
 from mistyle.stages.recover_table import fill
 

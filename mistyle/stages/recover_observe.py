@@ -13,6 +13,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt
 
+from mistyle.atlas.frames import texel_frames
+from mistyle.atlas.texels import beside
 from mistyle.core.camera import Camera, by_camera, of_corners
 from mistyle.core.capture import Captures
 from mistyle.core.image import erode
@@ -21,8 +23,6 @@ from mistyle.core.maps import Texels
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.render.texel_lm import Observations, Points, Rig
 from mistyle.render.texel_views import GBuffer, open_sky, rig, trace_gbuffer
-from mistyle.stages.frames import texel_frames
-from mistyle.stages.texels import beside
 
 REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
 LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane

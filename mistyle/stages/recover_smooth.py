@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.atlas.neighbours import Links, within
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT_X, TILT_Y
-from mistyle.stages.neighbours import Links, within
 from mistyle.stages.recover_prior import METAL_SPREAD
 from mistyle.stages.recover_table import OVER_SEAMS, Atlas, diffused, fill, with_seam_weights
 

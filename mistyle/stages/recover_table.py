@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Float
 
+from mistyle.atlas.neighbours import Links, links, weighted_seams
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels, rows_of
 from mistyle.core.mesh import Mesh
 from mistyle.render.deferred.material_table import COLUMNS, ROUGHNESS, SOLVED
-from mistyle.stages.neighbours import Links, links, weighted_seams
 from mistyle.stages.recover_observe import TexelObservations
 
 # Where a texel is thought to be before anything was seen.

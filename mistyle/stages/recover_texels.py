@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import by_camera
 from mistyle.core.image import resize
 from mistyle.core.light import has_soft
@@ -25,7 +26,6 @@ from mistyle.stages.recover_observe import (
 )
 from mistyle.stages.recover_settings import all_rounds, estimates
 from mistyle.stages.recover_table import PRIOR_MEAN, Atlas, Values, linked, scatter, scatter_to_atlas
-from mistyle.stages.texels import rasterise
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float
 
+from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, resized
 from mistyle.core.capture import Captures, in_memory
 from mistyle.core.errors import InputRefused
@@ -27,7 +28,6 @@ from mistyle.stages.light_solve import Bundle, State
 from mistyle.stages.recover_observe import ObservationOptions, TexelObservations, collect_observations
 from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.recover_table import atlas_of, scatter, scatter_to_atlas
-from mistyle.stages.texels import rasterise
 
 SIDE = 192  # pixels along the longer side of the small pictures
 ATLAS, LEAST = 96, 16  # texels along the coarse atlas's side: of all sets together, and of each at least

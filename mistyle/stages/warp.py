@@ -22,12 +22,12 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.atlas.texels import threaded
 from mistyle.core.camera import Camera
 from mistyle.core.image import bilinear, dilate, erode
 from mistyle.core.view import Prior, View
 from mistyle.stages.lift import Lifted, cosines, depth_tolerance, lift, transformed
 from mistyle.stages.sweep_settings import WarpSettings
-from mistyle.stages.texels import threaded
 
 __all__ = ["Lifted", "angle", "composite", "lift", "splat", "warp"]
 

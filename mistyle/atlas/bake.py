@@ -6,15 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.atlas.bake_settings import BakeSettings
+from mistyle.atlas.gaps import fill_in_place
+from mistyle.atlas.texels import pad_in_place, threaded
 from mistyle.core.camera import Camera
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.geometry.normals import area_vectors
 from mistyle.process import memory
-from mistyle.stages.bake_settings import BakeSettings
-from mistyle.stages.gaps import fill_in_place
-from mistyle.stages.texels import pad_in_place, threaded
 
 DEPTH_NOISE = 0.0005  # what depth maps may be off by: float32 through a file and another projection
 STEEP = 4.0  # depth per width of a surface seen at 76 degrees

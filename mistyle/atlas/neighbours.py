@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.atlas.frames import uv_derivatives
+from mistyle.atlas.texels import beside
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
-from mistyle.stages.frames import uv_derivatives
-from mistyle.stages.texels import beside
 
 STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns to the texel on the right, left, below and above
 NEAR = 1.0  # sides of a texel between where the surface goes on and the middle of the texel that is taken for it

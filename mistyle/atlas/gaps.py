@@ -3,9 +3,9 @@
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.atlas.texels import threaded
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels
-from mistyle.stages.texels import threaded
 
 NEIGHBOURS_3D = 1_000_000  # known texels that a search across islands looks through at most
 
