@@ -36,7 +36,7 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba import device, draw
 from mistyle.render.mitsuba import scene as scenery
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.solver.settings import RecoverSettings
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 MESH = "meshes/pbr/Avocado/Avocado.gltf"

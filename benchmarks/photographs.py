@@ -47,9 +47,9 @@ from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.run.material_budget import material_gb
 from mistyle.run.material_settings import MaterialSettings
-from mistyle.stages.recover import recover
-from mistyle.stages.recover_check import downsampling_factors
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.solver.recover import recover
+from mistyle.solver.settings import RecoverSettings
+from mistyle.solver.validate import downsampling_factors
 
 RADIAL = (0.04, -0.02, 0.0)
 ATLAS = 1024

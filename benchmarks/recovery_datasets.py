@@ -27,8 +27,8 @@ from mistyle.core.maps import Maps
 from mistyle.geometry.similarity import moved
 from mistyle.io.read_mesh import read_mesh
 from mistyle.render.mitsuba.scene import Frame
-from mistyle.stages.recover import recover
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.solver.recover import recover
+from mistyle.solver.settings import RecoverSettings
 
 QUARTER = 4  # Stanford-ORB is scored at a quarter of its size
 Figures = dict[str, float]

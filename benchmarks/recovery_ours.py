@@ -12,8 +12,8 @@ from benchmarks.recovery_truth import Truth
 from mistyle.core.capture import in_memory
 from mistyle.core.maps import Maps
 from mistyle.render.mitsuba.scene import Frame
-from mistyle.stages.recover import recover
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.solver.recover import recover
+from mistyle.solver.settings import RecoverSettings
 from mistyle.stages.unknown_light import find_light
 
 

@@ -49,7 +49,7 @@ def plain(scene: Any, keys: list[str], pictures: list[np.ndarray], steps: int) -
 
     mi: Any = mitsuba
 
-    from mistyle.render.scene_grad import ad_integrator
+    from mistyle.solver.scene.gradients import ad_integrator
 
     table, wanted = mi.traverse(scene), [mi.TensorXf(p) for p in pictures]
     engine, _ = ad_integrator(scene)
@@ -167,7 +167,7 @@ def least(spp: int, pictures: int, size: int, wanted: np.ndarray) -> float:
 
     mi: Any = mitsuba
 
-    from mistyle.render import scene_grad
+    from mistyle.solver.scene import gradients as scene_grad
 
     true = next(c for c in cases() if c.name == "cornell_box").true
     weights = scene_grad.relative_weights(wanted, np.ones(wanted.shape[:2], bool))

@@ -4,8 +4,8 @@ import time
 
 import numpy as np
 
-from mistyle.render.texel_lm import Problem
-from mistyle.render.texel_records import Observations, Options, Points, Rig
+from mistyle.solver.texels.levenberg_marquardt import Problem
+from mistyle.solver.texels.records import Observations, Options, Points, Rig
 
 
 def throughput(

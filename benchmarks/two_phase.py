@@ -36,10 +36,10 @@ from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
 from mistyle.run import start, stylize_start
 from mistyle.run.stylize_settings import Settings
+from mistyle.solver.recover import recover
+from mistyle.solver.settings import RecoverSettings
 from mistyle.stages.fit import FitStart, FitTargets, two_phase, view_mask
 from mistyle.stages.fit_lit import lit_phases
-from mistyle.stages.recover import recover
-from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.repair_settings import RepairSettings
 
 KINDS = {"lit": "phase1", "soft": "paper"}

@@ -238,8 +238,8 @@ def recovered(made: Stages) -> None:
     """Per-texel Levenberg-Marquardt, then Adam on whole pictures."""
     from test_seam import sphere
 
-    from mistyle.stages.recover import recover
-    from mistyle.stages.recover_settings import RecoverSettings
+    from mistyle.solver.recover import recover
+    from mistyle.solver.settings import RecoverSettings
 
     mesh = sphere(rings=16, sides=12)
     texels, captures = photographs(mesh, 32)
@@ -253,7 +253,7 @@ def scene_fitted(made: Stages) -> None:
     """A live Mitsuba scene through prb."""
     from test_scene_fit import COLOUR, ROUGH, flat, references
 
-    from mistyle.render.scene_fit import fit_scene
+    from mistyle.solver.scene.fit import fit_scene
 
     pictures = references(flat(), spp=4)
     made.note("scene: pictures", pictures)

@@ -31,7 +31,7 @@ from mistyle.io.cameras.captures import read_captures
 from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
 from mistyle.render.mitsuba.draw import gbuffer, tracer
-from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
+from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
 
 SCALE = 3.7
 TRUE = similarity(

@@ -30,7 +30,7 @@ from mistyle.io.cameras.views import read_views
 from mistyle.io.images.write import write_exr
 from mistyle.io.read import read_picture, read_size, read_stored_size
 from mistyle.render.mitsuba.draw import gbuffer, tracer
-from mistyle.stages.outline_check import Outlines, check_outlines, overlap_line, overlap_notes
+from mistyle.solver.cameras.outline_check import Outlines, check_outlines, overlap_line, overlap_notes
 
 TALL, WIDE = 32, 48  # of the stored pixels
 FOCAL = 60.0

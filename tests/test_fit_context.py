@@ -6,7 +6,7 @@ from mistyle.core.camera import look_at
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Directional
 from mistyle.core.stage_progress import StageProgress
-from mistyle.stages.fit_context import DISTRUST, DirectCaptures
+from mistyle.solver.context import DISTRUST, DirectCaptures
 
 
 def test_an_estimate_makes_another_record_and_leaves_the_old_one():

@@ -13,11 +13,11 @@ from mistyle.core.capture import in_memory
 from mistyle.core.image import gaussian
 from mistyle.render.deferred import image_samples as collecting
 from mistyle.render.deferred.material_table import pack, unpack
-from mistyle.render.indirect import Indirect
 from mistyle.render.mitsuba import device, draw
-from mistyle.stages import joint_pixels
-from mistyle.stages.fit_context import FitContext
-from mistyle.stages.recover_table import linked
+from mistyle.solver.context import FitContext
+from mistyle.solver.indirect import Indirect
+from mistyle.solver.joint import pixels as joint_pixels
+from mistyle.solver.table import linked
 
 SAMPLES = 1024
 

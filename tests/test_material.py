@@ -30,8 +30,8 @@ from mistyle.run.material_outlines import tell_placed
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 from mistyle.run.progress import Progress
 from mistyle.run.verbs import tell_views
+from mistyle.solver.cameras.align import Alignment
 from mistyle.stages import unknown_light
-from mistyle.stages.align import Alignment
 
 SIZE, SIDE = 64, 112
 KEYS = [
@@ -166,7 +166,7 @@ def test_cameras_that_do_not_fit_the_mesh_are_said(shots, tmp_path, capsys, monk
     turn = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
     turned = tuple(replace(c, world_from_cam=turn @ c.world_from_cam) for c in captures.cameras)
     if align:  # what was asked for already is not advised again
-        monkeypatch.setattr("mistyle.stages.align.align_by_masks", lambda *_: Alignment(turn, (), ()))
+        monkeypatch.setattr("mistyle.solver.cameras.align.align_by_masks", lambda *_: Alignment(turn, (), ()))
         job = replace(job, settings=MaterialSettings(references=ReferenceSettings(align=True)))
     else:
         captures = replace(captures, cameras=turned)

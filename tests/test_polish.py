@@ -14,7 +14,7 @@ from mistyle.core.mesh import Mesh
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.emitters import emitters
-from mistyle.render.polish import PolishSettings, polish
+from mistyle.solver.pictures.polish import PolishSettings, polish
 
 SIZE, RESOLUTION = 24, 48
 
@@ -165,8 +165,8 @@ def test_lights_of_a_scene_file_are_refused():
 def test_recover_ends_with_it_when_asked(room):
     """The fit of direct light first, then the steps through prb; what they lower is in the trace."""
     from mistyle.atlas.texels import rasterise
-    from mistyle.stages.recover import recover
-    from mistyle.stages.recover_settings import RecoverSettings
+    from mistyle.solver.recover import recover
+    from mistyle.solver.settings import RecoverSettings
 
     mesh, truth, captures = room
     texels = rasterise(mesh, 0, SIZE)

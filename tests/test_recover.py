@@ -16,22 +16,28 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import erode, gaussian
 from mistyle.core.light import Directional, Environment, Point
 from mistyle.core.maps import Maps
-from mistyle.render import indirect
 from mistyle.render.deferred import image_samples as collecting
-from mistyle.render.indirect import FIREFLY, MOST, Indirect, averaged, enlarged, in_proportion
 from mistyle.render.mitsuba import device, draw
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.emitters import emitters
-from mistyle.render.texel_views import GBuffer, trace_gbuffer
-from mistyle.stages import recover_observe, recover_pictures
-from mistyle.stages.recover import Checkpoints, recover
-from mistyle.stages.recover_check import validate_captures
-from mistyle.stages.recover_observe import ObservationOptions, TexelObservations, VisibleTexels, collect_observations
-from mistyle.stages.recover_pictures import SHORTEST
-from mistyle.stages.recover_prior import NOTHING
-from mistyle.stages.recover_settings import RecoverSettings, estimates, passes
-from mistyle.stages.recover_table import Atlas
-from mistyle.stages.recover_texels import TexelEstimate
+from mistyle.solver import indirect
+from mistyle.solver.indirect import FIREFLY, MOST, Indirect, averaged, enlarged, in_proportion
+from mistyle.solver.pictures import descend as recover_pictures
+from mistyle.solver.pictures.descend import SHORTEST
+from mistyle.solver.prior import NOTHING
+from mistyle.solver.recover import Checkpoints, recover
+from mistyle.solver.settings import RecoverSettings, estimates, passes
+from mistyle.solver.table import Atlas
+from mistyle.solver.texels import observations as recover_observe
+from mistyle.solver.texels.gbuffer import GBuffer, trace_gbuffer
+from mistyle.solver.texels.observations import (
+    ObservationOptions,
+    TexelObservations,
+    VisibleTexels,
+    collect_observations,
+)
+from mistyle.solver.texels.solve import TexelEstimate
+from mistyle.solver.validate import validate_captures
 
 SIZE, RESOLUTION, VIEWS = 64, 80, 10
 QUICK = RecoverSettings(rounds=3, iterations=300, bounces=0)
@@ -140,7 +146,7 @@ SIDE = 64
 
 def found_texels(values: np.ndarray, noise: float, prior: float, seen: np.ndarray):
     """What a solver would say of an atlas of SIDE² texels without seams: solution, observations, neighbours."""
-    from mistyle.render.texel_lm import Observations, Points, Rig, Solution
+    from mistyle.solver.texels.levenberg_marquardt import Observations, Points, Rig, Solution
 
     count = SIDE * SIDE
     priors, alone = np.full(values.shape, 1 / prior**2, np.float32), np.where(seen[:, None] > 0, 1 / noise**2, 1e-9)
@@ -164,7 +170,7 @@ def found_texels(values: np.ndarray, noise: float, prior: float, seen: np.ndarra
 @pytest.mark.parametrize(("variation", "noise"), [(0.0, 0.01), (0.01, 0.01), (0.02, 0.005), (0.2, 0.01)])
 def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
     """Texels that differ by `variation`, found with `noise` under a prior that has drawn them to their mean."""
-    from mistyle.stages import recover_prior
+    from mistyle.solver import prior as recover_prior
 
     mean = np.full((SIDE * SIDE, 7), 0.5, np.float32)
     truth = mean + variation * rng.standard_normal(mean.shape)
@@ -188,7 +194,7 @@ def test_smoothness_is_measured_on_the_surface(rng, variation, noise):
 def test_where_nothing_is_known_a_surface_is_level(rng, tilt):
     """The half that nobody saw has wild tilts, as neighbours of badly seen texels get: they are drawn to none, and what
     is left open is how much tilts vary where they are known. The half that was seen keeps its neighbours' mean."""
-    from mistyle.stages import recover_prior
+    from mistyle.solver import prior as recover_prior
 
     values = np.full((SIDE * SIDE, 7), 0.5, np.float32)
     values[:, 3:5] = np.hypot(tilt, 0.01) * rng.standard_normal((SIDE * SIDE, 2))
@@ -216,7 +222,7 @@ def test_where_nothing_is_known_a_surface_is_level(rng, tilt):
 
 def test_misfit_is_of_those_that_could_contradict_themselves():
     """A texel seen once has a cost of zero whatever it saw: its misfit is its neighbours'."""
-    from mistyle.stages import recover_prior
+    from mistyle.solver import prior as recover_prior
 
     seen = np.where(np.arange(SIDE * SIDE) % 2 == 0, 1, 9)
     values = np.full((SIDE * SIDE, 7), 0.5, np.float32)
@@ -229,7 +235,7 @@ def test_misfit_is_of_those_that_could_contradict_themselves():
 
 def test_what_observations_tell_is_measured_by_how_well_they_fit():
     """Unseen: nothing. Fitting as `noise` promises: that, with the margin. Far better: as BEST_FIT. Worse: less."""
-    from mistyle.stages import recover_prior
+    from mistyle.solver import prior as recover_prior
 
     seen = np.where(np.arange(SIDE * SIDE) < SIDE, 0, 9)
     solution, observed, where = found_texels(np.full((SIDE * SIDE, 7), 0.5, np.float32), 0.01, 0.6, seen)
@@ -417,8 +423,9 @@ def test_pictures_of_one_place_share_their_paths(monkeypatch):
 def test_with_light_between_surfaces_known_the_solver_begins_anew(world, monkeypatch):
     """Once before any estimate and after each among the rounds, always from the same start, and then with targets from
     which the estimate is taken off, and not those that rounds have corrected."""
-    from mistyle.render.texel_lm import Problem
-    from mistyle.stages import recover_solve, recover_texels
+    from mistyle.solver.texels import rounds as recover_solve
+    from mistyle.solver.texels import solve as recover_texels
+    from mistyle.solver.texels.levenberg_marquardt import Problem
 
     mesh, _, texels, captures = world
     some = subset(captures, range(0, 30, 5))
@@ -483,7 +490,7 @@ def test_whole_pictures_leave_no_texel_as_open_as_the_solver_did():
 
 def test_what_is_believed_of_metals_is_one_prior(rng: np.random.Generator):
     """The neighbours' prior, metal or not, and how much metals reflect: their sum is the one prior and its constant."""
-    from mistyle.stages import recover_prior
+    from mistyle.solver import prior as recover_prior
 
     x, mean, prior = (rng.uniform(0.1, 2, (20, 7)).astype(np.float32) for _ in range(3))
     metal = np.repeat([0, 1], 10).astype(np.float32)
@@ -495,7 +502,7 @@ def test_what_is_believed_of_metals_is_one_prior(rng: np.random.Generator):
 
 def test_black_that_no_gloss_shows_on_is_rather_a_mirror():
     """Black paint costs more than a metal where it is smooth and seen often, and nothing where its gloss shows."""
-    from mistyle.stages.recover_prior import OFTEN, log_prior_penalty
+    from mistyle.solver.prior import OFTEN, log_prior_penalty
 
     values = np.zeros((4, 7), np.float32)
     values[:, 5] = 0.1, 0.8, 0.1, 0.1
@@ -507,8 +514,8 @@ def test_black_that_no_gloss_shows_on_is_rather_a_mirror():
 @pytest.mark.parametrize("unlike", [0.0, 0.5])
 def test_where_texels_and_pictures_differ_observations_count_for_less(world, monkeypatch, unlike):
     """By what the picture drawn of the texels differs from their own radiance; no less where they agree."""
-    from mistyle.render.texel_lm import Problem
-    from mistyle.stages import recover_solve
+    from mistyle.solver.texels import rounds as recover_solve
+    from mistyle.solver.texels.levenberg_marquardt import Problem
 
     mesh, _, texels, captures = world
     few, tangents = subset(captures, range(0, 30, 5)), collecting.tangents_of(mesh, "mikkt")
@@ -606,7 +613,7 @@ def test_texel_frames_are_those_of_the_rays(world, frame):
 
 def test_observations_are_the_pictures_at_the_texels(world):
     """What is observed is what the model of the true material predicts, up to the pixels' size."""
-    from mistyle.render.texel_lm import Options, Problem
+    from mistyle.solver.texels.levenberg_marquardt import Options, Problem
 
     mesh, maps, texels, captures = world
     observed = collect_observations(draw.tracer(mesh), [texels], captures, collecting.tangents_of(mesh, "mikkt"))
@@ -710,7 +717,7 @@ def test_a_gradient_that_is_no_number_stops_at_its_texel():
     import drjit as dr
     import mitsuba as mi
 
-    from mistyle.render.descent import Descent, table_on_device
+    from mistyle.solver.pictures.adam import Descent, table_on_device
 
     device.use()
     descent = Descent([(4, 4), (2, 2)], (1, 1, 1, 1, 1, 1, 0, 0))
@@ -735,7 +742,7 @@ def test_descent_is_adam_with_masked_updates(rng, levels):
     import mitsuba as mi
 
     from mistyle.core.image import resize
-    from mistyle.render.descent import AdamOptions, Descent, table_on_device
+    from mistyle.solver.pictures.adam import AdamOptions, Descent, table_on_device
 
     device.use()
     size = (32, 32)

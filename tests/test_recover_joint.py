@@ -15,13 +15,13 @@ from mistyle.render.deferred import image_samples as collecting
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.render.mitsuba import draw
-from mistyle.stages import joint_algebra as algebra
-from mistyle.stages import recover_joint as joint
-from mistyle.stages.fit_context import DirectCaptures, FitContext
-from mistyle.stages.joint_pixels import UnknownTexels, image_footprints
-from mistyle.stages.recover import recover
-from mistyle.stages.recover_prior import NOTHING
-from mistyle.stages.recover_table import linked
+from mistyle.solver.context import DirectCaptures, FitContext
+from mistyle.solver.joint import algebra
+from mistyle.solver.joint import gauss_newton as joint
+from mistyle.solver.joint.pixels import UnknownTexels, image_footprints
+from mistyle.solver.prior import NOTHING
+from mistyle.solver.recover import recover
+from mistyle.solver.table import linked
 
 FEW = QUICK.model_copy(update={"iterations": 60, "rounds": 1})
 

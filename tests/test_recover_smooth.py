@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from mistyle.atlas.neighbours import NONE, Links, Seam, of_islands, within
-from mistyle.stages import recover_smooth as smoothing
-from mistyle.stages.recover_table import Atlas
+from mistyle.solver import smoothing
+from mistyle.solver.table import Atlas
 
 FLOOR = 0.04
 

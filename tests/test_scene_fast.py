@@ -7,10 +7,12 @@ import pytest
 from test_scene_fit import bitmap, smooth
 
 from mistyle.core.drjit_arrays import aligned
-from mistyle.render import scene_fit, scene_grad, scene_job
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.mitsuba import device
-from mistyle.render.scene_fast import DeferredRenderer, Unsupported
+from mistyle.solver.scene import fit as scene_fit
+from mistyle.solver.scene import gradients as scene_grad
+from mistyle.solver.scene import state as scene_job
+from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
 
 KEYS = ["wall.bsdf.base_color.data", "wall.bsdf.roughness.data", "wall.bsdf.normalmap.data", "ball.bsdf.base_color"]
 SIZE = 16

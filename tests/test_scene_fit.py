@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.render import scene_fit, scene_grad
 from mistyle.render.deferred import pyramid
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live import xml as scene_xml
 from mistyle.render.mitsuba import device
+from mistyle.solver.scene import fit as scene_fit
+from mistyle.solver.scene import gradients as scene_grad
 
 COLOUR, ROUGH = "wall.bsdf.base_color.data", "wall.bsdf.roughness.data"
 CAMERAS = ((0.0, 0.0), (1.2, 0.3), (-1.2, -0.2), (0.2, 1.2), (-0.3, -1.2), (0.9, -0.9))

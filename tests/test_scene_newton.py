@@ -8,10 +8,13 @@ from test_scene_fit import CAMERAS, COLOUR, TRUE_COLOUR, flat, references, root_
 
 import mistyle
 from mistyle.core.errors import UsageError
-from mistyle.render import scene_fit, scene_grad, scene_job, scene_newton
 from mistyle.render.deferred import pyramid
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.mitsuba import device
+from mistyle.solver.scene import fit as scene_fit
+from mistyle.solver.scene import gauss_newton as scene_newton
+from mistyle.solver.scene import gradients as scene_grad
+from mistyle.solver.scene import state as scene_job
 
 WHITE, GREEN, RED = (f"{name}.reflectance.value" for name in ("white", "green", "red"))
 TRUE = {WHITE: [0.88, 0.7, 0.66], GREEN: [0.11, 0.38, 0.08], RED: [0.57, 0.05, 0.05]}

@@ -14,10 +14,10 @@ from mistyle.core.light import Ambient, Directional, Environment, SphericalGauss
 from mistyle.render.deferred import sky
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.draw import tracer
-from mistyle.render.texel_lm import Observations, Options, Points, Problem
-from mistyle.render.texel_views import SKY_CELLS, open_sky, rig
-from mistyle.stages.recover import recover
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.solver.recover import recover
+from mistyle.solver.settings import RecoverSettings
+from mistyle.solver.texels.gbuffer import SKY_CELLS, open_sky, rig
+from mistyle.solver.texels.levenberg_marquardt import Observations, Options, Points, Problem
 
 SUN = SphericalGaussian(axis=(0.0, 0.6, 0.8), sharpness=400.0, amplitude=(30.0, 20.0, 10.0))
 EVEN = Ambient((0.5, 1.0, 2.0))

@@ -5,8 +5,8 @@ from dataclasses import fields
 import numpy as np
 import pytest
 
-from mistyle.render import texel_lm as lm
 from mistyle.render.mitsuba import device
+from mistyle.solver.texels import levenberg_marquardt as lm
 
 VIEWS = 16
 LIGHTS = np.array([[1, 1, 1], [-1, 0.5, 1], [0, -1, 1]]) / np.sqrt([[3], [2.25], [2]])

@@ -16,10 +16,11 @@ from mistyle.core.maps import flat_maps
 from mistyle.io.read_mesh import read_mesh
 from mistyle.render.deferred.sky import bin_environment, even_directions
 from mistyle.render.mitsuba.draw import tracer
-from mistyle.render.texel_lm import Options
-from mistyle.stages import light_cells, light_solve, recover_prior, unknown_light
-from mistyle.stages.recover_observe import ObservationOptions, collect_observations
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.solver import prior as recover_prior
+from mistyle.solver.settings import RecoverSettings
+from mistyle.solver.texels.levenberg_marquardt import Options
+from mistyle.solver.texels.observations import ObservationOptions, collect_observations
+from mistyle.stages import light_cells, light_solve, unknown_light
 
 ALBEDO = (0.3, 0.45, 0.6)
 
@@ -162,7 +163,7 @@ def test_texels_are_eliminated_as_from_the_whole_matrix(mesh, captures):
 
 
 def test_shares_add_up_to_the_prediction(mesh, captures):
-    from mistyle.render.texel_shares import light_transport_matrix
+    from mistyle.solver.texels.light_transport import light_transport_matrix
 
     own = bundled(mesh, captures)
     rng = np.random.default_rng(1)

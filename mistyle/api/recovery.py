@@ -13,7 +13,7 @@ from mistyle.core.capture import Captures, shrunk
 from mistyle.core.errors import InputRefused
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.solver.settings import RecoverSettings
 
 SURE = 0.5  # confidence above which a texel counts as determined
 
@@ -85,8 +85,8 @@ def recover(
     """
     from mistyle.atlas.texels import rasterise
     from mistyle.run.settings import validate
-    from mistyle.stages.recover import recover as solve
-    from mistyle.stages.recover_check import downsampling_factors
+    from mistyle.solver.recover import recover as solve
+    from mistyle.solver.validate import downsampling_factors
 
     shape = mesh.mesh if isinstance(mesh, Asset) else mesh
     given = {} if settings is None else settings

@@ -7,7 +7,7 @@ from os import PathLike
 from typing import Any
 
 from mistyle.api import html
-from mistyle.render.scene_result import FittedScene
+from mistyle.solver.scene.result import FittedScene
 
 
 class SceneFit(FittedScene):
@@ -90,8 +90,8 @@ def fit_scene(
     from pathlib import Path
 
     from mistyle.render.live.parameters import merged
-    from mistyle.render.scene_fit import fit_scene as run
     from mistyle.run.scene_references import read_reference
+    from mistyle.solver.scene.fit import fit_scene as run
 
     notes: list[str] = []
     pictures: list[Any] = []

@@ -37,7 +37,7 @@ from mistyle.run.start import read, start_engines
 @dataclass(frozen=True)
 class Placed:
     """The cameras in working space, the lights there, and what was done to bring them there. `overlap` is that of the
-    mesh's outline with each picture's alpha or mask (stages/outline_check.py), NaN where it has none."""
+    mesh's outline with each picture's alpha or mask (solver/cameras/outline_check.py), NaN where it has none."""
 
     cameras: tuple[Camera, ...]
     lights: tuple[Lights, ...]
@@ -186,8 +186,8 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     whether the mesh's outlines are where the pictures have them."""
     from mistyle.geometry.similarity import moved
     from mistyle.io.cameras.captures import camera_space, outline_of, silhouette, sparse_points
-    from mistyle.stages.align import align_by_masks, align_by_points, refine_poses
-    from mistyle.stages.outline_check import check_outlines, overlap_notes
+    from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
+    from mistyle.solver.cameras.outline_check import check_outlines, overlap_notes
 
     chosen = job.settings.references
     figures: dict[str, float] = {}
@@ -282,7 +282,7 @@ def pixels_of(captures: Captures) -> list[int]:
 def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, report: Report) -> Any:
     """The fit, with checkpoints in work/ under the stage's key: one of another job is not taken up."""
     from mistyle.atlas.texels import start_maps
-    from mistyle.stages.recover import Checkpoints, recover
+    from mistyle.solver.recover import Checkpoints, recover
 
     s: MaterialSettings = run.job.settings
     start = None

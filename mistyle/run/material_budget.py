@@ -5,7 +5,7 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.run.budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
-from mistyle.stages.recover_settings import joint_steps
+from mistyle.solver.settings import joint_steps
 
 # A fit to pictures, without what is kept of the pictures' samples, up to `recover.memory`; the system does not get all
 # of that back after the stage. Read off `fit_512` and `fit_200`, the report off `fit_256`, what hangs on large pictures
@@ -45,7 +45,7 @@ def material_counts(settings: Any, pixels: Sequence[int], faces: int = 0, sets: 
 
 
 def looked_at(settings: Any, pixels: Sequence[int]) -> list[int]:
-    """Pixels that are left of pictures of so many after blocks of them were averaged (stages/recover_check.py).
+    """Pixels that are left of pictures of so many after blocks of them were averaged (solver/validate.py).
 
     By the setting; else for an object that fills SHOWN of each picture, with COVERED of its atlas, SEEN by one, turned
     away from the camera such that half of its area is left.
@@ -67,7 +67,7 @@ def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int 
 
 def between_gb(settings: Any, pixels: Sequence[int]) -> float:
     """GB of the light between surfaces that is kept of every picture: three floats a pixel of the estimate."""
-    from mistyle.render.indirect import MOST
+    from mistyle.solver.indirect import MOST
 
     if settings.recover.solver == "pictures" or not settings.recover.bounces:
         return 0.0

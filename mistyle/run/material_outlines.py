@@ -20,7 +20,7 @@ def fix_of(chosen: ReferenceSettings) -> str:
 
 def tell_placed(placed: Any, progress: Progress) -> None:
     """Every picture's overlap of outlines, and a warning about the cameras at once, as the fit takes long."""
-    from mistyle.stages.outline_check import overlap_line
+    from mistyle.solver.cameras.outline_check import overlap_line
 
     if np.isfinite(placed.overlap).any():
         progress.say(overlap_line([camera.name for camera in placed.cameras], placed.overlap))

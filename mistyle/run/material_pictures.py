@@ -32,7 +32,7 @@ class Looked:
 def look_through(folder: Path, texels: Sequence[Texels], captures: Captures, average: int, report: Report) -> None:
     """Write into `folder` what `looked` reads. InputRefused where no picture says anything."""
     from mistyle.io.cameras.captures import check_pixels
-    from mistyle.stages.recover_check import downsampling_factors
+    from mistyle.solver.validate import downsampling_factors
 
     by = [average] * len(captures) if average else downsampling_factors(texels, captures.cameras)
     small = shrunk(captures, by)

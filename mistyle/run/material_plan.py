@@ -29,7 +29,7 @@ from mistyle.run.plan import (
     reading,
 )
 from mistyle.run.stages import claim_run
-from mistyle.stages.recover_settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
+from mistyle.solver.settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
 
 def plan_material(job: Any) -> dict[str, Any]:
@@ -37,9 +37,9 @@ def plan_material(job: Any) -> dict[str, Any]:
 
     How much of the pictures shows the object is not known yet: the shares of run/material_budget.py are taken.
     """
-    from mistyle.render.indirect import MOST
     from mistyle.run.material import inputs_of, pixels_of, references_of
-    from mistyle.stages.recover_solve import STARTS
+    from mistyle.solver.indirect import MOST
+    from mistyle.solver.texels.rounds import STARTS
 
     s, extent = job.settings, extent_of(job.mesh, job.settings)
     claim_run(job, MATERIAL_STAGES, inputs_of(job))

@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from mistyle.atlas.settings import AtlasSettings
 from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
 from mistyle.run.job_settings import LEAST_OVERLAP, ReadSettings, ReportSettings
-from mistyle.stages.recover_settings import RecoverSettings
+from mistyle.solver.settings import RecoverSettings
 
 
 class ReferenceSettings(BaseModel):

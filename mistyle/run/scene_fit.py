@@ -64,7 +64,7 @@ def loaded(scene: Path, defines: Mapping[str, str], settings: SceneSettings) -> 
 def listed(file: Any) -> list[Any]:
     """Every parameter of a loaded scene, as the integrator that would be used sees it."""
     from mistyle.render.live.parameters import parameters
-    from mistyle.render.scene_grad import ad_integrator
+    from mistyle.solver.scene.gradients import ad_integrator
 
     return parameters(file.scene, ad_integrator(file.scene)[0])
 
@@ -146,7 +146,7 @@ def _fit(
 
 def _descended(job: SceneJob, file: Any, keys, numbers, read, key: str, progress: Progress) -> Any:
     """The fit itself, with checkpoints in the run folder."""
-    from mistyle.render.scene_fit import fit_scene as run
+    from mistyle.solver.scene.fit import fit_scene as run
 
     how = job.settings
     folder = checkpoint.place(job.out, key)
@@ -191,7 +191,7 @@ def list_row(p: Any) -> dict[str, Any]:
 def draw(scene: Any, numbers: Sequence[int], seed: int, report: Any) -> list[Float[np.ndarray, "h w 3"]]:
     """The scene as it is now from its sensors, linear, by the integrator of the fit."""
     from mistyle.render.live.draw import sensor_picture
-    from mistyle.render.scene_grad import ad_integrator
+    from mistyle.solver.scene.gradients import ad_integrator
 
     result = []
     for k in numbers:

@@ -36,7 +36,7 @@ def changes(fitted: Any) -> list[dict[str, Any]]:
 
     A texture or an attribute stands for its channels' means.
     """
-    from mistyle.render.scene_result import brief
+    from mistyle.solver.scene.result import brief
 
     rows = []
     for p in fitted.parameters:

@@ -131,7 +131,7 @@ def baked_set(
 
 def tell_views(mesh: Mesh, views: Sequence[View], progress: Progress) -> None:
     """Every picture's overlap with the mesh's outline, and warnings about the cameras; alpha is the coverage."""
-    from mistyle.stages.outline_check import check_outlines, overlap_line, overlap_notes
+    from mistyle.solver.cameras.outline_check import check_outlines, overlap_line, overlap_notes
 
     names = [view.camera.name for view in views]
     found = check_outlines(mesh, [view.camera for view in views], (view.coverage > 0.5 for view in views))

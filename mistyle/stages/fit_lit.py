@@ -21,11 +21,11 @@ from mistyle.core.light import Lights, has_soft
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
+from mistyle.solver.recover import Recovered, recover
+from mistyle.solver.settings import RecoverSettings
 from mistyle.stages.fit import Fit, FitStart, FitTargets, shrinkage, two_phase, view_mask
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.fit_table import ROUGHNESS_FLOOR
-from mistyle.stages.recover import Recovered, recover
-from mistyle.stages.recover_settings import RecoverSettings
 from mistyle.stages.unlight import BOUND, LEAST, STROKE, blurred
 
 # A stylized view is not a measurement: fewer steps and samples than for photographs.

@@ -18,12 +18,12 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.render.deferred.material_table import ALBEDO, ROUGHNESS, TILT
 from mistyle.render.mitsuba.draw import Tracer
-from mistyle.render.texel_lm import Options, Points, Problem, Rig
-from mistyle.render.texel_shares import light_transport_matrix
-from mistyle.render.texel_views import open_sky
+from mistyle.solver.prior import LEAST_SEEN
+from mistyle.solver.texels.gbuffer import open_sky
+from mistyle.solver.texels.levenberg_marquardt import Options, Points, Problem, Rig
+from mistyle.solver.texels.light_transport import light_transport_matrix
+from mistyle.solver.texels.observations import TexelObservations
 from mistyle.stages.light_cells import EnvironmentCells, Radiance
-from mistyle.stages.recover_observe import TexelObservations
-from mistyle.stages.recover_prior import LEAST_SEEN
 
 # Of a texel's unknowns: where they are thought to be, and standard deviations. Tilts are small on the whole, or the
 # whole surface would lean towards where the light is residual.

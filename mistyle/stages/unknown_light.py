@@ -23,11 +23,12 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.render.deferred.material_table import ALBEDO
 from mistyle.render.mitsuba.draw import Tracer
-from mistyle.stages import light_cells, light_solve, recover_prior
+from mistyle.solver import prior as recover_prior
+from mistyle.solver.settings import RecoverSettings
+from mistyle.solver.table import atlas_of, scatter, scatter_to_atlas
+from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, collect_observations
+from mistyle.stages import light_cells, light_solve
 from mistyle.stages.light_solve import Bundle, State
-from mistyle.stages.recover_observe import ObservationOptions, TexelObservations, collect_observations
-from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.recover_table import atlas_of, scatter, scatter_to_atlas
 
 SIDE = 192  # pixels along the longer side of the small pictures
 ATLAS, LEAST = 96, 16  # texels along the coarse atlas's side: of all sets together, and of each at least
@@ -60,7 +61,7 @@ def find_light(
     are modelled, light between surfaces is not. Raises InputRefused where no texel is seen.
     """
     from mistyle.render.mitsuba.draw import tracer
-    from mistyle.render.texel_lm import Options
+    from mistyle.solver.texels.levenberg_marquardt import Options
 
     traced = tracer(mesh)
     texels, observed = _observations(traced, captures, settings)

@@ -21,8 +21,8 @@ from mistyle.core.image import erode
 from mistyle.core.light import DELTA, has_soft
 from mistyle.core.maps import Texels
 from mistyle.render.mitsuba.draw import Tracer
-from mistyle.render.texel_lm import Observations, Points, Rig
-from mistyle.render.texel_views import GBuffer, open_sky, rig, trace_gbuffer
+from mistyle.solver.texels.gbuffer import GBuffer, open_sky, rig, trace_gbuffer
+from mistyle.solver.texels.levenberg_marquardt import Observations, Points, Rig
 
 REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
 LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane

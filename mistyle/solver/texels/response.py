@@ -3,7 +3,7 @@
 from typing import Any
 
 from mistyle.render.deferred import bsdf
-from mistyle.render.texel_records import Options
+from mistyle.solver.texels.records import Options
 
 STEP = 1e-3  # of central differences, the twin of the derivatives by AD
 MIN_Z2 = 1e-4

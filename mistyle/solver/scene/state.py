@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.errors import UsageError
-from mistyle.render import scene_grad, scene_newton
 from mistyle.render.deferred import pyramid as laplacian
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live.parameters import Parameter
+from mistyle.solver.scene import gauss_newton as scene_newton
+from mistyle.solver.scene import gradients as scene_grad
 
 FEWEST_VIEWS = 3
 SOLVERS = ("auto", "adam", "gauss-newton")
@@ -192,7 +193,7 @@ def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[s
 
 def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
     """The fast path, or why there is none."""
-    from mistyle.render.scene_fast import DeferredRenderer, Unsupported
+    from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
 
     try:
         return DeferredRenderer(scene, chosen, views, loss if isinstance(loss, str) else "", engine), ""

@@ -11,7 +11,7 @@ from mistyle.core.image import nearest
 from mistyle.core.maps import Texels, rows_of
 from mistyle.core.mesh import Mesh
 from mistyle.render.deferred.material_table import COLUMNS, ROUGHNESS, SOLVED
-from mistyle.stages.recover_observe import TexelObservations
+from mistyle.solver.texels.observations import TexelObservations
 
 # Where a texel is thought to be before anything was seen.
 PRIOR_MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.5, 0.0)

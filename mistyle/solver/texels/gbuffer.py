@@ -15,7 +15,7 @@ from mistyle.render.deferred.image_samples import BLOCK_RAYS, camera_rays
 from mistyle.render.deferred.sky import bin_environment, even_directions
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.draw import Tracer
-from mistyle.render.texel_lm import Rig
+from mistyle.solver.texels.levenberg_marquardt import Rig
 
 SKY_CELLS = 128
 

@@ -26,9 +26,9 @@ from jaxtyping import Float, Int
 
 from mistyle.core.drjit_arrays import aligned
 from mistyle.render.mitsuba import device
-from mistyle.render.texel_algebra import Sums, flat_of, nothing, spread_of, step, triangle, unflat
-from mistyle.render.texel_records import UNKNOWNS, Observations, Options, Points, Rig, Solution
-from mistyle.render.texel_response import derivatives, differences, terms
+from mistyle.solver.texels.algebra import Sums, flat_of, nothing, spread_of, step, triangle, unflat
+from mistyle.solver.texels.records import UNKNOWNS, Observations, Options, Points, Rig, Solution
+from mistyle.solver.texels.response import derivatives, differences, terms
 
 __all__ = ["UNKNOWNS", "Observations", "Options", "Points", "Problem", "Rig", "Solution"]
 

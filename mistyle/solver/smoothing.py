@@ -22,8 +22,8 @@ from jaxtyping import Bool, Float
 
 from mistyle.atlas.neighbours import Links, within
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, SOLVED, TILT_X, TILT_Y
-from mistyle.stages.recover_prior import METAL_SPREAD
-from mistyle.stages.recover_table import OVER_SEAMS, Atlas, diffused, fill, with_seam_weights
+from mistyle.solver.prior import METAL_SPREAD
+from mistyle.solver.table import OVER_SEAMS, Atlas, diffused, fill, with_seam_weights
 
 # Channels of the table that are smoothed, and the least standard deviation of their second differences. Not metallic:
 # surfaces are metal or not.

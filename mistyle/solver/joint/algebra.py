@@ -1,4 +1,4 @@
-"""The algebra of the joint steps (`recover_joint.py`): normal equations of pictures that are linear in what their
+"""The algebra of the joint steps (`joint/gauss_newton.py`): normal equations of pictures that are linear in what their
 pixels fetch from texels, and conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, section 5.1)."""
 
 from collections.abc import Callable, Sequence

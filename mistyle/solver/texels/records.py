@@ -1,4 +1,4 @@
-"""What the per-texel solver (`texel_lm.py`) is given, and what it answers."""
+"""What the per-texel solver (`texels/levenberg_marquardt.py`) is given, and what it answers."""
 
 from dataclasses import dataclass
 

@@ -1,5 +1,5 @@
-"""What the joint steps (`recover_joint.py`) know of pictures' pixels: which texels each fetches, and how the light that
-reaches it by way of other surfaces depends on them.
+"""What the joint steps (`joint/gauss_newton.py`) know of pictures' pixels: which texels each fetches, and how the light
+that reaches it by way of other surfaces depends on them.
 
 Of that light the first surface point reflects albedo / π E · n by Lambert's law, with n the mapped normal and E the
 vector irradiance (Gershun, The Light Field, 1939): the sum of what arrives, each part along where it comes from. E is
@@ -20,10 +20,10 @@ from mistyle.core.camera import Camera, by_camera
 from mistyle.core.light import Point
 from mistyle.render.deferred.image_samples import SampleBlock, Sampling, TexturedMesh, bilinear_taps, collect
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, TILT
-from mistyle.render.indirect import PALE, enlarged
-from mistyle.stages.fit_context import FitContext
-from mistyle.stages.recover_observe import covered_rows, points_of
-from mistyle.stages.recover_table import fill
+from mistyle.solver.context import FitContext
+from mistyle.solver.indirect import PALE, enlarged
+from mistyle.solver.table import fill
+from mistyle.solver.texels.observations import covered_rows, points_of
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer

@@ -17,7 +17,7 @@ from mistyle.core.image import overlap
 from mistyle.core.mesh import Mesh
 from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.render.mitsuba.draw import gbuffer, tracer
-from mistyle.stages.align import shrunk
+from mistyle.solver.cameras.align import shrunk
 
 SIDE = 160  # pixels of the longer side that is looked at: some 1 % of the overlap
 FEW = 6  # pictures that the mesh is turned for

@@ -67,7 +67,7 @@ def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) ->
     Of the texels that face the camera, hidden ones too, three in four are at least that wide. With texels as wide as
     one block the normals are nearly twice as wrong, with four a quarter less (`python -m benchmarks.photographs`).
     """
-    from mistyle.stages.recover_observe import texel_sizes
+    from mistyle.solver.texels.observations import texel_sizes
 
     covered = [t.covered for t in texels]
     position, normal = (

@@ -18,12 +18,12 @@ from mistyle.core.camera import MITSUBA_FROM_OPENCV, Camera
 from mistyle.core.capture import in_memory
 from mistyle.core.light import Directional, Point
 from mistyle.core.mesh import Mesh
-from mistyle.render import scene_grad
 from mistyle.render.deferred.material_table import ALBEDO, COLUMNS, METALLIC, ROUGHNESS, TILT
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live import walk as scene_walk
 from mistyle.render.live.parameters import Parameter
 from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
+from mistyle.solver.scene import gradients as scene_grad
 
 ROLES = {
     "base_color": ALBEDO,

@@ -9,10 +9,10 @@ from jaxtyping import Float
 
 from mistyle.core.capture import Captures, Loaded
 from mistyle.core.maps import Texels
-from mistyle.render.indirect import enlarged
 from mistyle.render.mitsuba.draw import Tracer
-from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.recover_table import Atlas
+from mistyle.solver.indirect import enlarged
+from mistyle.solver.settings import RecoverSettings
+from mistyle.solver.table import Atlas
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer

@@ -1,15 +1,16 @@
 """Recovering materials: albedo, normal, roughness and metallic from pictures of known cameras under known light.
 
-1. `recover_texels.py` solves each texel alone by Levenberg-Marquardt. It renders nothing: cameras and lights are known.
+1. `texels/solve.py` solves each texel alone by Levenberg-Marquardt. It renders nothing: cameras and lights are known.
    Twenty such steps reach what hundreds of gradient steps on pictures do not.
-2. `recover_pictures.py` minimises the loss of whole pictures by Adam, through `render/deferred/renderer.py`, which
+2. `pictures/descend.py` minimises the loss of whole pictures by Adam, through `render/deferred/renderer.py`, which
 models pixels
    and interpolation exactly.
-3. `recover_joint.py` ends with a joint Gauss-Newton over all texels and pictures, under delta lights only.
+3. `joint/gauss_newton.py` ends with a joint Gauss-Newton over all texels and pictures, under delta lights only.
 
-Smoothness priors (`recover_smooth.py`) act before, between and after the passes of Adam. All parts fit to direct light:
-light between surfaces is estimated with the current maps and taken off the pictures (`bounces`). Lights and cameras are
-taken as given. A common factor of light and albedo is not identifiable: albedo is as right as the lights' units.
+Smoothness priors (`solver/smoothing.py`) act before, between and after the passes of Adam. All parts fit to direct
+light: light between surfaces is estimated with the current maps and taken off the pictures (`bounces`). Lights and
+cameras are taken as given. A common factor of light and albedo is not identifiable: albedo is as right as the lights'
+units.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,14 +24,14 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT, MaterialTable
-from mistyle.stages.fit_context import DirectCaptures, FitContext
-from mistyle.stages.recover_check import validate_captures
-from mistyle.stages.recover_joint import joint_gauss_newton, where_possible
-from mistyle.stages.recover_pictures import Checkpoints, optimise_on_pictures
-from mistyle.stages.recover_settings import RecoverSettings, descent_steps
-from mistyle.stages.recover_smooth import map_smoothing
-from mistyle.stages.recover_table import atlas_of, linked
-from mistyle.stages.recover_texels import TexelEstimate, solve_level
+from mistyle.solver.context import DirectCaptures, FitContext
+from mistyle.solver.joint.gauss_newton import joint_gauss_newton, where_possible
+from mistyle.solver.pictures.descend import Checkpoints, optimise_on_pictures
+from mistyle.solver.settings import RecoverSettings, descent_steps
+from mistyle.solver.smoothing import map_smoothing
+from mistyle.solver.table import atlas_of, linked
+from mistyle.solver.texels.solve import TexelEstimate, solve_level
+from mistyle.solver.validate import validate_captures
 
 __all__ = ["Checkpoints", "RecoverSettings", "Recovered", "recover"]
 
@@ -126,7 +127,7 @@ def polished(context: FitContext, table: MaterialTable, progress: Callable[[floa
     A result that explains the pictures no better is dropped, with a note.
     """
     from mistyle.render.deferred.material_table import pack, unpack
-    from mistyle.render.polish import PolishSettings, polish
+    from mistyle.solver.pictures.polish import PolishSettings, polish
 
     s = context.settings
     chosen = PolishSettings(s.polish, s.loss, s.polish_rate, s.metallic, s.polish_depth, model=s.model, frame=s.frame)

@@ -15,9 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from mistyle.render.deferred.material_table import METALLIC, ROUGHNESS
-from mistyle.render.texel_lm import Problem, Solution
-from mistyle.stages.recover_observe import TexelObservations, sample_image, with_extra_std
-from mistyle.stages.recover_prior import (
+from mistyle.solver.prior import (
     BLUR,
     PRIOR_SPREAD,
     combine_class_prior,
@@ -29,8 +27,10 @@ from mistyle.stages.recover_prior import (
     shrink_normals,
     unconstrained_std,
 )
-from mistyle.stages.recover_settings import RecoverSettings
-from mistyle.stages.recover_table import OVER_SEAMS, Atlas, Values, neighbourhood, scatter, with_seam_weights
+from mistyle.solver.settings import RecoverSettings
+from mistyle.solver.table import OVER_SEAMS, Atlas, Values, neighbourhood, scatter, with_seam_weights
+from mistyle.solver.texels.levenberg_marquardt import Problem, Solution
+from mistyle.solver.texels.observations import TexelObservations, sample_image, with_extra_std
 
 STARTS = (0.08, 0.25, 0.7)  # roughness has local minima
 UNLIKE = 0.3  # of what a texel and the picture drawn there differ by: what it adds to an observation's deviation

@@ -16,12 +16,12 @@ from mistyle.core.capture import Captures
 from mistyle.core.drjit_arrays import aligned
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.render import scene_grad
 from mistyle.render.deferred import pyramid as laplacian
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.emitters import emitters
+from mistyle.solver.scene import gradients as scene_grad
 
 SHARE = 0.7  # of the rate that each coarser level of the pyramid has
 LAST_RATE = 0.1  # share of the rate at the end

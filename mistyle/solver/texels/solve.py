@@ -14,18 +14,19 @@ from mistyle.core.light import has_soft
 from mistyle.core.maps import Maps
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import METALLIC, SOLVED, MaterialTable
-from mistyle.render.texel_lm import Options, Problem, Solution
-from mistyle.stages import recover_prior, recover_solve
-from mistyle.stages.fit_context import DirectCaptures, FitContext, Radiance
-from mistyle.stages.recover_observe import (
+from mistyle.solver import prior as recover_prior
+from mistyle.solver.context import DirectCaptures, FitContext, Radiance
+from mistyle.solver.settings import all_rounds, estimates
+from mistyle.solver.table import PRIOR_MEAN, Atlas, Values, linked, scatter, scatter_to_atlas
+from mistyle.solver.texels import rounds as recover_solve
+from mistyle.solver.texels.levenberg_marquardt import Options, Problem, Solution
+from mistyle.solver.texels.observations import (
     ObservationOptions,
     TexelObservations,
     collect_observations,
     sample_image,
     with_extra_std,
 )
-from mistyle.stages.recover_settings import all_rounds, estimates
-from mistyle.stages.recover_table import PRIOR_MEAN, Atlas, Values, linked, scatter, scatter_to_atlas
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
@@ -233,7 +234,7 @@ def estimate_indirect(
     """Each picture's number, its indirect light under the maps of `table`, and with `vectors` its vector irradiance
     (`Indirect.pictures_and_vectors`); camera by camera. `sampling`: samples a pixel, and the seed."""
     from mistyle.render.deferred.material_table import unpack
-    from mistyle.render.indirect import Indirect, in_proportion
+    from mistyle.solver.indirect import Indirect, in_proportion
 
     settings, captures, done, (samples, seed) = context.settings, context.captures, 0, sampling
     uploaded, maps = renderer.upload(table), unpack(table, context.atlas.sizes)

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from mistyle.render import scene_grad, scene_newton
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live.parameters import Parameter
-from mistyle.render.scene_job import Bad, FitState, SceneProblem
+from mistyle.solver.scene import gauss_newton as scene_newton
+from mistyle.solver.scene import gradients as scene_grad
+from mistyle.solver.scene.state import Bad, FitState, SceneProblem
 
 BATCHES = 8  # of the last steps, whose means' spread is the standard error
 DRIFT = 0.02  # relative change over the last steps that counts as not converged

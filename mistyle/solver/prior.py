@@ -6,9 +6,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, TILT
-from mistyle.render.texel_lm import UNKNOWNS, Solution
-from mistyle.stages.recover_observe import TexelObservations
-from mistyle.stages.recover_table import OVER_SEAMS, Atlas, Values, neighbourhood
+from mistyle.solver.table import OVER_SEAMS, Atlas, Values, neighbourhood
+from mistyle.solver.texels.levenberg_marquardt import UNKNOWNS, Solution
+from mistyle.solver.texels.observations import TexelObservations
 
 PRIOR_SPREAD = (1.0, 1.0, 1.0, 0.6, 0.6, 0.8, 0.2)  # standard deviations from PRIOR_MEAN before anything was seen
 METAL_SPREAD = 0.1  # of metallic about 0 or 1: surfaces are metal or not, and few are in between

@@ -18,9 +18,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.process import stopping
-from mistyle.render import scene_grad
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live.parameters import Parameter
+from mistyle.solver.scene import gradients as scene_grad
 
 MOST_NUMBERS = 32
 MOST_BYTES = 2.5e8  # of the derivatives that are kept, in checkpoints too

@@ -12,7 +12,7 @@ SWEEPS = 2  # how often a pass looks at every picture at least, or there are few
 
 
 class RecoverSettings(BaseModel):
-    """Choices of `stages/recover.py`; defaults are what measuring on synthetic maps of known truth suggested.
+    """Choices of `solver/recover.py`; defaults are what measuring on synthetic maps of known truth suggested.
 
     Lengths of radiance are relative to the brightest that was observed, so no default depends on the exposure.
     """

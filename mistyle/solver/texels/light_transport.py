@@ -6,8 +6,8 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.drjit_arrays import aligned
-from mistyle.render.texel_lm import Problem, local
-from mistyle.render.texel_response import terms
+from mistyle.solver.texels.levenberg_marquardt import Problem, local
+from mistyle.solver.texels.response import terms
 
 
 def light_transport_matrix(
@@ -16,7 +16,7 @@ def light_transport_matrix(
     """Both terms of every observation per unit irradiance from each cell, zero where the mesh hides it.
 
     The problem's pictures have `cells` cells of the sky and no other light; the model's radiance in channel c is
-    sum_k E_kc (albedo_c paint_k + gloss_k), as in `texel_lm.py`.
+    sum_k E_kc (albedo_c paint_k + gloss_k), as in `texels/levenberg_marquardt.py`.
     """
     import drjit as dr
     import mitsuba

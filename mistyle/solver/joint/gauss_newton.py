@@ -7,7 +7,7 @@ that valley slowly. Gauss-Newton steps follow it at once. Around the current map
 
 with b the bilinear weights, averaged over the pixel's lit samples, and D its derivative by a change that all its texels
 share, from central differences of whole pictures. (D takes the samples of a pixel as equal. The pictures themselves are
-exact, so the fixed point of the steps is, up to that.) With R the references and P the priors of `recover_smooth.py`,
+exact, so the fixed point of the steps is, up to that.) With R the references and P the priors of `solver/smoothing.py`,
 whose variances are measured alike, each step solves
 
     (B' D' W D B + P) d = B' D' W (R - I(x)) - P x
@@ -16,7 +16,7 @@ by conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, sectio
 texels' own blocks. W are Cauchy's weights (Huber, Robust Statistics, 1981, section 7.8) of residuals r of standard
 deviation s, 1 / (s² (1 + (r / (CAUCHY_SCALE s))²)): some pixels at edges of shadows and outlines are outliers. R is
 without the estimated light between surfaces. Its change with the texels that reflect it to the camera is in D and in I
-(`joint_pixels.py`), so places without direct light count too. Metallic stays. Soft light, whose pictures take long to
+(`joint/pixels.py`), so places without direct light count too. Metallic stays. Soft light, whose pictures take long to
 draw, has no such steps.
 """
 
@@ -31,9 +31,9 @@ from mistyle.core.capture import Captures
 from mistyle.core.light import has_soft
 from mistyle.core.stage_progress import StageProgress
 from mistyle.render.deferred.material_table import ALBEDO, JOINT, ROUGHNESS, SOLVED, TILT, TILT_X, TILT_Y, MaterialTable
-from mistyle.stages.fit_context import DirectCaptures, FitContext
-from mistyle.stages.joint_algebra import LinearisedImage, Unknowns, diagonal_blocks, normal_matvec, pcg, rhs
-from mistyle.stages.joint_pixels import (
+from mistyle.solver.context import DirectCaptures, FitContext
+from mistyle.solver.joint.algebra import LinearisedImage, Unknowns, diagonal_blocks, normal_matvec, pcg, rhs
+from mistyle.solver.joint.pixels import (
     ImageFootprint,
     UnknownTexels,
     image_footprints,
@@ -41,12 +41,12 @@ from mistyle.stages.joint_pixels import (
     indirect_jacobian,
     unknown_frames,
 )
-from mistyle.stages.recover_observe import observation_std
-from mistyle.stages.recover_prior import MARGIN, NOTHING
-from mistyle.stages.recover_settings import RecoverSettings, joint_estimates, joint_steps
-from mistyle.stages.recover_smooth import LEAST, prior_precision_matrix
-from mistyle.stages.recover_table import Atlas, with_seam_weights
-from mistyle.stages.recover_texels import estimate_indirect
+from mistyle.solver.prior import MARGIN, NOTHING
+from mistyle.solver.settings import RecoverSettings, joint_estimates, joint_steps
+from mistyle.solver.smoothing import LEAST, prior_precision_matrix
+from mistyle.solver.table import Atlas, with_seam_weights
+from mistyle.solver.texels.observations import observation_std
+from mistyle.solver.texels.solve import estimate_indirect
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer

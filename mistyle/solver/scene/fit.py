@@ -13,12 +13,15 @@ from typing import Any
 import numpy as np
 
 from mistyle.process import stopping
-from mistyle.render import scene_grad, scene_job, scene_newton, scene_result
 from mistyle.render.deferred import pyramid as laplacian
 from mistyle.render.live import parameters as scene_keys
 from mistyle.render.mitsuba import device
-from mistyle.render.scene_job import Bad, Regularizer
-from mistyle.render.scene_result import FittedScene, Residual
+from mistyle.solver.scene import gauss_newton as scene_newton
+from mistyle.solver.scene import gradients as scene_grad
+from mistyle.solver.scene import result as scene_result
+from mistyle.solver.scene import state as scene_job
+from mistyle.solver.scene.result import FittedScene, Residual
+from mistyle.solver.scene.state import Bad, Regularizer
 
 RATE = 0.02
 SHARE = 0.7  # of the rate that each coarser level of the pyramid has

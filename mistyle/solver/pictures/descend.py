@@ -1,8 +1,8 @@
 """Adam on whole pictures: one picture a step, in an order that is shuffled anew for each round of all pictures.
 
-The steps form passes. Smoothing (`recover_smooth.py`) follows each pass, and an estimate of the light between surfaces
-precedes the last ones. Both draw texels that few pictures show, or hardly light, towards their surroundings. The next
-pass corrects them by the pictures.
+The steps form passes. Smoothing (`solver/smoothing.py`) follows each pass, and an estimate of the light between
+surfaces precedes the last ones. Both draw texels that few pictures show, or hardly light, towards their surroundings.
+The next pass corrects them by the pictures.
 """
 
 import time
@@ -17,16 +17,16 @@ from mistyle.core.maps import place_of
 from mistyle.core.stage_progress import StageProgress
 from mistyle.process import stopping
 from mistyle.render.deferred.material_table import COLUMNS, SOLVED, TILT, MaterialTable
-from mistyle.stages.fit_context import DirectCaptures, FitContext
-from mistyle.stages.recover_prior import NOTHING
-from mistyle.stages.recover_settings import RecoverSettings, passes
-from mistyle.stages.recover_smooth import map_smoothing
-from mistyle.stages.recover_table import Atlas, fill
-from mistyle.stages.recover_texels import TexelEstimate, estimate_indirect
+from mistyle.solver.context import DirectCaptures, FitContext
+from mistyle.solver.prior import NOTHING
+from mistyle.solver.settings import RecoverSettings, passes
+from mistyle.solver.smoothing import map_smoothing
+from mistyle.solver.table import Atlas, fill
+from mistyle.solver.texels.solve import TexelEstimate, estimate_indirect
 
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
-    from mistyle.render.descent import Descent
+    from mistyle.solver.pictures.adam import Descent
 
 JUDGES = 48  # pictures that say whether the steps helped
 SEEDS = 7907  # between the seeds of two estimates: more than there are rounds
@@ -122,7 +122,7 @@ def _descend(
     checkpoints: Checkpoints,
 ) -> MaterialTable:
     """One pass; the rate falls to zero along a cosine."""
-    from mistyle.render.descent import table_on_device
+    from mistyle.solver.pictures.adam import table_on_device
 
     settings, count, resume = context.settings, len(context.captures), checkpoints.resume
     descent = _descent(context, estimate)
@@ -153,7 +153,7 @@ def _descend(
 
 
 def _descent(context: FitContext, estimate: TexelEstimate) -> "Descent":
-    from mistyle.render.descent import AdamOptions, Descent
+    from mistyle.solver.pictures.adam import AdamOptions, Descent
 
     settings, solved = context.settings, estimate.solved
     rates = [1.0, 1, 1, 1, 1, 1, 1 if settings.metallic else 0, 0]

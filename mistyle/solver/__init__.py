@@ -1,0 +1,1 @@
+"""Materials, cameras and scene parameters from pictures: inverse problems without files or jobs."""

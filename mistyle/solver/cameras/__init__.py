@@ -1,0 +1,1 @@
+"""Camera and mesh alignment by silhouettes and shading."""

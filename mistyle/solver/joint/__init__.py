@@ -1,0 +1,1 @@
+"""The joint Gauss–Newton step over all texels and pictures."""

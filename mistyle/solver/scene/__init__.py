@@ -1,0 +1,1 @@
+"""Fitting parameters of live Mitsuba scenes."""

@@ -1,0 +1,1 @@
+"""The per-texel solver: observations, batched Levenberg–Marquardt, rounds."""
