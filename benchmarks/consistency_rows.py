@@ -115,7 +115,7 @@ ROWS: dict[str, Callable[[Scene], Row]] = {
 
 def run(name: str, folder: Path, work: Callable[[Scene], Row] | None = None) -> None:
     """Compute a row of the scene in `folder` and leave it there."""
-    from mistyle.run.start import start_engines
+    from mistyle.jobs.start import start_engines
 
     scene = load(folder)
     start_engines(scene.settings)

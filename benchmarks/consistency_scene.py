@@ -69,8 +69,8 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
     from mistyle.atlas.texels import rasterise
     from mistyle.io.read import read_picture
     from mistyle.io.read_mesh import read_mesh
+    from mistyle.jobs.start import start_engines
     from mistyle.render.mitsuba.draw import draw_views
-    from mistyle.run.start import start_engines
     from mistyle.surface.chosen import settled
     from mistyle.surface.settings import SurfaceSettings
 

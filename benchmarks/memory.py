@@ -91,7 +91,7 @@ def stylized(out: Path, words: list[Any], stages: bool) -> dict[str, float]:
 def fitted(out: Path, atlas: int, side: int, pictures: int, stages: bool) -> dict[str, float]:
     """Estimate and peak of a fit to pictures that were rendered for it."""
     from mistyle.core.light import lights, to_json
-    from mistyle.run.budget import peaks
+    from mistyle.jobs.memory_budget import peaks
     from mistyle.run.material_budget import MATERIAL, material_counts, material_gb
     from mistyle.run.material_settings import MaterialSettings
 

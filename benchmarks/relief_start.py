@@ -22,7 +22,8 @@ from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
-from mistyle.run import painting, start, stylize_start
+from mistyle.jobs import start
+from mistyle.run import painting, stylize_start
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages import fit
 

@@ -111,7 +111,7 @@ def included(steps: int, size: int, spp: int) -> dict[str, float]:
     mi: Any = mitsuba
 
     from mistyle.io.images.write import write_exr
-    from mistyle.run.progress import Progress
+    from mistyle.jobs.progress import Progress
     from mistyle.run.scene_fit import SceneJob, fit_scene
     from mistyle.run.scene_settings import SceneSettings
 

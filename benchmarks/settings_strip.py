@@ -19,8 +19,9 @@ from mistyle.core.rig_settings import RigSettings
 from mistyle.io.images.write import write_png
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
+from mistyle.jobs import start
 from mistyle.render.mitsuba.unlit import unlit
-from mistyle.run import painting, start, stylize_start
+from mistyle.run import painting, stylize_start
 from mistyle.run.stylize_settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -60,8 +60,9 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
     from mistyle.backends.embedded import surface_colour
     from mistyle.core.image import linear_from_srgb
     from mistyle.io.read import read_picture
+    from mistyle.jobs import start
     from mistyle.render.mitsuba.draw import gbuffer, tracer
-    from mistyle.run import painting, start, stylize_start
+    from mistyle.run import painting, stylize_start
 
     def silent(done: float) -> None:
         pass

@@ -31,7 +31,8 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     from mistyle.core.view import View
     from mistyle.io.read import read_picture
     from mistyle.io.store.records import load_record
-    from mistyle.run import painting, start, stylize_start
+    from mistyle.jobs import start
+    from mistyle.run import painting, stylize_start
     from mistyle.run.stylize_settings import resolve
 
     settings = resolve(

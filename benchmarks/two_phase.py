@@ -34,7 +34,8 @@ from mistyle.core.light import Directional, Lights, has_soft, lights
 from mistyle.core.maps import Maps
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
-from mistyle.run import start, stylize_start
+from mistyle.jobs import start
+from mistyle.run import stylize_start
 from mistyle.run.stylize_settings import Settings
 from mistyle.solver.recover import recover
 from mistyle.solver.settings import RecoverSettings

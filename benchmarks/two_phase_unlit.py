@@ -77,7 +77,7 @@ def silent(done: float) -> None:
 
 def settings_of(preset: str, change: Mapping[str, Any]) -> Any:
     """A preset's settings with some of them changed."""
-    from mistyle.run.settings import merge
+    from mistyle.jobs.settings import merge
     from mistyle.run.stylize_settings import PRESETS, Settings
 
     return Settings.model_validate(merge(PRESETS[preset], change))
@@ -180,7 +180,7 @@ def sheet(left: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> np.ndarray
 
 def sheets(chosen: argparse.Namespace) -> dict[str, float]:
     """Write the sheets and the key of the chosen designs, one folder each below --out."""
-    from mistyle.run.start import start_engines
+    from mistyle.jobs.start import start_engines
     from mistyle.run.stylize_settings import Settings
 
     start_engines(Settings())

@@ -20,7 +20,8 @@ from mistyle.core.image import luminance
 from mistyle.core.view import View
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
-from mistyle.run import painting, start, stylize_start, sweep
+from mistyle.jobs import start
+from mistyle.run import painting, stylize_start, sweep
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.mvst import PaintedView
 

@@ -37,8 +37,9 @@ def lamp_map(azimuth: float, rows: int = 97) -> np.ndarray:
 def painted(mesh: Path, style: Path) -> tuple[Any, list[Any]]:
     """The asset and the maps of its texture sets, painted as `mistyle demo` paints them."""
     from mistyle.io.read import read_mesh, read_picture
-    from mistyle.run import painting, start
-    from mistyle.run.settings import resolve
+    from mistyle.jobs import start
+    from mistyle.jobs.settings import resolve
+    from mistyle.run import painting
 
     settings = resolve("demo", None, {}, {})
     start.start_engines(settings)

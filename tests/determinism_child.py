@@ -94,8 +94,9 @@ def style_job(made: Stages, settings: Any) -> None:
     from mistyle.core.light import lights
     from mistyle.io.cameras.views import read_views, write_views
     from mistyle.io.read import read_picture
+    from mistyle.jobs import start
     from mistyle.render.mitsuba.draw import draw_views
-    from mistyle.run import painting, start, stylize_start
+    from mistyle.run import painting, stylize_start
     from mistyle.stages.fit import FitStart, FitTargets, two_phase
 
     mesh_file, style_file = inputs(made.out)
@@ -151,7 +152,8 @@ def repair(made: Stages, asset: Any, atlas: Any, baked: Any, fitted: Any, settin
 
 def export(made: Stages, asset: Any, atlas: Any, maps: list[Any], settings: Any) -> None:
     from mistyle.atlas.texels import pad_maps
-    from mistyle.run import deliver, start
+    from mistyle.jobs import start
+    from mistyle.run import deliver
     from mistyle.stages.export import write_asset
 
     open_sky = [start.ambient(asset, part, settings.atlas.size, 0, nothing) for part in range(len(maps))]
@@ -193,9 +195,9 @@ def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any
 def compared(made: Stages) -> None:
     """Two pictures compared: the tables, the pictures, the page."""
     from mistyle.io.images.write import write_exr
+    from mistyle.jobs.progress import Progress
     from mistyle.run.compare import compare
     from mistyle.run.compare_records import CompareJob
-    from mistyle.run.progress import Progress
 
     rng, folder = np.random.default_rng(0), made.out / "pictures"
     picture = 0.2 + rng.random((40, 48, 3), np.float32)
@@ -264,8 +266,8 @@ def scene_fitted(made: Stages) -> None:
 
 
 def main(out: Path, threads: int, budget: float) -> None:
+    from mistyle.jobs.start import start_engines
     from mistyle.process import memory
-    from mistyle.run.start import start_engines
     from mistyle.run.stylize_settings import resolve
 
     settings = resolve("draft", None, SETTINGS | {"threads": threads}, {})

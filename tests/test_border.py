@@ -76,7 +76,7 @@ ALLOWED = {
     "render/mitsuba/scene": "the user's scene (--scene), trusted like code",
     "run/batch_page": "a report's own picture",
     "render/external/blender_worker": "the job that mistyle wrote for it",
-    "run/settings": "a word of the user's own command line",
+    "jobs/settings": "a word of the user's own command line",
     "run/verify_checks": "pictures that mistyle has just written, decoded by others on purpose",
     "run/verify_surfaces": "models that a list of mistyle's names, opened by others on purpose",
     "stages/mvst": "views that a run kept in its own folder",

@@ -16,14 +16,14 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.io.images.packing import TARGETS
 from mistyle.io.store import output
+from mistyle.jobs.deliver_settings import FORMATS
+from mistyle.jobs.progress import Progress
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan, with_delivery
 from mistyle.run.cli import main, parser
 from mistyle.run.deliver import DeliveryRequest, deliver, export
-from mistyle.run.deliver_settings import FORMATS
 from mistyle.run.finished import read_finished
 from mistyle.run.options import DELIVERY_OPTIONS, asset_name, given_settings
-from mistyle.run.progress import Progress
 from mistyle.run.stylize_settings import Settings, resolve
 from mistyle.stages.export import write_asset
 

@@ -18,10 +18,10 @@ from mistyle.backends.diffusion_settings import ModelSettings
 from mistyle.core.asset import Picture
 from mistyle.core.errors import EnvironmentMissing
 from mistyle.core.maps import flat_maps
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.stages import Run
 from mistyle.run.generative import inpainter_inputs
 from mistyle.run.made import Atlas, Baked
-from mistyle.run.progress import Progress
-from mistyle.run.stages import Run
 from mistyle.run.stylize_job import STAGES, Job
 from mistyle.run.stylize_settings import resolve
 from mistyle.stages.fit import Fit

@@ -16,8 +16,8 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.view import View
 from mistyle.io.read import read_exr, read_picture
 from mistyle.io.store.records import load_record
+from mistyle.jobs.progress import Progress
 from mistyle.run import pipeline
-from mistyle.run.progress import Progress
 from mistyle.run.retouch import EXACT, LOSSY, differs
 from mistyle.run.stylize_job import STAGES, Job
 from mistyle.run.stylize_settings import resolve

@@ -16,8 +16,8 @@ from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
 from mistyle.core.image import distance_to, linear_from_srgb, srgb_from_linear
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
+from mistyle.jobs.progress import Progress
 from mistyle.run import pipeline
-from mistyle.run.progress import Progress
 from mistyle.run.stylize_job import Job
 from mistyle.run.stylize_settings import resolve
 from mistyle.stages.mvst import ViewPainter, sweep

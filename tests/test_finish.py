@@ -16,13 +16,13 @@ from mistyle.atlas.texels import rasterise
 from mistyle.core.errors import UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import flat_maps
+from mistyle.jobs.progress import Progress
 from mistyle.measure.features import TORCHVISION_CONVOLUTIONS, TORCHVISION_POOLS, load_features
 from mistyle.render.deferred import pyramid
 from mistyle.render.mitsuba import device
 from mistyle.run import pipeline
 from mistyle.run.cli import main
 from mistyle.run.finishing import check_finish
-from mistyle.run.progress import Progress
 from mistyle.run.stylize_job import Job
 from mistyle.run.stylize_settings import resolve
 from mistyle.stages import finish_style

@@ -18,9 +18,9 @@ from benchmarks import faults_jobs as jobs
 from benchmarks.faults_kills import Moment
 from mistyle.core.paths import scenes
 from mistyle.io.store.keeper import Keeper
+from mistyle.jobs.progress import Progress
 from mistyle.run import engines, shard
 from mistyle.run.batch import Choices, describe, planned, summarise
-from mistyle.run.progress import Progress
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills with POSIX signals")
 

@@ -15,12 +15,12 @@ from mistyle.core.image import linear_from_srgb, luminance, srgb_from_linear
 from mistyle.core.light import Ambient, Environment, bake_environment
 from mistyle.io.read import read_exr
 from mistyle.io.read_mesh import read_mesh
+from mistyle.jobs.report.turntable import write_turn
 from mistyle.render.lookdev import sheet
 from mistyle.render.lookdev.aovs import aovs, density
 from mistyle.run import sheet_canvas
 from mistyle.run.cli import main
 from mistyle.run.sheet_canvas import Panel, PanelRow, Sheet, compose, fitted
-from mistyle.run.turntable import write_turn
 
 CYAN = 17
 SMALL = 0.5

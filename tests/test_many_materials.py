@@ -17,14 +17,15 @@ from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.paths import scenes
 from mistyle.core.rig_settings import RigSettings
 from mistyle.io.read_mesh import read_extent, read_mesh
+from mistyle.jobs import memory_budget as budget
+from mistyle.jobs.progress import Progress
 from mistyle.process import memory
 from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.mitsuba import device, draw
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba import texture_pages as pages
-from mistyle.run import budget, stylize_budget, verbs
+from mistyle.run import stylize_budget, verbs
 from mistyle.run.cli import main
-from mistyle.run.progress import Progress
 from mistyle.run.stylize_settings import resolve
 
 STYLE = str(scenes() / "demo_style.png")

@@ -19,16 +19,16 @@ from mistyle.core.view import View
 from mistyle.io.cameras.views import read_views, write_views
 from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.report.charts import Chart, svg
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.render.mitsuba import draw
-from mistyle.run.charts import Chart, svg
 from mistyle.run.cli import main
 from mistyle.run.material import hold_out, lights_in_order, place, references_of
 from mistyle.run.material_job import MATERIAL_STAGES, MaterialJob
 from mistyle.run.material_outlines import tell_placed
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
-from mistyle.run.progress import Progress
 from mistyle.run.verbs import tell_views
 from mistyle.solver.cameras.align import Alignment
 from mistyle.stages import unknown_light

@@ -25,11 +25,11 @@ from mistyle.io.images.packing import TARGETS, TextureSet
 from mistyle.io.images.textures import part_stems
 from mistyle.io.store import atomic
 from mistyle.io.usd.write import library
+from mistyle.jobs.deliver_settings import TEXTURES
 from mistyle.run import deliver_files
 from mistyle.run.batch_jobs import BatchJob, _names
 from mistyle.run.cli import main
 from mistyle.run.deliver import DeliveryRequest, export
-from mistyle.run.deliver_settings import TEXTURES
 from mistyle.run.finished import FinishedAsset
 from mistyle.run.options import asset_name
 from mistyle.stages.export import write_asset

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import pytest
 from verbs import VERBS
 
+from mistyle.jobs.progress import Progress, grouped
 from mistyle.run import summary
 from mistyle.run.cli import main
 from mistyle.run.pages import fit_facts
-from mistyle.run.progress import Progress, grouped
 from mistyle.stages.fit_judge import TOLERANCE, regressed, undone_where
 
 NOTE = "The mesh has no normals"  # of the square: smooth ones are computed
@@ -36,7 +36,7 @@ def test_notes_of_the_mesh_are_printed_at_the_end_and_in_json(verb_inputs, tmp_p
 
 
 def test_a_note_made_in_a_stage_is_said_again_where_the_stage_is_taken_over(tmp_path):
-    from mistyle.run.stages import Run
+    from mistyle.jobs.stages import Run
     from mistyle.run.stylize_job import STAGES, Job
     from mistyle.run.stylize_settings import resolve
 

@@ -16,9 +16,9 @@ from mistyle.core.errors import UsageError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Directional, Environment
 from mistyle.io.images.write import write_exr
+from mistyle.jobs.deliver_settings import ColourSettings
 from mistyle.run.colour import in_working_space, key_of, read_style
 from mistyle.run.deliver import DeliveryRequest, export
-from mistyle.run.deliver_settings import ColourSettings
 from mistyle.stages.export import write_asset
 
 pytest.importorskip("PyOpenColorIO")
@@ -207,8 +207,8 @@ def test_references_and_their_environment_maps_come_in_too(rng):
 
 
 def test_the_environment_names_the_config(monkeypatch):
-    from mistyle.run.job_settings import ReadSettings
-    from mistyle.run.settings import resolve as settings_of
+    from mistyle.jobs.job_settings import ReadSettings
+    from mistyle.jobs.settings import resolve as settings_of
     from mistyle.run.stylize_settings import resolve
 
     assert resolve("draft", None, {}, {"OCIO": CONFIG}).colour.config == CONFIG

@@ -13,8 +13,8 @@ from PIL import Image
 
 import mistyle
 from mistyle.core.errors import InputRefused, Stopped, UsageError
+from mistyle.jobs.progress import Progress
 from mistyle.run import painting, pipeline
-from mistyle.run.progress import Progress
 from mistyle.run.stylize_job import FIRST, REFINING, STAGES, Job
 from mistyle.run.stylize_settings import resolve
 

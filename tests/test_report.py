@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from mistyle.run import report as module
-from mistyle.run.report import (
+from mistyle.jobs.report import page as module
+from mistyle.jobs.report.page import (
     BeforeAfter,
     Figure,
     File,
@@ -30,7 +30,7 @@ from mistyle.run.report import (
     slug,
     write_report,
 )
-from mistyle.run.report_pictures import accents, eight_bit, in_bands, palette, relative_luminance, webp
+from mistyle.jobs.report.pictures import accents, eight_bit, in_bands, palette, relative_luminance, webp
 
 EVIL = """<script>alert('x')</script>"><img src=http://example.org/a onerror=alert(1)>&amp;{{ 7 * 7 }}"""
 VOID = {"meta", "img", "input", "br", "link", "hr"}
@@ -291,8 +291,8 @@ def test_the_maps_of_a_large_atlas_are_never_whole_as_numbers():
     import tracemalloc
 
     from mistyle.core.maps import Texels, flat_maps
-    from mistyle.run import report_overlays
-    from mistyle.run.report_parts import heat, map_shots, mask_over
+    from mistyle.jobs.report import overlays as report_overlays
+    from mistyle.jobs.report.parts import heat, map_shots, mask_over
 
     size = 2048
     maps, covered = flat_maps(size), np.ones((size, size), bool)

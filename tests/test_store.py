@@ -19,8 +19,8 @@ from mistyle.core.errors import MistyleError, UsageError
 from mistyle.io.store import atomic, lock, output
 from mistyle.io.store.atomic import atomic_folder, atomic_write, digest, sha256_file
 from mistyle.io.store.keeper import Keeper
+from mistyle.jobs import checkpoint
 from mistyle.process import disk_errors
-from mistyle.run import checkpoint
 
 ROOT = Path(__file__).parents[1]
 

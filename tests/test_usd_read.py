@@ -385,7 +385,7 @@ def test_without_the_library_the_sentence_says_what_to_install(tmp_path, monkeyp
 
 
 def test_a_change_in_a_layer_or_a_texture_is_noticed(tmp_path):
-    from mistyle.run.inputs import input_files
+    from mistyle.jobs.inputs import input_files
 
     stage(tmp_path / "part.usda", mesh())
     path = painted(tmp_path)

@@ -19,10 +19,8 @@ from test_report import Page, sample
 
 from mistyle.core.errors import InputRefused
 from mistyle.io.read import shrink_picture
-from mistyle.run import cli_lookdev, report_model
-from mistyle.run.cli import main
-from mistyle.run.report import Report, write_report
-from mistyle.run.report_model import (
+from mistyle.jobs.report import model as report_model
+from mistyle.jobs.report.model import (
     VENDOR,
     VIEWER,
     VIEWER_SHA256,
@@ -32,6 +30,9 @@ from mistyle.run.report_model import (
     page_model,
     viewer_script,
 )
+from mistyle.jobs.report.page import Report, write_report
+from mistyle.run import cli_lookdev
+from mistyle.run.cli import main
 
 RED = (200, 24, 16)
 

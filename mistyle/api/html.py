@@ -33,7 +33,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 def thumbnails(pictures: Mapping[str, Shaped[np.ndarray, "h w *c"]], longest: int = THUMBNAIL) -> str:
     """Pictures (sRGB 0..1, or 8 bit) in a row with their names below, as data URIs of WebP files."""
-    from mistyle.run.report_pictures import webp
+    from mistyle.jobs.report.pictures import webp
 
     figures = []
     for name, picture in pictures.items():

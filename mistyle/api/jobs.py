@@ -83,8 +83,8 @@ def stylize(
     `out` holds an earlier run of the same job. Raises `mistyle.core.errors.MistyleError`.
     """
     from mistyle.core.names import asset_name
+    from mistyle.jobs.progress import Progress
     from mistyle.run.pipeline import stylize as run
-    from mistyle.run.progress import Progress
     from mistyle.run.stylize_job import Job
     from mistyle.run.stylize_settings import resolve
 
@@ -124,10 +124,10 @@ def fit(
     Raises `mistyle.core.errors.MistyleError`.
     """
     from mistyle.core.names import asset_name
+    from mistyle.jobs.progress import Progress
+    from mistyle.jobs.settings import resolve
     from mistyle.run.material import MaterialJob, fit_material
     from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
-    from mistyle.run.progress import Progress
-    from mistyle.run.settings import resolve
 
     mesh = Path(mesh)
     job = MaterialJob(
@@ -168,7 +168,7 @@ def bake(
     `mistyle.core.errors.MistyleError`.
     """
     from mistyle.core.names import asset_name
-    from mistyle.run.progress import Progress
+    from mistyle.jobs.progress import Progress
     from mistyle.run.stylize_settings import resolve
     from mistyle.run.verbs import bake_views
 
@@ -200,10 +200,10 @@ def lookdev(
 
     Returns the paths of what was written, and notes. Raises `mistyle.core.errors.MistyleError`.
     """
+    from mistyle.jobs.progress import Progress
+    from mistyle.jobs.settings import validate
     from mistyle.run.lookdev import LookSettings
     from mistyle.run.lookdev import lookdev as run
-    from mistyle.run.progress import Progress
-    from mistyle.run.settings import validate
 
     chosen, progress = validate({**settings, "mp4": mp4}, "lookdev", LookSettings), Progress(quiet=quiet)
     place = None if hdri is None else Path(hdri)

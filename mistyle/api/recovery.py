@@ -84,7 +84,7 @@ def recover(
     that do not exist.
     """
     from mistyle.atlas.texels import rasterise
-    from mistyle.run.settings import validate
+    from mistyle.jobs.settings import validate
     from mistyle.solver.recover import recover as solve
     from mistyle.solver.validate import downsampling_factors
 

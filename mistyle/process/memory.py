@@ -181,7 +181,7 @@ def within(budget: float, folder: Path | None) -> Iterator[None]:
     """Keep large arrays in files of `folder` (None: in memory, as outside), and what is held near `budget` bytes.
 
     What has to be in memory at one time, above all the working arrays of a stage, is not made smaller by this: whether
-    a job can keep its budget is for `run/budget.py` to say. Blocks do not nest.
+    a job can keep its budget is for `jobs/memory_budget.py` to say. Blocks do not nest.
     """
     if folder is None:
         yield

@@ -9,9 +9,9 @@ import numpy as np
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps, Texels
 from mistyle.io.images.textures import part_stems
-from mistyle.run.edits import Edited
-from mistyle.run.progress import Report
-from mistyle.run.start import ambient
+from mistyle.jobs.edits import Edited
+from mistyle.jobs.progress import Report
+from mistyle.jobs.start import ambient
 
 
 def write(

@@ -19,11 +19,11 @@ from mistyle.core.errors import MistyleError, UsageError
 from mistyle.io.store.atomic import clean_leftovers
 from mistyle.io.store.keeper import Keeper
 from mistyle.io.store.output import keep_folder, write_file
+from mistyle.jobs.progress import grouped
 from mistyle.process.cores import cores
 from mistyle.run import engines
 from mistyle.run.batch_jobs import Record, read_jobs
 from mistyle.run.batch_plan import PLAN, BatchPlan, read_plan, write_plan
-from mistyle.run.progress import grouped
 from mistyle.run.shard import SHARDS, claim_batch, finished, job_of, marker, outcome
 
 

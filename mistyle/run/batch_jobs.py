@@ -30,8 +30,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.names import ASSET, distinct, safe_name
 from mistyle.io.read_mesh import MESHES
-from mistyle.run.inputs import input_files
-from mistyle.run.settings import merge, validate
+from mistyle.jobs.inputs import input_files
+from mistyle.jobs.settings import merge, validate
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MOST_JOBS = 100_000
@@ -257,7 +257,7 @@ def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int, bas
 
     Files that `said` names are relative to `base`, those of the environment to the working folder; all end absolute.
     """
-    from mistyle.run.settings import resolve
+    from mistyle.jobs.settings import resolve
 
     root: type[BaseModel]
     if kind == "fit":

@@ -5,8 +5,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
-from mistyle.files.html import csp_hash, template
 from mistyle.io.store.output import write_file
+from mistyle.jobs.report.html import csp_hash, template
 from mistyle.run.batch_plan import BatchPlan
 
 THUMBNAIL = 288  # pixels

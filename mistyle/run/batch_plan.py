@@ -14,8 +14,8 @@ from mistyle import __version__
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.io.store.output import write_file
 from mistyle.io.store.trusted_json import read_own
+from mistyle.jobs.settings import merge, validate
 from mistyle.run.batch_jobs import Record
-from mistyle.run.settings import merge, validate
 
 PLAN = "plan.json"
 VERSION = 1

@@ -300,7 +300,7 @@ OPTIONS = {
 
 def _settings(options: argparse.Namespace, preset: str | None = None) -> Any:
     """The resolved settings of a command."""
-    from mistyle.run.settings import merge
+    from mistyle.jobs.settings import merge
     from mistyle.run.stylize_settings import resolve
 
     return resolve(options.preset or preset, options.config, merge(_rig(options), given_settings(options, OPTIONS)))
@@ -331,7 +331,7 @@ def _need(options: argparse.Namespace, *names: str) -> None:
 
 
 def _print_plan(options: argparse.Namespace, estimate: dict[str, Any]) -> int:
-    from mistyle.run.plan import describe_plan
+    from mistyle.jobs.plan import describe_plan
 
     print(json.dumps(estimate, indent=1) if options.json else describe_plan(estimate))
     return 0
@@ -342,7 +342,7 @@ def _demo(options: argparse.Namespace) -> int:
 
 
 def _print_config(options: argparse.Namespace) -> int:
-    from mistyle.run.settings import as_toml
+    from mistyle.jobs.settings import as_toml
 
     sys.stdout.write(as_toml(_settings(options)))
     return 0
@@ -357,8 +357,8 @@ def _job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | Non
 
 
 def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
+    from mistyle.jobs.progress import Progress
     from mistyle.run.pipeline import stylize
-    from mistyle.run.progress import Progress
     from mistyle.run.stylize_plan import plan
 
     job = _job(options, mesh, style, preset, name)
@@ -404,7 +404,7 @@ def _render(options: argparse.Namespace) -> int:
 
         claim_views(options.mesh, options.out, settings, options.overwrite)
         return _print_plan(options, plan_render(options.mesh, options.out, settings))
-    from mistyle.run.progress import Progress
+    from mistyle.jobs.progress import Progress
     from mistyle.run.verbs import render_views
 
     progress = Progress()
@@ -426,7 +426,7 @@ def _bake(options: argparse.Namespace) -> int:
 
         claim_baked(options.mesh, options.views, options.out, called, options.overwrite)
         return _print_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
-    from mistyle.run.progress import Progress
+    from mistyle.jobs.progress import Progress
     from mistyle.run.verbs import bake_views
 
     progress = Progress()

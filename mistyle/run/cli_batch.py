@@ -157,8 +157,8 @@ def _add_pack(verbs: Any) -> None:
 
 
 def _pack(options: argparse.Namespace) -> int:
+    from mistyle.jobs.progress import Progress
     from mistyle.run.pack import pack
-    from mistyle.run.progress import Progress
 
     folder = pack(options.out, options.extras, Progress(), overwrite=options.overwrite)
     print(f"packed: {folder} (install with {folder / 'install.sh'} TARGET)", file=sys.stderr)
@@ -195,8 +195,8 @@ def _batch(options: argparse.Namespace) -> int:
 
 
 def _shard(options: argparse.Namespace) -> int:
+    from mistyle.jobs.progress import Progress
     from mistyle.run.batch_plan import indices, path_maps, read_plan
-    from mistyle.run.progress import Progress
     from mistyle.run.shard import FarmProgress, run_shard, stages_of
 
     plan = replace(read_plan(options.plan, path_maps(options.path_map)), overwrite=options.overwrite)

@@ -72,8 +72,8 @@ def add_converge(verbs: Any) -> None:
 
 
 def _converge(options: argparse.Namespace) -> int:
+    from mistyle.jobs.progress import Progress
     from mistyle.run.converge import ConvergeJob, converge
-    from mistyle.run.progress import Progress
 
     names = [n.strip() for text in options.renderers for n in _split(text) if n.strip()]
     if not names or options.out is None:
@@ -198,8 +198,8 @@ def run_compare(options: argparse.Namespace) -> int:
     if options.approve:
         return _approve(options)
     job = job_of(options)
+    from mistyle.jobs.progress import Progress
     from mistyle.run.compare import compare
-    from mistyle.run.progress import Progress
 
     return told(options, compare(job, Progress()))
 
@@ -211,8 +211,8 @@ def _compare_renders(options: argparse.Namespace) -> int:
         raise UsageError("compare needs -o OUT")
     if min(options.spp, options.size, options.seeds, options.views) < 1:
         raise UsageError("--spp, --size, --seeds and --views are 1 at least")
+    from mistyle.jobs.progress import Progress
     from mistyle.run.compare_render import RenderJob, compare_renders
-    from mistyle.run.progress import Progress
 
     job = RenderJob(
         file=options.render,

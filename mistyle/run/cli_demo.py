@@ -57,7 +57,7 @@ def demo(options: argparse.Namespace, make_job: MakeJob, run_job: Callable[..., 
 
 
 def _plans(options: argparse.Namespace, jobs: list[Any]) -> int:
-    from mistyle.run.plan import describe_plan
+    from mistyle.jobs.plan import describe_plan
     from mistyle.run.stylize_plan import plan
 
     plans = {job.out.name: plan(job) for job in jobs}
@@ -69,8 +69,8 @@ def _plans(options: argparse.Namespace, jobs: list[Any]) -> int:
 
 
 def _all(options: argparse.Namespace, jobs: list[Any]) -> int:
+    from mistyle.jobs.progress import Progress
     from mistyle.run.demo import run_all
-    from mistyle.run.progress import Progress
 
     progress = Progress()
     made = run_all(jobs, options.out, progress, overwrite=options.overwrite)

@@ -48,9 +48,9 @@ def add_export(verbs: Any) -> None:
 def _export(options: argparse.Namespace) -> int:
     import os
 
+    from mistyle.jobs.deliver_settings import TEXTURES, ColourSettings, listed
+    from mistyle.jobs.progress import Progress
     from mistyle.run.deliver import DeliveryRequest, export
-    from mistyle.run.deliver_settings import TEXTURES, ColourSettings, listed
-    from mistyle.run.progress import Progress
 
     colour = ColourSettings(space=options.colorspace, config=os.environ.get("OCIO") or None)
     targets, files, progress = listed(options.target), [], Progress()

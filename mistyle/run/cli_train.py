@@ -50,7 +50,7 @@ def add_train(verbs: Any) -> None:
 
 def run_train(options: argparse.Namespace) -> int:
     """Train what is missing and print the files."""
-    from mistyle.run.settings import as_toml, resolve, thread_count
+    from mistyle.jobs.settings import as_toml, resolve, thread_count
     from mistyle.run.train_settings import TRAIN_PRESETS, TrainJobSettings
 
     said = given_settings(options, OPTIONS)
@@ -61,7 +61,7 @@ def run_train(options: argparse.Namespace) -> int:
     if options.kind is None or options.source is None or options.out is None:
         raise UsageError("train needs style PICTURE or content VIEWS_DIR, and -o DIR; see mistyle train --help")
     from mistyle.backends.models import need_extra
-    from mistyle.run.progress import Progress
+    from mistyle.jobs.progress import Progress
 
     need_extra()
     images = training_set(options.kind, options.source, settings.word)

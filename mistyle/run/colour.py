@@ -11,7 +11,7 @@ from mistyle.core.asset import Picture
 from mistyle.core.capture import Captures, Loaded
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Environment, Lights
-from mistyle.run.deliver_settings import ColourSettings
+from mistyle.jobs.deliver_settings import ColourSettings
 
 LIGHT = (".exr", ".hdr")
 

@@ -21,14 +21,14 @@ from mistyle.core.errors import InputRefused
 from mistyle.io.images.layers import BEAUTY, LayeredPicture
 from mistyle.io.store.atomic import atomic_write
 from mistyle.io.store.output import claim, replace_files
+from mistyle.jobs.progress import Progress, grouped
+from mistyle.jobs.versions import peak_gb, versions
 from mistyle.measure.pictures import metrics, protocols
 from mistyle.measure.pictures.metrics import METRICS, MetricValues
 from mistyle.run.compare_inputs import Match, Planes, alpha_mask, chosen_layers, matches, planes, read_mask, reduced
 from mistyle.run.compare_limits import broken, without_effect
 from mistyle.run.compare_pictures import PairPictures, thumbnail, worst_regions, write_pictures
 from mistyle.run.compare_records import CompareJob, ComparisonRow, columns, csv_text, junit_text, number, row_record
-from mistyle.run.progress import Progress, grouped
-from mistyle.run.versions import peak_gb, versions
 
 ALPHA = (
     "EXR and HDR are taken as premultiplied; straight alpha (PNG, TIFF, WebP) is multiplied in, in linear light. "

@@ -10,11 +10,11 @@ from jaxtyping import UInt8
 
 from mistyle.core.errors import UsageError
 from mistyle.io.store.atomic import atomic_write
+from mistyle.jobs.report.false_colour import heat
 from mistyle.measure.pictures.flip_bands import flip_map
 from mistyle.run.compare_inputs import Match, Planes, chosen_layers, planes
 from mistyle.run.compare_pictures import shown
 from mistyle.run.compare_records import CompareJob
-from mistyle.run.false_colour import heat
 
 CROP = 360  # pixels of a crop's longer side in the figure
 GAP, TEXT = 10, 46

@@ -9,7 +9,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from mistyle.files.html import csp_hash, template
+from mistyle.jobs.report.html import csp_hash, template
 from mistyle.measure.pictures.metrics import METRICS
 from mistyle.measure.pictures.protocols import PROTOCOL_BETTER
 from mistyle.run.compare_pictures import GREY, STOPS, WIDE, PairPictures

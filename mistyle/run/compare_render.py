@@ -17,14 +17,14 @@ from mistyle.core.names import safe_name
 from mistyle.io.images.write import write_exr
 from mistyle.io.store.atomic import atomic_write
 from mistyle.io.store.output import claim
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.report.false_colour import DIVERGING, mapped
 from mistyle.measure.pictures.statistics import Tested, same_picture
 from mistyle.render.external.render_files import RenderView
 from mistyle.render.external.renderers import Rendered, Renderer, left_out, renderer, shots, subject
 from mistyle.run.compare import FILES, compare
 from mistyle.run.compare_pictures import webp
 from mistyle.run.compare_records import CompareJob
-from mistyle.run.false_colour import DIVERGING, mapped
-from mistyle.run.progress import Progress
 
 LEVEL = 0.01
 

@@ -18,16 +18,16 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, UsageError
-from mistyle.files.html import csp_hash, template
 from mistyle.io.store.atomic import atomic_write
 from mistyle.io.store.output import claim, replace_files
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.report.charts import Chart
+from mistyle.jobs.report.html import csp_hash, template
+from mistyle.jobs.versions import versions
 from mistyle.measure.pictures.metrics import definitions, measure_colour
 from mistyle.measure.pictures.statistics import interval, slope
 from mistyle.render.external.render_files import RenderView, Subject
 from mistyle.render.external.renderers import Renderer, left_out, renderer, shots, subject
-from mistyle.run.charts import Chart
-from mistyle.run.progress import Progress
-from mistyle.run.versions import versions
 
 FILES = ("converge.json", "converge.csv", "index.html")
 METRICS = ("relmse", "smape", "flip")
@@ -284,7 +284,7 @@ def page(record: dict[str, Any]) -> str:
     """The page as text; every text is escaped, scripts and connections are forbidden."""
     from markupsafe import Markup
 
-    from mistyle.run.charts import svg
+    from mistyle.jobs.report.charts import svg
     from mistyle.run.compare_page import figure
 
     here = Path(__file__).parent

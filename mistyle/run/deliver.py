@@ -22,11 +22,11 @@ from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import atomic_write, digest, sha256_file
 from mistyle.io.store.output import claim, keep_folder, read_written, replace_files
 from mistyle.io.store.trusted_json import read_own
+from mistyle.jobs.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
+from mistyle.jobs.stages import program
 from mistyle.run.colour import key_of, light_space, picture_space
 from mistyle.run.deliver_files import Delivery, fields_for, write_delivery
-from mistyle.run.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
 from mistyle.run.finished import FinishedAsset, read_finished, read_listing
-from mistyle.run.stages import program
 
 
 @dataclass(frozen=True)

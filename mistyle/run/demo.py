@@ -42,8 +42,8 @@ def run_all(jobs: Sequence[Any], out: Path, progress: Any, *, overwrite: bool = 
     Returns the sheet's path ("" where no job wrote a report) and the summaries.
     """
     from mistyle.io.store.output import claim, replace_files
+    from mistyle.jobs.progress import Progress
     from mistyle.run.pipeline import stylize
-    from mistyle.run.progress import Progress
 
     inputs = [path for job in jobs for path in (job.mesh, job.style)]
     claim(out, [SHEET], inputs=inputs, overwrite=overwrite)

@@ -9,10 +9,10 @@ from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import Maps
+from mistyle.jobs.progress import Report
+from mistyle.jobs.report.page import BeforeAfter, ReportPicture
+from mistyle.jobs.stages import Run
 from mistyle.run.made import Atlas, Baked
-from mistyle.run.progress import Report
-from mistyle.run.report import BeforeAfter, ReportPicture
-from mistyle.run.stages import Run
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.coat import StyleLayers
 from mistyle.stages.finish import StyleFinish
@@ -104,8 +104,8 @@ def laid(baked: Baked, made: StyleFinish) -> Baked:
 
 def finish_pair(asset: Asset, finishing: FinishRecord, camera: Camera) -> BeforeAfter:
     """The painting before and after, without light, for the report."""
+    from mistyle.jobs.report.draw import shown
     from mistyle.render.mitsuba.unlit import unlit
-    from mistyle.run.report_draw import shown
 
     shots = []
     for maps, caption in ((finishing.before, "as painted"), (finishing.after, "finished")):

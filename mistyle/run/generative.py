@@ -10,8 +10,8 @@ from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import EnvironmentMissing, UsageError
 from mistyle.core.light import Lights, SceneLights, lights
 from mistyle.core.view import View
-from mistyle.run.progress import Report
-from mistyle.run.stages import Run
+from mistyle.jobs.progress import Report
+from mistyle.jobs.stages import Run
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.inpaint import Inpainter

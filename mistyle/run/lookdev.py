@@ -22,8 +22,8 @@ from mistyle.core.errors import MistyleError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.io.store.atomic import atomic_write, sha256_file
 from mistyle.io.store.output import claim, replace_files
-from mistyle.run.progress import Progress
-from mistyle.run.report_overlays import MAGENTA, viridis
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.report.overlays import MAGENTA, viridis
 from mistyle.run.sheet_canvas import PANEL, Panel, PanelRow, Sheet, beside, compose, measures, panel_widths
 
 VIEW_TRANSFORM = "sRGB (Rec.709), no tone curve"
@@ -73,9 +73,9 @@ def lookdev(
     the asset's file was last changed, UTC). The same asset, settings and thread count give the same pictures.
     """
     from mistyle.io.read import read_radiance
+    from mistyle.jobs.report.turntable import encoder
+    from mistyle.jobs.start import start_engines
     from mistyle.render.lookdev import sheet as drawing
-    from mistyle.run.start import start_engines
-    from mistyle.run.turntable import encoder
 
     if settings.mp4:
         encoder()
@@ -123,7 +123,7 @@ def write_turns(
     folder: Path, stage: Any, lights: Sequence[Any], settings: LookSettings, progress: Progress
 ) -> dict[str, str]:
     """Draw and write the turntables that the settings ask for; returns the film of each, relative to the folder."""
-    from mistyle.run.turntable import write_turn
+    from mistyle.jobs.report.turntable import write_turn
 
     turns = {
         "turntable": (settings.turntable, stage.turn, lights[0]),

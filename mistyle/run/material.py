@@ -19,19 +19,19 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights
 from mistyle.core.maps import Maps, Texels
 from mistyle.io.images.textures import part_stems
-from mistyle.run import checkpoint
-from mistyle.run.budget import size_of, with_setting
-from mistyle.run.edits import asset_stage, tell_edits
-from mistyle.run.inputs import input_files
+from mistyle.jobs import checkpoint
+from mistyle.jobs.edits import asset_stage, tell_edits
+from mistyle.jobs.inputs import input_files
+from mistyle.jobs.memory_budget import size_of, with_setting
+from mistyle.jobs.progress import Progress, Report
+from mistyle.jobs.stages import Run, claim_run
+from mistyle.jobs.start import read, start_engines
 from mistyle.run.material_budget import check_material
 from mistyle.run.material_files import scene, write
 from mistyle.run.material_job import MATERIAL_STAGES, MaterialJob
 from mistyle.run.material_outlines import fix_of, tell_placed
 from mistyle.run.material_pictures import look_through, looked
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
-from mistyle.run.progress import Progress, Report
-from mistyle.run.stages import Run, claim_run
-from mistyle.run.start import read, start_engines
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,10 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     Raises a MistyleError for everything that a user can mend; what was finished before stays.
     """
     from mistyle.io.cameras.captures import read_shots, reading_notes
+    from mistyle.jobs.run_record import old_report
     from mistyle.run.colour import in_working_space, key_of
     from mistyle.run.deliver import check, deliver
     from mistyle.run.material_report import material_report, write_summary
-    from mistyle.run.record import old_report
 
     files = input_files(job.mesh)
     s = job.settings

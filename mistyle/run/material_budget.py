@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from mistyle.core.errors import UsageError
-from mistyle.run.budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
+from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
 from mistyle.solver.settings import joint_steps
 
 # A fit to pictures, without what is kept of the pictures' samples, up to `recover.memory`; the system does not get all

@@ -14,8 +14,8 @@ import numpy as np
 from mistyle.core.capture import Captures, Loaded, shrunk
 from mistyle.core.maps import Texels
 from mistyle.io.store.records import load_record, save_record
+from mistyle.jobs.progress import Report
 from mistyle.process import memory
-from mistyle.run.progress import Report
 
 KEPT = 2  # pictures held in memory
 

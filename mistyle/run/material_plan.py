@@ -1,20 +1,9 @@
-"""What a fit to pictures will do and cost, before it does it (`--dry-run`); see run/plan.py."""
+"""What a fit to pictures will do and cost, before it does it (`--dry-run`); see jobs/plan.py."""
 
 from typing import Any
 
-from mistyle.run.budget import peaks
-from mistyle.run.material_budget import (
-    COVERED,
-    MATERIAL,
-    SEEN,
-    SHOWN,
-    check_material,
-    looked_at,
-    material_counts,
-    material_gb,
-)
-from mistyle.run.material_job import MATERIAL_STAGES
-from mistyle.run.plan import (
+from mistyle.jobs.memory_budget import peaks
+from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
     PER_BOUNCED_PATH,
     PER_JOINT,
@@ -28,7 +17,18 @@ from mistyle.run.plan import (
     extent_of,
     reading,
 )
-from mistyle.run.stages import claim_run
+from mistyle.jobs.stages import claim_run
+from mistyle.run.material_budget import (
+    COVERED,
+    MATERIAL,
+    SEEN,
+    SHOWN,
+    check_material,
+    looked_at,
+    material_counts,
+    material_gb,
+)
+from mistyle.run.material_job import MATERIAL_STAGES
 from mistyle.solver.settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
 

@@ -7,19 +7,29 @@ from typing import Any, Literal
 import numpy as np
 
 from mistyle.core.image import luminance, srgb_from_linear
-from mistyle.run import report_overlays
-from mistyle.run.charts import Chart
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.report import overlays as report_overlays
+from mistyle.jobs.report.charts import Chart
+from mistyle.jobs.report.draw import draw
+from mistyle.jobs.report.model import page_model
+from mistyle.jobs.report.page import (
+    BeforeAfter,
+    Figure,
+    MapSet,
+    Note,
+    Report,
+    ReportPicture,
+    Step,
+    Timing,
+    write_report,
+)
+from mistyle.jobs.report.parts import file_list, heat, map_shots, setting_groups, side_by_side
+from mistyle.jobs.report.pictures import Sizes, kind_in_step, kind_of_maps
+from mistyle.jobs.report.turntable import write_turn
+from mistyle.jobs.run_record import earlier, merged_peaks, merged_seconds, report_files, write_record
+from mistyle.jobs.stages import Run
+from mistyle.jobs.versions import peak_gb, versions
 from mistyle.run.material_job import MATERIAL_STAGES
-from mistyle.run.progress import Progress
-from mistyle.run.record import earlier, merged_peaks, merged_seconds, report_files, write_record
-from mistyle.run.report import BeforeAfter, Figure, MapSet, Note, Report, ReportPicture, Step, Timing, write_report
-from mistyle.run.report_draw import draw
-from mistyle.run.report_model import page_model
-from mistyle.run.report_parts import file_list, heat, map_shots, setting_groups, side_by_side
-from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
-from mistyle.run.stages import Run
-from mistyle.run.turntable import write_turn
-from mistyle.run.versions import peak_gb, versions
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "seen_share": ("share of the covered texels that at least one reference sees", "higher"),

@@ -1,12 +1,12 @@
-"""The settings of `mistyle fit`: one record per stage, resolved by the functions of run/settings.py."""
+"""The settings of `mistyle fit`: one record per stage, resolved by the functions of jobs/settings.py."""
 
 from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from mistyle.atlas.settings import AtlasSettings
-from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
-from mistyle.run.job_settings import LEAST_OVERLAP, ReadSettings, ReportSettings
+from mistyle.jobs.deliver_settings import ColourSettings, DeliverSettings
+from mistyle.jobs.job_settings import LEAST_OVERLAP, ReadSettings, ReportSettings
 from mistyle.solver.settings import RecoverSettings
 
 

@@ -206,7 +206,7 @@ def add_mesh_options(verb: argparse.ArgumentParser) -> None:
 
 def given_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict[str, Any]:
     """The settings given on the command line, nested; `names` maps options to dotted settings."""
-    from mistyle.run.settings import assignments, merge
+    from mistyle.jobs.settings import assignments, merge
 
     said: dict[str, Any] = {}
     for option, key in names.items():

@@ -21,7 +21,7 @@ from mistyle import __version__
 from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.io.store.atomic import sha256_file
 from mistyle.io.store.output import claim, replace_files
-from mistyle.run.progress import Progress
+from mistyle.jobs.progress import Progress
 from mistyle.setup.environment import CONSTRAINTS, ROOT, home, in_clone, read_record
 
 INSTALL = """#!/bin/sh

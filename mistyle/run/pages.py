@@ -1,4 +1,4 @@
-"""What the report of a job shows: its pictures are drawn here, its page is made by `run/report.py`."""
+"""What the report of a job shows: its pictures are drawn here, its page is made by `jobs/report/page.py`."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -8,19 +8,29 @@ import numpy as np
 
 from mistyle.core.camera import Camera
 from mistyle.core.view import View
-from mistyle.run import report_overlays
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.report import overlays as report_overlays
+from mistyle.jobs.report.draw import close_up, draw, shown
+from mistyle.jobs.report.model import page_model
+from mistyle.jobs.report.page import (
+    BeforeAfter,
+    Figure,
+    MapSet,
+    Note,
+    Report,
+    ReportPicture,
+    Step,
+    Timing,
+    write_report,
+)
+from mistyle.jobs.report.parts import file_list, heat, map_shots, mask_over, setting_groups, side_by_side
+from mistyle.jobs.report.pictures import Sizes, kind_in_step, kind_of_maps
+from mistyle.jobs.report.turntable import write_turn
+from mistyle.jobs.versions import versions
 from mistyle.run.finishing import finish_pair
-from mistyle.run.progress import Progress
-from mistyle.run.report import BeforeAfter, Figure, MapSet, Note, Report, ReportPicture, Step, Timing, write_report
-from mistyle.run.report_draw import close_up, draw, shown
-from mistyle.run.report_model import page_model
-from mistyle.run.report_parts import file_list, heat, map_shots, mask_over, setting_groups, side_by_side
-from mistyle.run.report_pictures import Sizes, kind_in_step, kind_of_maps
 from mistyle.run.style_look import look_facts
 from mistyle.run.stylize_job import FINISH, FIRST, RETOUCH, STAGES
 from mistyle.run.summary import MEANINGS, figures
-from mistyle.run.turntable import write_turn
-from mistyle.run.versions import versions
 from mistyle.stages.fit_judge import TOLERANCE, regressed, undone_where
 
 SAME = "Under the same studio light"

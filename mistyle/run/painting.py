@@ -13,10 +13,10 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import face_areas
 from mistyle.core.view import View
 from mistyle.geometry.tangents import corner_tangents
+from mistyle.jobs.progress import Report
+from mistyle.jobs.stages import Run
 from mistyle.process import memory
 from mistyle.run.made import Atlas, Baked
-from mistyle.run.progress import Report
-from mistyle.run.stages import Run
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.coat import StyleLayers
 from mistyle.surface.guides import Content

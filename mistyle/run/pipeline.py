@@ -15,20 +15,20 @@ from mistyle.core.asset import Asset, Picture
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
 from mistyle.io.images.textures import part_stems
+from mistyle.jobs.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
+from mistyle.jobs.inputs import input_files
+from mistyle.jobs.memory_budget import Look, kept, size_of
+from mistyle.jobs.progress import Progress, Report
+from mistyle.jobs.stages import Run, claim_run
+from mistyle.jobs.start import mesh_stage, start_engines
 from mistyle.measure.baked_light import BakedLight
 from mistyle.run import asset_files
-from mistyle.run.budget import Look, kept, size_of
-from mistyle.run.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.run.finishing import FinishRecord, check_finish, finish_stage
 from mistyle.run.first_asset import write_first
 from mistyle.run.generative import check as check_generative
 from mistyle.run.generative import fit_settings, inpainter_inputs, lights_of_views, opaque, release, texture_inpainter
-from mistyle.run.inputs import input_files
 from mistyle.run.made import Atlas, Baked, Repaired
 from mistyle.run.painting import bake, check_paint, paint_files, stylized_stage, surface_stage, unlit_views
-from mistyle.run.progress import Progress, Report
-from mistyle.run.stages import Run, claim_run
-from mistyle.run.start import mesh_stage, start_engines
 from mistyle.run.style_look import StyleLook, style_looks
 from mistyle.run.stylize_budget import PLAIN, STYLED, TILED, counts
 from mistyle.run.stylize_job import EVERY_STAGE, REFINING, STAGES, Job
@@ -62,9 +62,9 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     Returns the paths of what was written and the figures of `run.json`. Raises a MistyleError for everything that a
     user can mend; what was finished before stays and is taken over by the next run.
     """
+    from mistyle.jobs.run_record import old_report
     from mistyle.run.colour import read_style
     from mistyle.run.deliver import check, deliver
-    from mistyle.run.record import old_report
     from mistyle.run.summary import write_summary
 
     files = input_files(job.mesh)

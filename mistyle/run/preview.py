@@ -16,13 +16,13 @@ from mistyle.core.camera import Camera, orbit
 from mistyle.core.errors import UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps
-from mistyle.run.budget import kept, size_of
-from mistyle.run.inputs import input_files
+from mistyle.jobs.inputs import input_files
+from mistyle.jobs.memory_budget import kept, size_of
+from mistyle.jobs.progress import Progress, Report
+from mistyle.jobs.stages import Run, claim_run
+from mistyle.jobs.start import mesh_stage, start_engines
 from mistyle.run.made import Atlas
 from mistyle.run.painting import check_paint, paint_layers, painted, raised, surface_stage
-from mistyle.run.progress import Progress, Report
-from mistyle.run.stages import Run, claim_run
-from mistyle.run.start import mesh_stage, start_engines
 from mistyle.run.stylize_budget import PLAIN, STYLED, TILED, counts
 from mistyle.run.stylize_job import PREVIEW_STAGES, Job
 from mistyle.run.stylize_settings import Settings
@@ -105,7 +105,7 @@ def painted_maps(asset: Asset, style: Picture, atlas: Atlas, settings: Settings,
 def write(path: Path, asset: Asset, maps: Sequence[Maps], seed: int) -> None:
     """The sheet: four views in a row, and below them the maps of each texture set."""
     from mistyle.io.images.write import write_png
-    from mistyle.run.report_parts import map_shots
+    from mistyle.jobs.report.parts import map_shots
 
     cameras = [orbit(azimuth, ELEVATION, distance=4, fov=30, size=(SIDE, SIDE)) for azimuth in VIEWS]
     views = lit_views(asset, seed)(maps, cameras)
@@ -119,9 +119,9 @@ def lit_views(
 ) -> Callable[[Sequence[Maps], Sequence[Camera]], list[Float[np.ndarray, "h w 3"]]]:
     """A function that draws maps from cameras under the studio's light, on white, sRGB; what all such pictures share
     (rays, light, open sky) is made once."""
+    from mistyle.jobs.report.draw import sky, studio_light
     from mistyle.render.lookdev.studio import Studio, prefiltered
     from mistyle.render.mitsuba.draw import tracer
-    from mistyle.run.report_draw import sky, studio_light
 
     traced, light = tracer(asset.mesh), prefiltered(studio_light())
     open_sky = sky(asset.mesh, traced, seed)

@@ -12,9 +12,9 @@ from mistyle.core.asset import Asset
 from mistyle.core.camera import resized
 from mistyle.core.image import erode, resize, srgb_from_linear
 from mistyle.core.view import View
+from mistyle.jobs.progress import Report
 from mistyle.run.made import Atlas, Baked, Retouched
 from mistyle.run.painting import unlit_views
-from mistyle.run.progress import Report
 from mistyle.run.stylize_settings import Settings
 
 # Steps of 8 bits that a pixel must differ by to be new, its least coverage, the width of the outline's rim that is not

@@ -17,16 +17,16 @@ from mistyle.core.errors import InputRefused, UsageError
 from mistyle.io.store.atomic import atomic_write, digest
 from mistyle.io.store.keeper import Keeper
 from mistyle.io.store.output import claim, keep_folder
+from mistyle.jobs import checkpoint
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.run_record import write_record
+from mistyle.jobs.settings import thread_count
+from mistyle.jobs.stages import program
+from mistyle.jobs.versions import peak_gb, versions
 from mistyle.process import stopping
-from mistyle.run import checkpoint
-from mistyle.run.progress import Progress
-from mistyle.run.record import write_record
 from mistyle.run.scene_references import read_reference, reference_files
 from mistyle.run.scene_report import changes, figures, noise_text, write_page
 from mistyle.run.scene_settings import SceneSettings
-from mistyle.run.settings import thread_count
-from mistyle.run.stages import program
-from mistyle.run.versions import peak_gb, versions
 
 FOLDERS = ("scene", "pictures", "report", "work")
 DRAWN_SPP = 64

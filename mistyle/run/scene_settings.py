@@ -1,4 +1,4 @@
-"""The settings of `mistyle fit --scene`, resolved by the functions of run/settings.py."""
+"""The settings of `mistyle fit --scene`, resolved by the functions of jobs/settings.py."""
 
 from typing import Any, Literal
 

@@ -19,13 +19,13 @@ from mistyle.io.store import lock
 from mistyle.io.store.atomic import LOCK, atomic_write, digest, sha256_file
 from mistyle.io.store.output import claim, keep_folder
 from mistyle.io.store.trusted_json import read_own
+from mistyle.jobs.inputs import input_files
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.stages import claim_run, program
 from mistyle.process.disk_errors import unexpected
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan
-from mistyle.run.inputs import input_files
 from mistyle.run.material_job import MATERIAL_STAGES
-from mistyle.run.progress import Progress
-from mistyle.run.stages import claim_run, program
 from mistyle.run.stylize_job import STAGES
 
 SHARDS = "shards"

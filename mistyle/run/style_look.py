@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.asset import Picture
-from mistyle.run.progress import Progress
+from mistyle.jobs.progress import Progress
 from mistyle.run.stylize_settings import Settings
 from mistyle.surface.chosen import FROM_PAINTING, settled
 from mistyle.surface.reading import StyleReading, read_style

@@ -10,7 +10,7 @@ counts the features of a painting of the largest size.
 
 from collections.abc import Sequence
 
-from mistyle.run.budget import Counts, Need, as_drawn, must_tile, shown, within_gb
+from mistyle.jobs.memory_budget import Counts, Need, as_drawn, must_tile, shown, within_gb
 from mistyle.run.stylize_settings import Settings
 
 # With every array in memory.

@@ -1,11 +1,11 @@
-"""What `stylize`, `render` and `bake` will do and cost, before they do it (`--dry-run`); see run/plan.py."""
+"""What `stylize`, `render` and `bake` will do and cost, before they do it (`--dry-run`); see jobs/plan.py."""
 
 from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import InputRefused
-from mistyle.run.budget import Counts
-from mistyle.run.plan import (
+from mistyle.jobs.memory_budget import Counts
+from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
     BYTES_PER_VIEW_PIXEL,
     PER_CROP_PIXEL,
@@ -20,7 +20,7 @@ from mistyle.run.plan import (
     needed_memory,
     reading,
 )
-from mistyle.run.stages import claim_run
+from mistyle.jobs.stages import claim_run
 from mistyle.run.stylize_budget import (
     BAKE,
     BAKE_TILED,

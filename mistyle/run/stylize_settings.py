@@ -11,9 +11,9 @@ from mistyle.atlas.bake_settings import BakeSettings
 from mistyle.atlas.settings import AtlasSettings
 from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, Paint3dSettings, TrainSettings
 from mistyle.core.rig_settings import RigSettings
-from mistyle.run import settings
-from mistyle.run.deliver_settings import ColourSettings, DeliverSettings
-from mistyle.run.job_settings import ReadSettings, ReportSettings
+from mistyle.jobs import settings
+from mistyle.jobs.deliver_settings import ColourSettings, DeliverSettings
+from mistyle.jobs.job_settings import ReadSettings, ReportSettings
 from mistyle.stages.finish_settings import FinishSettings
 from mistyle.stages.fit_settings import FitSettings
 from mistyle.stages.repair_settings import RepairSettings
@@ -166,5 +166,5 @@ def resolve(
     command_line: Mapping[str, Any],
     environment: Mapping[str, str] = os.environ,
 ) -> Settings:
-    """The settings of a job after every layer; see `resolve` of run/settings.py."""
+    """The settings of a job after every layer; see `resolve` of jobs/settings.py."""
     return settings.resolve(preset, config, command_line, environment, root=Settings, presets=PRESETS)

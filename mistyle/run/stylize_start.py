@@ -8,8 +8,8 @@ from mistyle.core.asset import Asset
 from mistyle.core.camera import Camera, rig
 from mistyle.core.maps import Maps, OwnMaps, Texels
 from mistyle.core.mesh import Mesh
+from mistyle.jobs.progress import Report
 from mistyle.run.made import Atlas
-from mistyle.run.progress import Report
 from mistyle.run.stylize_settings import Settings
 
 

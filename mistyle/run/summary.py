@@ -2,10 +2,10 @@
 
 from typing import Any, Literal
 
+from mistyle.jobs.run_record import earlier, merged_peaks, merged_seconds, report_files, write_record
+from mistyle.jobs.stages import Run
+from mistyle.jobs.versions import peak_gb, versions
 from mistyle.measure.baked_light import BakedLight
-from mistyle.run.record import earlier, merged_peaks, merged_seconds, report_files, write_record
-from mistyle.run.stages import Run
-from mistyle.run.versions import peak_gb, versions
 
 
 def write_summary(made: Any, run: Run) -> dict[str, Any]:

@@ -9,9 +9,9 @@ import numpy as np
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.errors import UsageError
 from mistyle.core.view import View
+from mistyle.jobs.progress import Report
+from mistyle.jobs.stages import Run
 from mistyle.run.made import Atlas, Baked
-from mistyle.run.progress import Report
-from mistyle.run.stages import Run
 from mistyle.run.stylize_settings import Settings
 from mistyle.stages.mvst import Masker, PaintedView, Stylizer, Swept, ViewPainter, ViewStore, finished, sweep
 

@@ -12,8 +12,8 @@ from jaxtyping import Float
 from mistyle.core.camera import rig
 from mistyle.core.rig_settings import RigSettings
 from mistyle.io.store.output import claim, replace_files
+from mistyle.jobs.progress import Progress
 from mistyle.run.preview import ATLAS, lit_views, painted_maps, reduced, rows_of
-from mistyle.run.progress import Progress
 from mistyle.run.stylize_settings import Settings
 
 SAMPLES, RESOLUTION = 40_000, 384
@@ -52,9 +52,10 @@ def sheet(
     mesh: Path, style: Path, out: Path, settings: Settings, count: int, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
     """Write OUT/variations.png; returns its path and, picture by picture, the options that make it."""
-    from mistyle.run import start, stylize_start
+    from mistyle.jobs import start
+    from mistyle.jobs.inputs import input_files
+    from mistyle.run import stylize_start
     from mistyle.run.colour import read_style
-    from mistyle.run.inputs import input_files
 
     inputs = [*input_files(mesh), style]
     claim(out, [SHEET], inputs=inputs, overwrite=overwrite)

@@ -13,14 +13,14 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.io.store.output import claim, read_written, replace_files
-from mistyle.run.budget import kept, size_of
-from mistyle.run.inputs import input_files
-from mistyle.run.job_settings import LEAST_OVERLAP
+from mistyle.jobs.inputs import input_files
+from mistyle.jobs.job_settings import LEAST_OVERLAP
+from mistyle.jobs.memory_budget import kept, size_of
+from mistyle.jobs.plan import existing
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.start import read, start_engines
 from mistyle.run.painting import with_geometry
 from mistyle.run.pipeline import write_asset
-from mistyle.run.plan import existing
-from mistyle.run.progress import Progress
-from mistyle.run.start import read, start_engines
 from mistyle.run.stylize_budget import BAKE, BAKE_TILED, BAKED, DRAWN, RENDER, RENDER_TILED, bake_counts, render_counts
 from mistyle.run.stylize_job import Job
 from mistyle.run.stylize_settings import Settings

@@ -199,7 +199,7 @@ def _judged(name: str, check: str, d: Difference, versions: str) -> Check:
 
 def _keep(folder: Path, shot: str, pictures: Sequence[np.ndarray], error: np.ndarray) -> None:
     from mistyle.core.image import srgb_from_linear
-    from mistyle.run.false_colour import heat
+    from mistyle.jobs.report.false_colour import heat
 
     for who, picture in zip(("cycles", "mitsuba"), pictures, strict=True):
         planes = dict(zip("RGBA", np.moveaxis(picture, -1, 0), strict=False))

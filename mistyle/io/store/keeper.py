@@ -56,7 +56,7 @@ class Keeper:
         """The folder of a stage finished under this key with every file as it was written, else None.
 
         A folder of another key stays where it is; a damaged one is renamed to `<stage>.broken-N`, never deleted.
-        Files that the stage did not write are ignored, and `editable` ones may have changed (run/edits.py). UsageError
+        Files that the stage did not write are ignored, and `editable` ones may have changed (jobs/edits.py). UsageError
         for a folder that is the user's.
         """
         folder = self.root / _checked(stage)

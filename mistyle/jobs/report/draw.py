@@ -16,7 +16,7 @@ from mistyle.core.camera import Camera, orbit
 from mistyle.core.image import nearest_fill, srgb_from_linear
 from mistyle.core.maps import Maps
 from mistyle.core.mesh import Mesh
-from mistyle.run.report_pictures import eight_bit
+from mistyle.jobs.report.pictures import eight_bit
 
 ELEVATION = 15.0
 FIRST = 30.0  # azimuth of the first frame and of the close-up

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from mistyle.core.asset import Asset
+from mistyle.jobs.job_settings import ReadSettings
+from mistyle.jobs.progress import Report
+from mistyle.jobs.settings import thread_count
 from mistyle.process.cores import use_threads
-from mistyle.run.job_settings import ReadSettings
-from mistyle.run.progress import Report
-from mistyle.run.settings import thread_count
 
 
 def start_engines(settings: Any) -> str:

@@ -2,7 +2,7 @@
 
 The times are products of counts and constants that were read off `python -m benchmarks.pipeline` and
 `benchmarks.photographs` on two cores of a server; they are guides of a factor of two, not promises. Memory is
-`run/budget.py`'s. Disk is what stays in the run folder.
+`jobs/memory_budget.py`'s. Disk is what stays in the run folder.
 """
 
 import shutil
@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mistyle.io.meshes.parsed_mesh import Extent
-from mistyle.run.budget import Counts, Need, must_tile, peaks, within_gb
-from mistyle.run.inputs import input_files
-from mistyle.run.settings import thread_count
+from mistyle.jobs.inputs import input_files
+from mistyle.jobs.memory_budget import Counts, Need, must_tile, peaks, within_gb
+from mistyle.jobs.settings import thread_count
 
 # Seconds on two cores, per unit named.
 PER_UNWRAPPED_FACE = 3.6e-4

@@ -3,7 +3,7 @@
 `Report` is pure data: pictures are arrays that are ready to look at (sRGB-encoded, 8 bit or float 0..1; grey, rgb or
 rgb with straight alpha), everything else is text and numbers. `write_report` inlines every picture as WebP, escapes
 every text (jinja2 autoescape) and forbids itself every connection by a content-security policy; its scripts are
-allowed by their hashes. The asset can be turned in three dimensions where it is small enough (run/report_model.py).
+allowed by their hashes. The asset can be turned in three dimensions where it is small enough (jobs/report/model.py).
 The page works without scripts too: the turntable then stands still, and the asset is a picture.
 """
 
@@ -16,11 +16,11 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from mistyle.files.html import csp_hash, template
 from mistyle.io.store.atomic import atomic_write
-from mistyle.run.charts import Chart, svg
-from mistyle.run.report_model import PageModel, TooLarge, packed, viewer_script
-from mistyle.run.report_pictures import Encoder, Sizes, accents, kind_in_step, kind_of_maps, palette
+from mistyle.jobs.report.charts import Chart, svg
+from mistyle.jobs.report.html import csp_hash, template
+from mistyle.jobs.report.model import PageModel, TooLarge, packed, viewer_script
+from mistyle.jobs.report.pictures import Encoder, Sizes, accents, kind_in_step, kind_of_maps, palette
 
 Pixels: TypeAlias = (
     UInt8[np.ndarray, "h w c"]

@@ -8,8 +8,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from mistyle.core.image import gaussian, resize
 from mistyle.core.maps import Texels
-from mistyle.run.report import Overlay
-from mistyle.run.report_pictures import in_bands
+from mistyle.jobs.report.page import Overlay
+from mistyle.jobs.report.pictures import in_bands
 
 OPACITY = 0.8
 MAGENTA = (1.0, 0.0, 0.8)

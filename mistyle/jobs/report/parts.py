@@ -9,8 +9,8 @@ from pydantic import BaseModel
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import Maps, Texels
 from mistyle.io.store.trusted_json import read_own
-from mistyle.run.report import File, ReportPicture, Setting
-from mistyle.run.report_pictures import in_bands
+from mistyle.jobs.report.page import File, ReportPicture, Setting
+from mistyle.jobs.report.pictures import in_bands
 
 
 def side_by_side(pictures: Sequence[np.ndarray]) -> np.ndarray:

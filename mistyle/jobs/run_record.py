@@ -5,8 +5,8 @@ from typing import Any
 
 from mistyle.io.store.output import write_file
 from mistyle.io.store.trusted_json import read_own
-from mistyle.run.progress import Progress
-from mistyle.run.stages import Run
+from mistyle.jobs.progress import Progress
+from mistyle.jobs.stages import Run
 
 
 def report_files(job: Any) -> dict[str, str]:

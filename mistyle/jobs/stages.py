@@ -13,10 +13,10 @@ from mistyle.io.store import atomic, output
 from mistyle.io.store.atomic import digest
 from mistyle.io.store.keeper import Keeper
 from mistyle.io.store.records import load_record, save_record
+from mistyle.jobs import edits
+from mistyle.jobs.progress import Progress, Report
+from mistyle.jobs.settings import thread_count
 from mistyle.process import memory, stopping
-from mistyle.run import edits
-from mistyle.run.progress import Progress, Report
-from mistyle.run.settings import thread_count
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
 # These stand in the run folder itself, for people; the others in work/.

@@ -1,0 +1,1 @@
+"""What every job has: settings, stage cache, progress, plans, summaries."""
