@@ -152,9 +152,9 @@ def repair(made: Stages, asset: Any, atlas: Any, baked: Any, fitted: Any, settin
 
 def export(made: Stages, asset: Any, atlas: Any, maps: list[Any], settings: Any) -> None:
     from mistyle.atlas.texels import pad_maps
+    from mistyle.deliver import export as deliver
+    from mistyle.deliver.asset import write_asset
     from mistyle.jobs import start
-    from mistyle.run import deliver
-    from mistyle.stages.export import write_asset
 
     open_sky = [start.ambient(asset, part, settings.atlas.size, 0, nothing) for part in range(len(maps))]
     made.note("occlusion", open_sky)

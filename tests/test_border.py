@@ -77,8 +77,8 @@ ALLOWED = {
     "run/batch_page": "a report's own picture",
     "render/external/blender_worker": "the job that mistyle wrote for it",
     "jobs/settings": "a word of the user's own command line",
-    "run/verify_checks": "pictures that mistyle has just written, decoded by others on purpose",
-    "run/verify_surfaces": "models that a list of mistyle's names, opened by others on purpose",
+    "deliver/verify_checks": "pictures that mistyle has just written, decoded by others on purpose",
+    "deliver/verify_surfaces": "models that a list of mistyle's names, opened by others on purpose",
     "stages/mvst": "views that a run kept in its own folder",
 }
 # Names of decoding modules that others may import: records, and what only looks at paths or checked trees.

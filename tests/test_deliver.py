@@ -14,6 +14,9 @@ from PIL import Image
 
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
+from mistyle.deliver.asset import write_asset
+from mistyle.deliver.export import DeliveryRequest, deliver, export
+from mistyle.deliver.read_asset import read_finished
 from mistyle.io.images.packing import TARGETS
 from mistyle.io.store import output
 from mistyle.jobs.deliver_settings import FORMATS
@@ -21,11 +24,8 @@ from mistyle.jobs.progress import Progress
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan, with_delivery
 from mistyle.run.cli import main, parser
-from mistyle.run.deliver import DeliveryRequest, deliver, export
-from mistyle.run.finished import read_finished
 from mistyle.run.options import DELIVERY_OPTIONS, asset_name, given_settings
 from mistyle.run.stylize_settings import Settings, resolve
-from mistyle.stages.export import write_asset
 
 OCCLUSION = np.linspace(0.2, 1, 256, dtype=np.float32).reshape(16, 16)
 

@@ -13,12 +13,12 @@ from gltf_cases import bumpy_sphere, from_gltf, glb_parts, no_texels, quad, quar
 from mistyle.atlas.texels import rasterise
 from mistyle.core.errors import UsageError
 from mistyle.core.maps import flat_maps
+from mistyle.deliver import asset as export
+from mistyle.deliver.asset import write_asset
 from mistyle.io.gltf.write import write_glb
 from mistyle.io.images import textures
 from mistyle.io.images.write import encode_png
 from mistyle.io.read_mesh import read_mesh
-from mistyle.stages import export
-from mistyle.stages.export import write_asset
 
 OPEN = np.ones((16, 16), np.float32)
 

@@ -10,10 +10,10 @@ import trimesh
 from gltf_cases import no_texels, quarters
 
 from mistyle.core.mesh import local_origin
+from mistyle.deliver.asset import write_asset
+from mistyle.deliver.export import DeliveryRequest, export
 from mistyle.io.read_mesh import read_mesh
 from mistyle.io.usd.write import library
-from mistyle.run.deliver import DeliveryRequest, export
-from mistyle.stages.export import write_asset
 
 # Where the middle is, and how far the mesh reaches from there: UTM, and a national grid with a wide tile.
 PLACES = {

@@ -8,12 +8,12 @@ import pytest
 from test_pipeline import inputs, job  # noqa: F401  (a fixture)
 
 from mistyle.core.errors import Stopped, UsageError
+from mistyle.deliver.read_asset import read_finished
 from mistyle.io.read import read_picture
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.report.pictures import Encoder
 from mistyle.run import pipeline, preview
 from mistyle.run.cli import main
-from mistyle.run.finished import read_finished
 from mistyle.run.stylize_settings import resolve
 
 

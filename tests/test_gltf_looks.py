@@ -19,12 +19,12 @@ from mistyle.core.asset import Asset
 from mistyle.core.camera import orbit
 from mistyle.core.errors import InputRefused
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
+from mistyle.deliver.asset import write_asset
 from mistyle.geometry.retexture import Wraps, fetch
 from mistyle.io.gltf.write import patch_glb
 from mistyle.io.meshes import lookups
 from mistyle.io.read_mesh import read_extent, read_mesh
 from mistyle.render.mitsuba.draw import draw_views
-from mistyle.stages.export import write_asset
 
 SIDE = 8
 INNER = np.array([[x, y] for x in (0.13, 0.38, 0.61, 0.9) for y in (0.07, 0.3, 0.55, 0.84)])

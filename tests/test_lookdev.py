@@ -13,14 +13,14 @@ from PIL import Image
 from mistyle.core.errors import EnvironmentMissing
 from mistyle.core.image import linear_from_srgb, luminance, srgb_from_linear
 from mistyle.core.light import Ambient, Environment, bake_environment
+from mistyle.deliver.lookdev import canvas as sheet_canvas
+from mistyle.deliver.lookdev.canvas import Panel, PanelRow, Sheet, compose, fitted
 from mistyle.io.read import read_exr
 from mistyle.io.read_mesh import read_mesh
 from mistyle.jobs.report.turntable import write_turn
 from mistyle.render.lookdev import sheet
 from mistyle.render.lookdev.aovs import aovs, density
-from mistyle.run import sheet_canvas
 from mistyle.run.cli import main
-from mistyle.run.sheet_canvas import Panel, PanelRow, Sheet, compose, fitted
 
 CYAN = 17
 SMALL = 0.5

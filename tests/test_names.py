@@ -21,18 +21,18 @@ from PIL import Image
 
 from mistyle.core import names
 from mistyle.core.errors import UsageError
+from mistyle.deliver import files as deliver_files
+from mistyle.deliver.asset import write_asset
+from mistyle.deliver.export import DeliveryRequest, export
+from mistyle.deliver.read_asset import FinishedAsset
 from mistyle.io.images.packing import TARGETS, TextureSet
 from mistyle.io.images.textures import part_stems
 from mistyle.io.store import atomic
 from mistyle.io.usd.write import library
 from mistyle.jobs.deliver_settings import TEXTURES
-from mistyle.run import deliver_files
 from mistyle.run.batch_jobs import BatchJob, _names
 from mistyle.run.cli import main
-from mistyle.run.deliver import DeliveryRequest, export
-from mistyle.run.finished import FinishedAsset
 from mistyle.run.options import asset_name
-from mistyle.stages.export import write_asset
 
 FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
 LONG = "木" * 82

@@ -15,11 +15,11 @@ from mistyle.core.capture import Captures
 from mistyle.core.errors import UsageError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
 from mistyle.core.light import Directional, Environment
+from mistyle.deliver.asset import write_asset
+from mistyle.deliver.colour import in_working_space, key_of, read_style
+from mistyle.deliver.export import DeliveryRequest, export
 from mistyle.io.images.write import write_exr
 from mistyle.jobs.deliver_settings import ColourSettings
-from mistyle.run.colour import in_working_space, key_of, read_style
-from mistyle.run.deliver import DeliveryRequest, export
-from mistyle.stages.export import write_asset
 
 pytest.importorskip("PyOpenColorIO")
 from mistyle.io.images.ocio import KNOWN, colour_space, exr_tags

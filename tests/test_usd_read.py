@@ -257,8 +257,8 @@ def test_a_usd_mesh_goes_through_the_one_reader(tmp_path):
 
 
 def test_what_we_wrote_comes_back(tmp_path):
-    from mistyle.run.deliver import DeliveryRequest, export
-    from mistyle.stages.export import write_asset
+    from mistyle.deliver.asset import write_asset
+    from mistyle.deliver.export import DeliveryRequest, export
 
     occlusion = np.ones((16, 16), np.float32)
     write_asset(
@@ -395,8 +395,8 @@ def test_a_change_in_a_layer_or_a_texture_is_noticed(tmp_path):
 
 def run_of(folder: Path, source: Path, style: str, uv="keep") -> Path:
     """What a run over a USD mesh leaves: the asset, and the mesh as it was read."""
+    from mistyle.deliver.asset import write_asset
     from mistyle.io.store.records import save_record
-    from mistyle.stages.export import write_asset
 
     asset = read_mesh(source, uv=uv)
     parts, occlusion = len(asset.mesh.parts), np.ones((16, 16), np.float32)
@@ -422,8 +422,8 @@ def opened(layer: Path, variant: str):
 def test_a_look_layer_holds_a_variant_per_style_over_the_untouched_source(tmp_path):
     from pxr import UsdGeom, UsdShade
 
+    from mistyle.deliver.export import DeliveryRequest, export
     from mistyle.io.usd.write import complaints
-    from mistyle.run.deliver import DeliveryRequest, export
 
     source = painted(tmp_path)
     before = source.read_bytes()
@@ -463,9 +463,9 @@ def test_a_look_layer_holds_a_variant_per_style_over_the_untouched_source(tmp_pa
 def test_new_uvs_come_as_a_primvar_and_may_cut_polygons(tmp_path, orientation):
     from pxr import UsdGeom
 
+    from mistyle.deliver.export import DeliveryRequest, export
     from mistyle.io.usd.look import write_look
     from mistyle.io.usd.write import complaints
-    from mistyle.run.deliver import DeliveryRequest, export
 
     extra = '    float3 xformOp:scale = (-1, 1, 1)\n    uniform token[] xformOpOrder = ["xformOp:scale"]\n'
     extra += '    normal3f[] normals = [(0, 0, 1), (0, 0, 1)] ( interpolation = "uniform" )\n'
@@ -538,7 +538,7 @@ def test_a_look_needs_the_source_and_the_run(tmp_path):
     import shutil
 
     from mistyle.core.errors import UsageError
-    from mistyle.run.deliver import DeliveryRequest, export
+    from mistyle.deliver.export import DeliveryRequest, export
 
     source = painted(tmp_path)
     run_of(tmp_path / "run", source, "wave")

@@ -12,13 +12,13 @@ from gltf_cases import bumpy_sphere, no_texels, quarters
 from node_tools import modules
 
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.deliver import verify_checks
+from mistyle.deliver.asset import write_asset
+from mistyle.deliver.export import DeliveryRequest, export
+from mistyle.deliver.verify import Rendering, compared, file_checks, table, verify
+from mistyle.deliver.verify_surfaces import surface_checks
 from mistyle.render.external.blender import blender_command, find_blender
-from mistyle.run import verify_checks
 from mistyle.run.cli import main
-from mistyle.run.deliver import DeliveryRequest, export
-from mistyle.run.verify import Rendering, compared, file_checks, table, verify
-from mistyle.run.verify_surfaces import surface_checks
-from mistyle.stages.export import write_asset
 
 FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
 

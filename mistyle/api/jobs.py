@@ -200,10 +200,10 @@ def lookdev(
 
     Returns the paths of what was written, and notes. Raises `mistyle.core.errors.MistyleError`.
     """
+    from mistyle.deliver.lookdev.job import LookSettings
+    from mistyle.deliver.lookdev.job import lookdev as run
     from mistyle.jobs.progress import Progress
     from mistyle.jobs.settings import validate
-    from mistyle.run.lookdev import LookSettings
-    from mistyle.run.lookdev import lookdev as run
 
     chosen, progress = validate({**settings, "mp4": mp4}, "lookdev", LookSettings), Progress(quiet=quiet)
     place = None if hdri is None else Path(hdri)

@@ -51,7 +51,7 @@ def gallery(rows: Mapping[str, Any], size: int = 160, *, names: Sequence[str] = 
 
     Colours above 1 clip; there is no tone curve.
     """
-    from mistyle.run.sheet_canvas import Panel, PanelRow, Sheet, compose, measures
+    from mistyle.deliver.lookdev.canvas import Panel, PanelRow, Sheet, compose, measures
 
     scale = size / 200
     gutter = measures(scale)["gutter"]
@@ -74,8 +74,8 @@ def gallery(rows: Mapping[str, Any], size: int = 160, *, names: Sequence[str] = 
 
 
 def _blank(row: Any, missing: int, gutter: int) -> tuple[Any, ...]:
-    from mistyle.run.sheet_canvas import GROUND as BETWEEN
-    from mistyle.run.sheet_canvas import Panel
+    from mistyle.deliver.lookdev.canvas import GROUND as BETWEEN
+    from mistyle.deliver.lookdev.canvas import Panel
 
     if missing <= gutter or not row.panels:
         return ()

@@ -48,9 +48,9 @@ def add_export(verbs: Any) -> None:
 def _export(options: argparse.Namespace) -> int:
     import os
 
+    from mistyle.deliver.export import DeliveryRequest, export
     from mistyle.jobs.deliver_settings import TEXTURES, ColourSettings, listed
     from mistyle.jobs.progress import Progress
-    from mistyle.run.deliver import DeliveryRequest, export
 
     colour = ColourSettings(space=options.colorspace, config=os.environ.get("OCIO") or None)
     targets, files, progress = listed(options.target), [], Progress()
@@ -107,7 +107,7 @@ def add_verify(verbs: Any) -> None:
 
 
 def _verify(options: argparse.Namespace) -> int:
-    from mistyle.run.verify import Rendering, table, verify
+    from mistyle.deliver.verify import Rendering, table, verify
 
     rendering = None
     if not options.no_render:

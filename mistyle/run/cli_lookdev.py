@@ -59,9 +59,9 @@ def add_lookdev(verbs: Any) -> None:
 
 
 def _lookdev(options: argparse.Namespace) -> int:
+    from mistyle.deliver.lookdev.job import LookSettings, lookdev
     from mistyle.jobs.progress import Progress
     from mistyle.jobs.settings import validate
-    from mistyle.run.lookdev import LookSettings, lookdev
 
     names = LookSettings.model_fields
     said = {name: value for name in names if (value := getattr(options, name, None)) is not None}

@@ -11,12 +11,12 @@ from typing import Any
 
 from mistyle.core.asset import Asset
 from mistyle.core.maps import Maps
+from mistyle.deliver import asset_files
 from mistyle.io.store.atomic import DONE, digest
 from mistyle.io.store.trusted_json import read_own
 from mistyle.jobs.edits import UNEDITED
 from mistyle.jobs.progress import Report
 from mistyle.jobs.run_record import merged_peaks, merged_seconds, write_record
-from mistyle.run import asset_files
 from mistyle.run.made import Atlas, Baked
 
 STATE = "painted and baked; not fitted, not repaired"

@@ -82,10 +82,10 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
 
     Raises a MistyleError for everything that a user can mend; what was finished before stays.
     """
+    from mistyle.deliver.colour import in_working_space, key_of
+    from mistyle.deliver.export import check, deliver
     from mistyle.io.cameras.captures import read_shots, reading_notes
     from mistyle.jobs.run_record import old_report
-    from mistyle.run.colour import in_working_space, key_of
-    from mistyle.run.deliver import check, deliver
     from mistyle.run.material_report import material_report, write_summary
 
     files = input_files(job.mesh)

@@ -8,9 +8,9 @@ from typing import Any
 from mistyle.core.asset import Asset
 from mistyle.core.capture import Captures
 from mistyle.core.maps import Texels
+from mistyle.deliver import asset_files
 from mistyle.jobs.edits import UNEDITED, Edited
 from mistyle.jobs.progress import Report
-from mistyle.run import asset_files
 
 BORDER = 1  # texels beside an island that interpolation brought into the pictures, so that they were fitted too
 

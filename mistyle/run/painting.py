@@ -65,7 +65,7 @@ def paint(
 
 def paint_layers(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> StyleLayers:
     """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
-    from mistyle.run.colour import read_style
+    from mistyle.deliver.colour import read_style
     from mistyle.stages.coat import content, masked_style, painted_direction, scaled, slot_masks
 
     surface = scaled(settings.surface, asset, settings.paint.stroke_size)

@@ -14,6 +14,7 @@ import numpy as np
 from mistyle.core.asset import Asset, Picture
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.view import View
+from mistyle.deliver import asset_files
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs.edits import UNEDITED, Edited, asset_stage, read_mask, tell_edits, write_mask
 from mistyle.jobs.inputs import input_files
@@ -22,7 +23,6 @@ from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import mesh_stage, start_engines
 from mistyle.measure.baked_light import BakedLight
-from mistyle.run import asset_files
 from mistyle.run.finishing import FinishRecord, check_finish, finish_stage
 from mistyle.run.first_asset import write_first
 from mistyle.run.generative import check as check_generative
@@ -62,9 +62,9 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     Returns the paths of what was written and the figures of `run.json`. Raises a MistyleError for everything that a
     user can mend; what was finished before stays and is taken over by the next run.
     """
+    from mistyle.deliver.colour import read_style
+    from mistyle.deliver.export import check, deliver
     from mistyle.jobs.run_record import old_report
-    from mistyle.run.colour import read_style
-    from mistyle.run.deliver import check, deliver
     from mistyle.run.summary import write_summary
 
     files = input_files(job.mesh)

@@ -39,7 +39,7 @@ SHEET = "preview.png"
 
 def preview(job: Job, progress: Progress) -> dict[str, Any]:
     """Paint the mesh and write OUT/preview/preview.png; returns its path, the seconds of each stage and the notes."""
-    from mistyle.run.colour import read_style
+    from mistyle.deliver.colour import read_style
     from mistyle.run.pipeline import inputs_of
 
     s = job.settings

@@ -34,7 +34,7 @@ class StyleLook:
 
 def style_looks(style: Picture, name: str, settings: Settings, progress: Progress) -> tuple[StyleLook, ...]:
     """Read the style and the pictures of slots, and say in a line each what follows; nothing for diffusion."""
-    from mistyle.run.colour import read_style as read_file
+    from mistyle.deliver.colour import read_style as read_file
     from mistyle.stages.coat import masked_style
 
     if settings.stylizer == "diffusion":

@@ -52,10 +52,10 @@ def sheet(
     mesh: Path, style: Path, out: Path, settings: Settings, count: int, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
     """Write OUT/variations.png; returns its path and, picture by picture, the options that make it."""
+    from mistyle.deliver.colour import read_style
     from mistyle.jobs import start
     from mistyle.jobs.inputs import input_files
     from mistyle.run import stylize_start
-    from mistyle.run.colour import read_style
 
     inputs = [*input_files(mesh), style]
     claim(out, [SHEET], inputs=inputs, overwrite=overwrite)

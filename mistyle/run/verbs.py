@@ -80,8 +80,8 @@ def bake_views(
     mesh: Path, views: Path, out: Path, settings: Settings, name: str, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
     """`mistyle bake`: anyone's pictures of known cameras projected onto the texture (section 4.1.4)."""
+    from mistyle.deliver.asset import asset_names
     from mistyle.io.cameras.views import read_views, view_cameras
-    from mistyle.stages.export import asset_names
 
     inputs = claim_baked(mesh, views, out, name, overwrite)
     sizes = [camera.size[0] * camera.size[1] for camera in view_cameras(views)]

@@ -17,6 +17,9 @@ from typing import Any
 
 from mistyle.core.errors import UsageError
 from mistyle.core.names import ASSET, FILE_NAME, folded, safe_name, shortened
+from mistyle.deliver.colour import key_of, light_space, picture_space
+from mistyle.deliver.files import Delivery, fields_for, write_delivery
+from mistyle.deliver.read_asset import FinishedAsset, read_finished, read_listing
 from mistyle.io.images.packing import TARGETS
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import atomic_write, digest, sha256_file
@@ -24,9 +27,6 @@ from mistyle.io.store.output import claim, keep_folder, read_written, replace_fi
 from mistyle.io.store.trusted_json import read_own
 from mistyle.jobs.deliver_settings import FORMATS, TEXTURES, ColourSettings, checked_name, checked_textures, fields_of
 from mistyle.jobs.stages import program
-from mistyle.run.colour import key_of, light_space, picture_space
-from mistyle.run.deliver_files import Delivery, fields_for, write_delivery
-from mistyle.run.finished import FinishedAsset, read_finished, read_listing
 
 
 @dataclass(frozen=True)

@@ -20,11 +20,11 @@ from mistyle import __version__
 from mistyle.core.asset import Asset
 from mistyle.core.errors import MistyleError
 from mistyle.core.image import linear_from_srgb, srgb_from_linear
+from mistyle.deliver.lookdev.canvas import PANEL, Panel, PanelRow, Sheet, beside, compose, measures, panel_widths
 from mistyle.io.store.atomic import atomic_write, sha256_file
 from mistyle.io.store.output import claim, replace_files
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.report.overlays import MAGENTA, viridis
-from mistyle.run.sheet_canvas import PANEL, Panel, PanelRow, Sheet, beside, compose, measures, panel_widths
 
 VIEW_TRANSFORM = "sRGB (Rec.709), no tone curve"
 USUAL = 560  # pixels of a hero picture for which the sheet's type is made

@@ -19,13 +19,13 @@ from mistyle.core.names import (
     split_tile,
     uses,
 )
+from mistyle.deliver.read_asset import FinishedAsset
 from mistyle.io.images.ocio import ColourSpace, exr_tags
 from mistyle.io.images.packing import TARGETS, Target, TextureSet, write_slot
 from mistyle.io.materialx import TexturedMaterial, write_materialx
 from mistyle.io.meshes.obj_write import write_obj
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
-from mistyle.run.finished import FinishedAsset
 
 # What materials in files refer to: every map by itself, whatever the target packs.
 SINGLE = ("albedo", "normal", "roughness", "metallic")

@@ -9,8 +9,8 @@ from xml.etree import ElementTree
 
 from mistyle.core.errors import InputRefused, MistyleError
 from mistyle.core.names import folded
+from mistyle.deliver.verify_checks import MODELS, Check, row
 from mistyle.io.sandbox.bounds import USD
-from mistyle.run.verify_checks import MODELS, Check, row
 
 CHECK = "materials and their maps"
 MAPS = ("map_kd", "map_pr", "map_pm", "norm")

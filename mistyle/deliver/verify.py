@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, MistyleError
+from mistyle.deliver.verify_checks import MODELS, READERS, Check, by_blender, exr, listed_files, png
+from mistyle.deliver.verify_surfaces import surface_checks
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.store.atomic import DONE
 from mistyle.io.store.output import claim, replace_files
 from mistyle.render.external.blender import BLENDER, find_blender
-from mistyle.run.verify_checks import MODELS, READERS, Check, by_blender, exr, listed_files, png
-from mistyle.run.verify_surfaces import surface_checks
 
 # Two right renderers differ by noise (FLIP 0.05 to 0.09 at 64 samples) and by their pixel filters.
 MOST_FLIP, LEAST_OVERLAP, LEAST_CORRELATION = 0.15, 0.98, 0.95

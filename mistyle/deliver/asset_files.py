@@ -26,7 +26,7 @@ def write(
 ) -> None:
     """The files of the texture sets, each finished and written before the next is taken; `edited` holds textures that
     a person painted over, `own` is as in `pad_maps`."""
-    from mistyle.stages.export import write_sets
+    from mistyle.deliver.asset import write_sets
 
     told = {**provenance, **edited.provenance}
     write_sets(folder, job.name, asset, _finished(job, asset, sets, report, edited, own), provenance=told)

@@ -1,0 +1,1 @@
+"""Finished assets in the files that other programs open, and their verification."""

@@ -1,0 +1,1 @@
+"""`mistyle lookdev`: sheets and turntables of an asset."""
