@@ -98,7 +98,7 @@ def halves(scene: Scene) -> dict[str, float]:
 def seams(scene: Scene, albedo: list[np.ndarray]) -> float:
     """`seam_ratio` of the texture drawn in every view, mean over the views that show a seam."""
     from mistyle.atlas.texels import pad
-    from mistyle.run.painting import unlit_views
+    from mistyle.stylization.pipeline.painting import unlit_views
 
     padded = [pad(a, t, scene.settings.atlas.padding) for a, t in zip(albedo, scene.texels, strict=True)]
     drawn = unlit_views(scene.asset, blank_maps(scene, padded), scene.views, lambda done: None)

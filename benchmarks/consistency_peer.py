@@ -18,7 +18,7 @@ from benchmarks.consistency_rows import Row
 from benchmarks.consistency_scene import Scene
 from mistyle.core.image import nearest_fill
 from mistyle.io.read import read_picture
-from mistyle.surface import style as styles
+from mistyle.stylization.surface.exemplar import exemplar as styles
 
 
 def ebsynth(program: Path) -> Callable[[Scene], Row]:

@@ -32,10 +32,10 @@ class Row:
 
 def surface(scene: Scene) -> Row:
     """The embedded surface stylizer: the surface is painted once and baked to the atlas, and the views are drawn."""
-    from mistyle.backends.embedded import solve_surface
     from mistyle.core.maps import flat_maps
-    from mistyle.run.made import Atlas
-    from mistyle.run.painting import painted, unlit_views
+    from mistyle.stylization.pipeline.painting import painted, unlit_views
+    from mistyle.stylization.records import Atlas
+    from mistyle.stylization.surface.surface_painter import solve_surface
 
     start, asset = time.perf_counter(), scene.asset
     solution = solve_surface(asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
@@ -49,10 +49,10 @@ def surface(scene: Scene) -> Row:
 
 def without_atlas(scene: Scene, solution: Any) -> list[np.ndarray]:
     """Views of a painted surface that asks it for the colour of every hit, as many a pixel as `unlit` has rays."""
-    from mistyle.backends.embedded import surface_colour
     from mistyle.core.camera import resized
     from mistyle.render.mitsuba.draw import gbuffer, tracer
     from mistyle.render.mitsuba.unlit import FINE
+    from mistyle.stylization.surface.surface_painter import surface_colour
 
     traced, pictures = tracer(scene.asset.mesh), []
     for view in scene.views:
@@ -86,8 +86,8 @@ def per_view(scene: Scene) -> Row:
 
 def swept(scene: Scene) -> Row:
     """The same, each view from what the earlier ones show of its surface (paper 4.1.3)."""
-    from mistyle.stages.mvst import ViewPainter, sweep
-    from mistyle.stages.sweep_settings import SweepSettings
+    from mistyle.stylization.mvst.settings import SweepSettings
+    from mistyle.stylization.mvst.sweep import ViewPainter, sweep
 
     start = time.perf_counter()
     done = sweep(
@@ -100,7 +100,7 @@ def swept(scene: Scene) -> Row:
 
 def view_stylizer(scene: Scene):
     """The embedded stylizer view by view."""
-    from mistyle.backends.embedded_view import stylizer
+    from mistyle.stylization.surface.view_painter import stylizer
 
     return stylizer(scene.asset.mesh, scene.style, scene.settings.surface, scene.settings.seed)
 

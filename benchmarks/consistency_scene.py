@@ -15,8 +15,8 @@ from mistyle.core.maps import Maps, Texels, flat_maps
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.io.store.records import load_record, save_record
-from mistyle.run.stylize_settings import Settings, resolve
-from mistyle.surface import style as styles
+from mistyle.stylization.settings import Settings, resolve
+from mistyle.stylization.surface.exemplar import exemplar as styles
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 WEIGHTS = DATA / "weights"
@@ -71,8 +71,8 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
     from mistyle.io.read_mesh import read_mesh
     from mistyle.jobs.start import start_engines
     from mistyle.render.mitsuba.draw import draw_views
-    from mistyle.surface.chosen import settled
-    from mistyle.surface.settings import SurfaceSettings
+    from mistyle.stylization.surface.exemplar.chosen import settled
+    from mistyle.stylization.surface.settings import SurfaceSettings
 
     layers = {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}
     settings = resolve(None, None, layers)
@@ -101,9 +101,9 @@ def make(folder: Path, mesh: Path, style: Path, resolution: int, samples: int, a
 
 def guided(asset: Asset, picture: Picture, settings: Settings, views: Sequence[View]):
     """Colour and detail guide of every view's pixels, and the painting at the size at which views show it."""
-    from mistyle.backends.embedded import array_module, open_sky
-    from mistyle.surface.kernels import module
-    from mistyle.surface.synthesis import SurfaceFields, finest_size, mesh_guides
+    from mistyle.stylization.surface.kernels import module
+    from mistyle.stylization.surface.surface_painter import array_module, open_sky
+    from mistyle.stylization.surface.synthesis import SurfaceFields, finest_size, mesh_guides
 
     dj, fields = module(array_module()), SurfaceFields(open_sky(asset.mesh, settings.seed))
     chosen = settings.surface
@@ -129,7 +129,7 @@ def nearest_samples(points, view: View) -> tuple[np.ndarray, np.ndarray]:
     from scipy.spatial import KDTree
 
     from mistyle.core.camera import pixel_centres, world_from_px
-    from mistyle.surface.samples import lifted
+    from mistyle.stylization.surface.samples import lifted
 
     px = pixel_centres(view.camera.size)[view.mask]
     place = world_from_px(view.camera, px, view.depth[view.mask].astype(np.float64))

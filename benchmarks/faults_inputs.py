@@ -109,7 +109,7 @@ def _colmap(path: Path) -> None:
 
 
 def _settings(path: Path) -> None:
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.settings import resolve
 
     resolve(None, path, {}, {})
 

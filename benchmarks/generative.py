@@ -110,9 +110,9 @@ def sdxl(shape: dict[str, Any], device: str, dtype: torch.dtype) -> Any:
 
 def train_step(pipeline: Any, shape: dict[str, Any], device: str, dtype: torch.dtype) -> Callable[[], object]:
     """One step of a content picture, optimiser included."""
-    from mistyle.backends import consislora
-    from mistyle.backends.consislora_train import TrainingExample, joint_phase, run_phase
-    from mistyle.backends.diffusion_settings import TrainSettings
+    from mistyle.stylization.diffusion import consislora
+    from mistyle.stylization.diffusion.lora_training import TrainingExample, joint_phase, run_phase
+    from mistyle.stylization.diffusion.settings import TrainSettings
 
     settings = TrainSettings(rank=shape["rank"], steps=1)
     for half in consislora.BLOCKS:
@@ -131,7 +131,7 @@ def train_step(pipeline: Any, shape: dict[str, Any], device: str, dtype: torch.d
 
 def denoise_step(pipeline: Any, shape: dict[str, Any], device: str, dtype: torch.dtype) -> Callable[[], object]:
     """One noise level: two ControlNets and the UNet with its LoRAs, for the empty and the real prompt."""
-    from mistyle.backends.diffusion_denoise import Conditioning, denoiser
+    from mistyle.stylization.diffusion.denoiser import Conditioning, denoiser
 
     side, width = shape["side"], shape["xl"]["cross_attention_dim"]
     latent = side // 2 ** (len(shape["vae"]) - 1)
@@ -154,9 +154,9 @@ def crop_step(shape: dict[str, Any], device: str, dtype: torch.dtype) -> Callabl
     from diffusers.pipelines.controlnet.pipeline_controlnet_inpaint import StableDiffusionControlNetInpaintPipeline
     from diffusers.schedulers.scheduling_ddim import DDIMScheduler
 
-    from mistyle.backends.diffusion_settings import Paint3dSettings
-    from mistyle.backends.paint3d import RECIPES, Brush, inpaint
-    from mistyle.backends.vae import ExactVae
+    from mistyle.stylization.diffusion.settings import Paint3dSettings
+    from mistyle.stylization.inpaint.paint3d import RECIPES, Brush, inpaint
+    from mistyle.stylization.models.vae import ExactVae
 
     channels = shape["vae"]
     with torch.device(device):
@@ -218,10 +218,10 @@ def ball(azimuth: float) -> Any:
 
 def painted_views(job: Any, views: list[Any], kept: Path, resumed: bool) -> list[np.ndarray]:
     """The sweep over the views; resumed: stopped in the last one and begun again with networks loaded anew."""
-    from mistyle.backends import diffusion
     from mistyle.core.errors import Stopped
-    from mistyle.stages.mvst import ViewPainter, ViewStore, sweep
-    from mistyle.stages.sweep_settings import SweepSettings
+    from mistyle.stylization.diffusion import stylizer as diffusion
+    from mistyle.stylization.mvst.settings import SweepSettings
+    from mistyle.stylization.mvst.sweep import ViewPainter, ViewStore, sweep
 
     key = diffusion.key(job, views)
 
@@ -240,8 +240,8 @@ def painted_views(job: Any, views: list[Any], kept: Path, resumed: bool) -> list
 
 def painted(made: Any, stylizer: str, resumed: bool, work: Path) -> bool:
     """Two views, from models on disk: LoRAs trained where the stylizer takes some; whether all colours are finite."""
-    from mistyle.backends.diffusion import DiffusionJob
-    from mistyle.backends.diffusion_settings import DiffusionSettings, TrainSettings
+    from mistyle.stylization.diffusion.settings import DiffusionSettings, TrainSettings
+    from mistyle.stylization.diffusion.stylizer import DiffusionJob
 
     sampling = DiffusionSettings(adapter=cast(Any, stylizer), steps=2, block=1, repeats=2, refinement=0.5)
     training = TrainSettings(rank=4, steps=2, style_steps=1, switch=1, resolution=16)
@@ -254,9 +254,9 @@ def painted(made: Any, stylizer: str, resumed: bool, work: Path) -> bool:
 def filled(made: Any, recipe: str) -> bool:
     """A hole in the texture of a triangle, from models on disk; whether all colours are finite."""
     from mistyle.atlas.texels import rasterise
-    from mistyle.backends import paint3d
-    from mistyle.backends.diffusion_settings import Paint3dSettings
     from mistyle.core.mesh import Mesh
+    from mistyle.stylization.diffusion.settings import Paint3dSettings
+    from mistyle.stylization.inpaint import paint3d
 
     corners = np.array([[-1, -1, 0], [1, -1, 0], [0, 1, 0]], np.float32)
     flat = np.tile(np.array([0, 0, 1], np.float32), (1, 3, 1))
@@ -276,8 +276,8 @@ def noise() -> np.ndarray:
 
 def paths(figures: dict[str, float], device: str, precision: str) -> None:
     """Every path on tiny random models, as users have models on disk; what paths share is run once."""
-    from mistyle.backends.diffusion_settings import ModelSettings
-    from mistyle.backends.paint3d import RECIPES
+    from mistyle.stylization.diffusion.settings import ModelSettings
+    from mistyle.stylization.inpaint.paint3d import RECIPES
     from tests import tiny_models
 
     made: Any = {"folder": tiny_models.folder(), "device": device, "precision": precision}

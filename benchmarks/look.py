@@ -85,7 +85,7 @@ def with_settings(found: Sequence[look_paint.Piece], pairs: Sequence[str]) -> li
 def start_engines() -> None:
     """The renderer, as a job starts it."""
     from mistyle.jobs.start import start_engines
-    from mistyle.run.stylize_settings import Settings
+    from mistyle.stylization.settings import Settings
 
     start_engines(Settings())
 

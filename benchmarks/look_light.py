@@ -74,7 +74,7 @@ def light_of(glb: Path) -> BakedLight:
     """What the albedo of a kept GLB says about light, over all its texels."""
     from mistyle.atlas.texels import rasterise, start_maps
     from mistyle.io.read_mesh import read_mesh
-    from mistyle.stages.light_left import light_left
+    from mistyle.stylization.optimise.light_left import light_left
 
     asset = read_mesh(glb)
     texels = [rasterise(asset.mesh, part, ATLAS) for part in range(len(asset.materials))]

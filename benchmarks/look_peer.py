@@ -55,11 +55,11 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
     from mistyle.io.read import read_picture
     from mistyle.io.read_mesh import read_mesh
     from mistyle.render.mitsuba.draw import draw_views as drawn
-    from mistyle.run.stylize_settings import resolve
-    from mistyle.stages.lift import lift
-    from mistyle.stages.sweep_settings import WarpSettings
-    from mistyle.surface.chosen import settled
-    from mistyle.surface.settings import SurfaceSettings
+    from mistyle.stylization.mvst.lift import lift
+    from mistyle.stylization.mvst.settings import WarpSettings
+    from mistyle.stylization.settings import resolve
+    from mistyle.stylization.surface.exemplar.chosen import settled
+    from mistyle.stylization.surface.settings import SurfaceSettings
 
     resolution, samples, atlas = sizes
     layers = {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}
@@ -90,8 +90,8 @@ def draw_views(program: Path, piece: Piece, folder: Path, sizes: tuple[int, int,
 def before(lifted: Sequence[Any], view: Any, picture: np.ndarray) -> np.ndarray:
     """What earlier views show in this one, encoded; where they show nothing, `picture`, which was made without them."""
     from mistyle.core.image import srgb_from_linear
-    from mistyle.stages.sweep_settings import WarpSettings
-    from mistyle.stages.warp import composite
+    from mistyle.stylization.mvst.settings import WarpSettings
+    from mistyle.stylization.mvst.warp import composite
 
     prior = composite(lifted, view, WarpSettings())
     return np.where(prior.known[..., None], srgb_from_linear(np.clip(prior.rgb, 0, 1)), picture).astype(np.float32)

@@ -5,7 +5,7 @@ Each job runs in a process of its own, with few steps and turntable frames, on w
 would take, `budget.asked_gb`, `budget.peak_gb` and `budget.same_bytes` (1: its asset is that of the job without a
 budget, byte for byte); `tiled.asked_gb` and `tiled.peak_gb` of an atlas of 8192² with 64 views. --quick runs the draft
 on spot, the fit at 256² and a small budget. `--stages` also prints every stage's peak beside its estimate, from which
-the constants of run/stylize_budget.py and run/material_budget.py come.
+the constants of stylization/pipeline/budget.py and run/material_budget.py come.
 """
 
 import argparse

@@ -1,10 +1,10 @@
 """Does a relief guessed from the painting help the fit? `python -m benchmarks.relief_start [--quick] [--json FILE]`
 
 Phase 1 (normal and roughness of strokes) of the demo mesh is run from flat maps and from the painting's own height and
-gloss (`mistyle.surface.relief`), with the same crops. What counts as unfitted is the flat object both times. Figures:
-`<start>.loss_<step>` (mean of ten steps about it, style and statistics together), `steps_to_match` (steps after which
-the painted start is where the flat one ends) and `correlation` (of both starts' final tilts). `--sheet FILE` draws clay
-and paint under a raking light: flat maps, painted start, both fits.
+gloss (`mistyle.stylization.surface.exemplar.relief`), with the same crops. What counts as unfitted is the flat object
+both times. Figures: `<start>.loss_<step>` (mean of ten steps about it, style and statistics together), `steps_to_match`
+(steps after which the painted start is where the flat one ends) and `correlation` (of both starts' final tilts).
+`--sheet FILE` draws clay and paint under a raking light: flat maps, painted start, both fits.
 """
 
 import argparse
@@ -23,9 +23,10 @@ from mistyle.core.view import View
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
 from mistyle.jobs import start
-from mistyle.run import painting, stylize_start
-from mistyle.run.stylize_settings import Settings
-from mistyle.stages import fit
+from mistyle.stylization.optimise import two_phase as fit
+from mistyle.stylization.pipeline import painting
+from mistyle.stylization.pipeline import start as stylize_start
+from mistyle.stylization.settings import Settings
 
 SCENES = Path(__file__).resolve().parents[1] / "scenes"
 WINDOW = 10

@@ -21,8 +21,9 @@ from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
 from mistyle.jobs import start
 from mistyle.render.mitsuba.unlit import unlit
-from mistyle.run import painting, stylize_start
-from mistyle.run.stylize_settings import Settings
+from mistyle.stylization.pipeline import painting
+from mistyle.stylization.pipeline import start as stylize_start
+from mistyle.stylization.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 STRIPS: dict[str, tuple[dict[str, Any], ...]] = {

@@ -36,7 +36,7 @@ from mistyle.core.camera import rig
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
-from mistyle.run.stylize_settings import Settings, resolve
+from mistyle.stylization.settings import Settings, resolve
 
 DATA = Path(os.environ.get("MISTYLE_DATA", Path(__file__).resolve().parents[2] / "shared" / "data"))
 VGG = DATA / "weights" / "vgg19_normalised_relu3_1.pth"
@@ -57,12 +57,13 @@ class Problem:
 
 def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Problem:
     """The stages of `mistyle stylize` up to the fit, without files."""
-    from mistyle.backends.embedded import surface_colour
     from mistyle.core.image import linear_from_srgb
     from mistyle.io.read import read_picture
     from mistyle.jobs import start
     from mistyle.render.mitsuba.draw import gbuffer, tracer
-    from mistyle.run import painting, stylize_start
+    from mistyle.stylization.pipeline import painting
+    from mistyle.stylization.pipeline import start as stylize_start
+    from mistyle.stylization.surface.surface_painter import surface_colour
 
     def silent(done: float) -> None:
         pass
@@ -89,7 +90,7 @@ def problem(mesh: str, style: str, preset: str, changes: dict[str, Any]) -> Prob
 
 def whole(where: Problem, figures: dict[str, float]) -> None:
     """The fit as a job runs it; then a few steps of each phase, part by part."""
-    from mistyle.stages.fit import FitStart, FitTargets, two_phase
+    from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, two_phase
 
     marks: list[float] = []
 
@@ -126,7 +127,9 @@ def whole(where: Problem, figures: dict[str, float]) -> None:
 
 def steppers(where: Problem, settings: Any) -> Iterator[tuple[str, Any]]:
     """Both phases, ready to step, one after the other on one table."""
-    from mistyle.stages import fit, fit_run, fit_table
+    from mistyle.stylization.optimise import phase as fit_run
+    from mistyle.stylization.optimise import table as fit_table
+    from mistyle.stylization.optimise import two_phase as fit
 
     scene = fit._scene(where.mesh, where.views, settings)
     shrink = fit.shrinkage(where.mesh, where.texels, where.views, settings.texels_per_pixel)
@@ -142,7 +145,7 @@ def watched(run: Any, spent: dict[str, float]) -> Iterator[None]:
 
     from mistyle.render.deferred import integrator as deferred
     from mistyle.render.deferred import split, torch_bridge
-    from mistyle.stages import fit_table
+    from mistyle.stylization.optimise import table as fit_table
 
     def clocked(name: str, function: Callable) -> Callable:
         def work(*arguments: Any, **options: Any) -> Any:
@@ -197,7 +200,7 @@ def _shading(run: Any) -> float:
     from mistyle.core.camera import zoom
     from mistyle.render.deferred import integrator as deferred
     from mistyle.render.deferred import torch_bridge
-    from mistyle.stages import fit_run
+    from mistyle.stylization.optimise import phase as fit_run
 
     scene, size = run.scene, run.settings.crop_size
     cameras = [zoom(scene.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in run._crops()]
@@ -232,7 +235,7 @@ def with_vgg(where: Problem, figures: dict[str, float], count: int, size: int) -
 
 def _style(run: Any, sets: Sequence[Any]) -> float:
     """The style loss of some sets of crops, lit as the first steps light them; nothing moves."""
-    from mistyle.stages.fit_run import PhaseRunner
+    from mistyle.stylization.optimise.phase import PhaseRunner
 
     probe = PhaseRunner(run.scene, replace(run.table), run.phase, run.settings, np.random.default_rng(0))
     for crops in sets:
@@ -245,8 +248,8 @@ def lights(where: Problem, figures: dict[str, float]) -> None:
     from mistyle.core.light import lights as scene_lights
     from mistyle.geometry.tangents import corner_tangents
     from mistyle.render.mitsuba.draw import tracer
-    from mistyle.stages import fit_judge
-    from mistyle.stages.fit import FitStart, FitTargets, two_phase
+    from mistyle.stylization.optimise import judge as fit_judge
+    from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, two_phase
 
     judge = fit_judge.build_evaluation(tracer(where.mesh), corner_tangents(where.mesh), where.views)
     for choice in ("together", "one-per-view"):

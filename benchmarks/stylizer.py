@@ -25,15 +25,16 @@ def paint(asset_file: Path, style_file: Path, samples: int, views: int, resoluti
     """The parts of one stylization, timed; runs in the process that is measured."""
     import numpy as np
 
-    from mistyle.backends.embedded import solve_surface
     from mistyle.core.camera import rig
     from mistyle.core.rig_settings import RigSettings
     from mistyle.core.view import View
     from mistyle.io.read import read_picture
     from mistyle.io.store.records import load_record
     from mistyle.jobs import start
-    from mistyle.run import painting, stylize_start
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.pipeline import painting
+    from mistyle.stylization.pipeline import start as stylize_start
+    from mistyle.stylization.settings import resolve
+    from mistyle.stylization.surface.surface_painter import solve_surface
 
     settings = resolve(
         None, None, {"surface": {"samples": samples}, "atlas": {"size": atlas}, "rig": {"resolution": resolution}}

@@ -35,13 +35,13 @@ from mistyle.core.maps import Maps
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
 from mistyle.jobs import start
-from mistyle.run import stylize_start
-from mistyle.run.stylize_settings import Settings
 from mistyle.solver.recover import recover
 from mistyle.solver.settings import RecoverSettings
-from mistyle.stages.fit import FitStart, FitTargets, two_phase, view_mask
-from mistyle.stages.fit_lit import lit_phases
-from mistyle.stages.repair_settings import RepairSettings
+from mistyle.stylization.inpaint.settings import RepairSettings
+from mistyle.stylization.optimise.lit_views import lit_phases
+from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, two_phase, view_mask
+from mistyle.stylization.pipeline import start as stylize_start
+from mistyle.stylization.settings import Settings
 
 KINDS = {"lit": "phase1", "soft": "paper"}
 DARK = 0.02  # linear albedo under which a logarithm says nothing of light

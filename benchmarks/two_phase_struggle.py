@@ -10,9 +10,9 @@ from benchmarks.two_phase_truth import Painted
 from mistyle.core.camera import px_from_world
 from mistyle.core.image import dilate_within
 from mistyle.core.view import View
-from mistyle.stages.fit import Fit
-from mistyle.stages.inpaint import radius, struggle_mask
-from mistyle.stages.repair_settings import RepairSettings
+from mistyle.stylization.inpaint.repair import radius, struggle_mask
+from mistyle.stylization.inpaint.settings import RepairSettings
+from mistyle.stylization.optimise.two_phase import Fit
 
 PLACES, RADIUS = 10, 0.13  # discs on the surface, and their radius in working units
 SHIFT = 0.12  # share of the view's side by which a planted piece was moved

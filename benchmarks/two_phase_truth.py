@@ -26,10 +26,10 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.geometry.tangents import corner_tangents
-from mistyle.run import painting
-from mistyle.run.made import Atlas
-from mistyle.run.stylize_settings import Settings
-from mistyle.stages.coat import PaintRelief, TexelBand, lay_relief
+from mistyle.stylization.pipeline import painting
+from mistyle.stylization.records import Atlas
+from mistyle.stylization.settings import Settings
+from mistyle.stylization.surface.layers import PaintRelief, TexelBand, lay_relief
 
 WET, DRY = 0.25, 0.7  # roughness of wet and of dry paint
 BRISTLES, PATCHES = (12.0, 32.0), (24.0, 64.0)  # wave lengths of the bristle marks and of the patches, texel sides
@@ -56,7 +56,7 @@ def silent(done: float) -> None:
 
 def painted(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, slope: float, seed: int) -> Painted:
     """The object painted with `style`; `slope` is the true relief's root mean square slope."""
-    from mistyle.backends.embedded import surface_relief
+    from mistyle.stylization.surface.surface_painter import surface_relief
 
     layers = painting.paint_layers(asset, style, atlas, settings, silent)
     flat = painting.painted(asset, layers, atlas, settings)

@@ -78,7 +78,7 @@ def silent(done: float) -> None:
 def settings_of(preset: str, change: Mapping[str, Any]) -> Any:
     """A preset's settings with some of them changed."""
     from mistyle.jobs.settings import merge
-    from mistyle.run.stylize_settings import PRESETS, Settings
+    from mistyle.stylization.settings import PRESETS, Settings
 
     return Settings.model_validate(merge(PRESETS[preset], change))
 
@@ -89,7 +89,8 @@ def paint(mesh: str, style: str, preset: str) -> Painted:
     from mistyle.io.read import read_picture
     from mistyle.io.read_mesh import read_mesh
     from mistyle.render.mitsuba.draw import gbuffer, tracer
-    from mistyle.run import painting, stylize_start
+    from mistyle.stylization.pipeline import painting
+    from mistyle.stylization.pipeline import start as stylize_start
 
     chosen = settings_of(preset, {})
     asset = read_mesh(DATA / "meshes/plain" / MESHES[mesh], size=chosen.atlas.size)
@@ -106,8 +107,9 @@ def paint(mesh: str, style: str, preset: str) -> Painted:
 
 def finish(painted: Painted, preset: str, change: Mapping[str, Any]) -> Finished:
     """Bake, fit and repair with a design's settings."""
-    from mistyle.run import painting, pipeline
-    from mistyle.stages.inpaint import struggle_mask
+    from mistyle.stylization.inpaint.repair import struggle_mask
+    from mistyle.stylization.pipeline import painting
+    from mistyle.stylization.pipeline import stylize as pipeline
 
     s = settings_of(preset, change)
     baked = painting.bake(painted.asset, painted.layers, painted.atlas, painted.views, s, silent)
@@ -181,7 +183,7 @@ def sheet(left: Sequence[np.ndarray], right: Sequence[np.ndarray]) -> np.ndarray
 def sheets(chosen: argparse.Namespace) -> dict[str, float]:
     """Write the sheets and the key of the chosen designs, one folder each below --out."""
     from mistyle.jobs.start import start_engines
-    from mistyle.run.stylize_settings import Settings
+    from mistyle.stylization.settings import Settings
 
     start_engines(Settings())
     pairs = [(mesh, style) for style in chosen.styles for mesh in chosen.meshes]

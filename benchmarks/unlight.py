@@ -21,9 +21,10 @@ from mistyle.core.view import View
 from mistyle.io.read import read_picture
 from mistyle.io.read_mesh import read_mesh
 from mistyle.jobs import start
-from mistyle.run import painting, stylize_start, sweep
-from mistyle.run.stylize_settings import Settings
-from mistyle.stages.mvst import PaintedView
+from mistyle.stylization.mvst.sweep import PaintedView
+from mistyle.stylization.pipeline import painting, sweep
+from mistyle.stylization.pipeline import start as stylize_start
+from mistyle.stylization.settings import Settings
 
 ROOT = Path(__file__).parents[1]
 SCENES = ROOT / "scenes"

@@ -15,8 +15,8 @@ from benchmarks.common import arguments, finish, peak_gb, timed
 from mistyle.core.camera import pixel_centres, rig, world_from_px
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
-from mistyle.stages.sweep_settings import WarpSettings
-from mistyle.stages.warp import composite, lift, splat
+from mistyle.stylization.mvst.settings import WarpSettings
+from mistyle.stylization.mvst.warp import composite, lift, splat
 
 
 def with_normals(view: View) -> View:

@@ -39,7 +39,7 @@ def painted(mesh: Path, style: Path) -> tuple[Any, list[Any]]:
     from mistyle.io.read import read_mesh, read_picture
     from mistyle.jobs import start
     from mistyle.jobs.settings import resolve
-    from mistyle.run import painting
+    from mistyle.stylization.pipeline import painting
 
     settings = resolve("demo", None, {}, {})
     start.start_engines(settings)

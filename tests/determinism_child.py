@@ -96,8 +96,9 @@ def style_job(made: Stages, settings: Any) -> None:
     from mistyle.io.read import read_picture
     from mistyle.jobs import start
     from mistyle.render.mitsuba.draw import draw_views
-    from mistyle.run import painting, stylize_start
-    from mistyle.stages.fit import FitStart, FitTargets, two_phase
+    from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, two_phase
+    from mistyle.stylization.pipeline import painting
+    from mistyle.stylization.pipeline import start as stylize_start
 
     mesh_file, style_file = inputs(made.out)
     asset = made.note("read and unwrap", start.read(mesh_file, settings.read, settings.atlas.size, nothing))
@@ -134,9 +135,9 @@ def style_job(made: Stages, settings: Any) -> None:
 
 
 def repair(made: Stages, asset: Any, atlas: Any, baked: Any, fitted: Any, settings: Any) -> list[Any]:
-    from mistyle.backends.fill import inpainter
-    from mistyle.stages.inpaint import repair as repaired
-    from mistyle.stages.inpaint import struggle_mask
+    from mistyle.stylization.inpaint.fill import inpainter
+    from mistyle.stylization.inpaint.repair import repair as repaired
+    from mistyle.stylization.inpaint.repair import struggle_mask
 
     result = []
     for part, texels in enumerate(atlas.texels):
@@ -178,11 +179,11 @@ def usd_is_there() -> bool:
 def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any], settings: Any) -> None:
     """The stylizer of single views, the warp between them, and the bake from views."""
     from mistyle.atlas.bake import bake
-    from mistyle.run.sweep import stylizer_of
-    from mistyle.stages.lift import lift
-    from mistyle.stages.mvst import ViewPainter, sweep
-    from mistyle.stages.sweep_settings import WarpSettings
-    from mistyle.stages.warp import composite
+    from mistyle.stylization.mvst.lift import lift
+    from mistyle.stylization.mvst.settings import WarpSettings
+    from mistyle.stylization.mvst.sweep import ViewPainter, sweep
+    from mistyle.stylization.mvst.warp import composite
+    from mistyle.stylization.pipeline.sweep import stylizer_of
 
     chosen = settings.model_copy(update={"stylizer": "embedded-view"})
     made.note("warp", composite([lift(view, WarpSettings()) for view in views[:2]], views[2], WarpSettings()))
@@ -268,7 +269,7 @@ def scene_fitted(made: Stages) -> None:
 def main(out: Path, threads: int, budget: float) -> None:
     from mistyle.jobs.start import start_engines
     from mistyle.process import memory
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.settings import resolve
 
     settings = resolve("draft", None, SETTINGS | {"threads": threads}, {})
     start_engines(settings)

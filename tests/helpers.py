@@ -12,8 +12,8 @@ NO_DATA = "no real data at MISTYLE_DATA"
 
 def fixed_surface(**changes: Any) -> Any:
     """Settings of the surface with every choice made, none of them by a painting."""
-    from mistyle.surface.chosen import resolved
-    from mistyle.surface.settings import SurfaceSettings
+    from mistyle.stylization.surface.exemplar.chosen import resolved
+    from mistyle.stylization.surface.settings import SurfaceSettings
 
     fixed = {"levels": 5, "detail": 4.0, "palette": 0.2, "stroke_coherence": 0.03, "modelling": 0.0, "crop": 0.0}
     return resolved(SurfaceSettings(**(fixed | {"look_up": "bilinear", "borders": "blend"} | changes)), None)

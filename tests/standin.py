@@ -141,7 +141,7 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[int]]:
     time that somebody asked how much is free."""
     from diffusers.pipelines import pipeline_utils
 
-    from mistyle.backends import models_load
+    from mistyle.stylization.models import load as models_load
 
     monkeypatch.setattr(models_load, "device_of", lambda settings: NAME)
     monkeypatch.setattr(pipeline_utils, "get_device", lambda: NAME)

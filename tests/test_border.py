@@ -79,7 +79,7 @@ ALLOWED = {
     "jobs/settings": "a word of the user's own command line",
     "deliver/verify_checks": "pictures that mistyle has just written, decoded by others on purpose",
     "deliver/verify_surfaces": "models that a list of mistyle's names, opened by others on purpose",
-    "stages/mvst": "views that a run kept in its own folder",
+    "stylization/mvst/sweep": "views that a run kept in its own folder",
 }
 # Names of decoding modules that others may import: records, and what only looks at paths or checked trees.
 TYPES = {"LayeredPicture", "Layer", "Window", "BEAUTY", "SparsePoints", "find_model", "data_uri"}

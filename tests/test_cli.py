@@ -61,7 +61,7 @@ def test_every_verb_has_examples(verb):
 def test_options_name_existing_settings():
     from mistyle.jobs.settings import known_keys
     from mistyle.run.cli import OPTIONS
-    from mistyle.run.stylize_settings import Settings
+    from mistyle.stylization.settings import Settings
 
     assert set(OPTIONS.values()) <= set(known_keys(Settings))
 

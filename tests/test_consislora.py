@@ -6,9 +6,11 @@ import tiny_models
 import torch
 from diffusers import StableDiffusionXLPipeline
 
-from mistyle.backends import consislora, consislora_make, consislora_train
-from mistyle.backends.diffusion_settings import ModelSettings, TrainSettings
 from mistyle.core.errors import InputRefused, Stopped
+from mistyle.stylization.diffusion import consislora
+from mistyle.stylization.diffusion import lora_files as consislora_make
+from mistyle.stylization.diffusion import lora_training as consislora_train
+from mistyle.stylization.diffusion.settings import ModelSettings, TrainSettings
 
 torch.set_num_threads(1)
 SETTINGS = TrainSettings(rank=4, steps=6, style_steps=4, switch=3, resolution=32, save_every=2)
@@ -250,7 +252,7 @@ def test_the_papers_training_takes_hours_and_says_so():
 
 def fresh() -> StableDiffusionXLPipeline:
     place = tiny_models.folder() / "sdxl"
-    from mistyle.backends.models_load import base_parts
+    from mistyle.stylization.models.load import base_parts
 
     return StableDiffusionXLPipeline(**base_parts(place, "sdxl", torch.float32), add_watermarker=False)
 

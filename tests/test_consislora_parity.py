@@ -9,9 +9,12 @@ import tiny_models
 import torch
 from safetensors.torch import load_file, save_file
 
-from mistyle.backends import consislora, consislora_make, consislora_train, models_check
-from mistyle.backends.diffusion_settings import ModelSettings, TrainSettings
 from mistyle.core.errors import EnvironmentMissing
+from mistyle.stylization.diffusion import consislora
+from mistyle.stylization.diffusion import lora_files as consislora_make
+from mistyle.stylization.diffusion import lora_training as consislora_train
+from mistyle.stylization.diffusion.settings import ModelSettings, TrainSettings
+from mistyle.stylization.models import check as models_check
 
 torch.set_num_threads(1)
 SETTINGS = TrainSettings(rank=4, steps=24, style_steps=6, switch=12, resolution=16)
@@ -215,7 +218,8 @@ def test_published_configurations_are_taken(configurations):
 def test_published_schedules_give_the_samplers_that_are_meant(configurations):
     from diffusers import DDIMScheduler
 
-    from mistyle.backends import models_load, paint3d
+    from mistyle.stylization.inpaint import paint3d
+    from mistyle.stylization.models import load as models_load
 
     found = models_load.schedule(configurations / "sdxl", None, "auto").config
     assert (found.timestep_spacing, found.prediction_type) == ("trailing", "epsilon")

@@ -10,8 +10,8 @@ from test_metrics import noise, plane_view
 
 from benchmarks import consistency_judge, consistency_peer, consistency_scene
 from mistyle.core.asset import Picture
-from mistyle.run.stylize_settings import Settings
-from mistyle.surface import style as styles
+from mistyle.stylization.settings import Settings
+from mistyle.stylization.surface.exemplar import exemplar as styles
 
 # Instead of EbSynth: checks its arguments as EbSynth would, and answers with the target's colour guide.
 PROGRAM = """#!{python}

@@ -25,7 +25,7 @@ from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan, with_delivery
 from mistyle.run.cli import main, parser
 from mistyle.run.options import DELIVERY_OPTIONS, asset_name, given_settings
-from mistyle.run.stylize_settings import Settings, resolve
+from mistyle.stylization.settings import Settings, resolve
 
 OCCLUSION = np.linspace(0.2, 1, 256, dtype=np.float32).reshape(16, 16)
 

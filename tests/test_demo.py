@@ -8,9 +8,9 @@ import pytest
 from PIL import Image
 
 from mistyle.core.paths import scenes
-from mistyle.run import pipeline
 from mistyle.run.cli import main
 from mistyle.run.demo import MESHES, PAINTINGS, ROW, demo_files
+from mistyle.stylization.pipeline import stylize as pipeline
 
 
 @pytest.fixture

@@ -13,18 +13,22 @@ import torch
 from test_surface_paint import asset_of
 
 from mistyle.atlas.texels import rasterise
-from mistyle.backends import consislora_make, diffusion, models_check, models_load, paint3d
-from mistyle.backends.diffusion_settings import ModelSettings
 from mistyle.core.asset import Picture
 from mistyle.core.errors import EnvironmentMissing
 from mistyle.core.maps import flat_maps
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.stages import Run
-from mistyle.run.generative import inpainter_inputs
-from mistyle.run.made import Atlas, Baked
-from mistyle.run.stylize_job import STAGES, Job
-from mistyle.run.stylize_settings import resolve
-from mistyle.stages.fit import Fit
+from mistyle.stylization.diffusion import lora_files as consislora_make
+from mistyle.stylization.diffusion import stylizer as diffusion
+from mistyle.stylization.diffusion.settings import ModelSettings
+from mistyle.stylization.inpaint import paint3d
+from mistyle.stylization.models import check as models_check
+from mistyle.stylization.models import load as models_load
+from mistyle.stylization.optimise.two_phase import Fit
+from mistyle.stylization.pipeline.generative import inpainter_inputs
+from mistyle.stylization.pipeline.job import STAGES, Job
+from mistyle.stylization.records import Atlas, Baked
+from mistyle.stylization.settings import resolve
 
 torch.set_num_threads(1)
 
@@ -103,8 +107,8 @@ def test_offloading_keeps_less_on_the_device(tmp_path, monkeypatch):
 
 def test_nothing_is_left_on_the_device_when_a_stage_asks_what_is_free(tmp_path, monkeypatch):
     """Sweep with its training, then repair, as a job runs them: every question is asked of an empty device."""
-    from mistyle.run import pipeline
-    from mistyle.run.sweep import swept
+    from mistyle.stylization.pipeline import stylize as pipeline
+    from mistyle.stylization.pipeline.sweep import swept
 
     chosen = {"steps": 1, "repeats": 1, "refinement": 0.0, "content": "shared"}
     training = {"rank": 4, "steps": 1, "style_steps": 1, "switch": 0, "resolution": 16}

@@ -9,13 +9,17 @@ import pytest
 import tiny_models
 import torch
 
-from mistyle.backends import consislora, consislora_make, diffusion, diffusion_denoise, models
-from mistyle.backends.diffusion_settings import DiffusionSettings, ModelSettings, TrainSettings
 from mistyle.core.camera import orbit
 from mistyle.core.errors import EnvironmentMissing, InputRefused, Stopped, UsageError
 from mistyle.core.view import Prior, View
-from mistyle.stages.mvst import ViewPainter, ViewStore, sweep
-from mistyle.stages.sweep_settings import SweepSettings
+from mistyle.stylization.diffusion import consislora
+from mistyle.stylization.diffusion import denoiser as diffusion_denoise
+from mistyle.stylization.diffusion import lora_files as consislora_make
+from mistyle.stylization.diffusion import stylizer as diffusion
+from mistyle.stylization.diffusion.settings import DiffusionSettings, ModelSettings, TrainSettings
+from mistyle.stylization.models import folder as models
+from mistyle.stylization.mvst.settings import SweepSettings
+from mistyle.stylization.mvst.sweep import ViewPainter, ViewStore, sweep
 
 torch.set_num_threads(1)
 SIDE = 32
@@ -125,7 +129,7 @@ def test_velocity_checkpoints_walk_diffusers_own_path(pipeline, monkeypatch, zer
 def test_single_files_say_that_they_predict_velocities(tmp_path):
     from safetensors.torch import save_file
 
-    from mistyle.backends import models_load
+    from mistyle.stylization.models import load as models_load
 
     place = tiny_models.folder() / "sdxl"
     for names, kind, zero in (((), "epsilon", False), (("v_pred", "ztsnr"), "v_prediction", True)):
@@ -281,7 +285,7 @@ def test_the_denoiser_agrees_with_diffusers_own_pipeline(pipeline):
 
 def walks_as_diffusers(pipeline) -> None:
     """The plain twin: diffusers' pipeline with the same latents, conditions and prompts walks the same path."""
-    from mistyle.stages.repaint import Resampling, sample
+    from mistyle.stylization.diffusion.repaint import Resampling, sample
 
     seen = view()
     conditioning = diffusion._conditioning(pipeline, QUICK, seen, (SIDE, SIDE), ())
@@ -309,7 +313,7 @@ def walks_as_diffusers(pipeline) -> None:
 
 
 def test_pinned_latents_end_as_the_prior_and_the_rest_does_not(pipeline):
-    from mistyle.stages.repaint import Resampling, sample
+    from mistyle.stylization.diffusion.repaint import Resampling, sample
 
     known, mask = diffusion_denoise.prior_latent(pipeline.vae, half_prior(), (SIDE, SIDE), 2)
     conditioning = diffusion._conditioning(pipeline, QUICK, view(), (SIDE, SIDE), ())

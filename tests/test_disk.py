@@ -217,7 +217,7 @@ def test_a_shard_that_cannot_be_started_does_not_stop_the_batch(tmp_path, monkey
 
 
 def test_fetching_models_names_the_full_disk_and_not_the_network(tmp_path, monkeypatch, capsys):
-    from mistyle.backends import models_fetch
+    from mistyle.stylization.models import fetch as models_fetch
 
     def full(model, revision, place, known) -> dict[str, str]:
         (place / models_fetch.PARTIAL).mkdir(parents=True)

@@ -17,10 +17,10 @@ from mistyle.core.view import View
 from mistyle.io.read import read_exr, read_picture
 from mistyle.io.store.records import load_record
 from mistyle.jobs.progress import Progress
-from mistyle.run import pipeline
-from mistyle.run.retouch import EXACT, LOSSY, differs
-from mistyle.run.stylize_job import STAGES, Job
-from mistyle.run.stylize_settings import resolve
+from mistyle.stylization.pipeline import stylize as pipeline
+from mistyle.stylization.pipeline.job import STAGES, Job
+from mistyle.stylization.pipeline.retouch import EXACT, LOSSY, differs
+from mistyle.stylization.settings import resolve
 
 TINY = {
     "rig": {"kind": "turntable", "views": 6, "resolution": 96},

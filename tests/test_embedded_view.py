@@ -17,13 +17,13 @@ from mistyle.core.image import distance_to, linear_from_srgb, srgb_from_linear
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import Prior, View
 from mistyle.jobs.progress import Progress
-from mistyle.run import pipeline
-from mistyle.run.stylize_job import Job
-from mistyle.run.stylize_settings import resolve
-from mistyle.stages.mvst import ViewPainter, sweep
-from mistyle.stages.sweep_settings import SweepSettings
-from mistyle.surface import view_samples
-from mistyle.surface.samples import GRID
+from mistyle.stylization.mvst.settings import SweepSettings
+from mistyle.stylization.mvst.sweep import ViewPainter, sweep
+from mistyle.stylization.pipeline import stylize as pipeline
+from mistyle.stylization.pipeline.job import Job
+from mistyle.stylization.settings import resolve
+from mistyle.stylization.surface import view_samples
+from mistyle.stylization.surface.samples import GRID
 
 __all__ = ["inputs"]
 RADIUS = 0.9
@@ -49,7 +49,7 @@ def strokes(rng: np.random.Generator) -> np.ndarray:
 @pytest.fixture(scope="module")
 def paint():
     """The stylizer of the ball."""
-    from mistyle.backends.embedded_view import stylizer
+    from mistyle.stylization.surface.view_painter import stylizer
 
     style = Picture(strokes(np.random.default_rng(0)), None, Path("strokes.png"))
     return stylizer(ball_mesh(), style, SETTINGS, 0)
@@ -75,7 +75,7 @@ def test_every_cell_has_the_pixel_nearest_to_its_middle(rng):
 
 @pytest.mark.parametrize("degrees", [0, 90, 180, 45])
 def test_tables_on_a_sheet_are_the_turned_grid(degrees):
-    from mistyle.surface.samples import as_points
+    from mistyle.stylization.surface.samples import as_points
 
     pixel, cell, size = view_samples.representatives(np.ones((24, 24), bool), 2)
     positions = np.stack([pixel % 24 + 0.5, pixel // 24 + 0.5, np.zeros(len(pixel))], axis=1).astype(np.float32)
@@ -100,7 +100,7 @@ def test_neighbours_never_lie_across_a_depth_step():
     pixel, cell, size = view_samples.representatives(view.mask, 2)
     depth = view.depth.reshape(-1)[pixel]
     positions = view_samples.flat_positions(view, pixel)
-    from mistyle.surface.samples import as_points
+    from mistyle.stylization.surface.samples import as_points
 
     points = as_points(positions, np.broadcast_to(view_samples.TOWARDS, positions.shape), 2.0)
     tangent = np.tile(np.array([1, 0, 0], np.float32), (len(pixel), 1))
@@ -186,7 +186,7 @@ def by_view(inputs, out, **more) -> Job:
 
 def test_the_job_with_this_stylizer_and_its_resumption(inputs, tmp_path, monkeypatch):
     """Killed in the fourth view, run again: only the rest is painted, and every file ends with the same bytes."""
-    from mistyle.backends import embedded_view
+    from mistyle.stylization.surface import view_painter as embedded_view
 
     pipeline.stylize(by_view(inputs, tmp_path / "whole"), Progress(quiet=True))
     painted = []

@@ -20,15 +20,15 @@ from mistyle.jobs.progress import Progress
 from mistyle.measure.features import TORCHVISION_CONVOLUTIONS, TORCHVISION_POOLS, load_features
 from mistyle.render.deferred import pyramid
 from mistyle.render.mitsuba import device
-from mistyle.run import pipeline
 from mistyle.run.cli import main
-from mistyle.run.finishing import check_finish
-from mistyle.run.stylize_job import Job
-from mistyle.run.stylize_settings import resolve
-from mistyle.stages import finish_style
-from mistyle.stages.finish import Film, Finishing, PaintedAsset, finish, own_directions, shape_edges
-from mistyle.stages.finish_settings import FinishSettings
-from mistyle.surface.lookup import PaintedSurface, colour
+from mistyle.stylization.optimise import finish_style
+from mistyle.stylization.optimise.finish import Film, Finishing, PaintedAsset, finish, own_directions, shape_edges
+from mistyle.stylization.optimise.finish_settings import FinishSettings
+from mistyle.stylization.pipeline import stylize as pipeline
+from mistyle.stylization.pipeline.finishing import check_finish
+from mistyle.stylization.pipeline.job import Job
+from mistyle.stylization.settings import resolve
+from mistyle.stylization.surface.lookup import PaintedSurface, colour
 
 SIZE = 64
 QUICK = FinishSettings(method="vgg", steps=3, crops=2, crop_size=64, texels_per_pixel=1)

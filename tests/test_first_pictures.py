@@ -12,9 +12,10 @@ from mistyle.deliver.read_asset import read_finished
 from mistyle.io.read import read_picture
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.report.pictures import Encoder
-from mistyle.run import pipeline, preview
 from mistyle.run.cli import main
-from mistyle.run.stylize_settings import resolve
+from mistyle.stylization.pipeline import preview
+from mistyle.stylization.pipeline import stylize as pipeline
+from mistyle.stylization.settings import resolve
 
 
 class Heard(Progress):

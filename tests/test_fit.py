@@ -17,9 +17,10 @@ from mistyle.core.view import View
 from mistyle.render.deferred import integrator as deferred
 from mistyle.render.deferred import torch_bridge
 from mistyle.render.mitsuba import device, draw
-from mistyle.stages import fit_judge, fit_table
-from mistyle.stages.fit import FitStart, FitTargets, shrinkage, two_phase
-from mistyle.stages.fit_settings import FitSettings
+from mistyle.stylization.optimise import judge as fit_judge
+from mistyle.stylization.optimise import table as fit_table
+from mistyle.stylization.optimise.settings import FitSettings
+from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, shrinkage, two_phase
 
 SIZE, RESOLUTION = 128, 112
 QUICK = FitSettings(

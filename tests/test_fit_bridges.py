@@ -16,10 +16,11 @@ from mistyle.core.maps import flat_maps
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import View
 from mistyle.render.mitsuba import device, draw
-from mistyle.run.stylize_settings import PRESETS
-from mistyle.stages import fit as fitting
-from mistyle.stages import fit_run, fit_table
-from mistyle.stages.fit import FitStart, FitTargets, two_phase
+from mistyle.stylization.optimise import phase as fit_run
+from mistyle.stylization.optimise import table as fit_table
+from mistyle.stylization.optimise import two_phase as fitting
+from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, two_phase
+from mistyle.stylization.settings import PRESETS
 
 VGG = "weights/vgg19_normalised_relu3_1.pth"
 

@@ -104,7 +104,7 @@ def test_no_import_cycles():
     [
         (("core", "mesh"), "from mistyle.render.mitsuba import draw"),
         (("core", "mesh"), "def f():\n    from ..render.draw import draw_views"),
-        (("files", "views"), "import mistyle.surface.lookup"),
+        (("files", "views"), "import mistyle.stylization.surface.lookup"),
         (("stages", "fit"), "from mistyle import backends"),
         (("stages", "fit"), "import mitsuba as mi"),
         (("measure", "losses"), "import drjit.auto as dr"),

@@ -9,13 +9,13 @@ import tiny_models
 import trimesh
 from PIL import Image
 
-from mistyle.backends import consislora
 from mistyle.core.camera import rig
 from mistyle.core.paths import scenes
 from mistyle.io.cameras.views import read_views
 from mistyle.io.store.records import load_record
 from mistyle.run.cli import main
-from mistyle.run.generative import opaque, watcher
+from mistyle.stylization.diffusion import consislora
+from mistyle.stylization.pipeline.generative import opaque, watcher
 
 SETTINGS = {
     "rig.views": 4,
@@ -75,8 +75,8 @@ def test_the_demo_goes_through_every_network_and_comes_out_as_an_asset(whole):
 
 
 def test_the_papers_cost_is_said_before_it_starts():
-    from mistyle.backends.diffusion import announcement
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.diffusion.stylizer import announcement
+    from mistyle.stylization.settings import resolve
 
     paper = resolve("paper", None, {}, {})
     text = announcement(paper.models, paper.train, paper.diffusion, 16)
@@ -176,7 +176,7 @@ def test_settings_and_help_name_the_generative_stages(capsys):
 
 
 def test_the_paper_preset_is_the_paper():
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.settings import resolve
 
     paper, fine = (resolve(name, None, {}, {}) for name in ("paper", "fine"))
     assert (paper.stylizer, paper.inpainter) == ("diffusion", "paint3d")

@@ -8,10 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from mistyle.backends.fill import _harmonic, grow, inpainter
 from mistyle.core.maps import Maps, Texels, flat_maps
-from mistyle.stages.inpaint import blend_weights, radius, repair, struggle_mask
-from mistyle.stages.repair_settings import RepairSettings
+from mistyle.stylization.inpaint.fill import _harmonic, grow, inpainter
+from mistyle.stylization.inpaint.repair import blend_weights, radius, repair, struggle_mask
+from mistyle.stylization.inpaint.settings import RepairSettings
 
 BARE = RepairSettings(dilation=0, blend=0, smooth=0, outlier=0, agreement=0.3)
 

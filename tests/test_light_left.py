@@ -8,7 +8,7 @@ from test_surface import dented_ball
 
 from mistyle.atlas.texels import rasterise
 from mistyle.core.maps import flat_maps
-from mistyle.stages.light_left import light_left
+from mistyle.stylization.optimise.light_left import light_left
 
 
 @pytest.mark.parametrize(("lit", "ratio"), [(0.0, 1.0), (0.8, 3.0)])

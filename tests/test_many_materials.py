@@ -24,9 +24,10 @@ from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.mitsuba import device, draw
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba import texture_pages as pages
-from mistyle.run import stylize_budget, verbs
 from mistyle.run.cli import main
-from mistyle.run.stylize_settings import resolve
+from mistyle.stylization.pipeline import budget as stylize_budget
+from mistyle.stylization.pipeline import single_stages as verbs
+from mistyle.stylization.settings import resolve
 
 STYLE = str(scenes() / "demo_style.png")
 SMALL = {"rig": {"kind": "turntable", "views": 2, "resolution": 32}, "draw": {"spp": 1}, "atlas": {"size": 32}}
@@ -113,7 +114,7 @@ def test_each_map_is_as_fine_as_pictures_show_it():
 @pytest.fixture
 def alive(monkeypatch):
     """How many texture sets were in memory when the next was laid out."""
-    from mistyle.run import stylize_start
+    from mistyle.stylization.pipeline import start as stylize_start
 
     living: list[weakref.ref] = []
     counts: list[int] = []

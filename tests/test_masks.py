@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from test_warp import BALL, at, see
 
-from mistyle.backends import masks
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.core.image import overlap, srgb_from_linear
-from mistyle.stages.mvst import ViewPainter, sweep
-from mistyle.stages.sweep_settings import SweepSettings
+from mistyle.stylization.mvst import masks
+from mistyle.stylization.mvst.settings import SweepSettings
+from mistyle.stylization.mvst.sweep import ViewPainter, sweep
 
 
 class Session:

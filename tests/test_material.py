@@ -29,9 +29,9 @@ from mistyle.run.material import hold_out, lights_in_order, place, references_of
 from mistyle.run.material_job import MATERIAL_STAGES, MaterialJob
 from mistyle.run.material_outlines import tell_placed
 from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
-from mistyle.run.verbs import tell_views
 from mistyle.solver.cameras.align import Alignment
 from mistyle.stages import unknown_light
+from mistyle.stylization.pipeline.single_stages import tell_views
 
 SIZE, SIDE = 64, 112
 KEYS = [

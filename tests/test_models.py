@@ -21,11 +21,14 @@ import torch
 from helpers import ROOT
 from safetensors.torch import load_file, save_file
 
-from mistyle.backends import models, models_check, models_fetch, models_load
-from mistyle.backends.diffusion_settings import ModelSettings
-from mistyle.backends.models_list import ENCODER
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
 from mistyle.run.cli import main
+from mistyle.stylization.diffusion.settings import ModelSettings
+from mistyle.stylization.models import check as models_check
+from mistyle.stylization.models import fetch as models_fetch
+from mistyle.stylization.models import folder as models
+from mistyle.stylization.models import load as models_load
+from mistyle.stylization.models.catalogue import ENCODER
 
 torch.set_num_threads(1)
 
@@ -125,7 +128,7 @@ def fetch(
     # What the test's server holds is not what is published under these names.
     program = (
         "import sys; from dataclasses import replace; from mistyle.run.cli import main; "
-        "from mistyle.backends.models_list import MODELS; "
+        "from mistyle.stylization.models.catalogue import MODELS; "
         "MODELS.update({name: replace(model, sha256={}) for name, model in MODELS.items()}); "
         "sys.exit(main(sys.argv[1:]))"
     )
@@ -360,8 +363,8 @@ def test_pictures_reach_clip_whole(rng):
 
 def test_single_files_are_found_by_their_models_names(tmp_path, monkeypatch, capsys):
     from mistyle.measure.features import load_features
-    from mistyle.run.generative import fit_settings, named
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.pipeline.generative import fit_settings, named
+    from mistyle.stylization.settings import resolve
 
     folder = tiny_models.folder()
     for name, file in (("vgg19", "vgg19-dcbb9e9d.pth"), ("birefnet", "BiRefNet-general-epoch_244.onnx")):
@@ -392,8 +395,8 @@ def test_single_files_are_found_by_their_models_names(tmp_path, monkeypatch, cap
 
 
 def test_the_paper_preset_names_what_it_lacks_and_what_needs_nothing(tmp_path, monkeypatch):
-    from mistyle.run.generative import check
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.pipeline.generative import check
+    from mistyle.stylization.settings import resolve
 
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path))
     with pytest.raises(EnvironmentMissing, match=r"vgg19.* --preset fine"):
@@ -427,7 +430,7 @@ def test_a_single_checkpoint_loads_like_the_folder(tmp_path):
     for network in ("unet", "vae", "text_encoder", "text_encoder_2"):
         for file in (place / network).glob("*.safetensors"):
             file.unlink()
-    from mistyle.backends import consislora_make
+    from mistyle.stylization.diffusion import lora_files as consislora_make
 
     settings = ModelSettings(folder=tmp_path / "models", checkpoint=tmp_path / "finetune.safetensors", device="cpu")
     trained = consislora_make.trainer(settings)

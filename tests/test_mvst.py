@@ -8,8 +8,8 @@ from mistyle.core.camera import angular_order, rig
 from mistyle.core.image import erode, match_histogram, overlap, srgb_from_linear
 from mistyle.core.rig_settings import RigSettings
 from mistyle.core.view import Prior, View
-from mistyle.stages.mvst import PaintedView, ViewPainter, ViewStore, sweep, towards, visiting
-from mistyle.stages.sweep_settings import SweepSettings
+from mistyle.stylization.mvst.settings import SweepSettings
+from mistyle.stylization.mvst.sweep import PaintedView, ViewPainter, ViewStore, sweep, towards, visiting
 
 SETTINGS = SweepSettings()
 
@@ -35,8 +35,8 @@ class Noise:
 
 def disagreement(views: list[View]) -> float:
     """Mean difference between a view and its neighbour carried into it."""
-    from mistyle.stages.sweep_settings import WarpSettings
-    from mistyle.stages.warp import lift, warp
+    from mistyle.stylization.mvst.settings import WarpSettings
+    from mistyle.stylization.mvst.warp import lift, warp
 
     plain = WarpSettings(erosion=0, fill=0)
     errors = []
@@ -171,7 +171,7 @@ def test_masks_and_drift():
 @pytest.mark.parametrize("follows", [False, True])
 def test_depth_follows_the_outline_where_the_stylizer_moves_it(follows, monkeypatch):
     """A stylizer that draws the ball four pixels to the right: what is carried on has the depth of the drawn ball."""
-    from mistyle.stages import mvst
+    from mistyle.stylization.mvst import sweep as mvst
 
     views = [see(at(a, size=128), [(0.0, 0.0, 0.0, 0.7)]) for a in (0, 25)]
     lifted = []

@@ -7,10 +7,10 @@ import pytest
 from verbs import VERBS
 
 from mistyle.jobs.progress import Progress, grouped
-from mistyle.run import summary
 from mistyle.run.cli import main
-from mistyle.run.pages import fit_facts
-from mistyle.stages.fit_judge import TOLERANCE, regressed, undone_where
+from mistyle.stylization.optimise.judge import TOLERANCE, regressed, undone_where
+from mistyle.stylization.report import summary
+from mistyle.stylization.report.page import fit_facts
 
 NOTE = "The mesh has no normals"  # of the square: smooth ones are computed
 
@@ -37,8 +37,8 @@ def test_notes_of_the_mesh_are_printed_at_the_end_and_in_json(verb_inputs, tmp_p
 
 def test_a_note_made_in_a_stage_is_said_again_where_the_stage_is_taken_over(tmp_path):
     from mistyle.jobs.stages import Run
-    from mistyle.run.stylize_job import STAGES, Job
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.pipeline.job import STAGES, Job
+    from mistyle.stylization.settings import resolve
 
     job = Job(tmp_path / "m.obj", tmp_path / "s.png", tmp_path / "out", resolve("draft", None, {}, {}), "x")
     for _ in range(2):

@@ -209,7 +209,7 @@ def test_references_and_their_environment_maps_come_in_too(rng):
 def test_the_environment_names_the_config(monkeypatch):
     from mistyle.jobs.job_settings import ReadSettings
     from mistyle.jobs.settings import resolve as settings_of
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.settings import resolve
 
     assert resolve("draft", None, {}, {"OCIO": CONFIG}).colour.config == CONFIG
     assert resolve("draft", None, {}, {}).colour.config is None

@@ -7,7 +7,7 @@ import pytest
 from test_warp import at, see
 
 from mistyle.core.image import dilate, erode, gaussian
-from mistyle.stages.outline import carried, displacement, distance_to, follow, signed
+from mistyle.stylization.mvst.outline import carried, displacement, distance_to, follow, signed
 
 SIZE = 192
 

@@ -207,8 +207,8 @@ def test_models_and_loras_that_were_put_there_by_hand_stay(tmp_path, monkeypatch
     import torch
     from safetensors.torch import save_file
 
-    from mistyle.backends import consislora_make
     from mistyle.core.errors import UsageError
+    from mistyle.stylization.diffusion import lora_files as consislora_make
 
     place = tmp_path / "models" / "position"
     place.mkdir(parents=True)

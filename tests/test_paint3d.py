@@ -6,14 +6,14 @@ import tiny_models
 import torch
 
 from mistyle.atlas.texels import rasterise
-from mistyle.backends import paint3d
-from mistyle.backends import paint3d_plan as plan
-from mistyle.backends.diffusion_settings import LIGHTING, ModelSettings, Paint3dSettings
 from mistyle.core.errors import EnvironmentMissing
 from mistyle.core.maps import Texels, flat_maps
 from mistyle.core.mesh import Mesh
-from mistyle.stages.inpaint import repair
-from mistyle.stages.repair_settings import RepairSettings
+from mistyle.stylization.diffusion.settings import LIGHTING, ModelSettings, Paint3dSettings
+from mistyle.stylization.inpaint import paint3d
+from mistyle.stylization.inpaint import paint3d_plan as plan
+from mistyle.stylization.inpaint.repair import repair
+from mistyle.stylization.inpaint.settings import RepairSettings
 
 torch.set_num_threads(1)
 SETTINGS = Paint3dSettings(size=32, overlap=8, steps=2)

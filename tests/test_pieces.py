@@ -6,7 +6,9 @@ from helpers import fixed_surface
 from test_surface import plain_cost, plane_level, small_search
 
 from mistyle.render.mitsuba import device
-from mistyle.surface import field, guides, kernels, pieces, style, synthesis
+from mistyle.stylization.surface import field, kernels, pieces, synthesis
+from mistyle.stylization.surface.exemplar import exemplar as style
+from mistyle.stylization.surface.guides import guides
 
 
 @pytest.fixture(scope="module")

@@ -14,9 +14,10 @@ from PIL import Image
 import mistyle
 from mistyle.core.errors import InputRefused, Stopped, UsageError
 from mistyle.jobs.progress import Progress
-from mistyle.run import painting, pipeline
-from mistyle.run.stylize_job import FIRST, REFINING, STAGES, Job
-from mistyle.run.stylize_settings import resolve
+from mistyle.stylization.pipeline import painting
+from mistyle.stylization.pipeline import stylize as pipeline
+from mistyle.stylization.pipeline.job import FIRST, REFINING, STAGES, Job
+from mistyle.stylization.settings import resolve
 
 TINY = {
     "rig": {"resolution": 128},

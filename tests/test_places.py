@@ -5,7 +5,8 @@ import pytest
 from helpers import fixed_surface
 from test_surface import dented_ball, mesh_of, solved, strokes
 
-from mistyle.surface import creases, kernels, places, samples, synthesis
+from mistyle.stylization.surface import kernels, samples, synthesis
+from mistyle.stylization.surface.guides import creases, places
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +54,7 @@ def test_vibrations_step_where_the_surface_is_narrow(dj):
 
 
 def test_the_painting_of_a_ball_holds_no_light():
-    from mistyle.surface import lookup
+    from mistyle.stylization.surface import lookup
 
     ratio = {}
     for form in (0.0, 1.0):

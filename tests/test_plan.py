@@ -9,13 +9,14 @@ from mistyle.core.errors import UsageError
 from mistyle.jobs import memory_budget as budget
 from mistyle.jobs.settings import resolve as settings_of
 from mistyle.process import memory
-from mistyle.run import material_budget, stylize_budget
+from mistyle.run import material_budget
 from mistyle.run.cli import main
 from mistyle.run.material_job import MATERIAL_STAGES
 from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
 from mistyle.run.options import gigabytes
-from mistyle.run.stylize_job import FINISH, STAGES
-from mistyle.run.stylize_settings import Settings, resolve
+from mistyle.stylization.pipeline import budget as stylize_budget
+from mistyle.stylization.pipeline.job import FINISH, STAGES
+from mistyle.stylization.settings import Settings, resolve
 
 
 def job(**more) -> Settings:

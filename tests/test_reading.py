@@ -6,11 +6,13 @@ import pytest
 from helpers import data, fixed_surface
 
 from mistyle.core.errors import UsageError
-from mistyle.run.stylize_settings import resolve
-from mistyle.surface import edges, field, style, synthesis
-from mistyle.surface.chosen import FROM_PAINTING, flat, graphic, resolved, settled
-from mistyle.surface.reading import read_style
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.stylization.settings import resolve
+from mistyle.stylization.surface import field, synthesis
+from mistyle.stylization.surface.exemplar import edges
+from mistyle.stylization.surface.exemplar import exemplar as style
+from mistyle.stylization.surface.exemplar.chosen import FROM_PAINTING, flat, graphic, resolved, settled
+from mistyle.stylization.surface.exemplar.reading import read_style
+from mistyle.stylization.surface.settings import SurfaceSettings
 
 
 def noise(size=(384, 512), blur=2.0, seed=0):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from mistyle.stages.repaint import Resampling, normal, refined, sample, step
+from mistyle.stylization.diffusion.repaint import Resampling, normal, refined, sample, step
 
 RHO, GIVEN = 0.9, 1.5  # two unit normals of this correlation; the first one is known
 MEAN, VARIANCE = RHO * GIVEN, 1 - RHO**2

@@ -14,8 +14,8 @@ from mistyle.geometry import next_best_view as rigs
 from mistyle.render.mitsuba.draw import tracer
 from mistyle.render.mitsuba.rigs import next_best_views, sample_surface
 from mistyle.render.mitsuba.visible import face_on
-from mistyle.run.stylize_settings import resolve
-from mistyle.run.stylize_start import cameras_of
+from mistyle.stylization.pipeline.start import cameras_of
+from mistyle.stylization.settings import resolve
 
 
 def as_mesh(solid: trimesh.Trimesh, inward: bool = False) -> Mesh:

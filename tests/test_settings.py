@@ -10,7 +10,7 @@ from mistyle.core.errors import UsageError
 from mistyle.jobs.settings import as_toml, assignments, known_keys
 from mistyle.jobs.settings import resolve as settings_of
 from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
-from mistyle.run.stylize_settings import PRESETS, Settings, resolve
+from mistyle.stylization.settings import PRESETS, Settings, resolve
 
 
 def test_later_layers_win(tmp_path):
@@ -79,7 +79,7 @@ def test_every_known_key_can_be_printed():
 
 
 def test_views_take_the_samples_that_their_use_needs():
-    from mistyle.run.stylize_settings import DrawSettings
+    from mistyle.stylization.settings import DrawSettings
 
     assert (DrawSettings().samples(read=False), DrawSettings().samples()) == (1, 8)
     assert (DrawSettings(spp=3).samples(read=False), DrawSettings(spp=3).samples()) == (3, 3)

@@ -14,8 +14,8 @@ from helpers import ROOT
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-from mistyle.backends.models_list import MODELS
 from mistyle.core.paths import PACKAGE
+from mistyle.stylization.models.catalogue import MODELS
 
 PROGRAM = sorted(PACKAGE.rglob("*.py"))
 EVIL = "<img src=x onerror=alert(1)>'\"&{{7*7}}</script><script>alert(2)</script>"

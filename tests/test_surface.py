@@ -15,8 +15,10 @@ from mistyle.core.mesh import Mesh, face_areas
 from mistyle.io.store.records import load_record, save_record
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.occlusion import ambient_occlusion
-from mistyle.surface import creases, field, guides, kernels, linefield, lookup, samples, style, synthesis
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.stylization.surface import field, kernels, lookup, samples, synthesis
+from mistyle.stylization.surface.exemplar import exemplar as style
+from mistyle.stylization.surface.guides import creases, guides, linefield
+from mistyle.stylization.surface.settings import SurfaceSettings
 
 
 def mesh_of(positions, faces, normals=None) -> Mesh:
@@ -427,7 +429,7 @@ def small_search(dj, rng):
 
 
 def plain_cost(level, exemplar, described, asked, weight, use, choice, at, coherence, variety, full=2.0):
-    """The search cost of places `at`, neighbours standing at `choice`; see mistyle.surface.synthesis."""
+    """The search cost of places `at`, neighbours standing at `choice`; see mistyle.stylization.surface.synthesis."""
     pixel = (
         exemplar.starts[at.page] + np.rint(at.y).astype(int) * exemplar.shapes[at.page, 1] + np.rint(at.x).astype(int)
     )
@@ -628,8 +630,8 @@ def test_occlusion_has_its_closed_forms():
 def test_a_real_pair_shows_palette_strokes_and_form():
     import trimesh
 
-    from mistyle.backends.embedded import solve_surface, surface_colour
     from mistyle.core.asset import Picture
+    from mistyle.stylization.surface.surface_painter import solve_surface, surface_colour
 
     loaded = trimesh.load(data("meshes/plain/spot.obj"), force="mesh")
     loaded.merge_vertices(merge_tex=True, merge_norm=True)

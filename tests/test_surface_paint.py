@@ -23,13 +23,17 @@ from mistyle.geometry.tangents import corner_tangents
 from mistyle.io.images.write import write_png
 from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.render.mitsuba.unlit import unlit
-from mistyle.run import options, painting, preview, stylize_start, variations
-from mistyle.run.stylize_settings import Settings
-from mistyle.stages import coat
-from mistyle.surface import cells, guides, linefield, lookup, samples, style, synthesis
-from mistyle.surface import relief as reliefs
-from mistyle.surface.glaze import band, glaze
-from mistyle.surface.settings import SurfaceSettings
+from mistyle.run import options
+from mistyle.stylization.pipeline import painting, preview, variations
+from mistyle.stylization.pipeline import start as stylize_start
+from mistyle.stylization.settings import Settings
+from mistyle.stylization.surface import cells, lookup, samples, synthesis
+from mistyle.stylization.surface import layers as coat
+from mistyle.stylization.surface.exemplar import exemplar as style
+from mistyle.stylization.surface.exemplar import relief as reliefs
+from mistyle.stylization.surface.guides import guides, linefield
+from mistyle.stylization.surface.guides.glaze import band, glaze
+from mistyle.stylization.surface.settings import SurfaceSettings
 
 
 def on_a_ball(count: int, rng):

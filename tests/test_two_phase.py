@@ -20,17 +20,17 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.draw import tracer
-from mistyle.run import pipeline
-from mistyle.run.generative import lights_of_views
-from mistyle.run.made import Atlas, Baked
-from mistyle.run.stylize_settings import Settings, resolve
-from mistyle.run.summary import MEANINGS
-from mistyle.stages import fit as stages_fit
-from mistyle.stages import fit_lit
-from mistyle.stages.fit import Fit, FitStart, FitTargets, two_phase, view_mask
-from mistyle.stages.fit_lit import lit_phases
-from mistyle.stages.fit_settings import FitSettings
-from mistyle.stages.repair_settings import RepairSettings
+from mistyle.stylization.inpaint.settings import RepairSettings
+from mistyle.stylization.optimise import lit_views as fit_lit
+from mistyle.stylization.optimise import two_phase as stages_fit
+from mistyle.stylization.optimise.lit_views import lit_phases
+from mistyle.stylization.optimise.settings import FitSettings
+from mistyle.stylization.optimise.two_phase import Fit, FitStart, FitTargets, two_phase, view_mask
+from mistyle.stylization.pipeline import stylize as pipeline
+from mistyle.stylization.pipeline.generative import lights_of_views
+from mistyle.stylization.records import Atlas, Baked
+from mistyle.stylization.report.summary import MEANINGS
+from mistyle.stylization.settings import Settings, resolve
 
 SIZE, RESOLUTION, SLOPE = 48, 56, 0.2
 IDENTITY = np.eye(4, dtype=np.float32)

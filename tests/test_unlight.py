@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_diffusion import view
 
-from mistyle.stages import unlight
+from mistyle.stylization.mvst import unlight
 
 
 def shading(seen) -> np.ndarray:

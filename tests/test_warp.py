@@ -8,10 +8,10 @@ import pytest
 from mistyle.core.camera import Camera, look_at, orbit, pixel_centres, px_from_world, world_from_px
 from mistyle.core.image import dilate, distance_to
 from mistyle.core.view import View
-from mistyle.stages import warp as warp_module
-from mistyle.stages.lift import depth_tolerance, discontinuities
-from mistyle.stages.sweep_settings import WarpSettings
-from mistyle.stages.warp import angle, composite, lift, splat, warp
+from mistyle.stylization.mvst import warp as warp_module
+from mistyle.stylization.mvst.lift import depth_tolerance, discontinuities
+from mistyle.stylization.mvst.settings import WarpSettings
+from mistyle.stylization.mvst.warp import angle, composite, lift, splat, warp
 
 BALL = (0.0, 0.0, 0.0, 0.9)
 BARE = WarpSettings(fill=0, erosion=0, facing=0.0, sharpness=0.0, look_up=False)  # the scatter alone

@@ -20,8 +20,8 @@ from transformers import (
     CLIPVisionModelWithProjection,
 )
 
-from mistyle.backends.models_fetch import adopt
-from mistyle.backends.models_list import MODELS
+from mistyle.stylization.models.catalogue import MODELS
+from mistyle.stylization.models.fetch import adopt
 
 DOWN, UP = ("DownBlock2D", "CrossAttnDownBlock2D"), ("CrossAttnUpBlock2D", "UpBlock2D")
 SDXL = {

@@ -84,9 +84,9 @@ def stylize(
     """
     from mistyle.core.names import asset_name
     from mistyle.jobs.progress import Progress
-    from mistyle.run.pipeline import stylize as run
-    from mistyle.run.stylize_job import Job
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.pipeline.job import Job
+    from mistyle.stylization.pipeline.stylize import stylize as run
+    from mistyle.stylization.settings import resolve
 
     mesh, style, chosen = Path(mesh), Path(style), resolve(preset, None, dict(settings))
     job = Job(mesh, style, Path(out), chosen, asset_name(name, mesh.stem, style.stem), overwrite=overwrite)
@@ -169,8 +169,8 @@ def bake(
     """
     from mistyle.core.names import asset_name
     from mistyle.jobs.progress import Progress
-    from mistyle.run.stylize_settings import resolve
-    from mistyle.run.verbs import bake_views
+    from mistyle.stylization.pipeline.single_stages import bake_views
+    from mistyle.stylization.settings import resolve
 
     mesh, chosen = Path(mesh), resolve(preset, None, dict(settings))
     called = asset_name(name, mesh.stem)

@@ -265,7 +265,7 @@ def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int, bas
 
         root, presets = MaterialSettings, MATERIAL_PRESETS
     else:
-        from mistyle.run.stylize_settings import PRESETS, Settings
+        from mistyle.stylization.settings import PRESETS, Settings
 
         root, presets = Settings, PRESETS
     settings = resolve(preset, None, placed_files(said, root, base), root=root, presets=presets)

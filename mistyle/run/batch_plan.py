@@ -123,7 +123,7 @@ def with_delivery(plan: BatchPlan, said: Mapping[str, Any]) -> BatchPlan:
     """A batch's plan in which every job delivers what the command line says. UsageError where a job cannot."""
     from mistyle.deliver import export as deliver
     from mistyle.run.material_settings import MaterialSettings
-    from mistyle.run.stylize_settings import Settings
+    from mistyle.stylization.settings import Settings
 
     if not said:
         return plan

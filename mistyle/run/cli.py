@@ -301,7 +301,7 @@ OPTIONS = {
 def _settings(options: argparse.Namespace, preset: str | None = None) -> Any:
     """The resolved settings of a command."""
     from mistyle.jobs.settings import merge
-    from mistyle.run.stylize_settings import resolve
+    from mistyle.stylization.settings import resolve
 
     return resolve(options.preset or preset, options.config, merge(_rig(options), given_settings(options, OPTIONS)))
 
@@ -349,7 +349,7 @@ def _print_config(options: argparse.Namespace) -> int:
 
 
 def _job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> Any:
-    from mistyle.run.stylize_job import Job
+    from mistyle.stylization.pipeline.job import Job
 
     settings = _settings(options, preset)
     called = name or asset_name(options, mesh.stem, style.stem)
@@ -358,8 +358,8 @@ def _job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | Non
 
 def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
     from mistyle.jobs.progress import Progress
-    from mistyle.run.pipeline import stylize
-    from mistyle.run.stylize_plan import plan
+    from mistyle.stylization.pipeline.plan import plan
+    from mistyle.stylization.pipeline.stylize import stylize
 
     job = _job(options, mesh, style, preset, name)
     settings = job.settings
@@ -369,14 +369,14 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
     if options.preview and options.variations:
         raise UsageError("--preview and --variations: give one of them; --variations shows several paintings")
     if options.preview:
-        from mistyle.run.preview import preview
+        from mistyle.stylization.pipeline.preview import preview
 
         made = preview(job, progress)
         print(json.dumps(made) if options.json else f"preview   {made['preview']}")
         progress.tell_notes()
         return 0
     if options.variations:
-        from mistyle.run.variations import sheet
+        from mistyle.stylization.pipeline.variations import sheet
 
         made = sheet(mesh, style, options.out, settings, options.variations, progress, overwrite=options.overwrite)
         print(json.dumps(made) if options.json else "\n".join([f"sheet     {made['sheet']}", *made["variations"]]))
@@ -399,13 +399,13 @@ def _render(options: argparse.Namespace) -> int:
     _need(options, "mesh", "out")
     settings = _settings(options)
     if options.dry_run:
-        from mistyle.run.stylize_plan import plan_render
-        from mistyle.run.verbs import claim_views
+        from mistyle.stylization.pipeline.plan import plan_render
+        from mistyle.stylization.pipeline.single_stages import claim_views
 
         claim_views(options.mesh, options.out, settings, options.overwrite)
         return _print_plan(options, plan_render(options.mesh, options.out, settings))
     from mistyle.jobs.progress import Progress
-    from mistyle.run.verbs import render_views
+    from mistyle.stylization.pipeline.single_stages import render_views
 
     progress = Progress()
     written = render_views(options.mesh, options.out, settings, progress, overwrite=options.overwrite)
@@ -421,13 +421,13 @@ def _bake(options: argparse.Namespace) -> int:
     _need(options, "mesh", "views", "out")
     settings, called = _settings(options), asset_name(options, options.mesh.stem)
     if options.dry_run:
-        from mistyle.run.stylize_plan import plan_bake
-        from mistyle.run.verbs import claim_baked
+        from mistyle.stylization.pipeline.plan import plan_bake
+        from mistyle.stylization.pipeline.single_stages import claim_baked
 
         claim_baked(options.mesh, options.views, options.out, called, options.overwrite)
         return _print_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
     from mistyle.jobs.progress import Progress
-    from mistyle.run.verbs import bake_views
+    from mistyle.stylization.pipeline.single_stages import bake_views
 
     progress = Progress()
     summary = bake_views(

@@ -58,7 +58,7 @@ def demo(options: argparse.Namespace, make_job: MakeJob, run_job: Callable[..., 
 
 def _plans(options: argparse.Namespace, jobs: list[Any]) -> int:
     from mistyle.jobs.plan import describe_plan
-    from mistyle.run.stylize_plan import plan
+    from mistyle.stylization.pipeline.plan import plan
 
     plans = {job.out.name: plan(job) for job in jobs}
     if options.json:

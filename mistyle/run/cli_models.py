@@ -86,8 +86,8 @@ def run_models(options: argparse.Namespace) -> int:
         return _convert(options)
     if not options.names:
         raise UsageError(f"mistyle models {options.action} NAME...; `mistyle models` prints the names")
-    from mistyle.backends.models import get
-    from mistyle.backends.models_fetch import adopt, fetch
+    from mistyle.stylization.models.fetch import adopt, fetch
+    from mistyle.stylization.models.folder import get
 
     for name in options.names:
         get(name)
@@ -104,8 +104,8 @@ def run_models(options: argparse.Namespace) -> int:
 
 
 def _convert(options: argparse.Namespace) -> int:
-    from mistyle.backends.models import get, lacking, need_extra
-    from mistyle.backends.models_fetch import adopt, convert
+    from mistyle.stylization.models.fetch import adopt, convert
+    from mistyle.stylization.models.folder import get, lacking, need_extra
 
     if len(options.names) != 2:
         raise UsageError("mistyle models convert NAME FILE.bin --models DIR")
@@ -120,7 +120,7 @@ def _convert(options: argparse.Namespace) -> int:
 
 
 def _list(options: argparse.Namespace) -> int:
-    from mistyle.backends.models_fetch import listing
+    from mistyle.stylization.models.fetch import listing
 
     rows = listing(options.models)
     if options.json:

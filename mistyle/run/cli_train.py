@@ -14,7 +14,7 @@ from mistyle.run.cli_models import add_model_options
 from mistyle.run.options import add_job_options, examples, given_settings
 
 if TYPE_CHECKING:
-    from mistyle.backends.consislora_make import TrainingImage
+    from mistyle.stylization.diffusion.lora_files import TrainingImage
 
 OPTIONS = {
     "seed": "seed",
@@ -51,7 +51,7 @@ def add_train(verbs: Any) -> None:
 def run_train(options: argparse.Namespace) -> int:
     """Train what is missing and print the files."""
     from mistyle.jobs.settings import as_toml, resolve, thread_count
-    from mistyle.run.train_settings import TRAIN_PRESETS, TrainJobSettings
+    from mistyle.stylization.diffusion.train_settings import TRAIN_PRESETS, TrainJobSettings
 
     said = given_settings(options, OPTIONS)
     settings = resolve(options.preset, options.config, said, root=TrainJobSettings, presets=TRAIN_PRESETS)
@@ -60,13 +60,13 @@ def run_train(options: argparse.Namespace) -> int:
         return 0
     if options.kind is None or options.source is None or options.out is None:
         raise UsageError("train needs style PICTURE or content VIEWS_DIR, and -o DIR; see mistyle train --help")
-    from mistyle.backends.models import need_extra
     from mistyle.jobs.progress import Progress
+    from mistyle.stylization.models.folder import need_extra
 
     need_extra()
     images = training_set(options.kind, options.source, settings.word)
-    from mistyle.backends.consislora_make import LoraFolder, make_all
-    from mistyle.backends.consislora_make import check as check_models
+    from mistyle.stylization.diffusion.lora_files import LoraFolder, make_all
+    from mistyle.stylization.diffusion.lora_files import check as check_models
 
     use_threads(thread_count(settings))
     check_models(settings.models, settings.train)
@@ -81,12 +81,12 @@ def run_train(options: argparse.Namespace) -> int:
 
 def training_set(kind: str, source: Path, word: str) -> "list[TrainingImage]":
     """The pictures to train LoRAs on."""
-    from mistyle.backends.consislora_make import TrainingImage
     from mistyle.core.image import srgb_from_linear
+    from mistyle.stylization.diffusion.lora_files import TrainingImage
 
     if kind == "style":
         from mistyle.io.read import read_picture
-        from mistyle.run.generative import opaque
+        from mistyle.stylization.pipeline.generative import opaque
 
         return [TrainingImage("style", source.stem, opaque(read_picture(source)), word or "[v]")]
     from mistyle.io.cameras.views import read_views
@@ -98,7 +98,7 @@ def training_set(kind: str, source: Path, word: str) -> "list[TrainingImage]":
 @contextmanager
 def bar(say: Callable[[str], None]) -> Iterator[Callable[[int, int, float], None]]:
     """A progress bar with the mean loss over its weight on a terminal, a line now and then elsewhere."""
-    from mistyle.run.generative import watcher
+    from mistyle.stylization.pipeline.generative import watcher
 
     if not sys.stderr.isatty():
         yield watcher(say, lambda share: None)

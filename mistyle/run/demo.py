@@ -43,7 +43,7 @@ def run_all(jobs: Sequence[Any], out: Path, progress: Any, *, overwrite: bool = 
     """
     from mistyle.io.store.output import claim, replace_files
     from mistyle.jobs.progress import Progress
-    from mistyle.run.pipeline import stylize
+    from mistyle.stylization.pipeline.stylize import stylize
 
     inputs = [path for job in jobs for path in (job.mesh, job.style)]
     claim(out, [SHEET], inputs=inputs, overwrite=overwrite)

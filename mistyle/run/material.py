@@ -1,7 +1,7 @@
 """`mistyle fit`: a mesh and pictures of it under known light -> its material, measured against what was held out.
 
-Stages are kept as those of `stylize` are (run/pipeline.py): a killed run goes on from the last finished stage, and the
-fit itself from its last checkpoint.
+Stages are kept as those of `stylize` are (stylization/pipeline/stylize.py): a killed run goes on from the last finished
+stage, and the fit itself from its last checkpoint.
 """
 
 from collections.abc import Sequence

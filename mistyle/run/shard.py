@@ -26,7 +26,7 @@ from mistyle.process.disk_errors import unexpected
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan
 from mistyle.run.material_job import MATERIAL_STAGES
-from mistyle.run.stylize_job import STAGES
+from mistyle.stylization.pipeline.job import STAGES
 
 SHARDS = "shards"
 
@@ -144,8 +144,8 @@ def job_of(plan: BatchPlan, record: Record) -> Any:
         settings = MaterialSettings.model_validate(record.settings)
         given = (record.mesh, record.references, out, settings, record.name, lights, record.masks, record.exposure)
         return MaterialJob(*given, overwrite=plan.overwrite)
-    from mistyle.run.stylize_job import Job
-    from mistyle.run.stylize_settings import Settings
+    from mistyle.stylization.pipeline.job import Job
+    from mistyle.stylization.settings import Settings
 
     assert record.style is not None
     settings = Settings.model_validate(record.settings)
@@ -157,7 +157,7 @@ def _run(plan: BatchPlan, record: Record, progress: Progress) -> dict[str, Any]:
         from mistyle.run.material import fit_material
 
         return fit_material(job_of(plan, record), progress)
-    from mistyle.run.pipeline import stylize
+    from mistyle.stylization.pipeline.stylize import stylize
 
     return stylize(job_of(plan, record), progress)
 

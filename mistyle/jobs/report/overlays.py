@@ -66,7 +66,8 @@ def struggle(
     looked = covered & (looks > 0)
     if not looked.any():
         return None
-    # Single texels' gradients are noise: what lies around them is told, as for the repair (stages/inpaint.py).
+    # Single texels' gradients are noise: what lies around them is told, as for the repair
+    # (stylization/inpaint/repair.py).
     total, looks = (gaussian(np.where(looked, a, 0).astype(np.float32), 0.002 * len(total)) for a in (total, looks))
     least = 0.25 * float(np.median(looks[looked]))
     mean = np.where(looked, total / np.maximum(looks, least), 0)

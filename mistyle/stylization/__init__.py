@@ -1,0 +1,1 @@
+"""`mistyle stylize`: the paper's method, section by section."""

@@ -1,0 +1,25 @@
+"""The settings of `mistyle train`."""
+
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mistyle.stylization.diffusion.settings import ModelSettings, TrainSettings
+
+
+class TrainJobSettings(BaseModel):
+    """LoRAs from pictures."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    seed: int = Field(default=0, ge=0, lt=2**31, description="every random choice follows from it")
+    threads: int = Field(default=0, ge=0, le=1024, description="threads of torch; 0 takes all cores")
+    word: str = Field(default="", description="the prompt's word for the picture; empty: [c] or [v]")
+    models: ModelSettings = ModelSettings()
+    train: TrainSettings = TrainSettings()
+
+
+TRAIN_PRESETS: dict[str, dict[str, Any]] = {
+    "draft": {"train": {"steps": 500, "switch": 200, "style_steps": 400}},
+    "standard": {},
+}

@@ -1,0 +1,1 @@
+"""Repair of the texture (paper 4.3): struggle mask, fill, texture inpainting."""

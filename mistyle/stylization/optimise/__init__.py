@@ -1,0 +1,1 @@
+"""The two-phase optimisation of normal and roughness, then albedo (paper 4.2)."""

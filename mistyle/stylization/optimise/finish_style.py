@@ -1,0 +1,118 @@
+"""The painting as the features that a finished surface should have: each pixel knows the place it was painted from.
+
+A patch of the surface shows pieces of the painting, turned along the strokes. Its features are compared with those
+of the whole, unbroken painting at the same places, turned alike, and not with the painting's overall statistics: those
+would pull every patch towards the mean of all colours.
+"""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.image import resize
+from mistyle.measure.features import Features
+from mistyle.stylization.surface.lookup import PaintedSurface
+from mistyle.stylization.surface.samples import as_points, lifted, workers
+
+TURNED = 35.0  # degrees between a piece of the painting and the page that stands for it, beyond which it does not count
+
+
+@dataclass(frozen=True)
+class PaintingFeatures:
+    """The painting's features on four quarter turns (page k is np.rot90(picture, k)).
+
+    solution  the painted surface           tree   of its samples, in `lifted` space
+    size      (rows, columns) of the unturned painting at the renders' scale
+    pages     per page and level of the features, a map (k, rows, columns), torch
+    """
+
+    solution: PaintedSurface
+    tree: Any
+    size: tuple[int, int]
+    pages: tuple[tuple[Any, ...], ...]
+
+
+@dataclass(frozen=True)
+class Places:
+    """Where n pixels lie in the painting: the page, the place on it in pixels (x, y), whether that can be said, and the
+    painter's nearest sample."""
+
+    page: Int[np.ndarray, " n"]
+    at: Float[np.ndarray, "n 2"]
+    sure: Bool[np.ndarray, " n"]
+    sample: Int[np.ndarray, " n"]
+
+
+def painting_features(solution: PaintedSurface, pixel: float, features: Features) -> PaintingFeatures:
+    """The painting at `pixel` working units a pixel, and its features (half precision)."""
+    import torch
+
+    own = solution.spacing / max(solution.scale)
+    rows, columns = (max(32, round(side * own / pixel)) for side in solution.painting.shape[:2])
+    picture = resize(solution.painting, (rows, columns))
+    pages = []
+    for turn in range(4):
+        page = torch.from_numpy(np.ascontiguousarray(np.rot90(picture, turn).transpose(2, 0, 1)))[None]
+        with torch.no_grad():
+            pages.append(tuple(_thin(found[0], rows * columns).half() for found in features(page)))
+    tree = as_points(solution.positions, solution.normals, solution.spacing).tree
+    return PaintingFeatures(solution, tree, (rows, columns), tuple(pages))
+
+
+def places(
+    painting: PaintingFeatures,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    right: Float[np.ndarray, "n 3"],
+    down: Float[np.ndarray, "n 3"],
+) -> Places:
+    """The painting's places at surface points; `right` and `down` are the axes of the camera that sees each."""
+    solution = painting.solution
+    sample = painting.tree.query(lifted(positions, normals, solution.spacing), workers=workers())[1]
+    tangent, turn = solution.tangent[sample], solution.turn[sample]
+    across = np.cross(tangent, solution.normals[sample])
+    step = positions - solution.positions[sample]
+    u, v = ((step * axis).sum(axis=1) for axis in (tangent, across))
+    # A step (u, v) on the page turned k times is this step in the picture itself (as in stylization/surface/lookup.py).
+    own = np.stack([np.choose(turn, [u, -v, -u, v]), np.choose(turn, [v, u, -v, -u])], axis=1)
+    per_unit = np.array(solution.scale, np.float32) / np.float32(solution.spacing)
+    shrink = np.array(painting.size[::-1]) / np.array(solution.painting.shape[1::-1])
+    x, y = ((solution.centre[sample] + own * per_unit) * shrink).T
+    # The page stands on the screen as its x axis does there; what is left after quarter turns may not be much.
+    angle = np.degrees(np.arctan2((tangent * down).sum(axis=1), (tangent * right).sum(axis=1)))
+    quarter = np.round(angle / 90)
+    page = (turn - quarter.astype(np.int64)) % 4
+    rows, columns = painting.size
+    at = [np.choose(page, [x, y, columns - x, rows - y]), np.choose(page, [y, columns - x, rows - y, x])]
+    inside = (x > 0) & (x < columns) & (y > 0) & (y < rows)
+    sure = inside & (np.abs(angle - 90 * quarter) < TURNED)
+    return Places(page, np.stack(at, axis=1).astype(np.float32), sure, sample)
+
+
+def target_features(painting: PaintingFeatures, where: Places, crops: int, size: int) -> list[Any]:
+    """Per level the painting's features at the places of n square crops, (n, k, rows, columns), torch."""
+    import torch
+
+    result = []
+    for level in range(len(painting.pages[0])):
+        by = max(1, round(painting.size[1] / painting.pages[0][level].shape[2]))
+        middle = slice(by // 2, None, by)
+        page = where.page.reshape(crops, size, size)[:, middle, middle]
+        at = where.at.reshape(crops, size, size, 2)[:, middle, middle] / by
+        made = torch.empty(crops, painting.pages[0][level].shape[0], *page.shape[1:])
+        for turn, pages in enumerate(painting.pages):
+            rows, columns = pages[level].shape[1:]
+            x, y = (np.clip(at[..., axis].astype(np.int64), 0, most - 1) for axis, most in ((0, columns), (1, rows)))
+            chosen = torch.from_numpy(page == turn)
+            values = pages[level].reshape(pages[level].shape[0], -1)
+            flat = torch.from_numpy(y * columns + x)[chosen]
+            made.permute(1, 0, 2, 3)[:, chosen] = values[:, flat].float()
+        result.append(made)
+    return result
+
+
+def _thin(maps: Any, pixels: int) -> Any:
+    """Every second row and column of maps as large as the picture: statistics need no more, and they are the most."""
+    return maps[:, ::2, ::2] if maps[0].numel() == pixels else maps

@@ -1,0 +1,240 @@
+"""One phase of the fit under way: crops, render, loss, gradient, step."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.core.camera import Camera, zoom
+from mistyle.core.image import luminance
+from mistyle.core.light import Directional, Lights, direction_in_world
+from mistyle.core.maps import place_of
+from mistyle.stylization.optimise import table as fit_table
+from mistyle.stylization.optimise.settings import FitSettings
+from mistyle.stylization.optimise.table import FitTable
+
+if TYPE_CHECKING:
+    import torch
+
+    from mistyle.measure.losses import Crop
+
+CLAY = 0.25  # albedo of the clay of phase 1: dark enough for highlights to count
+GRAZING = 0.2  # pixels whose surface is seen at a smaller cosine are left out
+LAST_RATE = 0.1  # share of the learning rate at the end of a phase; a cosine leads there
+
+
+@dataclass(frozen=True)
+class CropBatch:
+    """One step's crops, rendered, beside their targets: n crops of s x s pixels (torch).
+
+    render linear, target sRGB (n, 3, s, s); `plain` the same render with the normals and roughness of the unpainted
+    surface, where the phase asks for it; mask (n, 1, s, s) 0 or 1; world position and normal (n, 3, s, s); `light`
+    (n, 3) the direction to each crop's light, or to where the mean of its lights stands, None under ambient light;
+    `zoomed` crop pixels per pixel of the view.
+    """
+
+    render: Any
+    plain: Any
+    target: Any
+    mask: Any
+    position: Any
+    normal: Any
+    light: Any
+    zoomed: float
+
+
+# (batch, features, generator) -> weighted losses by name
+Loss = Callable[[CropBatch, Callable[[Any], list[Any]], np.random.Generator], "dict[str, torch.Tensor]"]
+
+
+@dataclass(frozen=True)
+class SceneContext:
+    """What stands still during the fit; `targets` are (4, h, w): sRGB and the mask of pixels that are wholly inside."""
+
+    traced: Any
+    tangents: Float[np.ndarray, "f 3 4"]
+    cameras: tuple[Camera, ...]
+    targets: tuple[Any, ...]
+    masks: tuple[Bool[np.ndarray, "h w"], ...]
+    features: Callable[[Any], list[Any]]
+
+
+@dataclass(frozen=True)
+class Phase:
+    """One of the two optimisations: under which lights, what moves how fast, and what is minimised."""
+
+    name: str
+    lights: Lights
+    one_by_one: bool  # each crop under one of the lights alone, in turn
+    clay: bool  # compared with a relief's shading under the crop's lights, so without shadows
+    gloss: bool
+    rates: Mapping[str, float]
+    variation: Mapping[str, float]
+    iterations: int
+    loss: Loss
+
+
+class PhaseRunner:
+    """A phase under way: its trace, and what the last steps say about where the albedo struggles."""
+
+    def __init__(
+        self, scene: SceneContext, table: FitTable, phase: Phase, settings: FitSettings, rng: np.random.Generator
+    ) -> None:
+        self.scene, self.table, self.phase, self.settings, self.rng = scene, table, phase, settings, rng
+        self.shader = shader(settings, phase.gloss)
+        self.trace: dict[str, list[float]] = {}
+        self.order: list[int] = []
+        self.beam = 0
+        self.struggle = np.zeros(len(table.still), np.float32)
+        self.touched = np.zeros(len(table.still), np.float32)
+        self.pulled = np.zeros((len(table.still), 3), np.float32)
+        table.forget()
+
+    def step(self, iteration: int) -> str:
+        """One step of Adam; where something is not a number nothing moves, and the note says which texel."""
+        crops = self._crops()
+        texels, pure, looks, crop_of = self._gradients(crops)
+        gradients, near = dict(pure), fit_table.pairs(self.table, texels)
+        for name, weight in self.phase.variation.items():
+            value, slope = fit_table.variation(self.table, name, near)
+            self._note(f"tv_{name}", weight * value)
+            gradients[name] = gradients[name] + np.float32(weight) * slope * fit_table.nonzero(gradients[name])[:, None]
+        bad = self._not_a_number(texels, gradients)
+        if bad:
+            name, row = bad
+            return self._stopped(iteration, name, int(texels[row]), crops[crop_of(row)])
+        if "albedo" in gradients and self.phase.iterations - iteration <= self.settings.struggle_window:
+            self.struggle[texels] += np.abs(pure["albedo"]) @ np.full(3, 1 / 3, np.float32)
+            self.touched[texels] += looks
+            self.pulled[texels] += pure["albedo"]
+        share = iteration / max(self.phase.iterations, 1)
+        decay = LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * share))
+        for name, gradient in gradients.items():
+            fit_table.step(self.table, name, texels, gradient, self.phase.rates[name] * decay)
+        return ""
+
+    def _crops(self) -> "list[Crop]":
+        """Views in turn, in an order drawn anew after each round."""
+        from mistyle.measure.losses import sample_crops
+
+        settings = self.settings
+        while len(self.order) < settings.crops:
+            self.order += self.rng.permutation(len(self.scene.cameras)).tolist()
+        views, self.order = self.order[: settings.crops], self.order[settings.crops :]
+        return sample_crops(
+            self.rng, self.scene.masks, settings.crops, settings.crop_size, settings.crop_scale, views=views
+        )
+
+    def _gradients(
+        self, crops: "Sequence[Crop]"
+    ) -> tuple[Int[np.ndarray, " t"], dict[str, np.ndarray], Float[np.ndarray, " t"], Callable[[int], int]]:
+        """Touched texels; the gradient of the loss for each map that moves; how often each texel was looked at (sum of
+        bilinear weights of the pixels that count); and a function that says in which crop a texel was seen."""
+        import torch
+
+        from mistyle.measure.losses import crop_picture
+        from mistyle.render.deferred import integrator as deferred
+        from mistyle.render.deferred import torch_bridge
+
+        size, count = self.settings.crop_size, self.settings.crops
+        cameras = [zoom(self.scene.cameras[c.view], c.x, c.y, c.width, (size, size)) for c in crops]
+        surface = deferred.trace(self.scene.traced, cameras, self.scene.tangents)
+        lit, towards = self._light(surface)
+        where = torch_bridge.taps(surface, self.table.sizes)
+
+        def picture(values: Mapping[str, np.ndarray], moving: Mapping[str, float]) -> tuple[Any, dict[str, Any]]:
+            leaves = {n: torch.from_numpy(v[where.texels]).requires_grad_(n in moving) for n, v in values.items()}
+            pixels = torch_bridge.fetch(materials(leaves, self.phase.clay), where)
+            names = tuple("normal" if name == "tilt" else name for name in moving)
+            return self.shader(lit, pixels, names).reshape(count, size, size, 3).permute(0, 3, 1, 2), leaves
+
+        plain = picture(self.table.plain, {})[0] if self.phase.clay else None
+        render, leaves = picture(self.table.values, self.phase.rates)
+        target = torch.stack([crop_picture(self.scene.targets[c.view], c, size) for c in crops])
+
+        def image(values: np.ndarray) -> "torch.Tensor":
+            return torch.from_numpy(values).reshape(count, size, size, -1).permute(0, 3, 1, 2)
+
+        mask = (image(np.abs(surface.facing) > GRAZING) & (target[:, 3:] > 0.999)).float()
+        position, normal = image(surface.position), image(surface.normal)
+        batch = CropBatch(render, plain, target[:, :3], mask, position, normal, towards, size / crops[0].width)
+        losses = self.phase.loss(batch, self.scene.features, self.rng)
+        for name, value in losses.items():
+            self._note(name, float(value.detach()))
+        torch.stack(list(losses.values())).sum().backward()
+        gradients = {}
+        for name in self.phase.rates:
+            grad = leaves[name].grad
+            gradients[name] = np.zeros(leaves[name].shape, np.float32) if grad is None else grad.numpy()
+        looks = where.matrix.T @ mask.numpy().ravel()
+        return where.texels, gradients, looks, lambda row: int(where.matrix[:, [row]].nonzero()[0][0]) // (size * size)
+
+    def _light(self, surface: Any) -> "tuple[Any, torch.Tensor | None]":
+        import torch
+
+        from mistyle.render.deferred import integrator as deferred
+
+        beams = [light for light in self.phase.lights if isinstance(light, Directional)]
+        if not self.phase.one_by_one:
+            lit = deferred.light(self.scene.traced, surface, self.phase.lights, shadows=not self.phase.clay)
+            rows = [beams] * len(surface.cameras)
+        else:
+            first, self.beam = self.beam, self.beam + len(surface.cameras)
+            alone = [beams[k % len(beams)] for k in range(first, self.beam)]
+            lit, rows = deferred.light_each(self.scene.traced, surface, alone, shadows=False), [[b] for b in alone]
+        if not beams:
+            return lit, None
+        towards = [_mean_direction(row, camera) for row, camera in zip(rows, surface.cameras, strict=True)]
+        return lit, torch.from_numpy(np.stack(towards))
+
+    def _note(self, name: str, value: float) -> None:
+        self.trace.setdefault(name, []).append(value)
+
+    def _not_a_number(
+        self, texels: Int[np.ndarray, " t"], gradients: Mapping[str, np.ndarray]
+    ) -> tuple[str, int] | None:
+        """The map and the row of the first texel that is, or would become, no number; Mitsuba gives such a texel itself
+        a gradient of zero, so the values are looked at too where the loss is no number."""
+        broken = not all(np.isfinite(values[-1]) for values in self.trace.values())
+        looked_at = {name: self.table.values[name][texels] for name in self.table.values} if broken else {}
+        for tables in (looked_at, gradients):
+            for name, values in tables.items():
+                if not np.isfinite(values.sum(dtype=np.float64)):
+                    return name, int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
+        return (next(iter(gradients)), 0) if broken else None
+
+    def _stopped(self, iteration: int, name: str, texel: int, crop: "Crop") -> str:
+        part, row, column = place_of(texel, self.table.sizes)
+        shape = "x".join(map(str, self.table.sizes[part]))
+        view = self.scene.cameras[crop.view].name
+        return (
+            f"{self.phase.name} stopped before step {iteration + 1}: {name} or its gradient is not a number at texel "
+            f"(row {row}, column {column} of {shape}) of texture set {part}, seen in view {view}; "
+            "the maps are those of the last good step."
+        )
+
+
+def _mean_direction(beams: Sequence[Directional], camera: Camera) -> Float[np.ndarray, "3"]:
+    """Where one light would stand that shades a matt surface as all of these do, up to its strength."""
+    strength = luminance(np.array([beam.irradiance for beam in beams], np.float32))
+    total = strength @ np.stack([direction_in_world(beam, camera) for beam in beams])
+    return (total / np.linalg.norm(total)).astype(np.float32)
+
+
+def shader(settings: FitSettings, gloss: bool) -> Any:
+    """The film of one step's crops, one below the other."""
+    from mistyle.render.deferred.torch_bridge import Shader
+
+    return Shader((settings.crops * settings.crop_size, settings.crop_size), gloss=gloss, bridge=settings.bridge)
+
+
+def materials(leaves: "Mapping[str, torch.Tensor]", clay: bool = False) -> "torch.Tensor":
+    """Texel values side by side as the shader wants them: tilt becomes a unit normal, clay a constant albedo."""
+    import torch
+
+    tilt = leaves["tilt"]
+    z = (1 - tilt.square().sum(dim=1, keepdim=True)).clamp_min(1e-4).sqrt()
+    albedo = torch.full_like(leaves["albedo"], CLAY) if clay else leaves["albedo"]
+    return torch.cat([albedo, tilt, z, leaves["roughness"], leaves["metallic"]], dim=1)

@@ -1,0 +1,1 @@
+"""The stylization jobs, stage by stage."""

@@ -1,0 +1,227 @@
+"""The embedded stylizer in a job: the surface painted once, laid into the texture, and drawn from every camera."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from mistyle.core.asset import Asset, Picture
+from mistyle.core.errors import InputRefused
+from mistyle.core.image import linear_from_srgb
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import face_areas
+from mistyle.core.view import View
+from mistyle.geometry.tangents import corner_tangents
+from mistyle.jobs.progress import Report
+from mistyle.jobs.stages import Run
+from mistyle.process import memory
+from mistyle.stylization.records import Atlas, Baked
+from mistyle.stylization.settings import Settings
+from mistyle.stylization.surface.guides.guides import Content
+from mistyle.stylization.surface.guides.linefield import DirectionConstraint
+from mistyle.stylization.surface.layers import StyleLayers
+from mistyle.stylization.surface.lookup import PaintedSurface
+from mistyle.stylization.surface.settings import PaintSettings
+
+
+def paint_pictures(chosen: PaintSettings) -> list[Path]:
+    """The pictures that the paint settings name and that must be there."""
+    return [path for path in (chosen.style_mask, chosen.protect, chosen.direction_map) if path is not None]
+
+
+def check_paint(chosen: PaintSettings) -> None:
+    """Refuse pictures that are not there, before anything is rendered."""
+    for path in paint_pictures(chosen):
+        if not path.is_file():
+            raise InputRefused(f"{path}: found nothing; expected a picture. Check the path")
+
+
+def paint_files(chosen: PaintSettings) -> list[Path]:
+    """The files that the paint settings name: their contents count, not their names."""
+    named = paint_pictures(chosen)
+    for slot in chosen.slots:
+        name, _, picture = slot.rpartition("=")
+        named += [Path(name), Path(picture)]
+    return [path for path in named if path.is_file()]
+
+
+def paint(
+    asset: Asset,
+    style: Picture,
+    settings: Settings,
+    report: Report,
+    content: Content | None = None,
+    direction: DirectionConstraint | None = None,
+) -> PaintedSurface:
+    """The surface painted once with one picture; `content` is the lightness of a texture that it has already,
+    `direction` where strokes shall run."""
+    from mistyle.stylization.surface.surface_painter import solve_surface
+
+    return solve_surface(
+        asset.mesh, style, settings.surface, settings.seed, progress=report, content=content, direction=direction
+    )
+
+
+def paint_layers(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> StyleLayers:
+    """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
+    from mistyle.deliver.colour import read_style
+    from mistyle.stylization.surface.layers import content, masked_style, painted_direction, scaled, slot_masks
+
+    surface = scaled(settings.surface, asset, settings.paint.stroke_size)
+    settings = settings.model_copy(update={"surface": surface})
+    paths, masks = slot_masks(asset, atlas.texels, settings.paint.slots)
+    pictures = [masked_style(style, settings.paint.style_mask), *(read_style(path, settings.colour) for path in paths)]
+    choice = [np.zeros(texels.covered.shape, np.int32) for texels in atlas.texels]
+    for number, chosen in enumerate(masks, start=1):
+        for texels_of, mask in zip(choice, chosen, strict=True):
+            texels_of[mask] = number
+    lightness = content(atlas.texels, atlas.start) if surface.keep_content > 0 else None
+    direction = painted_direction(settings.paint.direction_map, asset.mesh, atlas.texels)
+    solutions = []
+    for k, picture in enumerate(pictures):
+
+        def part_done(done: float, k: int = k) -> None:
+            report((k + done) / len(pictures))
+
+        solutions.append(paint(asset, picture, settings, part_done, lightness, direction))
+    return StyleLayers(tuple(solutions), tuple(choice))
+
+
+def texel_side(asset: Asset, part: int, texels: Texels) -> float:
+    """The mean side of a texel on the surface, working units: what the painting is averaged over."""
+    area = face_areas(asset.mesh)[asset.mesh.part == part].sum()
+    return float(np.sqrt(area / max(int(texels.covered.sum()), 1)))
+
+
+def bake(
+    asset: Asset, layers: StyleLayers, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report
+) -> Baked:
+    """Section 4.1.4 for a painted surface: texels look the painting up directly; the views say who sees what."""
+    from mistyle.atlas.bake import accepted
+
+    maps, seen = painted(asset, layers, atlas, settings), []
+    with_relief = raised(asset, layers, atlas, settings, maps)
+    for part, texels in enumerate(atlas.texels):
+        seen.append(accepted(views, texels, settings.bake, mesh=asset.mesh)[1].reshape(texels.covered.shape))
+        report((part + 1) / len(atlas.texels))
+    if settings.refined in PAINTERS:
+        return Baked(tuple(with_relief), tuple(seen))
+    return Baked(tuple(maps), tuple(seen), tuple(with_relief))
+
+
+PAINTERS = ("off", "albedo")  # what may be refined where normal and roughness stay the painter's
+HEIGHT, GLOSS = 0.15, 1.0  # slope of the painting's relief in the normal map, and share of its gloss in the roughness
+LOOKED_UP = 2**20  # texels whose colour is looked up at one time
+
+
+def painted(asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, settings: Settings) -> list[Maps]:
+    """The start maps with the painting's colours in place of the albedo, looked up for every covered texel.
+
+    A single solution paints everything.
+    """
+    from mistyle.atlas.texels import pad_in_place, sharpen_in_place
+    from mistyle.stylization.surface.layers import painted_mask, protected
+    from mistyle.stylization.surface.surface_painter import surface_colour
+
+    maps = []
+    for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
+        side, albedo = texel_side(asset, part, texels), memory.zeros(start.albedo.shape)
+        for solution, at in whose(layers, part, texels):
+            for rows in pieces(at):
+                here = at[rows]
+                place = texels.position[rows][here], texels.normal[rows][here]
+                albedo[rows][here] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
+        sharpen_in_place(albedo, texels)
+        pad_in_place([albedo], texels, settings.atlas.padding)
+        painted_maps = replace(start, albedo=albedo, known=texels.covered)
+        if settings.paint.protect is not None:
+            painted_maps = protected(painted_maps, start, painted_mask(settings.paint.protect, texels))
+        maps.append(painted_maps)
+    return maps
+
+
+def raised(
+    asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, settings: Settings, maps: Sequence[Maps]
+) -> list[Maps]:
+    """Painted maps with the painting's relief laid upon their normals, and its gloss upon their roughness."""
+    from mistyle.core.image import nearest_fill_in_place
+    from mistyle.stylization.surface.layers import PaintRelief, TexelBand, lay_relief, painted_mask, protected
+    from mistyle.stylization.surface.surface_painter import surface_relief
+
+    height = HEIGHT if settings.paint.height is None else settings.paint.height
+    gloss = GLOSS if settings.paint.gloss is None else settings.paint.gloss
+    if height == gloss == 0:
+        return list(maps)
+    result = []
+    for part, (texels, flat) in enumerate(zip(atlas.texels, maps, strict=True)):
+        side, tangents = texel_side(asset, part, texels), corner_tangents(asset.mesh)
+        made = replace(flat, normal=memory.copied(flat.normal), roughness=memory.copied(flat.roughness))
+        for solution, at in whose(layers, part, texels):
+            for rows in pieces(at):
+                here = at[rows]
+                place = texels.position[rows][here], texels.normal[rows][here]
+                relief = PaintRelief(*surface_relief(solution, *place, footprint=side))
+                lay_relief(made, TexelBand(texels, rows, here), relief, height, gloss, asset.mesh, tangents)
+        chosen = [values for values, used in ((made.normal, height), (made.roughness, gloss)) if used > 0]
+        nearest_fill_in_place(chosen, texels.covered)
+        if settings.paint.protect is not None:
+            made = protected(made, flat, painted_mask(settings.paint.protect, texels))
+        result.append(made)
+    return result
+
+
+def pieces(at: np.ndarray) -> Iterator[slice]:
+    """Bands of rows with about LOOKED_UP chosen texels each: what is looked up at one time."""
+    from mistyle.atlas.texels import bands
+
+    share = max(float(at.mean()), 1e-3)
+    return (rows for rows in bands(at.shape[0], at.shape[1], round(LOOKED_UP / share)) if at[rows].any())
+
+
+def whose(layers: StyleLayers | PaintedSurface, part: int, texels: Texels) -> list[tuple[PaintedSurface, np.ndarray]]:
+    """Each solution with the covered texels of a set that it paints."""
+    if isinstance(layers, PaintedSurface):
+        return [(layers, texels.covered)]
+    return [(one, texels.covered & (layers.choice[part] == k)) for k, one in enumerate(layers.solutions)]
+
+
+def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> StyleLayers:
+    """The stage "surface": the painting, before it is laid into a texture."""
+    s, seed = run.job.settings, run.job.settings.seed
+    inputs = [style.rgb, style.alpha, s.surface, s.paint, paint_files(s.paint), seed]
+    return run.record("surface", ["texels"], inputs, lambda r: paint_layers(asset, style, atlas, s, r))
+
+
+def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View], after: str) -> list[View]:
+    """The stylized views, drawn from the painted texture so that all agree by construction;
+    `after` is the stage that made it."""
+    from mistyle.io.cameras.views import read_views, write_views
+
+    def write(folder: Path, report: Report) -> None:
+        drawn = unlit_views(asset, baked.maps, views, report)
+        write_views(folder, drawn, (), paper_files=False)
+
+    return read_views(run.stage("stylized", [after, "views"], [], write))
+
+
+def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], report: Report) -> list[View]:
+    """Each view with its rgb replaced by the albedo seen there, premultiplied."""
+    from mistyle.render.mitsuba.unlit import unlit
+
+    drawn = unlit(asset.mesh, maps, [view.camera for view in views], progress=report)
+    return [replace(view, rgb=rgb, coverage=share) for view, (rgb, share) in zip(views, drawn, strict=True)]
+
+
+def with_geometry(asset: Asset, views: Sequence[View]) -> list[View]:
+    """Pictures with the depth and normals of the mesh where the files brought none: the mesh itself is the truth."""
+    from mistyle.render.mitsuba.draw import gbuffer, tracer
+
+    traced = tracer(asset.mesh)
+    result = []
+    for view in views:
+        hits = gbuffer(traced, view.camera)
+        result.append(
+            replace(view, depth=hits.depth, normal=hits.normal, uv=hits.uv, part=hits.part, mask=hits.mask & view.mask)
+        )
+    return result

@@ -1,0 +1,142 @@
+"""What `stylize`, `render` and `bake` will do and cost, before they do it (`--dry-run`); see jobs/plan.py."""
+
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.errors import InputRefused
+from mistyle.jobs.memory_budget import Counts
+from mistyle.jobs.plan import (
+    BYTES_PER_TEXEL,
+    BYTES_PER_VIEW_PIXEL,
+    PER_CROP_PIXEL,
+    PER_SAMPLE_RAY,
+    PER_SURFACE_SAMPLE,
+    PER_TABLE_PIXEL,
+    PER_TEXEL,
+    PER_VGG_PIXEL,
+    PER_VIEW_PIXEL,
+    costs,
+    extent_of,
+    needed_memory,
+    reading,
+)
+from mistyle.jobs.stages import claim_run
+from mistyle.stylization.pipeline.budget import (
+    BAKE,
+    BAKE_TILED,
+    BAKED,
+    DRAWN,
+    PLAIN,
+    RENDER,
+    RENDER_TILED,
+    STYLED,
+    TILED,
+    bake_counts,
+    counts,
+    render_counts,
+    view_pixels,
+)
+from mistyle.stylization.pipeline.job import FINISH, STAGES, Job
+from mistyle.stylization.settings import Settings
+
+
+def plan(job: Job) -> dict[str, Any]:
+    """Stages with estimated seconds, and the disk they take; refuses a missing mesh or picture, and a folder with the
+    user's files in the way, as the job would."""
+    from mistyle.stylization.pipeline.stylize import inputs_of
+
+    extent = extent_of(job.mesh, job.settings)
+    claim_run(job, STAGES, inputs_of(job))
+    if not job.style.is_file():
+        raise InputRefused(f"{job.style}: found nothing, expected a picture; check the path")
+    s = job.settings
+    pixels = view_pixels(s)
+    texels = extent.sets * s.atlas.size**2
+    crops = fit_steps(s) * s.fit.crops
+    repaired = not s.keeps_painting
+    frames = s.report.frames * s.report.resolution**2 * s.report.spp
+    seconds = {
+        "mesh": reading(extent),
+        "texels": texels * PER_TEXEL,
+        "views": pixels * (s.draw.samples(s.stylizer != "embedded") * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
+        "surface": s.surface.samples * PER_SURFACE_SAMPLE,
+        "bake": 2 * texels * PER_TEXEL + pixels * PER_VIEW_PIXEL,
+        **_finishing(s),
+        "stylized": 2 * pixels * PER_VIEW_PIXEL,
+        "fit": crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
+        "masks": repaired * 0.3 * texels * PER_TEXEL,
+        "repair": repaired * texels * PER_TEXEL + 0.1 * crops * s.fit.crop_size**2 * PER_CROP_PIXEL,
+        "asset": 2 * texels * PER_TEXEL,
+        "report": 5 + frames * PER_SAMPLE_RAY,
+    }
+    return {
+        "mesh": str(job.mesh),
+        "style": str(job.style),
+        **costs(job, STAGES | FINISH, seconds, extent.sets),
+        **needed_memory(s, lambda c: counts(c, extent.faces, extent.sets, extent.own), PLAIN, TILED, STYLED),
+        "disk_gb": round((texels * BYTES_PER_TEXEL + 2 * pixels * BYTES_PER_VIEW_PIXEL) / 1e9, 2),
+    }
+
+
+def fit_steps(settings: Settings) -> int:
+    """The steps of the phases that will run."""
+    steps = {"normal-roughness": settings.fit.iterations1, "albedo": settings.fit.iterations2}
+    return sum(count for name, count in steps.items() if settings.refined in (name, "all"))
+
+
+def plan_render(mesh: Path, out: Path, settings: Settings) -> dict[str, Any]:
+    """The same for `mistyle render`."""
+    extent = extent_of(mesh, settings)
+
+    def count(chosen: Settings) -> Counts:
+        return render_counts(chosen, extent.faces, extent.sets, extent.own)
+
+    pixels = count(settings).view
+    seconds = {
+        "mesh": reading(extent),
+        "views": 2 + pixels * (settings.draw.samples() * PER_SAMPLE_RAY * 0.3 + PER_VIEW_PIXEL),
+    }
+    job = Job(mesh, mesh, out, settings, mesh.stem)
+    return {
+        "mesh": str(mesh),
+        "views": f"{pixels / 1e6:.1f} megapixels of views",
+        **costs(job, STAGES, seconds, extent.sets),
+        **needed_memory(settings, count, RENDER, RENDER_TILED, DRAWN),
+        "disk_gb": round(pixels * BYTES_PER_VIEW_PIXEL / 1e9, 2),
+    }
+
+
+def plan_bake(mesh: Path, views: Path, out: Path, settings: Settings, name: str) -> dict[str, Any]:
+    """The same for `mistyle bake`, whose views' cameras are read."""
+    from mistyle.io.cameras.views import view_cameras
+
+    extent = extent_of(mesh, settings)
+    sizes = [camera.size[0] * camera.size[1] for camera in view_cameras(views)]
+    texels = extent.sets * settings.atlas.size**2
+
+    def count(chosen: Settings) -> Counts:
+        return bake_counts(sizes, chosen, extent.faces, extent.sets, extent.own)
+
+    seconds = {
+        "mesh": reading(extent),
+        "asset": 4 * texels * PER_TEXEL + extent.sets * sum(sizes) * PER_TABLE_PIXEL,
+    }
+    return {
+        "mesh": str(mesh),
+        "pictures": len(sizes),
+        "megapixels": round(sum(sizes) / 1e6, 1),
+        "references": str(views),
+        **costs(Job(mesh, views, out, settings, name), STAGES, seconds, extent.sets),
+        **needed_memory(settings, count, BAKE, BAKE_TILED, BAKED),
+        "disk_gb": round(texels * BYTES_PER_TEXEL / 1e9, 2),
+    }
+
+
+def _finishing(settings: Settings) -> dict[str, float]:
+    """Seconds of the stage 'finish', where it is wanted, with the crops that judge it before and after."""
+    from mistyle.stylization.optimise.finish_settings import JUDGED
+
+    chosen = settings.finish
+    if chosen.method == "off":
+        return {}
+    return {"finish": (chosen.steps + 2 * JUDGED) * chosen.crops * chosen.crop_size**2 * PER_VGG_PIXEL}

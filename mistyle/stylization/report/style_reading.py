@@ -1,0 +1,90 @@
+"""How a job's style pictures read and which settings follow: for the console, run.json and the report."""
+
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from mistyle.core.asset import Picture
+from mistyle.jobs.progress import Progress
+from mistyle.stylization.settings import Settings
+from mistyle.stylization.surface.exemplar.chosen import FROM_PAINTING, settled
+from mistyle.stylization.surface.exemplar.reading import StyleReading, read_style
+from mistyle.stylization.surface.settings import ResolvedSettings
+
+
+@dataclass(frozen=True)
+class StyleLook:
+    """One style picture: its file name, its measures, and the settings that it is painted with."""
+
+    name: str
+    reading: StyleReading
+    settings: ResolvedSettings
+    chosen: tuple[str, ...]
+
+    def record(self) -> dict[str, Any]:
+        """For run.json: the measures, the settings that can follow from them, and which of these did."""
+        settings = {name: getattr(self.settings, name) for name in FROM_PAINTING}
+        return {
+            "picture": self.name,
+            "reading": asdict(self.reading),
+            "settings": settings,
+            "from_the_picture": list(self.chosen),
+        }
+
+
+def style_looks(style: Picture, name: str, settings: Settings, progress: Progress) -> tuple[StyleLook, ...]:
+    """Read the style and the pictures of slots, and say in a line each what follows; nothing for diffusion."""
+    from mistyle.deliver.colour import read_style as read_file
+    from mistyle.stylization.surface.layers import masked_style
+
+    if settings.stylizer == "diffusion":
+        return ()
+    pictures = {name: masked_style(style, settings.paint.style_mask)}
+    for slot in settings.paint.slots:
+        path = Path(slot.rpartition("=")[2])
+        if path.is_file():  # a slot without its picture is refused where slots are placed
+            pictures[slot.rpartition("=")[0] + "=" + path.name] = read_file(path, settings.colour)
+    looks = tuple(look(picture, called, settings) for called, picture in pictures.items())
+    for one in looks:
+        progress.say(f"{one.name}: {told(one)}")
+    return looks
+
+
+def look(picture: Picture, name: str, settings: Settings) -> StyleLook:
+    """One picture's measures and settings."""
+    reading = read_style(picture.rgb, picture.alpha)
+    chosen = tuple(key for key in FROM_PAINTING if getattr(settings.surface, key) is None)
+    return StyleLook(name, reading, settled(picture.rgb, picture.alpha, settings.surface, reading), chosen)
+
+
+def told(one: StyleLook) -> str:
+    """What was read and what follows, in a line."""
+    return f"{measures(one.reading)}; so {choices(one)}"
+
+
+def measures(reading: StyleReading) -> str:
+    """The measures of a picture in words."""
+    grid = "x".join(str(side) for side in reading.pixel_grid)
+    return (
+        f"unit {reading.unit:.2f} of the long side (clarity {reading.clarity:.2f}), lines {reading.line_likeness:.2f}, "
+        f"flat {reading.flatness:.2f}, rectilinear {reading.rectilinear:.2f}, tones {reading.tones}"
+        + ("" if reading.pixel_grid == (0, 0) else f", art pixels of {grid}")
+    )
+
+
+def choices(one: StyleLook) -> str:
+    """The settings that follow from a picture, and those that were set."""
+    shown = {name: getattr(one.settings, name) for name in FROM_PAINTING}
+    shown["crop"] = "/".join(f"{share:.3f}" for share in one.settings.crop)
+    own = [f"{name} {value}" for name, value in shown.items() if name in one.chosen]
+    kept = [f"{name} {value} (set)" for name, value in shown.items() if name not in one.chosen]
+    return ", ".join(own + kept)
+
+
+def look_facts(looks: tuple[StyleLook, ...]) -> tuple[tuple[str, str], ...]:
+    """For the report: a line of measures and a line of settings a picture."""
+    return tuple(
+        fact
+        for one in looks
+        for fact in ((f"{one.name}, as read", measures(one.reading)), (f"{one.name}, settings", choices(one)))
+    )

@@ -1,0 +1,1 @@
+"""The style picture as the painter sees it."""

@@ -1,0 +1,55 @@
+"""Height and gloss that a painting suggests: strokes stand proud, cracks, grout and outlines lie deep and are dull.
+
+Nothing in a picture says how thick its paint is; this is a guess by lightness, good enough for a first normal and
+roughness map, which the fit then refines.
+"""
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.stylization.surface.exemplar.exemplar import blurred, lab_from_srgb
+
+FINE, BROAD = 1 / 700, 1 / 60  # widths (long sides of the painting) between which strokes are looked for
+GROOVE = 1 / 80  # and the widest groove
+STEADY = 0.02  # local contrast of lightness (Lab / 100) under which strokes are paper grain
+LEAST_SLOPE = 1e-3  # height per pixel under which a picture is flat: rounding
+DULL, SHINY = 0.3, 0.12  # roughness that a groove adds, and that a stroke's crest takes away
+
+
+@dataclass(frozen=True)
+class Relief:
+    """Per pixel of a painting: the slope of its height along x and y (root mean square 1 together), and what is to be
+    added to the roughness."""
+
+    slope: Float[np.ndarray, "h w 2"]
+    dull: Float[np.ndarray, "h w"]
+
+
+def height_and_grooves(painting: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Height, how much of a groove a pixel is (0..1), and how much of a stroke's crest (-1..1).
+
+    A stroke's crest is light against its surroundings, in units of the contrast there; a groove is a dark line narrower
+    than GROOVE (a black top-hat).
+    """
+    long = max(painting.shape[:2])
+    light = blurred(lab_from_srgb(painting)[..., 0], max(0.6, FINE * long))
+    around = blurred(light, BROAD * long)
+    contrast = np.sqrt(blurred((light - around) ** 2, BROAD * long)) + STEADY
+    crest = np.tanh((light - around) / contrast).astype(np.float32)
+    reach = 2 * max(1, round(GROOVE * long / 2)) + 1
+    disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach))
+    hat = cv2.morphologyEx(light, cv2.MORPH_BLACKHAT, disc, borderType=cv2.BORDER_REPLICATE)
+    groove = np.clip(hat / max(float(np.percentile(hat, 99)), 5 * STEADY), 0, 1).astype(np.float32)
+    return 0.5 * crest - groove, groove, crest
+
+
+def relief(painting: Float[np.ndarray, "h w 3"]) -> Relief:
+    """Slopes and dullness of an encoded sRGB painting; flat where it is flat."""
+    height, groove, crest = height_and_grooves(painting)
+    smooth = blurred(height, max(0.6, FINE * max(painting.shape[:2])))
+    slope = np.stack([cv2.Scharr(smooth, cv2.CV_32F, 1, 0), cv2.Scharr(smooth, cv2.CV_32F, 0, 1)], axis=2) / 32
+    size = float(np.sqrt((slope**2).sum(axis=2).mean()))
+    return Relief(slope / max(size, LEAST_SLOPE), DULL * groove - SHINY * crest)

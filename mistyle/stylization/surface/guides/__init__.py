@@ -1,0 +1,1 @@
+"""What each surface point asks of the painting: tone, colour, direction."""

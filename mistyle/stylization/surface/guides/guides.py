@@ -1,0 +1,228 @@
+"""What every place of the surface asks of the painting: how light, which colour, and where dark and light must be.
+
+All of it comes from the shape alone and is the same from every side: places that follow its parts, creases and ridges.
+Light from above and openness (ambient occlusion) count as far as `form` says. The painting answers with its own range
+of values.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from mistyle.stylization.surface.guides.creases import LEAST_RELIEF, bounded, cavity_of, creases
+from mistyle.stylization.surface.guides.linefield import KEY
+from mistyle.stylization.surface.guides.places import light, place_fields, without
+from mistyle.stylization.surface.samples import Level, SurfacePoints, carry, drop, smooth, workers
+from mistyle.stylization.surface.settings import ResolvedSettings
+
+Occlusion = Callable[[np.ndarray, np.ndarray], np.ndarray]
+Content = Callable[[np.ndarray, np.ndarray], np.ndarray]  # positions, normals -> lightness 0..1 of the asset's texture
+ROTATIONS = 30
+LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, while colours are transported
+FIELD_POINTS = 6_000  # samples at most on which the places are found
+MIDDLE, SPREAD = 0.5, 0.22  # mean and standard deviation of the tone of places
+HOLLOW = 0.4  # tone that a full hollow loses and a full ridge gains by CONVEX: parts end at their creases
+CALM = 0.65  # share of the palette's spread of lightness between places, where the shape alone chooses them
+LEAST_DETAIL = 0.05  # difference of tone between two smoothings that counts as full detail
+CONVEX = 0.4  # how much of a ridge or bulge counts, against a hollow
+LEAST_CONTENT = 0.02  # standard deviation of a texture's lightness from which on it counts in full
+HIDDEN = 0.05  # share of open sky under which a place is taken for invisible
+STANDING = -0.85  # height of the normal under which a place is taken for what the thing stands on
+
+
+@dataclass(frozen=True)
+class Guide:
+    """Guides of one level: `colour` Lab/100 (large areas), `detail` -1.6 (dark) .. 1.6 (light), `directed` 0..1."""
+
+    colour: Float[np.ndarray, "n 3"]
+    detail: Float[np.ndarray, " n"]
+    directed: Float[np.ndarray, " n"]
+
+
+def level_guides(
+    levels: Sequence[Level],
+    palette: Float[np.ndarray, "m 3"],
+    occlusion: Occlusion,
+    settings: ResolvedSettings,
+    rng: np.random.Generator,
+    content: Content | None = None,
+) -> list[Guide]:
+    """Guides of all levels, coarse to fine. `palette` is Lab/100 of the blurred painting, a few thousand colours.
+
+    `content` is the lightness of a texture that the surface has already; `settings.keep_content` is its share in tone
+    and detail, `settings.form` that of sky light and openness, `settings.modelling` that of all hollows and bumps.
+    """
+    middle = max(len(levels) - 2, 0)
+    base = levels[middle].points
+    openness = smooth(levels[middle], occlusion(base.positions, base.normals).astype(np.float32), 1)
+    fields = places(levels, base, openness)
+    lit, cavity = tones(levels, openness, settings.bake_light)
+    tone = [
+        carry(base, MIDDLE + SPREAD * fields[:, 0], level.points) - HOLLOW * hollow
+        for level, hollow in zip(levels, cavity, strict=True)
+    ]
+    details = mixed(creases(levels), detail(levels, tone, cavity), settings.modelling)
+    if settings.form > 0:
+        tone = mixed(tone, lit, settings.form)
+        details = mixed(details, detail(levels, lit, cavity), settings.form)
+    kept = 0.0
+    if content is not None and settings.keep_content > 0:
+        lightness = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
+        kept = settings.keep_content * min(float(lightness[-1].std()) / LEAST_CONTENT, 1.0)
+        tone, details = with_content(levels, tone, details, lightness, kept)
+    shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
+    colour = colour_field(tone[middle], fields, shown, palette, rng)
+    typical, spread = palette[:, 0].mean(), CALM + (1 - CALM) * max(settings.form, kept)
+    colour[:, 0] = typical + spread * (colour[:, 0] - typical)
+    return [
+        Guide(carry(base, colour, level.points), own, level.directed)
+        for level, own in zip(levels, details, strict=True)
+    ]
+
+
+def mixed(
+    first: Sequence[Float[np.ndarray, " _"]], second: Sequence[Float[np.ndarray, " _"]], share: float
+) -> list[Float[np.ndarray, " _"]]:
+    """Level by level, the share of the second laid over the first."""
+    return [(1 - share) * a + share * b for a, b in zip(first, second, strict=True)]
+
+
+def places(levels: Sequence[Level], base: SurfacePoints, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
+    """`place_fields` at the points of `base`, found on the finest level that is small enough.
+
+    The first, of lightness, grows upwards in the mean: heads and lids are light, and dark strokes draw their features.
+    """
+    small = next((level for level in reversed(levels) if len(level.directed) <= FIELD_POINTS), levels[0])
+    fields = carry(small.points, place_fields(small, drop(base, openness, small.points)), base)
+    rest = without(fields, light(base.normals, openness))
+    if (rest[:, 0] * base.positions[:, 1]).sum() < 0:
+        rest[:, 0] = -rest[:, 0]
+    return (rest / np.maximum(rest.std(axis=0), 1e-9)).astype(np.float32)
+
+
+def tones(
+    levels: Sequence[Level], openness: Float[np.ndarray, " m"], bake_light: float
+) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
+    """Tone (about 0..1) and cavity (-1..1, positive in hollows) of every level.
+
+    `openness` (ambient occlusion, 1 = open) and the cavity belong to the second finest level, where they are smooth;
+    each level has its own normals.
+    """
+    middle = levels[max(len(levels) - 2, 0)]
+    coarse = levels[max(len(levels) - 3, 0)]
+    fine_cavity = smooth(middle, cavity_of(middle), 1)
+    broad_cavity = carry(coarse.points, smooth(coarse, cavity_of(coarse), 1), middle.points)
+    hollow = (bounded(fine_cavity, 95, LEAST_RELIEF, 1) + bounded(broad_cavity, 95, LEAST_RELIEF, 1)) / 2
+    # Round things are convex nearly everywhere: counted in full, flat places among them would look like hollows.
+    hollow = np.where(hollow < 0, CONVEX * hollow, hollow)
+    tone, cavity = [], []
+    for level in levels:
+        own = level is middle
+        open_here = openness if own else carry(middle.points, openness, level.points)
+        hollow_here = hollow if own else carry(middle.points, hollow, level.points)
+        normals = level.points.normals
+        sky = 0.5 + 0.5 * normals[:, 1]
+        shade = 0.35 + 0.65 * open_here
+        key = (0.75 * (0.5 + 0.5 * normals @ KEY.astype(np.float32)) ** 1.2 + 0.25 * sky) * shade - 0.16 * hollow_here
+        top = sky * shade - 0.2 * hollow_here
+        tone.append((bake_light * key + (1 - bake_light) * top).astype(np.float32))
+        cavity.append(hollow_here.astype(np.float32))
+    return tone, cavity
+
+
+def with_content(
+    levels: Sequence[Level],
+    tone: Sequence[Float[np.ndarray, " _"]],
+    details: Sequence[Float[np.ndarray, " _"]],
+    content: Sequence[Float[np.ndarray, " _"]],
+    share: float,
+) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
+    """Tone and details with that share given over to the lightness of the asset's own texture, at its contrast.
+
+    The texture's lightness is brought to the tone's mean.
+    """
+    shift = np.float32(tone[-1].mean() - content[-1].mean())
+    own = [lightness + shift for lightness in content]
+    return mixed(tone, own, share), mixed(details, detail(levels, own, [0 * c for c in own]), share)
+
+
+def detail(
+    levels: Sequence[Level], tone: Sequence[Float[np.ndarray, " _"]], cavity: Sequence[Float[np.ndarray, " _"]]
+) -> list[Float[np.ndarray, " _"]]:
+    """Exaggerated tone of small forms: two bands between smoothings of tone and cavity, -1.6..1.6, for every level."""
+    fine, middle, coarse = levels[-1], levels[max(len(levels) - 2, 0)], levels[max(len(levels) - 3, 0)]
+    sharp = smooth(fine, tone[-1] - 0.25 * cavity[-1], 1)
+    medium = smooth(middle, drop(fine.points, smooth(fine, sharp, 2), middle.points), 2)
+    broad = smooth(coarse, drop(middle.points, smooth(middle, medium, 2), coarse.points), 2)
+    medium_here = carry(middle.points, medium, fine.points)
+    broad_here = carry(coarse.points, broad, fine.points)
+    small = bounded(sharp - medium_here, 92, LEAST_DETAIL, 1.5)
+    large = bounded(medium_here - broad_here, 92, LEAST_DETAIL, 1.5)
+    finest = np.clip(0.6 * small + 0.8 * large, -1.6, 1.6).astype(np.float32)
+    softened = smooth(fine, finest, 1)
+    return [drop(fine.points, softened, level.points) for level in levels[:-1]] + [finest]
+
+
+def normal_scores(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Values replaced by those a standard normal variable takes at the same ranks."""
+    from scipy.special import ndtri
+
+    rank = np.empty(len(values))
+    rank[np.argsort(values, kind="stable")] = (np.arange(len(values)) + 0.5) / len(values)
+    return ndtri(rank)
+
+
+def at_quantiles(values: Float[np.ndarray, " n"], of: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
+    """Values replaced, in their order, by the quantiles of another set (ties by position)."""
+    share = (np.arange(len(values)) + 0.5) / len(values)
+    result = np.empty(len(values))
+    result[np.argsort(values, kind="stable")] = np.interp(share, (np.arange(len(of)) + 0.5) / len(of), np.sort(of))
+    return result
+
+
+def colour_field(
+    tone: Float[np.ndarray, " n"],
+    fields: Float[np.ndarray, "n 3"],
+    shown: Bool[np.ndarray, " n"],
+    palette: Float[np.ndarray, "m 3"],
+    rng: np.random.Generator,
+) -> Float[np.ndarray, "n 3"]:
+    """A smooth colour (Lab/100) at every point; over those `shown` the palette keeps its own proportions.
+
+    Optimal transport by iterated one-dimensional transport along rotated axes (Pitie, Kokaram and Dahyot 2007), from
+    a description of the place (its tone and the second and third of `fields`) to the palette: light places get light
+    colours, and what lies together on the surface gets colours that lie together in the palette. The others (the inside
+    of a pot and what it stands on) take no share; each gets the colour of the shown point most like it.
+    """
+    from scipy.spatial import KDTree
+
+    seen = np.flatnonzero(shown) if shown.any() else np.arange(len(tone))
+    mean, spread = palette.mean(axis=0), palette.std(axis=0)
+    place = np.stack(
+        [
+            at_quantiles(tone[seen], palette[:, 0]),
+            normal_scores(fields[seen, 1]) * spread[1] + mean[1],
+            normal_scores(fields[seen, 2]) * spread[2] + mean[2],
+        ],
+        axis=1,
+    )
+    scale = np.array([np.clip(LIGHTNESS_LEAD * spread[1:].mean() / max(spread[0], 1e-6), 0.25, 4.0), 1.0, 1.0])
+    colours = transport(place * scale, palette * scale, rng) / scale
+    features = np.stack([tone / SPREAD, fields[:, 1], fields[:, 2]], axis=1)
+    alike = KDTree(features[seen]).query(features, workers=workers())[1]
+    return colours[alike].astype(np.float32)
+
+
+def transport(
+    source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"], rng: np.random.Generator
+) -> Float[np.ndarray, "n 3"]:
+    """The source moved until its distribution is the target's; ends on the unrotated axes, exact in each of them."""
+    for step in range(ROTATIONS + 1):
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0] if step < ROTATIONS else np.eye(3)
+        turned, aim = source @ rotation, target @ rotation
+        for axis in range(3):
+            turned[:, axis] = at_quantiles(turned[:, axis], aim[:, axis])
+        source = turned @ rotation.T
+    return source

@@ -1,0 +1,245 @@
+"""The paint on an asset: which picture goes where, what of the asset's own look stays, and what the painting
+says about height and gloss (before the paper's 4.2, which then refines those maps)."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from mistyle.atlas.frames import texel_frames
+from mistyle.core.asset import Asset, Picture
+from mistyle.core.errors import InputRefused, UsageError
+from mistyle.core.image import resize, srgb_from_linear
+from mistyle.core.maps import Maps, Texels
+from mistyle.core.mesh import Mesh, face_areas
+from mistyle.geometry.tangents import corner_tangents
+from mistyle.stylization.surface.guides.linefield import DirectionConstraint
+from mistyle.stylization.surface.lookup import PaintedSurface
+from mistyle.stylization.surface.settings import SurfaceSettings
+
+PICTURE_STROKES = 32  # strokes side by side along a picture's long side, by which `stroke_size` is turned into a scale
+FEW_TEXELS = 200_000  # texels that are asked for content, or for a painted direction
+PLAIN = 0.004  # standard deviation of lightness (0..1) below which an albedo has no content
+ROUGHEST, SMOOTHEST = 1.0, 0.08
+FLOW_FREE, FLOW_SURE = 0.1, 0.5  # distances from mid grey up to which, and from which on, a painted direction counts
+
+
+@dataclass(frozen=True)
+class StyleLayers:
+    """One solution a picture, and per texture set which of them each texel takes (0: the job's own style)."""
+
+    solutions: tuple[PaintedSurface, ...]
+    choice: tuple[np.ndarray, ...]
+
+
+def masked_style(style: Picture, mask: Path | None) -> Picture:
+    """The style with the dark parts of a mask picture (of any size) taken out."""
+    if mask is None:
+        return style
+    from mistyle.io.read import read_picture
+
+    light = resize(read_picture(mask).rgb.mean(axis=2), style.rgb.shape[:2])
+    if not (light > 0.5).any():
+        raise InputRefused(f"{mask}: dark everywhere; a style mask is light where the picture may be used")
+    alpha = np.ones(style.rgb.shape[:2], np.float32) if style.alpha is None else style.alpha
+    return replace(style, alpha=(alpha * (light > 0.5)).astype(np.float32))
+
+
+def scaled(surface: SurfaceSettings, asset: Asset, stroke_size: float | None) -> SurfaceSettings:
+    """`stroke_scale` such that a stroke (a 32nd of the picture) is `stroke_size` of the mesh's own units wide.
+
+    Refused where that is beyond what the number of samples can show.
+    """
+    if stroke_size is None:
+        return surface
+    from mistyle.stylization.surface.samples import YIELD
+    from mistyle.stylization.surface.synthesis import finest_size
+
+    area = float(face_areas(asset.mesh).sum())
+    spacing = np.sqrt(area / (YIELD * surface.samples))
+    per_unit = float(np.cbrt(abs(np.linalg.det(asset.source.work_from_user[:3, :3]))))
+
+    def stroke(scale: float) -> float:
+        """Width of a stroke in the mesh's units at a stroke_scale, as far as that is possible."""
+        size = finest_size(surface.model_copy(update={"stroke_scale": scale}))
+        return float(size * spacing / PICTURE_STROKES / per_unit)
+
+    scale = stroke_size / stroke(1.0)
+    if not (0.1 <= scale <= 10 and np.isclose(stroke(scale), stroke_size, rtol=1e-3)):
+        raise UsageError(
+            f"strokes of {stroke_size:g} on this mesh would be {scale:.3g} times the usual size; choose from "
+            f"{stroke(0.1):.3g} to {stroke(10):.3g} (in the mesh's own units) with {surface.samples} samples"
+        )
+    return surface.model_copy(update={"stroke_scale": scale})
+
+
+def slot_masks(
+    asset: Asset, texels: Sequence[Texels], slots: Sequence[str]
+) -> tuple[list[Path], list[list[Bool[np.ndarray, "h w"]]]]:
+    """The pictures of `slots` and, per picture and texture set, the texels that take it.
+
+    SLOT names a material (all of its texels) or is a picture in the mesh's UVs (texels where it is light).
+    """
+    pictures, masks = [], []
+    for slot in slots:
+        name, equals, picture = slot.rpartition("=")
+        if not equals or not name or not picture:
+            raise UsageError(
+                f"'{slot}' is not of the form SLOT=PICTURE, for example wood=bark.jpg or mask.png=gold.jpg"
+            )
+        pictures.append(Path(picture))
+        if name in asset.mesh.parts:
+            own = zip(asset.mesh.parts, texels, strict=True)
+            masks.append([np.full(t.covered.shape, part == name) for part, t in own])
+        elif Path(name).is_file():
+            masks.append([painted_mask(Path(name), t) for t in texels])
+        else:
+            raise UsageError(
+                f"there is neither a material nor a picture called '{name}'; materials: {', '.join(asset.mesh.parts)}"
+            )
+    return pictures, masks
+
+
+def painted_mask(path: Path, texels: Texels) -> Bool[np.ndarray, "h w"]:
+    """A picture in the mesh's UVs (row 0 is v = 1) as a mask at the atlas's size: light (and opaque) is True."""
+    from mistyle.io.read import read_picture
+
+    mask = read_picture(path)
+    light = mask.rgb.mean(axis=2) * (1 if mask.alpha is None else mask.alpha)
+    return resize(light.astype(np.float32), texels.covered.shape) > 0.5
+
+
+def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
+    """Lightness (encoded luminance, 0..1) of the asset's own albedo at surface points; None where it is of one colour.
+
+    The nearest of about 200,000 texels of the same side answers.
+    """
+    if not any(t.covered.any() for t in texels):
+        return None
+    near, chosen = nearest_texels(texels)
+    weights = np.array([0.2126, 0.7152, 0.0722], np.float32)
+    own = zip(start, chosen, strict=True)
+    light = np.concatenate([srgb_from_linear(m.albedo.reshape(-1, 3)[few] @ weights) for m, few in own])
+    return None if light.std() < PLAIN else lambda where, facing: light[near(where, facing)]
+
+
+def nearest_texels(
+    texels: Sequence[Texels],
+) -> tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], list[Int[np.ndarray, " n"]]]:
+    """About FEW_TEXELS of the covered texels, as flat indices of each set, and which of them, counted through all sets,
+    lies nearest to points (positions, normals) of the surface, of the same side."""
+    from scipy.spatial import KDTree
+
+    counts = np.cumsum([0] + [int(t.covered.sum()) for t in texels])
+    every = max(int(counts[-1]) // FEW_TEXELS, 1)
+    reach = np.float32(0.02)  # working units by which a turn of the normal by one radian counts
+    spans = zip(texels, counts[:-1], counts[1:], strict=True)
+    chosen = [np.flatnonzero(t.covered)[int(-first % every) : end - first : every] for t, first, end in spans]
+    both = zip(texels, chosen, strict=True)
+    parts = [(t.position.reshape(-1, 3)[few], reach * t.normal.reshape(-1, 3)[few]) for t, few in both]
+    tree = KDTree(np.concatenate([np.concatenate(part, axis=1) for part in parts]))
+
+    def near(where: np.ndarray, facing: np.ndarray) -> np.ndarray:
+        return np.asarray(tree.query(np.concatenate([where, reach * facing], axis=1), workers=-1)[1])
+
+    return near, chosen
+
+
+def painted_direction(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> DirectionConstraint | None:
+    """Where strokes shall run by a picture in the mesh's UVs (row 0 is v = 1): red and green, less one half, are the
+    direction along u and v. The further a colour is from mid grey, and the more opaque, the more it counts; half way is
+    fully.
+
+    Lines have no sign: opposite colours mean the same.
+    """
+    if path is None:
+        return None
+    from mistyle.io.read import read_picture
+
+    flow_map = read_picture(path)
+    alpha = np.ones(flow_map.rgb.shape[:2], np.float32) if flow_map.alpha is None else flow_map.alpha
+    near, chosen = nearest_texels(texels)
+    tangents, flows, frames = corner_tangents(mesh), [], []
+    for t, few in zip(texels, chosen, strict=True):
+        wide = resize(2 * flow_map.rgb[..., :2] - 1, t.covered.shape) * resize(alpha, t.covered.shape)[..., None]
+        flows.append(wide.reshape(-1, 2)[few])
+        place = t.face.ravel()[few], t.position.reshape(-1, 3)[few], t.normal.reshape(-1, 3)[few]
+        frames.append(texel_frames(mesh, *place, tangents)[:, :2])
+    flow = np.concatenate(flows)
+    length = np.linalg.norm(flow, axis=1)
+    counts = np.clip((length - FLOW_FREE) / (FLOW_SURE - FLOW_FREE), 0, 1).astype(np.float32)
+    world = np.einsum("tk,tkx->tx", flow, np.concatenate(frames))
+    world /= np.maximum(np.linalg.norm(world, axis=1, keepdims=True), 1e-9)
+    if not counts.any():
+        raise InputRefused(
+            f"{path}: mid grey or transparent everywhere; a direction map holds stroke directions in red (along u) "
+            "and green (along v)"
+        )
+
+    def direction(where: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        index = near(where, facing)
+        return world[index], counts[index]
+
+    return direction
+
+
+@dataclass(frozen=True)
+class TexelBand:
+    """Chosen texels of some rows of a texture set; `at` masks them within these rows."""
+
+    texels: Texels
+    rows: slice
+    at: Bool[np.ndarray, "h w"]
+
+
+@dataclass(frozen=True)
+class PaintRelief:
+    """A painting's relief at some texels, in row order.
+
+    gradient  of its height (world, along the surface)
+    dull      what the paint adds to the roughness
+    """
+
+    gradient: Float[np.ndarray, "t 3"]
+    dull: Float[np.ndarray, " t"]
+
+
+def lay_relief(
+    maps: Maps,
+    band: TexelBand,
+    relief: PaintRelief,
+    height: float,
+    gloss: float,
+    mesh: Mesh,
+    tangents: Float[np.ndarray, "f 3 4"],
+) -> None:
+    """Bend the normals of `maps` by `height` times the painting's slope, and add `gloss` times its dullness to their
+    roughness, in place, for the texels of a band.
+
+    The normal that the asset's map shows is bent, not overwritten. `tangents` are `corner_tangents` of the mesh.
+    """
+    texels, rows, at = band.texels, band.rows, band.at
+    normal, roughness = maps.normal[rows], maps.roughness[rows]
+    if height > 0:
+        place = texels.face[rows][at], texels.position[rows][at], texels.normal[rows][at]
+        frames = texel_frames(mesh, *place, tangents)
+        world = np.einsum("tk,tkx->tx", normal[at], frames) - np.float32(height) * relief.gradient
+        bent = np.einsum("tx,tkx->tk", world, frames)
+        bent[:, 2] = np.maximum(bent[:, 2], 0.05)
+        normal[at] = bent / np.linalg.norm(bent, axis=1, keepdims=True)
+    if gloss > 0:
+        roughness[at] = np.clip(roughness[at] + np.float32(gloss) * relief.dull, SMOOTHEST, ROUGHEST)
+
+
+def protected(maps: Maps, start: Maps, mask: Bool[np.ndarray, "h w"]) -> Maps:
+    """The maps with the asset's own look where the mask says so."""
+    chosen = mask[..., None]
+    return replace(
+        maps,
+        albedo=np.where(chosen, start.albedo, maps.albedo),
+        normal=np.where(chosen, start.normal, maps.normal),
+        roughness=np.where(mask, start.roughness, maps.roughness),
+        metallic=np.where(mask, start.metallic, maps.metallic),
+    )

@@ -1,0 +1,76 @@
+"""The weight-free stylizer: paints the surface once and answers for any point of it. Needs no network, no weights."""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from mistyle.core.asset import Picture
+from mistyle.core.mesh import Mesh
+from mistyle.stylization.surface.guides.guides import Content, Occlusion
+from mistyle.stylization.surface.guides.linefield import DirectionConstraint
+from mistyle.stylization.surface.lookup import PaintedSurface
+from mistyle.stylization.surface.settings import ResolvedSettings, SurfaceSettings
+
+
+def array_module() -> str:
+    """Dr.Jit's array module for the Mitsuba variant in use: "llvm", "cuda" or "metal"."""
+    from mistyle.render.mitsuba import device
+
+    return device.use().split("_")[0]
+
+
+def open_sky(mesh: Mesh, seed: int) -> Occlusion:
+    """The share of open sky at points of a mesh, as the guides ask for it; the mesh is made ready for tracing once."""
+    from mistyle.render.mitsuba.draw import tracer
+    from mistyle.render.mitsuba.occlusion import ambient_occlusion
+
+    traced = tracer(mesh)
+    return lambda positions, normals: ambient_occlusion(traced, positions, normals, seed=seed)
+
+
+def solve_surface(
+    mesh: Mesh,
+    style: Picture,
+    settings: SurfaceSettings | ResolvedSettings,
+    seed: int = 0,
+    progress: Callable[[float], None] = lambda done: None,
+    *,
+    content: Content | None = None,
+    direction: DirectionConstraint | None = None,
+) -> PaintedSurface:
+    """Paint `mesh` in the style of a picture; see `mistyle.stylization.surface.synthesis.solve` for what it can and
+    cannot do.
+
+    `content(positions, normals)` is the lightness (0..1) of a texture that the mesh has already, `direction` where
+    strokes shall run.
+    """
+    from mistyle.stylization.surface.synthesis import SurfaceFields, solve
+
+    module, occlusion = array_module(), open_sky(mesh, seed)
+    return solve(mesh, style, SurfaceFields(occlusion, content, direction), settings, seed, progress, module)
+
+
+def surface_colour(
+    surface: PaintedSurface,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    footprint: float = 0.0,
+) -> Float[np.ndarray, "n 3"]:
+    """Encoded sRGB of surface points; `footprint` is the distance of neighbours, over which colour is averaged."""
+    from mistyle.stylization.surface.lookup import colour
+
+    return colour(surface, positions, normals, footprint=footprint, device=array_module())
+
+
+def surface_relief(
+    surface: PaintedSurface,
+    positions: Float[np.ndarray, "n 3"],
+    normals: Float[np.ndarray, "n 3"],
+    footprint: float = 0.0,
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
+    """Gradient of the painted height along the surface (root mean square about 1) and what the paint adds to the
+    roughness; `footprint` as in `surface_colour`."""
+    from mistyle.stylization.surface.lookup import relief
+
+    return relief(surface, positions, normals, footprint=footprint, device=array_module())
