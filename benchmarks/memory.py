@@ -5,7 +5,7 @@ Each job runs in a process of its own, with few steps and turntable frames, on w
 would take, `budget.asked_gb`, `budget.peak_gb` and `budget.same_bytes` (1: its asset is that of the job without a
 budget, byte for byte); `tiled.asked_gb` and `tiled.peak_gb` of an atlas of 8192² with 64 views. --quick runs the draft
 on spot, the fit at 256² and a small budget. `--stages` also prints every stage's peak beside its estimate, from which
-the constants of stylization/pipeline/budget.py and run/material_budget.py come.
+the constants of stylization/pipeline/budget.py and fitting/pipeline/budget.py come.
 """
 
 import argparse
@@ -91,9 +91,9 @@ def stylized(out: Path, words: list[Any], stages: bool) -> dict[str, float]:
 def fitted(out: Path, atlas: int, side: int, pictures: int, stages: bool) -> dict[str, float]:
     """Estimate and peak of a fit to pictures that were rendered for it."""
     from mistyle.core.light import lights, to_json
+    from mistyle.fitting.pipeline.budget import MATERIAL, material_counts, material_gb
+    from mistyle.fitting.settings.material import MaterialSettings
     from mistyle.jobs.memory_budget import peaks
-    from mistyle.run.material_budget import MATERIAL, material_counts, material_gb
-    from mistyle.run.material_settings import MaterialSettings
 
     views, light = out / "pictures", out / "lights.json"
     rig = ["--rig", "turntable", "--set", f"rig.views={pictures}"]

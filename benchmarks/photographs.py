@@ -38,6 +38,8 @@ from mistyle.core.capture import Captures, in_memory, shrunk
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.light import Directional, to_json
 from mistyle.core.maps import flat_maps
+from mistyle.fitting.pipeline.budget import material_gb
+from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.geometry.lens import Lens, distort
 from mistyle.io.cameras.camera_files import transforms
 from mistyle.io.cameras.captures import read_captures
@@ -45,8 +47,6 @@ from mistyle.io.read_mesh import read_mesh
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 from mistyle.render.mitsuba.draw import tracer
-from mistyle.run.material_budget import material_gb
-from mistyle.run.material_settings import MaterialSettings
 from mistyle.solver.recover import recover
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.validate import downsampling_factors

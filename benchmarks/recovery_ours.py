@@ -11,10 +11,10 @@ from benchmarks.recovery_pictures import Shot
 from benchmarks.recovery_truth import Truth
 from mistyle.core.capture import in_memory
 from mistyle.core.maps import Maps
+from mistyle.fitting.light.unknown_light import find_light
 from mistyle.render.mitsuba.scene import Frame
 from mistyle.solver.recover import recover
 from mistyle.solver.settings import RecoverSettings
-from mistyle.stages.unknown_light import find_light
 
 
 @dataclass(frozen=True)

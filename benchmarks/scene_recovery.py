@@ -110,10 +110,10 @@ def included(steps: int, size: int, spp: int) -> dict[str, float]:
 
     mi: Any = mitsuba
 
+    from mistyle.fitting.pipeline.scene import SceneJob, fit_scene
+    from mistyle.fitting.settings.scene import SceneSettings
     from mistyle.io.images.write import write_exr
     from mistyle.jobs.progress import Progress
-    from mistyle.run.scene_fit import SceneJob, fit_scene
-    from mistyle.run.scene_settings import SceneSettings
 
     with TemporaryDirectory(prefix="mistyle-") as place:
         folder = Path(place)

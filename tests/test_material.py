@@ -16,6 +16,11 @@ from mistyle.core.light import Ambient, Directional, Lights, SphericalGaussian, 
 from mistyle.core.maps import flat_maps
 from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
+from mistyle.fitting.light import unknown_light
+from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
+from mistyle.fitting.pipeline.material import hold_out, lights_in_order, place, references_of
+from mistyle.fitting.pipeline.outlines import tell_placed
+from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.cameras.views import read_views, write_views
 from mistyle.io.images.write import write_png
 from mistyle.io.read_mesh import read_mesh
@@ -25,12 +30,7 @@ from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.render.mitsuba import draw
 from mistyle.run.cli import main
-from mistyle.run.material import hold_out, lights_in_order, place, references_of
-from mistyle.run.material_job import MATERIAL_STAGES, MaterialJob
-from mistyle.run.material_outlines import tell_placed
-from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 from mistyle.solver.cameras.align import Alignment
-from mistyle.stages import unknown_light
 from mistyle.stylization.pipeline.single_stages import tell_views
 
 SIZE, SIDE = 64, 112

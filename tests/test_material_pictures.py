@@ -12,11 +12,11 @@ from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, look_at
 from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
+from mistyle.fitting.pipeline.pictures import look_through, looked
 from mistyle.io.read_mesh import read_mesh
 from mistyle.render.deferred import image_samples, renderer
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.mitsuba import draw
-from mistyle.run.material_pictures import look_through, looked
 from mistyle.solver.texels import gbuffer as texel_views
 from mistyle.solver.validate import LEAST_PIXELS, downsampling_factors
 

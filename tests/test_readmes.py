@@ -21,10 +21,10 @@ from pathlib import Path
 import pytest
 from helpers import ROOT
 
+from mistyle.fitting.settings.material import MaterialSettings
+from mistyle.fitting.settings.scene import SceneSettings
 from mistyle.jobs.settings import Settings, known_keys
 from mistyle.run.cli import parser
-from mistyle.run.material_settings import MaterialSettings
-from mistyle.run.scene_settings import SceneSettings
 
 LANGUAGES = {"shell", "python", "toml", "json", "text"}
 MARK = "<!-- run -->"

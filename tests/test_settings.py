@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from mistyle.core.errors import UsageError
+from mistyle.fitting.settings.material import MATERIAL_PRESETS, MaterialSettings
 from mistyle.jobs.settings import as_toml, assignments, known_keys
 from mistyle.jobs.settings import resolve as settings_of
-from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
 from mistyle.stylization.settings import PRESETS, Settings, resolve
 
 

@@ -13,6 +13,9 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import luminance, resize
 from mistyle.core.light import Environment, environment_directions
 from mistyle.core.maps import flat_maps
+from mistyle.fitting.light import cells as light_cells
+from mistyle.fitting.light import solve as light_solve
+from mistyle.fitting.light import unknown_light
 from mistyle.io.read_mesh import read_mesh
 from mistyle.render.deferred.sky import bin_environment, even_directions
 from mistyle.render.mitsuba.draw import tracer
@@ -20,7 +23,6 @@ from mistyle.solver import prior as recover_prior
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.texels.levenberg_marquardt import Options
 from mistyle.solver.texels.observations import ObservationOptions, collect_observations
-from mistyle.stages import light_cells, light_solve, unknown_light
 
 ALBEDO = (0.3, 0.45, 0.6)
 

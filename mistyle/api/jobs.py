@@ -124,10 +124,10 @@ def fit(
     Raises `mistyle.core.errors.MistyleError`.
     """
     from mistyle.core.names import asset_name
+    from mistyle.fitting.pipeline.material import MaterialJob, fit_material
+    from mistyle.fitting.settings.material import MATERIAL_PRESETS, MaterialSettings
     from mistyle.jobs.progress import Progress
     from mistyle.jobs.settings import resolve
-    from mistyle.run.material import MaterialJob, fit_material
-    from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
 
     mesh = Path(mesh)
     job = MaterialJob(

@@ -14,7 +14,7 @@ class SceneFit(FittedScene):
     """A `FittedScene` with a face for notebooks."""
 
     def _repr_html_(self) -> str:
-        from mistyle.run.scene_report import changes, figures, row_text
+        from mistyle.fitting.report.scene import changes, figures, row_text
 
         rows = [(row["name"], row_text(row)) for row in changes(self)]
         head = ("parameter", "before → after ± standard error")
@@ -89,8 +89,8 @@ def fit_scene(
     from dataclasses import replace
     from pathlib import Path
 
+    from mistyle.fitting.pipeline.scene_references import read_reference
     from mistyle.render.live.parameters import merged
-    from mistyle.run.scene_references import read_reference
     from mistyle.solver.scene.fit import fit_scene as run
 
     notes: list[str] = []

@@ -1,7 +1,7 @@
 """How much memory a job will need, stage by stage, from counts alone; and whether it keeps the budget it was given.
 
 A stage's peak is what the program itself takes, plus bytes of each count of the job: see `Need`. The needs and counts
-of a verb stand in `pipeline/budget.py` and `material_budget.py`. They hold on the processor, with two threads and the
+of a verb stand in `pipeline/budget.py` and `pipeline/budget.py`. They hold on the processor, with two threads and the
 embedded filter bank: VGG-19 and the stylizers that need models count their own (stylization/pipeline/generative.py).
 """
 

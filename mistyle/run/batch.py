@@ -161,7 +161,7 @@ def describe(summary: dict[str, Any]) -> str:
 
 def dry_run(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
     """What the batch would do: estimated seconds, disk and memory of every job that is not done yet."""
-    from mistyle.run.material_plan import plan_material
+    from mistyle.fitting.pipeline.plan import plan_material
     from mistyle.stylization.pipeline.plan import plan as plan_style
 
     rows = []

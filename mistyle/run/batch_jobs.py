@@ -261,7 +261,7 @@ def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int, bas
 
     root: type[BaseModel]
     if kind == "fit":
-        from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
+        from mistyle.fitting.settings.material import MATERIAL_PRESETS, MaterialSettings
 
         root, presets = MaterialSettings, MATERIAL_PRESETS
     else:

@@ -122,7 +122,7 @@ def indices(text: str, count: int) -> tuple[int, ...]:
 def with_delivery(plan: BatchPlan, said: Mapping[str, Any]) -> BatchPlan:
     """A batch's plan in which every job delivers what the command line says. UsageError where a job cannot."""
     from mistyle.deliver import export as deliver
-    from mistyle.run.material_settings import MaterialSettings
+    from mistyle.fitting.settings.material import MaterialSettings
     from mistyle.stylization.settings import Settings
 
     if not said:

@@ -180,8 +180,8 @@ def run_fit(options: argparse.Namespace) -> int:
 
 def material_settings(options: argparse.Namespace) -> Any:
     """The resolved settings of `mistyle fit MESH REFERENCES`."""
+    from mistyle.fitting.settings.material import MATERIAL_PRESETS, MaterialSettings
     from mistyle.jobs.settings import resolve
-    from mistyle.run.material_settings import MATERIAL_PRESETS, MaterialSettings
 
     said = given_settings(options, OPTIONS)
     return resolve(options.preset, options.config, said, root=MaterialSettings, presets=MATERIAL_PRESETS)
@@ -189,11 +189,11 @@ def material_settings(options: argparse.Namespace) -> Any:
 
 def _fit_scene(options: argparse.Namespace) -> int:
     """List a scene's parameters, or fit them."""
+    from mistyle.fitting.pipeline.scene import SceneJob, describe, fit_scene, list_row, listed, loaded
+    from mistyle.fitting.report.scene import row_text
+    from mistyle.fitting.settings.scene import SCENE_PRESETS, SceneSettings
     from mistyle.jobs.progress import Progress
     from mistyle.jobs.settings import as_toml, resolve
-    from mistyle.run.scene_fit import SceneJob, describe, fit_scene, list_row, listed, loaded
-    from mistyle.run.scene_report import row_text
-    from mistyle.run.scene_settings import SCENE_PRESETS, SceneSettings
 
     if options.report is not None:
         raise UsageError("--report belongs to a fit of MESH and REFERENCES; fit --scene always writes its whole report")
@@ -226,11 +226,11 @@ def _fit_scene(options: argparse.Namespace) -> int:
 
 
 def _fit_mesh(options: argparse.Namespace, settings: Any) -> int:
+    from mistyle.fitting.pipeline.job import MaterialJob
+    from mistyle.fitting.pipeline.material import fit_material
+    from mistyle.fitting.pipeline.plan import plan_material
     from mistyle.jobs.plan import describe_plan
     from mistyle.jobs.progress import Progress
-    from mistyle.run.material import fit_material
-    from mistyle.run.material_job import MaterialJob
-    from mistyle.run.material_plan import plan_material
 
     job = MaterialJob(
         options.mesh,

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from mistyle.core.errors import MistyleError, Stopped
+from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.io.store import lock
 from mistyle.io.store.atomic import LOCK, atomic_write, digest, sha256_file
 from mistyle.io.store.output import claim, keep_folder
@@ -25,7 +26,6 @@ from mistyle.jobs.stages import claim_run, program
 from mistyle.process.disk_errors import unexpected
 from mistyle.run.batch_jobs import Record
 from mistyle.run.batch_plan import BatchPlan
-from mistyle.run.material_job import MATERIAL_STAGES
 from mistyle.stylization.pipeline.job import STAGES
 
 SHARDS = "shards"
@@ -136,8 +136,8 @@ def job_of(plan: BatchPlan, record: Record) -> Any:
     """The `Job` or `MaterialJob` that a record of the plan says."""
     out = plan.out / record.name
     if record.kind == "fit":
-        from mistyle.run.material_job import MaterialJob
-        from mistyle.run.material_settings import MaterialSettings
+        from mistyle.fitting.pipeline.job import MaterialJob
+        from mistyle.fitting.settings.material import MaterialSettings
 
         assert record.references is not None
         lights = record.lights if record.lights in (None, "unknown") else Path(record.lights)
@@ -154,7 +154,7 @@ def job_of(plan: BatchPlan, record: Record) -> Any:
 
 def _run(plan: BatchPlan, record: Record, progress: Progress) -> dict[str, Any]:
     if record.kind == "fit":
-        from mistyle.run.material import fit_material
+        from mistyle.fitting.pipeline.material import fit_material
 
         return fit_material(job_of(plan, record), progress)
     from mistyle.stylization.pipeline.stylize import stylize

@@ -14,6 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from mistyle.core.errors import InputRefused, UsageError
+from mistyle.fitting.pipeline.scene_references import read_reference, reference_files
+from mistyle.fitting.report.scene import changes, figures, noise_text, write_page
+from mistyle.fitting.settings.scene import SceneSettings
 from mistyle.io.store.atomic import atomic_write, digest
 from mistyle.io.store.keeper import Keeper
 from mistyle.io.store.output import claim, keep_folder
@@ -24,9 +27,6 @@ from mistyle.jobs.settings import thread_count
 from mistyle.jobs.stages import program
 from mistyle.jobs.versions import peak_gb, versions
 from mistyle.process import stopping
-from mistyle.run.scene_references import read_reference, reference_files
-from mistyle.run.scene_report import changes, figures, noise_text, write_page
-from mistyle.run.scene_settings import SceneSettings
 
 FOLDERS = ("scene", "pictures", "report", "work")
 DRAWN_SPP = 64

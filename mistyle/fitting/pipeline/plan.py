@@ -2,6 +2,17 @@
 
 from typing import Any
 
+from mistyle.fitting.pipeline.budget import (
+    COVERED,
+    MATERIAL,
+    SEEN,
+    SHOWN,
+    check_material,
+    looked_at,
+    material_counts,
+    material_gb,
+)
+from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.jobs.memory_budget import peaks
 from mistyle.jobs.plan import (
     BYTES_PER_TEXEL,
@@ -18,26 +29,15 @@ from mistyle.jobs.plan import (
     reading,
 )
 from mistyle.jobs.stages import claim_run
-from mistyle.run.material_budget import (
-    COVERED,
-    MATERIAL,
-    SEEN,
-    SHOWN,
-    check_material,
-    looked_at,
-    material_counts,
-    material_gb,
-)
-from mistyle.run.material_job import MATERIAL_STAGES
 from mistyle.solver.settings import all_rounds, descent_steps, estimates, joint_estimates, joint_steps, passes
 
 
 def plan_material(job: Any) -> dict[str, Any]:
     """The same for a `MaterialJob`, whose cameras, lights and pictures' headers are read and refused as it does.
 
-    How much of the pictures shows the object is not known yet: the shares of run/material_budget.py are taken.
+    How much of the pictures shows the object is not known yet: the shares of fitting/pipeline/budget.py are taken.
     """
-    from mistyle.run.material import inputs_of, pixels_of, references_of
+    from mistyle.fitting.pipeline.material import inputs_of, pixels_of, references_of
     from mistyle.solver.indirect import MOST
     from mistyle.solver.texels.rounds import STARTS
 

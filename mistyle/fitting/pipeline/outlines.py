@@ -4,8 +4,8 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.fitting.settings.material import ReferenceSettings
 from mistyle.jobs.progress import Progress
-from mistyle.run.material_settings import ReferenceSettings
 
 
 def fix_of(chosen: ReferenceSettings) -> str:

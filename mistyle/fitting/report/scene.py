@@ -6,10 +6,10 @@ from typing import Any, Literal
 
 import numpy as np
 
+from mistyle.fitting.report.material import difference, encoded
 from mistyle.jobs.report.charts import Chart
 from mistyle.jobs.report.page import BeforeAfter, Figure, Note, Report, ReportPicture, Step, write_report
 from mistyle.jobs.versions import versions
-from mistyle.run.material_report import difference, encoded
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "psnr_before": ("mean PSNR of the sensors' pictures before the fit (sRGB, peak 1), dB", "higher"),

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from mistyle.run.material_settings import MaterialSettings
+from mistyle.fitting.settings.material import MaterialSettings
 
 MATERIAL_STAGES = {
     "mesh": "read the mesh",

@@ -18,6 +18,12 @@ from mistyle.core.capture import Captures, subset
 from mistyle.core.errors import InputRefused
 from mistyle.core.light import Lights, SceneLights
 from mistyle.core.maps import Maps, Texels
+from mistyle.fitting.pipeline.budget import check_material
+from mistyle.fitting.pipeline.files import scene, write
+from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
+from mistyle.fitting.pipeline.outlines import fix_of, tell_placed
+from mistyle.fitting.pipeline.pictures import look_through, looked
+from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs import checkpoint
 from mistyle.jobs.edits import asset_stage, tell_edits
@@ -26,12 +32,6 @@ from mistyle.jobs.memory_budget import size_of, with_setting
 from mistyle.jobs.progress import Progress, Report
 from mistyle.jobs.stages import Run, claim_run
 from mistyle.jobs.start import read, start_engines
-from mistyle.run.material_budget import check_material
-from mistyle.run.material_files import scene, write
-from mistyle.run.material_job import MATERIAL_STAGES, MaterialJob
-from mistyle.run.material_outlines import fix_of, tell_placed
-from mistyle.run.material_pictures import look_through, looked
-from mistyle.run.material_settings import MaterialSettings, ReferenceSettings
 
 
 @dataclass(frozen=True)
@@ -84,9 +84,9 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
     """
     from mistyle.deliver.colour import in_working_space, key_of
     from mistyle.deliver.export import check, deliver
+    from mistyle.fitting.report.material import material_report, write_summary
     from mistyle.io.cameras.captures import read_shots, reading_notes
     from mistyle.jobs.run_record import old_report
-    from mistyle.run.material_report import material_report, write_summary
 
     files = input_files(job.mesh)
     s = job.settings
@@ -241,7 +241,7 @@ def no_finer(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Ca
 
 def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
     """The captures lit by an environment that is solved for together with a first material."""
-    from mistyle.stages.unknown_light import find_light
+    from mistyle.fitting.light.unknown_light import find_light
 
     s: MaterialSettings = run.job.settings
     found = run.record("light", ["pictures"], [s.recover], lambda r: find_light(asset.mesh, captures, s.recover, r))

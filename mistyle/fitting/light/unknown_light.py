@@ -1,7 +1,7 @@
 """An environment map for pictures whose light nobody measured, found together with a first, coarse material.
 
 The sky is cut into cells, and their radiances and all texels of a coarse atlas are solved for together
-(`light_solve.py`), first with even cells, then with finer ones where the light is. Two things pictures may leave open,
+(`light/solve.py`), first with even cells, then with finer ones where the light is. Two things pictures may leave open,
 and are begun by convention: the albedo's scale (its brightest twentieth over what was seen has luminance BRIGHT) and
 the light's colour (its mean over the sphere is neutral). Highlights, which take no colour from the surface and whose
 strength the material model fixes, move both away from the convention as far as there are any.
@@ -21,14 +21,15 @@ from mistyle.core.image import luminance
 from mistyle.core.light import Ambient, Environment
 from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh
+from mistyle.fitting.light import cells as light_cells
+from mistyle.fitting.light import solve as light_solve
+from mistyle.fitting.light.solve import Bundle, State
 from mistyle.render.deferred.material_table import ALBEDO
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver import prior as recover_prior
 from mistyle.solver.settings import RecoverSettings
 from mistyle.solver.table import atlas_of, scatter, scatter_to_atlas
 from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, collect_observations
-from mistyle.stages import light_cells, light_solve
-from mistyle.stages.light_solve import Bundle, State
 
 SIDE = 192  # pixels along the longer side of the small pictures
 ATLAS, LEAST = 96, 16  # texels along the coarse atlas's side: of all sets together, and of each at least

@@ -7,6 +7,7 @@ from typing import Any, Literal
 import numpy as np
 
 from mistyle.core.image import luminance, srgb_from_linear
+from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.report import overlays as report_overlays
 from mistyle.jobs.report.charts import Chart
@@ -29,7 +30,6 @@ from mistyle.jobs.report.turntable import write_turn
 from mistyle.jobs.run_record import earlier, merged_peaks, merged_seconds, report_files, write_record
 from mistyle.jobs.stages import Run
 from mistyle.jobs.versions import peak_gb, versions
-from mistyle.run.material_job import MATERIAL_STAGES
 
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "seen_share": ("share of the covered texels that at least one reference sees", "higher"),

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from mistyle.fitting.light.cells import EnvironmentCells, Radiance
 from mistyle.render.deferred.material_table import ALBEDO, ROUGHNESS, TILT
 from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.prior import LEAST_SEEN
@@ -23,7 +24,6 @@ from mistyle.solver.texels.gbuffer import open_sky
 from mistyle.solver.texels.levenberg_marquardt import Options, Points, Problem, Rig
 from mistyle.solver.texels.light_transport import light_transport_matrix
 from mistyle.solver.texels.observations import TexelObservations
-from mistyle.stages.light_cells import EnvironmentCells, Radiance
 
 # Of a texel's unknowns: where they are thought to be, and standard deviations. Tilts are small on the whole, or the
 # whole surface would lean towards where the light is residual.

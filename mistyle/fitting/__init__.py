@@ -1,0 +1,1 @@
+"""`mistyle fit`: materials and scenes from photographs or renders."""

@@ -1,0 +1,1 @@
+"""An unknown environment light, solved together with a coarse material."""

@@ -1,0 +1,1 @@
+"""The fitting jobs, stage by stage."""
