@@ -121,7 +121,7 @@ def _jobs(path: Path) -> None:
 
 
 def _limits(path: Path) -> None:
-    from mistyle.run.compare_limits import read_limits
+    from mistyle.comparison.limits import read_limits
 
     read_limits(path, ("flip", "psnr", "angle"))
 

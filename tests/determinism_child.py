@@ -195,10 +195,10 @@ def one_by_one(made: Stages, asset: Any, style: Any, atlas: Any, views: list[Any
 
 def compared(made: Stages) -> None:
     """Two pictures compared: the tables, the pictures, the page."""
+    from mistyle.comparison.pipeline import compare
+    from mistyle.comparison.records import CompareJob
     from mistyle.io.images.write import write_exr
     from mistyle.jobs.progress import Progress
-    from mistyle.run.compare import compare
-    from mistyle.run.compare_records import CompareJob
 
     rng, folder = np.random.default_rng(0), made.out / "pictures"
     picture = 0.2 + rng.random((40, 48, 3), np.float32)

@@ -204,7 +204,7 @@ def test_every_page_forbids_connections_and_escapes_by_default():
 
 
 def test_the_page_of_converge_shows_names_as_they_are():
-    from mistyle.run.converge import METRICS, page
+    from mistyle.comparison.converge import METRICS, page
 
     values = {metric: [(0.1, 0.01), (0.05, 0.01)] for metric in METRICS}
     row = {"renderer": EVIL, "spp": [1, 2], "seconds": [(0.1, 0.01), (0.2, 0.01)], **values}

@@ -75,9 +75,9 @@ def compare(
     is resampled, exposed or tone-mapped. Raises InputRefused where sizes or layers differ, UsageError for metrics that
     do not exist.
     """
+    from mistyle.comparison.inputs import planes
     from mistyle.core.errors import UsageError
     from mistyle.measure.pictures import metrics as measure
-    from mistyle.run.compare_inputs import planes
 
     frames = [_frame(given, who, kind, layer) for given, who in ((reference, "reference"), (test, "test"))]
     both = planes(frames[0], frames[1], layer, "display", mask)

@@ -72,8 +72,8 @@ def add_converge(verbs: Any) -> None:
 
 
 def _converge(options: argparse.Namespace) -> int:
+    from mistyle.comparison.converge import ConvergeJob, converge
     from mistyle.jobs.progress import Progress
-    from mistyle.run.converge import ConvergeJob, converge
 
     names = [n.strip() for text in options.renderers for n in _split(text) if n.strip()]
     if not names or options.out is None:
@@ -109,7 +109,7 @@ def _split(text: str) -> list[str]:
 
 def _tell_curves(options: argparse.Namespace, record: dict[str, Any]) -> None:
     """Print the errors, slopes and efficiencies of every renderer."""
-    from mistyle.run.converge import METRICS, without_nan
+    from mistyle.comparison.converge import METRICS, without_nan
 
     if options.json:
         print(json.dumps(without_nan(record)))
@@ -198,8 +198,8 @@ def run_compare(options: argparse.Namespace) -> int:
     if options.approve:
         return _approve(options)
     job = job_of(options)
+    from mistyle.comparison.pipeline import compare
     from mistyle.jobs.progress import Progress
-    from mistyle.run.compare import compare
 
     return told(options, compare(job, Progress()))
 
@@ -211,8 +211,8 @@ def _compare_renders(options: argparse.Namespace) -> int:
         raise UsageError("compare needs -o OUT")
     if min(options.spp, options.size, options.seeds, options.views) < 1:
         raise UsageError("--spp, --size, --seeds and --views are 1 at least")
+    from mistyle.comparison.renderers import RenderJob, compare_renders
     from mistyle.jobs.progress import Progress
-    from mistyle.run.compare_render import RenderJob, compare_renders
 
     job = RenderJob(
         file=options.render,
@@ -244,7 +244,7 @@ def _list() -> int:
 def _approve(options: argparse.Namespace) -> int:
     if options.baseline is None or len(options.pictures) != 1:
         raise UsageError("--approve NAME needs --baseline DIR and one folder of new pictures")
-    from mistyle.run.compare_baseline import approve
+    from mistyle.comparison.baseline import approve
 
     names = approve(options.baseline, options.pictures[0], options.approve, overwrite=options.overwrite)
     print(json.dumps({"approved": names}) if options.json else "\n".join(f"approved {name}" for name in names))
@@ -253,9 +253,9 @@ def _approve(options: argparse.Namespace) -> int:
 
 def job_of(options: argparse.Namespace, reference: Path | None = None, tests: tuple[Path, ...] = ()) -> Any:
     """The job that the command line describes; with `reference`, of those pictures instead of the given ones."""
+    from mistyle.comparison.limits import checked, parse, read_limits
+    from mistyle.comparison.records import CompareJob
     from mistyle.measure.pictures.metrics import COLOUR, DATA, METRICS
-    from mistyle.run.compare_limits import checked, parse, read_limits
-    from mistyle.run.compare_records import CompareJob
 
     if reference is None:
         reference, tests = _given(options)

@@ -9,10 +9,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from mistyle.comparison.pictures import GREY, STOPS, WIDE, PairPictures
 from mistyle.jobs.report.html import csp_hash, template
 from mistyle.measure.pictures.metrics import METRICS
 from mistyle.measure.pictures.protocols import PROTOCOL_BETTER
-from mistyle.run.compare_pictures import GREY, STOPS, WIDE, PairPictures
 
 
 def page(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -> str:

@@ -17,6 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.comparison.inputs import Match, Planes, alpha_mask, chosen_layers, matches, planes, read_mask, reduced
+from mistyle.comparison.limits import broken, without_effect
+from mistyle.comparison.pictures import PairPictures, thumbnail, worst_regions, write_pictures
+from mistyle.comparison.records import CompareJob, ComparisonRow, columns, csv_text, junit_text, number, row_record
 from mistyle.core.errors import InputRefused
 from mistyle.io.images.layers import BEAUTY, LayeredPicture
 from mistyle.io.store.atomic import atomic_write
@@ -25,10 +29,6 @@ from mistyle.jobs.progress import Progress, grouped
 from mistyle.jobs.versions import peak_gb, versions
 from mistyle.measure.pictures import metrics, protocols
 from mistyle.measure.pictures.metrics import METRICS, MetricValues
-from mistyle.run.compare_inputs import Match, Planes, alpha_mask, chosen_layers, matches, planes, read_mask, reduced
-from mistyle.run.compare_limits import broken, without_effect
-from mistyle.run.compare_pictures import PairPictures, thumbnail, worst_regions, write_pictures
-from mistyle.run.compare_records import CompareJob, ComparisonRow, columns, csv_text, junit_text, number, row_record
 
 ALPHA = (
     "EXR and HDR are taken as premultiplied; straight alpha (PNG, TIFF, WebP) is multiplied in, in linear light. "
@@ -85,7 +85,7 @@ def compare(
 
     def write(folder: Path) -> None:
         if job.crop is not None:
-            from mistyle.run.compare_figure import inset
+            from mistyle.comparison.figure import inset
 
             with progress.stage("inset", "draw the inset figure"):
                 inset(job, pairs, folder)
@@ -340,7 +340,7 @@ def summary(rows: Sequence[ComparisonRow]) -> list[dict[str, Any]]:
 
 
 def _write_files(folder: Path, record: dict[str, Any], found: ComparisonState, overall: Sequence[str]) -> None:
-    from mistyle.run.compare_page import page
+    from mistyle.comparison.page import page
 
     text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     atomic_write(folder / "compare.json", text.encode("utf-8", "replace"))

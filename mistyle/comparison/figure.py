@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
+from mistyle.comparison.inputs import Match, Planes, chosen_layers, planes
+from mistyle.comparison.pictures import shown
+from mistyle.comparison.records import CompareJob
 from mistyle.core.errors import UsageError
 from mistyle.io.store.atomic import atomic_write
 from mistyle.jobs.report.false_colour import heat
 from mistyle.measure.pictures.flip_bands import flip_map
-from mistyle.run.compare_inputs import Match, Planes, chosen_layers, planes
-from mistyle.run.compare_pictures import shown
-from mistyle.run.compare_records import CompareJob
 
 CROP = 360  # pixels of a crop's longer side in the figure
 GAP, TEXT = 10, 46

@@ -6,9 +6,9 @@ from datetime import UTC, datetime
 from fnmatch import fnmatchcase
 from pathlib import Path
 
+from mistyle.comparison.inputs import ENDINGS, pictures_of
 from mistyle.core.errors import UsageError
 from mistyle.io.store.atomic import atomic_write, sha256_file
-from mistyle.run.compare_inputs import ENDINGS, pictures_of
 
 RECORD = "approved.json"
 

@@ -14,11 +14,11 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
+from mistyle.comparison.inputs import Planes
 from mistyle.core.image import luminance
 from mistyle.jobs.report.charts import Chart, svg
 from mistyle.jobs.report.false_colour import DIVERGING, RAINBOW, heat, mapped
 from mistyle.measure.pictures.metrics import encoded
-from mistyle.run.compare_inputs import Planes
 
 WIDE = 4.4
 LOSSLESS = 2_200_000  # pixels; larger pictures are stored with losses that are not seen

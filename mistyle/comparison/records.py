@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 from xml.etree import ElementTree
 
+from mistyle.comparison.limits import Limit
 from mistyle.measure.pictures.metrics import COLOUR, DATA, Viewing
-from mistyle.run.compare_limits import Limit
 
 Protocol = Literal["stanford-orb", "tensoir", "idiff"]
 
@@ -21,7 +21,7 @@ class CompareJob:
 
     metrics   names of measure/pictures/metrics.py; of a protocol, its own are measured instead
     layers    layers to compare; empty: all that both pictures have
-    window    "display" or "overlap" (run/compare_inputs.py)
+    window    "display" or "overlap" (comparison/inputs.py)
     mask      None, "alpha" (the reference's alpha above one half) or a mask file
     limits    in order, the last one that fits an image counts
     pictures  how many pictures the page shows, the worst ones

@@ -284,8 +284,8 @@ def page(record: dict[str, Any]) -> str:
     """The page as text; every text is escaped, scripts and connections are forbidden."""
     from markupsafe import Markup
 
+    from mistyle.comparison.page import figure
     from mistyle.jobs.report.charts import svg
-    from mistyle.run.compare_page import figure
 
     here = Path(__file__).parent
 

@@ -13,6 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from mistyle.comparison.pictures import webp
+from mistyle.comparison.pipeline import FILES, compare
+from mistyle.comparison.records import CompareJob
 from mistyle.core.names import safe_name
 from mistyle.io.images.write import write_exr
 from mistyle.io.store.atomic import atomic_write
@@ -22,9 +25,6 @@ from mistyle.jobs.report.false_colour import DIVERGING, mapped
 from mistyle.measure.pictures.statistics import Tested, same_picture
 from mistyle.render.external.render_files import RenderView
 from mistyle.render.external.renderers import Rendered, Renderer, left_out, renderer, shots, subject
-from mistyle.run.compare import FILES, compare
-from mistyle.run.compare_pictures import webp
-from mistyle.run.compare_records import CompareJob
 
 LEVEL = 0.01
 

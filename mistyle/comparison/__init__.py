@@ -1,0 +1,1 @@
+"""`mistyle compare` and `mistyle converge`: how renders differ, in numbers and pictures."""
