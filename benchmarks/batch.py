@@ -14,12 +14,12 @@ import time
 from pathlib import Path
 
 from benchmarks.common import arguments, finish
+from mistyle.batch import engines
+from mistyle.batch.pipeline import Choices, planned, run_batch
+from mistyle.batch.plan import BatchPlan, write_plan
+from mistyle.batch.shard import outcome
 from mistyle.core.paths import scenes
 from mistyle.process.cores import cores
-from mistyle.run import engines
-from mistyle.run.batch import Choices, planned, run_batch
-from mistyle.run.batch_plan import BatchPlan, write_plan
-from mistyle.run.shard import outcome
 
 MESHES, STYLES = ("spot.obj", "teapot.obj"), ("starry_night", "great_wave", "mosaic", "woodcut")
 # Drafts that take about half a minute.

@@ -115,7 +115,7 @@ def _settings(path: Path) -> None:
 
 
 def _jobs(path: Path) -> None:
-    from mistyle.run.batch_jobs import read_jobs
+    from mistyle.batch.jobs_file import read_jobs
 
     read_jobs(path, 1)
 

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mistyle.batch import engines
+from mistyle.batch.farm import ShardNeeds, export
+from mistyle.batch.jobs_file import read_jobs
+from mistyle.batch.page import write_page
+from mistyle.batch.pipeline import Choices, describe, describe_dry_run, dry_run, planned, run_batch, summarise
+from mistyle.batch.plan import PLAN, indices, path_maps, read_plan, replaced, write_plan
+from mistyle.batch.shard import finished, key_of, marker, outcome
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
-from mistyle.run import engines
-from mistyle.run.batch import Choices, describe, describe_dry_run, dry_run, planned, run_batch, summarise
-from mistyle.run.batch_jobs import read_jobs
-from mistyle.run.batch_page import write_page
-from mistyle.run.batch_plan import PLAN, indices, path_maps, read_plan, replaced, write_plan
-from mistyle.run.farm import ShardNeeds, export
-from mistyle.run.shard import finished, key_of, marker, outcome
 
 CUBE = """v -1 -1 -1\nv 1 -1 -1\nv 1 1 -1\nv -1 1 -1\nv -1 -1 1\nv 1 -1 1\nv 1 1 1\nv -1 1 1
 f 1 3 2\nf 1 4 3\nf 5 6 7\nf 5 7 8\nf 1 2 6\nf 1 6 5\nf 4 7 3\nf 4 8 7\nf 1 5 8\nf 1 8 4\nf 2 3 7\nf 2 7 6

@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from benchmarks.faults_jobs import BATCH
+from mistyle.batch import engines
+from mistyle.batch.farm import ShardNeeds, export
+from mistyle.batch.pipeline import Choices, planned, run_batch
+from mistyle.batch.plan import PLAN
+from mistyle.batch.shard import marker
 from mistyle.core.paths import scenes
-from mistyle.run import engines
-from mistyle.run.batch import Choices, planned, run_batch
-from mistyle.run.batch_plan import PLAN
-from mistyle.run.farm import ShardNeeds, export
-from mistyle.run.shard import marker
 
 
 def plan_in(folder: Path):

@@ -74,7 +74,7 @@ ALLOWED = {
     "render/external/mitsuba_worker": "the job that mistyle wrote for it, or the user's scene, trusted like code",
     "render/lookdev/scenes": "the user's scene (--scene), trusted like code",
     "render/mitsuba/scene": "the user's scene (--scene), trusted like code",
-    "run/batch_page": "a report's own picture",
+    "batch/page": "a report's own picture",
     "render/external/blender_worker": "the job that mistyle wrote for it",
     "jobs/settings": "a word of the user's own command line",
     "deliver/verify_checks": "pictures that mistyle has just written, decoded by others on purpose",

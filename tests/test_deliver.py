@@ -12,6 +12,8 @@ import trimesh
 from gltf_cases import bumpy_sphere, no_texels, quad, quarters
 from PIL import Image
 
+from mistyle.batch.jobs_file import Record
+from mistyle.batch.plan import BatchPlan, with_delivery
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.deliver.asset import write_asset
@@ -21,8 +23,6 @@ from mistyle.io.images.packing import TARGETS
 from mistyle.io.store import output
 from mistyle.jobs.deliver_settings import FORMATS
 from mistyle.jobs.progress import Progress
-from mistyle.run.batch_jobs import Record
-from mistyle.run.batch_plan import BatchPlan, with_delivery
 from mistyle.run.cli import main, parser
 from mistyle.run.options import DELIVERY_OPTIONS, asset_name, given_settings
 from mistyle.stylization.settings import Settings, resolve

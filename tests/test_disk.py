@@ -12,6 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mistyle.batch import engines
+from mistyle.batch.pipeline import Choices, planned, summarise
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.paths import PACKAGE, scenes
 from mistyle.io.images.write import write_png
@@ -19,8 +21,7 @@ from mistyle.io.store import atomic, output
 from mistyle.io.store.atomic import atomic_folder, atomic_write
 from mistyle.io.store.keeper import Keeper
 from mistyle.process import disk_errors
-from mistyle.run import engines, exits
-from mistyle.run.batch import Choices, planned, summarise
+from mistyle.run import exits
 from mistyle.run.cli import main
 
 ROOT = Path(__file__).parents[1]

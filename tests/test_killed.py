@@ -16,11 +16,11 @@ import pytest
 
 from benchmarks import faults_jobs as jobs
 from benchmarks.faults_kills import Moment
+from mistyle.batch import engines, shard
+from mistyle.batch.pipeline import Choices, describe, planned, summarise
 from mistyle.core.paths import scenes
 from mistyle.io.store.keeper import Keeper
 from mistyle.jobs.progress import Progress
-from mistyle.run import engines, shard
-from mistyle.run.batch import Choices, describe, planned, summarise
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="kills with POSIX signals")
 

@@ -19,6 +19,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from PIL import Image
 
+from mistyle.batch.jobs_file import BatchJob, _names
 from mistyle.core import names
 from mistyle.core.errors import UsageError
 from mistyle.deliver import files as deliver_files
@@ -30,7 +31,6 @@ from mistyle.io.images.textures import part_stems
 from mistyle.io.store import atomic
 from mistyle.io.usd.write import library
 from mistyle.jobs.deliver_settings import TEXTURES
-from mistyle.run.batch_jobs import BatchJob, _names
 from mistyle.run.cli import main
 from mistyle.run.options import asset_name
 

@@ -28,7 +28,7 @@ ASIDE = ("stylize", "demo", "fit", "fit --scene", "batch", "shard", "farm")
 @pytest.fixture(autouse=True)
 def no_network(monkeypatch):
     """A pack without its wheels: what it collects is its own business, where it goes is tested here."""
-    from mistyle.run import pack
+    from mistyle.batch import pack
 
     def fill(folder: Path, *_: object) -> None:
         for name in ("install.sh", "constraints.txt", "SHA256SUMS"):

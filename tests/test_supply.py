@@ -227,7 +227,7 @@ def test_the_page_of_converge_shows_names_as_they_are():
 RAY = """
 import json, sys
 import psutil
-from mistyle.run import engines
+from mistyle.batch import engines
 
 def look(library, *rest):
     here = psutil.Process()

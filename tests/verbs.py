@@ -149,8 +149,8 @@ def planned(inputs: Path, out: Path) -> Path:
     """A plan of one job, as `mistyle batch` resolves it, that lies beside `out` and works there."""
     from dataclasses import replace
 
-    from mistyle.run.batch import Choices, planned
-    from mistyle.run.batch_plan import write_plan
+    from mistyle.batch.pipeline import Choices, planned
+    from mistyle.batch.plan import write_plan
 
     place = out.parent / f"plan of {out.name}"
     if not (place / "plan.json").is_file():

@@ -157,8 +157,8 @@ def _add_pack(verbs: Any) -> None:
 
 
 def _pack(options: argparse.Namespace) -> int:
+    from mistyle.batch.pack import pack
     from mistyle.jobs.progress import Progress
-    from mistyle.run.pack import pack
 
     folder = pack(options.out, options.extras, Progress(), overwrite=options.overwrite)
     print(f"packed: {folder} (install with {folder / 'install.sh'} TARGET)", file=sys.stderr)
@@ -166,7 +166,7 @@ def _pack(options: argparse.Namespace) -> int:
 
 
 def _batch(options: argparse.Namespace) -> int:
-    from mistyle.run.batch import Choices, describe, describe_dry_run, dry_run, planned, run_batch, say
+    from mistyle.batch.pipeline import Choices, describe, describe_dry_run, dry_run, planned, run_batch, say
 
     choices = Choices(
         engine=options.engine,
@@ -179,7 +179,7 @@ def _batch(options: argparse.Namespace) -> int:
         only=tuple(options.only),
         watch=options.watch and sys.stderr.isatty(),
     )
-    from mistyle.run.batch_plan import with_delivery
+    from mistyle.batch.plan import with_delivery
 
     given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
     plan = with_delivery(given, given_settings(options, DELIVERY_OPTIONS))
@@ -195,9 +195,9 @@ def _batch(options: argparse.Namespace) -> int:
 
 
 def _shard(options: argparse.Namespace) -> int:
+    from mistyle.batch.plan import indices, path_maps, read_plan
+    from mistyle.batch.shard import FarmProgress, run_shard, stages_of
     from mistyle.jobs.progress import Progress
-    from mistyle.run.batch_plan import indices, path_maps, read_plan
-    from mistyle.run.shard import FarmProgress, run_shard, stages_of
 
     plan = replace(read_plan(options.plan, path_maps(options.path_map)), overwrite=options.overwrite)
     chosen: Sequence[int] = indices(options.index, len(plan.jobs))
@@ -213,7 +213,7 @@ def _shard(options: argparse.Namespace) -> int:
 
 def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
     """Each shard of a range as a process of its own, one after the other; a failing one does not stop the rest."""
-    from mistyle.run.engines import stopped
+    from mistyle.batch.engines import stopped
 
     worst = 0
     maps = [part for pair in options.path_map for part in ("--path-map", pair)]
@@ -232,9 +232,9 @@ def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
 
 
 def _farm(options: argparse.Namespace) -> int:
-    from mistyle.run.batch import Choices, planned, say, threads_each
-    from mistyle.run.batch_plan import path_maps, with_delivery
-    from mistyle.run.farm import ShardNeeds, export
+    from mistyle.batch.farm import ShardNeeds, export
+    from mistyle.batch.pipeline import Choices, planned, say, threads_each
+    from mistyle.batch.plan import path_maps, with_delivery
 
     choices = Choices(workers=options.workers, threads=options.threads)
     given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)

@@ -19,10 +19,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from mistyle.batch.plan import PLAN, BatchPlan
+from mistyle.batch.shard import SHARDS
 from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.process.children import PARENT
-from mistyle.run.batch_plan import PLAN, BatchPlan
-from mistyle.run.shard import SHARDS
 
 # Exit codes that a program gives itself; a shell reports a signal as 128 + its number.
 CRASHES = tuple(128 + n for n in (4, 6, 7, 8, 9, 11))

@@ -5,9 +5,9 @@ from io import BytesIO
 from pathlib import Path
 from typing import Any
 
+from mistyle.batch.plan import BatchPlan
 from mistyle.io.store.output import write_file
 from mistyle.jobs.report.html import csp_hash, template
-from mistyle.run.batch_plan import BatchPlan
 
 THUMBNAIL = 288  # pixels
 COLUMNS = ("seconds", "peak_gb")

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mistyle.batch.jobs_file import Record
+from mistyle.batch.plan import BatchPlan
 from mistyle.core.errors import MistyleError, Stopped
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
 from mistyle.io.store import lock
@@ -24,8 +26,6 @@ from mistyle.jobs.inputs import input_files
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.stages import claim_run, program
 from mistyle.process.disk_errors import unexpected
-from mistyle.run.batch_jobs import Record
-from mistyle.run.batch_plan import BatchPlan
 from mistyle.stylization.pipeline.job import STAGES
 
 SHARDS = "shards"

@@ -15,16 +15,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from mistyle.batch import engines
+from mistyle.batch.jobs_file import Record, read_jobs
+from mistyle.batch.plan import PLAN, BatchPlan, read_plan, write_plan
+from mistyle.batch.shard import SHARDS, claim_batch, finished, job_of, marker, outcome
 from mistyle.core.errors import MistyleError, UsageError
 from mistyle.io.store.atomic import clean_leftovers
 from mistyle.io.store.keeper import Keeper
 from mistyle.io.store.output import keep_folder, write_file
 from mistyle.jobs.progress import grouped
 from mistyle.process.cores import cores
-from mistyle.run import engines
-from mistyle.run.batch_jobs import Record, read_jobs
-from mistyle.run.batch_plan import PLAN, BatchPlan, read_plan, write_plan
-from mistyle.run.shard import SHARDS, claim_batch, finished, job_of, marker, outcome
 
 
 @dataclass(frozen=True)
@@ -87,14 +87,14 @@ def run_batch(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
         summary = summarise(plan, ended, time.monotonic() - start, reused=len(chosen) - len(todo))
         data = (json.dumps(summary, indent=1) + "\n").encode()
         write_file(plan.out, "batch.json", data, overwrite=plan.overwrite)
-        from mistyle.run.batch_page import write_page
+        from mistyle.batch.page import write_page
 
         write_page(plan, summary)
     return summary
 
 
 def _run(plan: BatchPlan, todo: Sequence[int], choices: Choices, reused: int) -> list[engines.Ended]:
-    from mistyle.run.batch_watch import watching
+    from mistyle.batch.watch import watching
 
     with watching(plan, todo, reused, live=choices.watch) as watch:
         if not todo:

@@ -7,8 +7,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
-from mistyle.run.batch_plan import BatchPlan
-from mistyle.run.engines import Ended, Watch, last_lines
+from mistyle.batch.engines import Ended, Watch, last_lines
+from mistyle.batch.plan import BatchPlan
 
 ROWS = 30  # of the live table
 

@@ -11,11 +11,11 @@ from pathlib import Path, PurePath
 from typing import Any
 
 from mistyle import __version__
+from mistyle.batch.jobs_file import Record
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.io.store.output import write_file
 from mistyle.io.store.trusted_json import read_own
 from mistyle.jobs.settings import merge, validate
-from mistyle.run.batch_jobs import Record
 
 PLAN = "plan.json"
 VERSION = 1

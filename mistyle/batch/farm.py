@@ -10,10 +10,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from mistyle.batch.plan import PLAN, BatchPlan, write_plan
+from mistyle.batch.shard import SHARDS, claim_batch
 from mistyle.io.store.atomic import atomic_write
 from mistyle.io.store.output import claim, keep_folder, replace_files
-from mistyle.run.batch_plan import PLAN, BatchPlan, write_plan
-from mistyle.run.shard import SHARDS, claim_batch
 
 Form = Literal["openjd", "sbatch", "commands"]
 BUNDLE = ("template.yaml", "parameter_values.yaml", "asset_references.yaml")
@@ -69,7 +69,7 @@ def _options(plan: BatchPlan, needs: ShardNeeds) -> list[str]:
 
 def _line(plan: BatchPlan, needs: ShardNeeds, index: str) -> str:
     """One shard as a line for a shell; `index` may be a variable of that shell."""
-    from mistyle.run.batch_plan import replaced
+    from mistyle.batch.plan import replaced
 
     place, options = replaced(str(plan.out / PLAN), needs.maps), shlex.join(_options(plan, needs))
     return f"{needs.program} shard {shlex.quote(place)} --index {index} {options}".rstrip()
@@ -77,7 +77,7 @@ def _line(plan: BatchPlan, needs: ShardNeeds, index: str) -> str:
 
 def _sbatch(plan: BatchPlan, needs: ShardNeeds) -> str:
     """A batch script of Slurm: an array of shards."""
-    from mistyle.run.batch_plan import replaced
+    from mistyle.batch.plan import replaced
 
     logs = replaced(str(plan.out / "shards"), needs.maps)
     options = [

@@ -1,0 +1,1 @@
+"""`mistyle batch`: many jobs on one machine or on a farm."""
