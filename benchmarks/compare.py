@@ -90,7 +90,7 @@ class Taken:
 def run(words: Sequence[object]) -> Taken:
     """The command in a process of its own."""
     code = (
-        "import sys; from mistyle.run.cli import main; from benchmarks.compare import peak; rc = main(sys.argv[1:]); "
+        "import sys; from mistyle.cli.main import main; from benchmarks.compare import peak; rc = main(sys.argv[1:]); "
     )
     code += "print('PEAK', peak(), file=sys.stderr); sys.exit(rc)"
     start, before = time.perf_counter(), os.times()

@@ -240,7 +240,7 @@ def native(wholes: Mapping[str, Whole], folder: Path) -> Iterator[Row]:
 
 
 # A command line, and one on a machine (or in a control group) that says it has so much memory.
-PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main(sys.argv[1:]))"
+PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main(sys.argv[1:]))"
 POOR = f"from mistyle.process import memory; memory.limit = lambda: MOST; {PROGRAM}"
 MATERIALS, MOST = 200, 1.5  # of the mesh; GB
 

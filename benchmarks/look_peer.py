@@ -118,7 +118,7 @@ def stylized(program: Path, folder: Path, mask: np.ndarray, wanted: dict[str, np
 
 def bake(mesh: Path, folder: Path, atlas: int) -> Path:
     """The GLB of `mistyle bake`."""
-    from mistyle.run.cli import main
+    from mistyle.cli.main import main
 
     out = folder / "baked"
     arguments = ["bake", str(mesh), str(folder / "views"), "-o", str(out), "--atlas", str(atlas), "--name", "look"]

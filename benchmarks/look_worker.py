@@ -21,7 +21,7 @@ def command_line() -> Any:
     try:
         from mistyle.cli import main  # pyright: ignore[reportMissingImports]
     except ImportError:
-        from mistyle.run.cli import main
+        from mistyle.cli.main import main
     return main
 
 

@@ -35,7 +35,7 @@ STYLIZE: dict[str, list[Any]] = {
 }
 TILED = [*DRAFT, "--atlas", "8192", "--set", "rig.kind=turntable", "--set", "rig.views=64"]
 FITS = {"fit_256": (256, 256, 16), "fit_512": (512, 256, 16), "fit_200": (1024, 128, 200)}  # atlas, pixels, pictures
-PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main())"
+PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main())"
 
 
 def main() -> None:

@@ -54,7 +54,7 @@ from mistyle.solver.validate import downsampling_factors
 RADIAL = (0.04, -0.02, 0.0)
 ATLAS = 1024
 FINEST = 4
-PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main())"
+PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main())"
 
 
 def main() -> None:

@@ -23,7 +23,7 @@ MAIN = """import sys
 try:
     from mistyle.cli import main
 except ImportError:
-    from mistyle.run.cli import main
+    from mistyle.cli.main import main
 sys.exit(main(sys.argv[1:]))"""
 JOBS = ("draft", "standard", "demo", "materials", "preview")
 REPORTED = ("draft", "standard", "materials")  # whose report counts

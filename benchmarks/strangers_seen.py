@@ -21,7 +21,7 @@ from mistyle.io.cameras.captures import read_captures, read_shots, reading_notes
 from mistyle.io.read import read_frame, read_picture
 from mistyle.io.read_mesh import MESHES, read_mesh
 
-PROGRAM = "import sys; from mistyle.run.cli import main; sys.exit(main(sys.argv[1:]))"
+PROGRAM = "import sys; from mistyle.cli.main import main; sys.exit(main(sys.argv[1:]))"
 PIXELS = 64  # along each side of a drawn mesh
 LIMIT = 600.0  # seconds of one command
 # What points to the right and up in a picture taken from that side; the mesh is as the reader has it, Y up.

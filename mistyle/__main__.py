@@ -32,7 +32,7 @@ def command_line(arguments):
     # Before the imports, which take seconds on a busy machine: a shard whose batch is gone must not linger in them.
     end_with_asker()
     try:
-        from mistyle.run.cli import main as run
+        from mistyle.cli.main import main as run
     except KeyboardInterrupt:
         return 130
     return run(arguments)
@@ -40,7 +40,7 @@ def command_line(arguments):
 
 def doctor(json):
     """Print what this machine has and what is missing, without installed packages too; returns the exit code."""
-    from mistyle.run.doctor import main as report
+    from mistyle.cli.doctor import main as report
 
     return report(json)
 

@@ -87,7 +87,7 @@ def write(path: Path) -> None:
 
     from PIL import Image
 
-    from mistyle.run.demo import MESHES, PAINTINGS
+    from mistyle.cli.demo_inputs import MESHES, PAINTINGS
 
     above, middle, below = [], [], []
     for name, painting in PAINTINGS.items():

@@ -67,7 +67,7 @@ EVERY["folder"] = ["box_ink", "box_wave", "cube_ink", "cube_wave"]
 @pytest.mark.parametrize("kind", ["list", "grid", "folder"])
 @pytest.mark.parametrize("where", ["beside", "elsewhere", "inside", "absolute"])
 def test_paths_are_those_of_the_jobs_file_or_folder_wherever_one_stands(props, kind, where, monkeypatch, capsys):
-    from mistyle.run.cli import main
+    from mistyle.cli.main import main
 
     jobs = props if kind == "folder" else jobs_file(props, {"list": LIST, "grid": GRID}[kind])
     (props.parent / "elsewhere").mkdir()

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from mistyle.run.cli import USED, main, parser
+from mistyle.cli.main import USED, main, parser
 
 
 def run(*arguments: str) -> subprocess.CompletedProcess[str]:
@@ -59,8 +59,8 @@ def test_every_verb_has_examples(verb):
 
 
 def test_options_name_existing_settings():
+    from mistyle.cli.main import OPTIONS
     from mistyle.jobs.settings import known_keys
-    from mistyle.run.cli import OPTIONS
     from mistyle.stylization.settings import Settings
 
     assert set(OPTIONS.values()) <= set(known_keys(Settings))

@@ -14,11 +14,11 @@ import pytest
 from helpers import data
 from PIL import Image
 
+from mistyle.cli.main import main
 from mistyle.comparison.inputs import matches
 from mistyle.comparison.limits import Limit, broken
 from mistyle.io.images.write import write_exr, write_png
 from mistyle.io.read import read_frame
-from mistyle.run.cli import main
 
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 FAST = ["--metrics", "psnr,relmse,rmse,mae"]

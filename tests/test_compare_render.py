@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from helpers import data
 
+from mistyle.cli.main import main
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
 from mistyle.core.light import Ambient, Directional, Environment, environment_directions
 from mistyle.core.paths import scenes
@@ -17,7 +18,6 @@ from mistyle.render.external.render_files import Subject, write_asset_glb
 from mistyle.render.external.renderers import left_out, renderer, shots, subject
 from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.mitsuba.draw import gbuffer
-from mistyle.run.cli import main
 
 CORNER = """<scene version="3.9.0">
   <integrator type="path"><integer name="max_depth" value="4"/></integrator>

@@ -14,6 +14,8 @@ from PIL import Image
 
 from mistyle.batch.jobs_file import Record
 from mistyle.batch.plan import BatchPlan, with_delivery
+from mistyle.cli.main import main, parser
+from mistyle.cli.options import DELIVERY_OPTIONS, asset_name, given_settings
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.deliver.asset import write_asset
@@ -23,8 +25,6 @@ from mistyle.io.images.packing import TARGETS
 from mistyle.io.store import output
 from mistyle.jobs.deliver_settings import FORMATS
 from mistyle.jobs.progress import Progress
-from mistyle.run.cli import main, parser
-from mistyle.run.options import DELIVERY_OPTIONS, asset_name, given_settings
 from mistyle.stylization.settings import Settings, resolve
 
 OCCLUSION = np.linspace(0.2, 1, 256, dtype=np.float32).reshape(16, 16)
@@ -311,8 +311,8 @@ def options_of(*arguments: str):
 
 
 def test_the_command_line_says_it_for_stylize_fit_and_batch(tmp_path):
-    from mistyle.run.cli import _settings
-    from mistyle.run.cli_fit import material_settings
+    from mistyle.cli.fit import material_settings
+    from mistyle.cli.main import _settings
 
     said = _settings(options_of("--formats", "glb,usd", "--target", "unreal,houdini", "--colorspace", "ACEScg"))
     assert said.deliver.chosen_formats == ("glb", "usd") and said.deliver.chosen_targets == ("unreal", "houdini")

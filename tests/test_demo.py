@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mistyle.cli.demo_inputs import MESHES, PAINTINGS, ROW, demo_files
+from mistyle.cli.main import main
 from mistyle.core.paths import scenes
-from mistyle.run.cli import main
-from mistyle.run.demo import MESHES, PAINTINGS, ROW, demo_files
 from mistyle.stylization.pipeline import stylize as pipeline
 
 

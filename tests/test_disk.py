@@ -14,6 +14,8 @@ import pytest
 
 from mistyle.batch import engines
 from mistyle.batch.pipeline import Choices, planned, summarise
+from mistyle.cli import exits
+from mistyle.cli.main import main
 from mistyle.core.errors import InputRefused, MistyleError, UsageError
 from mistyle.core.paths import PACKAGE, scenes
 from mistyle.io.images.write import write_png
@@ -21,8 +23,6 @@ from mistyle.io.store import atomic, output
 from mistyle.io.store.atomic import atomic_folder, atomic_write
 from mistyle.io.store.keeper import Keeper
 from mistyle.process import disk_errors
-from mistyle.run import exits
-from mistyle.run.cli import main
 
 ROOT = Path(__file__).parents[1]
 
@@ -170,7 +170,7 @@ def test_compare_keeps_the_earlier_page_when_the_disk_fills(tmp_path, capsys):
     before = {name: (out / name).read_bytes() for name in names(out) if (out / name).is_file()}
     code = (
         "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (3000, 3000));"
-        "from mistyle.run.cli import main; sys.exit(main(sys.argv[1:]))"
+        "from mistyle.cli.main import main; sys.exit(main(sys.argv[1:]))"
     )
     line = [sys.executable, "-c", code, "compare", picture, picture, "-o", str(out), "--metrics", "psnr"]
     done = subprocess.run(line, cwd=ROOT, capture_output=True, text=True)

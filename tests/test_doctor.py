@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from mistyle.run import doctor
+from mistyle.cli import doctor
 from mistyle.setup import facts, llvm
 
 

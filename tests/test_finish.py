@@ -13,6 +13,7 @@ from test_seam import sphere
 from torch import nn
 
 from mistyle.atlas.texels import rasterise
+from mistyle.cli.main import main
 from mistyle.core.errors import UsageError
 from mistyle.core.image import srgb_from_linear
 from mistyle.core.maps import flat_maps
@@ -20,7 +21,6 @@ from mistyle.jobs.progress import Progress
 from mistyle.measure.features import TORCHVISION_CONVOLUTIONS, TORCHVISION_POOLS, load_features
 from mistyle.render.deferred import pyramid
 from mistyle.render.mitsuba import device
-from mistyle.run.cli import main
 from mistyle.stylization.optimise import finish_style
 from mistyle.stylization.optimise.finish import Film, Finishing, PaintedAsset, finish, own_directions, shape_edges
 from mistyle.stylization.optimise.finish_settings import FinishSettings

@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 from test_pipeline import inputs, job  # noqa: F401  (a fixture)
 
+from mistyle.cli.main import main
 from mistyle.core.errors import Stopped, UsageError
 from mistyle.deliver.read_asset import read_finished
 from mistyle.io.read import read_picture
 from mistyle.jobs.progress import Progress
 from mistyle.jobs.report.pictures import Encoder
-from mistyle.run.cli import main
 from mistyle.stylization.pipeline import preview
 from mistyle.stylization.pipeline import stylize as pipeline
 from mistyle.stylization.settings import resolve

@@ -9,11 +9,11 @@ import tiny_models
 import trimesh
 from PIL import Image
 
+from mistyle.cli.main import main
 from mistyle.core.camera import rig
 from mistyle.core.paths import scenes
 from mistyle.io.cameras.views import read_views
 from mistyle.io.store.records import load_record
-from mistyle.run.cli import main
 from mistyle.stylization.diffusion import consislora
 from mistyle.stylization.pipeline.generative import opaque, watcher
 

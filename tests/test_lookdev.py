@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+from mistyle.cli.main import main
 from mistyle.core.errors import EnvironmentMissing
 from mistyle.core.image import linear_from_srgb, luminance, srgb_from_linear
 from mistyle.core.light import Ambient, Environment, bake_environment
@@ -20,7 +21,6 @@ from mistyle.io.read_mesh import read_mesh
 from mistyle.jobs.report.turntable import write_turn
 from mistyle.render.lookdev import sheet
 from mistyle.render.lookdev.aovs import aovs, density
-from mistyle.run.cli import main
 
 CYAN = 17
 SMALL = 0.5

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from test_seam import random_maps, torus
 
+from mistyle.cli.main import main
 from mistyle.core.asset import Material
 from mistyle.core.camera import rig
 from mistyle.core.errors import UsageError
@@ -24,7 +25,6 @@ from mistyle.render.lookdev import scenes as lookdev
 from mistyle.render.mitsuba import device, draw
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba import texture_pages as pages
-from mistyle.run.cli import main
 from mistyle.stylization.pipeline import budget as stylize_budget
 from mistyle.stylization.pipeline import single_stages as verbs
 from mistyle.stylization.settings import resolve

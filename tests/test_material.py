@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import mistyle
+from mistyle.cli.main import main
 from mistyle.core.camera import Camera, look_at
 from mistyle.core.capture import in_memory
 from mistyle.core.errors import InputRefused, UsageError
@@ -29,7 +30,6 @@ from mistyle.jobs.report.charts import Chart, svg
 from mistyle.render.deferred.material_table import pack
 from mistyle.render.deferred.renderer import MaterialRenderer
 from mistyle.render.mitsuba import draw
-from mistyle.run.cli import main
 from mistyle.solver.cameras.align import Alignment
 from mistyle.stylization.pipeline.single_stages import tell_views
 

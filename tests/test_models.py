@@ -21,8 +21,8 @@ import torch
 from helpers import ROOT
 from safetensors.torch import load_file, save_file
 
+from mistyle.cli.main import main
 from mistyle.core.errors import EnvironmentMissing, InputRefused, UsageError
-from mistyle.run.cli import main
 from mistyle.stylization.diffusion.settings import ModelSettings
 from mistyle.stylization.models import check as models_check
 from mistyle.stylization.models import fetch as models_fetch
@@ -127,7 +127,7 @@ def fetch(
     words = ["models", "fetch", *names, "--models", str(folder), *(["--allow-download"] if allow else [])]
     # What the test's server holds is not what is published under these names.
     program = (
-        "import sys; from dataclasses import replace; from mistyle.run.cli import main; "
+        "import sys; from dataclasses import replace; from mistyle.cli.main import main; "
         "from mistyle.stylization.models.catalogue import MODELS; "
         "MODELS.update({name: replace(model, sha256={}) for name, model in MODELS.items()}); "
         "sys.exit(main(sys.argv[1:]))"

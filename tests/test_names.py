@@ -20,6 +20,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from mistyle.batch.jobs_file import BatchJob, _names
+from mistyle.cli.main import main
+from mistyle.cli.options import asset_name
 from mistyle.core import names
 from mistyle.core.errors import UsageError
 from mistyle.deliver import files as deliver_files
@@ -31,8 +33,6 @@ from mistyle.io.images.textures import part_stems
 from mistyle.io.store import atomic
 from mistyle.io.usd.write import library
 from mistyle.jobs.deliver_settings import TEXTURES
-from mistyle.run.cli import main
-from mistyle.run.options import asset_name
 
 FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
 LONG = "木" * 82

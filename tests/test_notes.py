@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import pytest
 from verbs import VERBS
 
+from mistyle.cli.main import main
 from mistyle.jobs.progress import Progress, grouped
-from mistyle.run.cli import main
 from mistyle.stylization.optimise.judge import TOLERANCE, regressed, undone_where
 from mistyle.stylization.report import summary
 from mistyle.stylization.report.page import fit_facts

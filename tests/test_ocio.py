@@ -233,7 +233,7 @@ def test_without_opencolorio_the_sentence_says_what_to_install(monkeypatch):
 
 
 def test_the_command_line_refuses_an_unknown_space_before_the_work(tmp_path, capsys):
-    from mistyle.run.cli import main
+    from mistyle.cli.main import main
 
     Image.new("RGB", (8, 8)).save(tmp_path / "style.png")
     (tmp_path / "m.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")

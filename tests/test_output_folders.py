@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from verbs import ATLAS, PAINT, VERBS, line
 
+from mistyle.cli.main import main
 from mistyle.io.store import output
-from mistyle.run.cli import main
 
 # What a second call would put in the place of a file that was edited since: refused, or set aside in a run folder.
 EDITS = {

@@ -5,6 +5,8 @@ import json
 
 import pytest
 
+from mistyle.cli.main import main
+from mistyle.cli.options import gigabytes
 from mistyle.core.errors import UsageError
 from mistyle.fitting.pipeline import budget as material_budget
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES
@@ -12,8 +14,6 @@ from mistyle.fitting.settings.material import MATERIAL_PRESETS, MaterialSettings
 from mistyle.jobs import memory_budget as budget
 from mistyle.jobs.settings import resolve as settings_of
 from mistyle.process import memory
-from mistyle.run.cli import main
-from mistyle.run.options import gigabytes
 from mistyle.stylization.pipeline import budget as stylize_budget
 from mistyle.stylization.pipeline.job import FINISH, STAGES
 from mistyle.stylization.settings import Settings, resolve

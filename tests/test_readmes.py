@@ -21,10 +21,10 @@ from pathlib import Path
 import pytest
 from helpers import ROOT
 
+from mistyle.cli.main import parser
 from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.fitting.settings.scene import SceneSettings
 from mistyle.jobs.settings import Settings, known_keys
-from mistyle.run.cli import parser
 
 LANGUAGES = {"shell", "python", "toml", "json", "text"}
 MARK = "<!-- run -->"

@@ -5,6 +5,7 @@ import json
 import numpy as np
 import pytest
 
+from mistyle.cli import main as cli
 from mistyle.core.errors import InputRefused, Stopped, UsageError
 from mistyle.fitting.pipeline.scene_references import choose_channels
 from mistyle.process import stopping
@@ -12,7 +13,6 @@ from mistyle.render.live import parameters as scene_keys
 from mistyle.render.live import source as scene_source
 from mistyle.render.live import xml as scene_xml
 from mistyle.render.mitsuba import device
-from mistyle.run import cli
 from mistyle.solver.scene import fit as scene_fit
 from mistyle.solver.scene import gradients as scene_grad
 

@@ -17,7 +17,7 @@ VERB = """
 import argparse, os, signal, sys, time
 from pathlib import Path
 from mistyle.process import stopping
-from mistyle.run import exits
+from mistyle.cli import exits
 def command(options):
     print("ready", flush=True)
     BODY

@@ -12,6 +12,7 @@ from scipy.spatial import KDTree
 from test_surface import box, dented_ball, dj, mesh_of, open_sky, sheet, solved, spread_on, strokes  # noqa: F401
 
 from mistyle.atlas.texels import rasterise
+from mistyle.cli import options
 from mistyle.core.asset import Asset, Material, Picture, Source
 from mistyle.core.camera import resized, rig
 from mistyle.core.errors import InputRefused, UsageError
@@ -23,7 +24,6 @@ from mistyle.geometry.tangents import corner_tangents
 from mistyle.io.images.write import write_png
 from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.render.mitsuba.unlit import unlit
-from mistyle.run import options
 from mistyle.stylization.pipeline import painting, preview, variations
 from mistyle.stylization.pipeline import start as stylize_start
 from mistyle.stylization.settings import Settings

@@ -11,6 +11,7 @@ import pytest
 from gltf_cases import bumpy_sphere, no_texels, quarters
 from node_tools import modules
 
+from mistyle.cli.main import main
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.deliver import verify_checks
 from mistyle.deliver.asset import write_asset
@@ -18,7 +19,6 @@ from mistyle.deliver.export import DeliveryRequest, export
 from mistyle.deliver.verify import Rendering, compared, file_checks, table, verify
 from mistyle.deliver.verify_surfaces import surface_checks
 from mistyle.render.external.blender import blender_command, find_blender
-from mistyle.run.cli import main
 
 FORMATS = ["glb", "usd", "mtlx", "obj", "maps"]
 

@@ -17,6 +17,8 @@ from browser import BROWSER, NO_BROWSER, Browser
 from PIL import Image
 from test_report import Page, sample
 
+from mistyle.cli import lookdev as cli_lookdev
+from mistyle.cli.main import main
 from mistyle.core.errors import InputRefused
 from mistyle.io.read import shrink_picture
 from mistyle.jobs.report import model as report_model
@@ -31,8 +33,6 @@ from mistyle.jobs.report.model import (
     viewer_script,
 )
 from mistyle.jobs.report.page import Report, write_report
-from mistyle.run import cli_lookdev
-from mistyle.run.cli import main
 
 RED = (200, 24, 16)
 

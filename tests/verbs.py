@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from mistyle.run.cli import main
+from mistyle.cli.main import main
 
 SQUARE = """v -1 0 -1
 v 1 0 -1

@@ -6,8 +6,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mistyle.cli.options import add_overwrite_option, examples
 from mistyle.core.errors import UsageError
-from mistyle.run.options import add_overwrite_option, examples
 
 # Option -> dotted setting, for `add_generative_options`.
 GENERATIVE_OPTIONS = {

@@ -7,8 +7,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from mistyle.cli.options import add_overwrite_option, examples, given_defines
 from mistyle.core.errors import UsageError
-from mistyle.run.options import add_overwrite_option, examples, given_defines
 
 
 def add_compare(verbs: Any) -> None:

@@ -12,17 +12,15 @@ from pathlib import Path
 from typing import Any
 
 from mistyle import __version__
-from mistyle.core.errors import UsageError
-from mistyle.run import exits
-from mistyle.run.cli_batch import add_batch
-from mistyle.run.cli_compare import add_compare, add_converge
-from mistyle.run.cli_demo import add_demo, demo
-from mistyle.run.cli_export import add_export, add_verify
-from mistyle.run.cli_fit import add_fit
-from mistyle.run.cli_lookdev import add_lookdev, add_view
-from mistyle.run.cli_models import GENERATIVE_OPTIONS, add_generative_options, add_models
-from mistyle.run.cli_train import add_train
-from mistyle.run.options import (
+from mistyle.cli import exits
+from mistyle.cli.batch import add_batch
+from mistyle.cli.compare import add_compare, add_converge
+from mistyle.cli.demo import add_demo, demo
+from mistyle.cli.export import add_export, add_verify
+from mistyle.cli.fit import add_fit
+from mistyle.cli.lookdev import add_lookdev, add_view
+from mistyle.cli.models import GENERATIVE_OPTIONS, add_generative_options, add_models
+from mistyle.cli.options import (
     DELIVERY_OPTIONS,
     NAME_HELP,
     PAINT_OPTIONS,
@@ -37,6 +35,8 @@ from mistyle.run.options import (
     examples,
     given_settings,
 )
+from mistyle.cli.train import add_train
+from mistyle.core.errors import UsageError
 
 Command = Callable[[argparse.Namespace], int]
 
@@ -439,7 +439,7 @@ def _bake(options: argparse.Namespace) -> int:
 
 
 def _doctor(options: argparse.Namespace) -> int:
-    from mistyle.run import doctor
+    from mistyle.cli import doctor
 
     return doctor.main(json=options.json)
 

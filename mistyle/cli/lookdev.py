@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mistyle.cli.options import add_overwrite_option, examples
 from mistyle.core.errors import InputRefused
-from mistyle.run.options import add_overwrite_option, examples
 
 
 def add_view(verbs: Any) -> None:

@@ -7,9 +7,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from mistyle.cli.demo_inputs import DEFAULT, MESHES, PAINTINGS, demo_files
+from mistyle.cli.options import asset_name, examples
 from mistyle.core.errors import UsageError
-from mistyle.run.demo import DEFAULT, MESHES, PAINTINGS, demo_files
-from mistyle.run.options import asset_name, examples
 
 MakeJob = Callable[..., Any]
 
@@ -69,8 +69,8 @@ def _plans(options: argparse.Namespace, jobs: list[Any]) -> int:
 
 
 def _all(options: argparse.Namespace, jobs: list[Any]) -> int:
+    from mistyle.cli.demo_inputs import run_all
     from mistyle.jobs.progress import Progress
-    from mistyle.run.demo import run_all
 
     progress = Progress()
     made = run_all(jobs, options.out, progress, overwrite=options.overwrite)

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mistyle.run.options import NAME_HELP, add_overwrite_option, examples
+from mistyle.cli.options import NAME_HELP, add_overwrite_option, examples
 
 
 def add_export(verbs: Any) -> None:

@@ -8,10 +8,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mistyle.cli.models import add_model_options
+from mistyle.cli.options import add_job_options, examples, given_settings
 from mistyle.core.errors import UsageError
 from mistyle.process.cores import use_threads
-from mistyle.run.cli_models import add_model_options
-from mistyle.run.options import add_job_options, examples, given_settings
 
 if TYPE_CHECKING:
     from mistyle.stylization.diffusion.lora_files import TrainingImage

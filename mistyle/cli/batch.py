@@ -10,8 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from mistyle.process.children import PARENT
-from mistyle.run.options import (
+from mistyle.cli.options import (
     DELIVERY_OPTIONS,
     NAME_HELP,
     add_delivery_options,
@@ -19,6 +18,7 @@ from mistyle.run.options import (
     examples,
     given_settings,
 )
+from mistyle.process.children import PARENT
 
 
 def add_batch(verbs: Any) -> None:

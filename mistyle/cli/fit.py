@@ -6,9 +6,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from mistyle.core import names
-from mistyle.core.errors import UsageError
-from mistyle.run.options import (
+from mistyle.cli.options import (
     DELIVERY_OPTIONS,
     NAME_HELP,
     REPORT_OPTIONS,
@@ -22,6 +20,8 @@ from mistyle.run.options import (
     given_defines,
     given_settings,
 )
+from mistyle.core import names
+from mistyle.core.errors import UsageError
 
 # Option of the command line -> dotted setting.
 OPTIONS = {
