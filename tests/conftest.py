@@ -34,7 +34,7 @@ def rng() -> np.random.Generator:
 
 @pytest.fixture(scope="session")
 def verb_inputs(tmp_path_factory) -> Path:
-    """A folder with what every verb that writes can be given (tests/verbs.py); not to be changed."""
+    """A folder with what every verb that writes can be given (tests/support/verbs.py); not to be changed."""
     from verbs import write_inputs
 
     folder = tmp_path_factory.mktemp("verbs") / "inputs"

@@ -51,7 +51,7 @@ MALLOC_FILL = "MALLOC_PERTURB_"  # glibc: the byte whose complement fresh memory
 
 def start(folder: Path, out: Path, budget: str = "0", **environment: str) -> subprocess.Popen[bytes]:
     folder.mkdir()
-    child = ROOT / "tests" / "determinism_child.py"
+    child = ROOT / "tests" / "support" / "determinism_child.py"
     paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
     with open(folder / SAID, "wb") as said:
         return subprocess.Popen(

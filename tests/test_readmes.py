@@ -32,8 +32,6 @@ FOLDERS = ("mistyle", "scenes", "tests", "benchmarks")
 READMES = sorted([*ROOT.glob("*.md"), *(path for top in FOLDERS for path in (ROOT / top).rglob("*.md"))])
 # Settings that keep the executed blocks short.
 SMALL = "rig.resolution=64;atlas.size=128;surface.samples=2000;fit.refine=off;report.detail=none;report.frames=4"
-# READMEs name the modules of the finished tree.
-MOVED = (ROOT / "mistyle" / "cli").is_dir()
 
 
 @dataclass(frozen=True)
@@ -190,11 +188,11 @@ def inline_problems(text: str) -> Iterator[str]:
         for key in re.findall(r"(?:^|--set )([a-z]\w*\.[a-z]\w*(?:\.\w+)?)(?==|$)", code):
             if key.partition(".")[0] in tables and key not in settings():
                 yield f"`{code}`: there is no setting {key}"
-        for name in re.findall(r"(?<![\w./])mistyle(?:\.[a-zA-Z_]\w*)+", code) if MOVED else ():
+        for name in re.findall(r"(?<![\w./])mistyle(?:\.[a-zA-Z_]\w*)+", code):
             if not resolves(name):
                 yield f"`{code}`: {name} does not exist"
         named = re.fullmatch(r"((?:mistyle|tests|benchmarks|scenes)/[\w/.-]+\.\w+)", code)
-        if named and not (ROOT / code).exists() and (MOVED or not code.startswith("mistyle/")):
+        if named and not (ROOT / code).exists():
             yield f"`{code}`: no such file"
 
 
@@ -291,8 +289,6 @@ RUN = [path for path in READMES if MARK in path.read_text(encoding="utf-8")]
 @pytest.mark.parametrize("path", RUN, ids=ids(RUN))
 def test_marked_blocks_run(path, tmp_path):
     text = path.read_text(encoding="utf-8")
-    if not MOVED and "mistyle.setup" in text:
-        pytest.skip("the modules that it imports are not moved yet")
     (tmp_path / "bin").mkdir()
     shim = tmp_path / "bin" / "mistyle"
     shim.write_text(f"#!{sys.executable}\nimport sys\nfrom {parser.__module__} import main\nsys.exit(main())\n")

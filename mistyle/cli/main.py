@@ -101,7 +101,7 @@ def parser() -> argparse.ArgumentParser:
     test = verbs.add_parser(
         "test",
         help="set up and run the test suite; arguments go to pytest",
-        **examples("python3 -m mistyle test tests/test_cli.py -x"),
+        **examples("python3 -m mistyle test tests/cli/test_cli.py -x"),
     )
     test.add_argument("arguments", nargs="*", help="passed on to pytest")
     test.set_defaults(command=_test)

@@ -130,7 +130,7 @@ def named_texture(
 
 
 def decode(data: bytes, where: str, budget: Budget, kind: Kind, scale: float = 1.0) -> Float[np.ndarray, "h w 3"]:
-    """A mesh's texture as `Material` has it: see io/images/quantisation.py `finished`; at most WORK_TEXTURE on a side."""
+    """A mesh's texture as `Material` has it (io/images/quantisation.py `finished`), at most WORK_TEXTURE on a side."""
     return finished(texture(data, where, budget), kind, scale, WORK_TEXTURE)
 
 

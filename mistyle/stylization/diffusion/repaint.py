@@ -5,7 +5,8 @@ scaled for a network's input (a denoiser that wants x / sqrt(sigma^2 + 1) divide
 
 The paper re-noises a block "before the final resample". With one re-noising in ten repeats the other eight start from
 latents quieter than the denoiser is told, and the variance of the result falls under half of the true one; here, as in
-RePaint itself, every repeat but the first is re-noised. tests/test_repaint.py holds both against a closed form.
+RePaint itself, every repeat but the first is re-noised. tests/stylization/diffusion/test_repaint.py holds both against
+a closed form.
 """
 
 from collections.abc import Callable, Sequence

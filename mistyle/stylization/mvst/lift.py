@@ -1,4 +1,4 @@
-"""Finished views as coloured points of the surface, ready to be carried into other views (`stylization/mvst/warp.py`)."""
+"""Finished views as coloured points of the surface; `stylization/mvst/warp.py` carries them into other views."""
 
 from dataclasses import dataclass
 

@@ -22,7 +22,7 @@ from mistyle.io.store.keeper import Keeper
 from mistyle.jobs import checkpoint
 from mistyle.process import disk_errors
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 
 
 def names(folder: Path) -> list[str]:
@@ -182,7 +182,7 @@ if {moment == "swapping"}:
     os.rename = rename_then_die
 keeper.put("bake", "new", write)
 """
-    child = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[1])
+    child = subprocess.run([sys.executable, "-c", code], cwd=Path(__file__).parents[3])
     assert child.returncode == -9 and len(names(tmp_path)) == 2
     with Keeper(tmp_path) as keeper:
         assert names(tmp_path) == ["bake"]
@@ -437,7 +437,7 @@ def test_digest_is_the_same_in_another_process(tmp_path):
     code = "from mistyle.io.store.atomic import digest; print(digest({'a': {'x', 'y', 'z'}, 'b': 0.1}))"
     for seed in ("1", "2"):
         out = subprocess.run(
-            [sys.executable, "-c", code], cwd=Path(__file__).parents[1], env=os.environ | {"PYTHONHASHSEED": seed},
+            [sys.executable, "-c", code], cwd=Path(__file__).parents[3], env=os.environ | {"PYTHONHASHSEED": seed},
             capture_output=True, text=True, check=True,
         )  # fmt: skip
         assert out.stdout.strip() == digest({"a": {"x", "y", "z"}, "b": 0.1})

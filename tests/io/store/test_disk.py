@@ -24,7 +24,7 @@ from mistyle.io.store.atomic import atomic_folder, atomic_write
 from mistyle.io.store.keeper import Keeper
 from mistyle.process import disk_errors
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[3]
 
 
 def names(folder: Path) -> list[str]:
@@ -199,7 +199,7 @@ def test_an_input_that_vanished_is_a_sentence_and_a_mistake_of_ours_is_not(tmp_p
     code, words = ends(OSError("2446080 requested and 718 written"), capsys)
     assert code == 1 and "TMPDIR" in words
     with pytest.raises(FileNotFoundError):
-        ends(FileNotFoundError(errno.ENOENT, "No such file", str(PACKAGE / "run" / "lost.j2")), capsys)
+        ends(FileNotFoundError(errno.ENOENT, "No such file", str(PACKAGE / "jobs" / "lost.j2")), capsys)
     assert isinstance(disk_errors.unexpected(OSError(errno.ENOENT, "x", str(gone))), InputRefused)
 
 

@@ -273,7 +273,7 @@ def test_a_file_that_takes_too_much_memory_is_refused(tmp_path: Path):
     """In a process of its own: what ran before in this one decides with how much its reader begins."""
     write_png(tmp_path / "a.png", np.zeros((3000, 3000, 3), np.float32))
     line = [sys.executable, "-c", LITTLE, str(tmp_path / "a.png")]
-    done = subprocess.run(line, cwd=Path(__file__).parents[1], capture_output=True, text=True)
+    done = subprocess.run(line, cwd=Path(__file__).parents[3], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 
@@ -294,7 +294,10 @@ def test_threads_share_the_child(tmp_path: Path):
     assert found == {k: [float(k)] * 5 for k in range(8)}
 
 
-READ = "from pathlib import Path; from mistyle.io import read; from mistyle.io.sandbox import reader_process; read.read_size(Path(r'{}'));"
+READ = (
+    "from pathlib import Path; from mistyle.io import read; from mistyle.io.sandbox import reader_process; "
+    "read.read_size(Path(r'{}'));"
+)
 READ += "pid = reader_process._reader.process.pid; print(pid, flush=True);"
 
 

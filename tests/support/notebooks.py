@@ -1,6 +1,6 @@
 """Notebooks executed without Jupyter: cells in order, what they show kept as nbformat 4 outputs.
 
-`python tests/notebooks.py scenes/fit_a_material.ipynb` executes a notebook and stores it with its outputs.
+`python tests/support/notebooks.py scenes/fit_a_material.ipynb` executes a notebook and stores it with its outputs.
 """
 
 import ast

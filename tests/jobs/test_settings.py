@@ -109,9 +109,17 @@ def test_what_is_fitted_follows_what_painted_the_views(preset, change, refined, 
     assert (settings.refined, settings.keeps_painting) == (refined, kept)
 
 
-@pytest.mark.parametrize("verb", ["stylize", "material", "scene", "train"])
-def test_settings_are_read_without_the_stages_and_their_libraries(verb):
-    code = f"import sys, mistyle.run.{verb}_settings; print(*sys.modules)"
+@pytest.mark.parametrize(
+    "module",
+    [
+        "stylization.settings",
+        "fitting.settings.material",
+        "fitting.settings.scene",
+        "stylization.diffusion.train_settings",
+    ],
+)
+def test_settings_are_read_without_the_stages_and_their_libraries(module):
+    code = f"import sys, mistyle.{module}; print(*sys.modules)"
     loaded = set(
         subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
     )

@@ -62,7 +62,7 @@ def test_large_pictures_are_not_copied():
 def test_no_array_goes_to_the_device_by_another_way():
     """Calls such as mi.Float(np.…) or mi.Float(x.astype(…)) in render/ and surface/."""
     found = []
-    for path in sorted([*Path(ROOT, "mistyle/render").glob("*.py"), *Path(ROOT, "mistyle/surface").glob("*.py")]):
+    for path in sorted([*Path(ROOT, "mistyle").rglob("*.py")]):
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if not (isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr in ARRAYS):
                 continue

@@ -12,7 +12,7 @@ import pytest
 from mistyle.core.errors import Stopped
 from mistyle.process import stopping
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 VERB = """
 import argparse, os, signal, sys, time
 from pathlib import Path
