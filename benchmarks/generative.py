@@ -278,7 +278,7 @@ def paths(figures: dict[str, float], device: str, precision: str) -> None:
     """Every path on tiny random models, as users have models on disk; what paths share is run once."""
     from mistyle.stylization.diffusion.settings import ModelSettings
     from mistyle.stylization.inpaint.paint3d import RECIPES
-    from tests import tiny_models
+    from tests.support import tiny_models
 
     made: Any = {"folder": tiny_models.folder(), "device": device, "precision": precision}
     places = {word: ModelSettings(**made, offload=word == "offloaded") for word in ("whole", "offloaded")}

@@ -36,15 +36,17 @@ def lamp_map(azimuth: float, rows: int = 97) -> np.ndarray:
 
 def painted(mesh: Path, style: Path) -> tuple[Any, list[Any]]:
     """The asset and the maps of its texture sets, painted as `mistyle demo` paints them."""
-    from mistyle.io.read import read_mesh, read_picture
-    from mistyle.jobs import start
-    from mistyle.jobs.settings import resolve
+    from mistyle.io.read import read_picture
+    from mistyle.io.read_mesh import read_mesh
+    from mistyle.jobs.start import start_engines
     from mistyle.stylization.pipeline import painting
+    from mistyle.stylization.pipeline.start import lay_out
+    from mistyle.stylization.settings import resolve
 
     settings = resolve("demo", None, {}, {})
-    start.start_engines(settings)
+    start_engines(settings)
     asset = read_mesh(mesh)
-    atlas = start.lay_out(asset, settings, lambda done: None)
+    atlas = lay_out(asset, settings, lambda done: None)
     layers = painting.paint_layers(asset, read_picture(style), atlas, settings, lambda done: None)
     flat = painting.painted(asset, layers, atlas, settings)
     return asset, painting.raised(asset, layers, atlas, settings, flat)

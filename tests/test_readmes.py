@@ -24,7 +24,8 @@ from helpers import ROOT
 from mistyle.cli.main import parser
 from mistyle.fitting.settings.material import MaterialSettings
 from mistyle.fitting.settings.scene import SceneSettings
-from mistyle.jobs.settings import Settings, known_keys
+from mistyle.jobs.settings import known_keys
+from mistyle.stylization.settings import Settings
 
 LANGUAGES = {"shell", "python", "toml", "json", "text"}
 MARK = "<!-- run -->"

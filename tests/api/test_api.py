@@ -70,7 +70,7 @@ def test_every_function_says_what_it_takes(name):
 def test_the_settings_of_the_verbs_are_those_that_there_are():
     from mistyle.deliver.lookdev.job import LookSettings
     from mistyle.fitting.settings.material import MaterialSettings
-    from mistyle.jobs.settings import Settings
+    from mistyle.stylization.settings import Settings
 
     for typed, model in ((StylizeSettings, Settings), (FitSettings, MaterialSettings), (LookdevSettings, LookSettings)):
         assert set(typed.__annotations__) == set(model.model_fields), typed

@@ -64,7 +64,7 @@ def test_the_peer_gets_guides_of_the_paintings_size_and_its_pictures_are_masked(
 def test_source_guides_are_the_synthesis_own(rng):
     """The page's large-area colour and its band, at the same size."""
     painting = noise(rng, size=128, sigma=2)
-    page = styles.pages(styles.StyleImage(painting, np.ones((128, 128), bool)), 128, 0.0)
+    page = styles.exemplar(styles.StyleImage(painting, np.ones((128, 128), bool)), 128, 0.0)
     broad, band = consistency_peer.source_guides(painting)
     np.testing.assert_allclose(
         styles.lab_from_srgb(broad).reshape(-1, 3), page.broad[: 128 * 128], atol=4e-3

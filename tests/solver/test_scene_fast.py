@@ -178,7 +178,7 @@ def test_other_materials_are_left_out_of_the_pictures(references):
     scene = start(other={"type": "diffuse", "reflectance": {"type": "rgb", "value": [0.9, 0.1, 0.1]}})
     chosen = scene_keys.match(scene, KEYS[:1])
     fast = DeferredRenderer(scene, chosen, sights(scene, references), "l2", scene_grad.ad_integrator(scene)[0])
-    counted = [fast.shade.captures.load(k)[1].mean() for k in range(3)]
+    counted = [fast.renderer.captures.load(k)[1].mean() for k in range(3)]
     assert max(counted) < 0.98 and min(counted) > 0.5
 
 
