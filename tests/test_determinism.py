@@ -52,7 +52,9 @@ MALLOC_FILL = "MALLOC_PERTURB_"  # glibc: the byte whose complement fresh memory
 def start(folder: Path, out: Path, budget: str = "0", **environment: str) -> subprocess.Popen[bytes]:
     folder.mkdir()
     child = ROOT / "tests" / "support" / "determinism_child.py"
-    paths = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
+    # The child imports other tests, as this process can.
+    shared = [path for path in sys.path if path.startswith(str(ROOT / "tests"))]
+    paths = os.pathsep.join([str(ROOT), *shared, os.environ.get("PYTHONPATH", "")])
     with open(folder / SAID, "wb") as said:
         return subprocess.Popen(
             [sys.executable, str(child), str(out), "2", budget],
