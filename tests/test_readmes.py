@@ -187,7 +187,7 @@ def inline_problems(text: str) -> Iterator[str]:
         if words[:2] == ["python", "-m"] and words[2].startswith("benchmarks."):
             yield from (f"`{code}`: {problem}" for problem in benchmark_problems(words))
         for key in re.findall(r"(?:^|--set )([a-z]\w*\.[a-z]\w*(?:\.\w+)?)(?==|$)", code):
-            if key.partition(".")[0] in tables and key not in settings():
+            if key.partition(".")[0] in tables and not key.endswith(".py") and key not in settings():
                 yield f"`{code}`: there is no setting {key}"
         for name in re.findall(r"(?<![\w./])mistyle(?:\.[a-zA-Z_]\w*)+", code):
             if not resolves(name):

@@ -59,7 +59,7 @@ DECODERS = {
     *("io/gltf/pose", "io/usd/stage", "io/usd/mesh"),
 }
 ALLOWED = {
-    "environment": "pyproject.toml of the clone",
+    "setup/environment": "pyproject.toml of the clone",
     "core/light": "scene files that come with mistyle",
     "process/memory": "arrays that mistyle wrote into a run's folder",
     "geometry/unwrap": "what its own child wrote into a folder of its own",
