@@ -184,7 +184,6 @@ def lookdev(
     *,
     hdri: str | PathLike | None = None,
     date: str | None = None,
-    mp4: bool = False,
     overwrite: bool = False,
     quiet: bool = True,
     **settings: Unpack[LookdevSettings],
@@ -193,10 +192,9 @@ def lookdev(
 
     hdri       an .hdr or .exr environment map for the third light
     date       stands in the burn-in; None: the day on which the asset's file was last changed, UTC
-    mp4        write the turntables as mp4 too (needs mistyle[video])
     overwrite  replace files in `out` that mistyle did not write
     quiet      False: progress on stderr
-    settings   size, spp, seed, frame, threads, variant, and the frames of `turntable` and `hdri_turn` (0: none)
+    settings   size, spp, seed, frame, threads, variant, the frames of `turntable` and `hdri_turn` (0: none), and `mp4`
 
     Returns the paths of what was written, and notes. Raises `mistyle.core.errors.MistyleError`.
     """
@@ -205,7 +203,7 @@ def lookdev(
     from mistyle.jobs.progress import Progress
     from mistyle.jobs.settings import validate
 
-    chosen, progress = validate({**settings, "mp4": mp4}, "lookdev", LookSettings), Progress(quiet=quiet)
+    chosen, progress = validate(settings, "lookdev", LookSettings), Progress(quiet=quiet)
     place = None if hdri is None else Path(hdri)
     written = run(Path(asset), Path(out), chosen, progress, hdri=place, date=date, overwrite=overwrite)
     return JobResult(written | {"notes": list(progress.notes)})

@@ -59,6 +59,7 @@ class LookdevSettings(TypedDict, total=False):
     size: int
     spp: int
     seed: int
+    mp4: bool
     turntable: int
     hdri_turn: int
     frame: int
