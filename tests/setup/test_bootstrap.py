@@ -81,7 +81,8 @@ def test_help_answers_on_a_bare_python_without_set_up(clone):
 
 
 def test_nothing_heavy_is_imported_before_a_command_runs(clone):
-    names = "__main__", "bootstrap", "environment", "install", "llvm", "facts", "run.doctor", "run.cli"
+    setup = [f"setup.{name}" for name in ("bootstrap", "environment", "install", "llvm", "facts")]
+    names = ["__main__", *setup, "cli.doctor", "cli.main"]
     code = (
         f"import sys; sys.path.insert(0, '.'); {'; '.join(f'import mistyle.{n}' for n in names)}; print(*sys.modules)"
     )

@@ -241,7 +241,7 @@ def test_no_interpreter_is_left_running_when_pip_is_interrupted(tmp_path):
     """SIGTERM to the set-up reaches the pip that it waits for."""
     program(tmp_path / "python", "echo $$ > pid; echo Installing collected packages: numpy; exec sleep 100")
     code = (
-        "import sys; from pathlib import Path; from mistyle import bootstrap, install\n"
+        "import sys; from pathlib import Path; from mistyle.setup import bootstrap, install\n"
         "with bootstrap._stoppable(): install.pip(Path('python').absolute(), Path('.').absolute(), 'numpy')"
     )
     variables = {**os.environ, "PYTHONPATH": str(environment.ROOT)}
