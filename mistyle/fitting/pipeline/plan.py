@@ -1,4 +1,4 @@
-"""What a fit to pictures will do and cost, before it does it (`--dry-run`); see jobs/plan.py."""
+"""Estimates of `--dry-run` for a fit to pictures; see jobs/plan.py."""
 
 from typing import Any
 
@@ -33,9 +33,9 @@ from mistyle.solver.settings import all_rounds, descent_steps, estimates, joint_
 
 
 def plan_material(job: Any) -> dict[str, Any]:
-    """The same for a `MaterialJob`, whose cameras, lights and pictures' headers are read and refused as it does.
+    """The plan of a `MaterialJob`; cameras, lights and pictures' headers are read and refused as the job does.
 
-    How much of the pictures shows the object is not known yet: the shares of fitting/pipeline/budget.py are taken.
+    The object's share of the pictures is still unknown: fitting/pipeline/budget.py gives typical shares.
     """
     from mistyle.fitting.pipeline.material import inputs_of, pixels_of, references_of
     from mistyle.solver.indirect import MOST
@@ -57,7 +57,7 @@ def plan_material(job: Any) -> dict[str, Any]:
     again = joint_estimates(s.recover)
     samples += sum(again)
     paths = samples * sum(min(n, MOST**2) for n in averaged)
-    words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
+    smoothings = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
         "mesh": reading(extent),
         "texels": texels * PER_TEXEL,
@@ -67,13 +67,13 @@ def plan_material(job: Any) -> dict[str, Any]:
         + (begun * len(STARTS) / 2 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
         + paths * PER_BOUNCED_PATH
         + joint * max(1, len(again)) * SHOWN * sum(averaged) * PER_JOINT
-        + words * COVERED * texels * PER_SMOOTHED,
+        + smoothings * COVERED * texels * PER_SMOOTHED,
         "measure": 2 * looked * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,
         "scene": 2 * texels * PER_TEXEL,
         "report": 5 + s.report.frames * s.report.resolution**2 * s.report.spp * PER_SAMPLE_RAY,
     }
-    kept = sum(12 * n for n, whole in zip(averaged, sizes, strict=True) if n < whole)
+    stored = sum(12 * n for n, whole in zip(averaged, sizes, strict=True) if n < whole)
     return {
         "mesh": str(job.mesh),
         "references": str(job.references),
@@ -83,5 +83,5 @@ def plan_material(job: Any) -> dict[str, Any]:
         "memory_gb": material_gb(chosen, sizes, *size),
         "in_files": False,
         "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, *size)),
-        "disk_gb": round((texels * BYTES_PER_TEXEL + kept) / 1e9, 2),
+        "disk_gb": round((texels * BYTES_PER_TEXEL + stored) / 1e9, 2),
     }
