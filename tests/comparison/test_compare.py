@@ -264,7 +264,7 @@ def test_a_regression_suite(tmp_path, capsys, rng):
     save(golden / "old.exr", first)
     suite = ("--baseline", golden, new, "-o", tmp_path / "out", *FAST, "--min", "psnr=60")
     code, _, said = run(capsys, *suite)
-    assert code == 3 and "none called like" in said
+    assert code == 3 and "none named as" in said
     approving = ["compare", "--baseline", str(golden), str(new), "--approve"]
     assert main([*approving, "chair"]) == 0
     capsys.readouterr()
