@@ -196,7 +196,8 @@ def describe_dry_run(estimate: dict[str, Any]) -> str:
         lines.append(f"  {row['name']:<40} {row['kind']:<8} {cost}")
     lines.append(
         f"{sum(not row['done'] for row in estimate['jobs'])} jobs, {estimate['workers']} at a time: "
-        f"about {estimate['seconds']} s, {estimate['disk_gb']} GB of disk, {estimate['memory_gb']} GB of memory -> {estimate['out']}"
+        f"about {estimate['seconds']} s, {estimate['disk_gb']} GB of disk, {estimate['memory_gb']} GB of memory "
+        f"-> {estimate['out']}"
     )
     return "\n".join(lines)
 
