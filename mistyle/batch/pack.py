@@ -2,7 +2,7 @@
 
     DIR/wheels/       mistyle and its dependencies, in the exact versions of mistyle/constraints.txt
     DIR/llvm/         the libLLVM of this machine, with its own libraries
-    DIR/install.sh    ./install.sh /opt/mistyle: no network, no root; the result may then be made read-only
+    DIR/install.sh    ./install.sh /opt/mistyle: no network, no root; the installed folder may be read-only
     DIR/SHA256SUMS    of every file
 
 The installed program writes nothing into its own folder: kernels and caches go to $MISTYLE_SCRATCH (default
@@ -45,7 +45,7 @@ echo "installed: $target/mistyle"
 """
 
 START = """#!/bin/sh
-# mistyle from a place that may be read-only; what it keeps for later runs goes to local scratch.
+# mistyle in a folder that may be read-only; caches go to local scratch.
 here=$(CDPATH= cd -- "$(dirname -- "$(readlink -f -- "$0")")" && pwd)
 scratch=${{MISTYLE_SCRATCH:-${{TMPDIR:-/tmp}}/mistyle-$(id -u)}}
 mkdir -p "$scratch"

@@ -190,7 +190,7 @@ def describe_dry_run(estimate: dict[str, Any]) -> str:
     """The estimate as text for the terminal."""
     lines = []
     for row in estimate["jobs"]:
-        cost = "done before" if row["done"] else f"about {row['seconds']} s, {row['disk_gb']} GB of disk"
+        cost = "finished" if row["done"] else f"about {row['seconds']} s, {row['disk_gb']} GB of disk"
         if row["refused"]:
             cost = f"will be refused: {row['refused']}"
         lines.append(f"  {row['name']:<40} {row['kind']:<8} {cost}")

@@ -87,7 +87,7 @@ def run_shard(plan: BatchPlan, index: int, progress: Progress) -> dict[str, Any]
     key = key_of(job)  # of the present files: a file that changes during the run changes the key
     content = finished(plan, job, key)
     if content is not None:
-        progress.say(f"{job.name}: done before, taken over")
+        progress.say(f"{job.name}: reused from an earlier run")
         return content | {"reused": True}
     start = time.monotonic()
     failure = marker(plan, job, failed=True)

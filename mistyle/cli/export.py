@@ -84,7 +84,7 @@ def add_verify(verbs: Any) -> None:
         help="open written files with independent readers, render them in Cycles and Mitsuba",
         **examples(
             """
-            mistyle verify out/                                  a run folder: its manifest, its GLB, what was delivered
+            mistyle verify out/                                  a run folder: its manifest, its GLB, its deliveries
             mistyle verify delivered/ --blender /opt/bpy/bin/python
             mistyle verify chair.glb -o checked/ --no-render
             """

@@ -207,7 +207,7 @@ def _fit_scene(options: argparse.Namespace) -> int:
         return 0
     missing = [n for n, v in (("--references DIR", options.shots), ("-o OUT", options.out)) if v is None]
     if missing:
-        raise UsageError(f"fit --scene needs {' and '.join(missing)}; --list shows what can be fitted")
+        raise UsageError(f"fit --scene needs {' and '.join(missing)}; --list shows the parameters")
     name = names.asset_name(options.name, options.scene.stem)
     arguments = (options.scene, options.shots, options.out, tuple(options.optimize), settings, name, defines)
     progress = Progress()

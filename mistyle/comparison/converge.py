@@ -102,7 +102,7 @@ def converge(job: ConvergeJob, progress: Progress) -> dict[str, Any]:
         measurements, renderer_versions = measure(scene, shot, chosen, counts, job.seeds, reference, progress)
     missing = left_out(scene) if any("mitsuba" in r.kind for r in chosen) else []
     if missing:
-        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {job.scene.name} here.")
+        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {job.scene.name}.")
     record = summary(measurements, [r.name for r in chosen], counts) | {
         "scene": str(job.scene),
         "defines": [f"{name}={value}" for name, value in job.defines.items()],

@@ -48,7 +48,7 @@ def parse(text: str, side: Side, known: Sequence[str]) -> Limit:
 
 def checked(name: str, known: Sequence[str], where: str) -> str:
     if name not in known:
-        raise UsageError(f"{where}: {name!r} is not measured here; expected one of {', '.join(known)}")
+        raise UsageError(f"{where}: {name!r} is not measured; expected one of {', '.join(known)}")
     return name
 
 

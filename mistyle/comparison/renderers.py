@@ -92,8 +92,8 @@ def _draw(job: RenderJob, chosen: Sequence[Renderer], work: Path, progress: Prog
     }
     missing = left_out(scene) if any("mitsuba" in r.kind for r in chosen) else []
     if missing:
-        context["not drawn by Mitsuba here"] = ", ".join(missing)
-        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {job.file.name} here.")
+        context["not drawn by Mitsuba"] = ", ".join(missing)
+        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {job.file.name}.")
     if tests:
         context["z-test"] = "; ".join(f"{name}: {verdict_text(test)}" for name, test in tests)
     return folders, tests, context

@@ -99,7 +99,7 @@ def _write(new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any])
     files: list[dict[str, Any]] = []
     remaining = iter(sets)
     for part, stem in enumerate(stems):
-        # No variable here holds a set: its memory is free before the next one is computed.
+        # No variable of the loop holds a set: its memory is free before the next one is computed.
         encoded, written = _write_set(new, stem, asset, alpha_by_part.get(part), next(remaining))
         pictures.append(encoded)
         files += [_entry(new, path, part=asset.mesh.parts[part], **about) for path, about in written]

@@ -38,7 +38,7 @@ def _finished(
     """Each set with occlusion, padding around its islands, and a person's edits."""
     stems, remaining = part_stems(job.name, asset.mesh.parts), iter(sets)
     for part, stem in enumerate(stems):
-        # No variable here holds a set: its memory is free before the next one is computed.
+        # No variable of the loop holds a set: its memory is free before the next one is computed.
         yield _finish(job, asset, part, stem, next(remaining), report, (edited, own))
 
 

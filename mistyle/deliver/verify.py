@@ -156,7 +156,7 @@ def _rendered(
             scene = subject(models[0], Path(work), both, rendering.threads)
             missing = left_out(scene)
             if missing:
-                checks.append(Check(name, check, "not checked", f"{', '.join(missing)}: not drawn by Mitsuba here"))
+                checks.append(Check(name, check, "not checked", f"{', '.join(missing)}: not drawn by Mitsuba"))
                 return
             for k, shot in enumerate(shots(scene, [rendering.light], rendering.views, rendering.size)):
                 pair = [r.draw(scene, shot, rendering.spp, [1 + 1000 * k + 100 * j]) for j, r in enumerate(both)]

@@ -1,7 +1,7 @@
 """Edits of a run folder: the files that a person may change, and how the next run uses them.
 
     stylized/<view>.png (.exr, or a .jpg, .webp, .tif beside it)   a view painted over
-    masks/<set>.png                                                which texels are painted again after the fit
+    masks/<set>.png                                                the texels that are painted again after the fit
     asset/textures/<set>_<map>.png or .exr                         a finished map
 
 The sha256 detects an edit. The edited file stays unchanged; the stages that depend on it run again. No other file may
@@ -42,7 +42,7 @@ def editable(stage: str, name: str) -> bool:
     return pattern is not None and pattern.fullmatch(name) is not None
 
 
-def found(folder: Path, stage: str) -> tuple[dict[str, str], dict[str, str]]:
+def edits_of(folder: Path, stage: str) -> tuple[dict[str, str], dict[str, str]]:
     """A person's edits of a finished stage's folder, name to sha256: (taken up by an earlier run, changed since).
 
     A file counts as changed if it differs from the stage's own, or was added with the stem of a stage's file.
@@ -144,7 +144,7 @@ def read_mask(path: Path, like: np.ndarray) -> np.ndarray:
 def edited_maps(
     folder: Path, stem: str, maps: Maps, occlusion: np.ndarray, taken_up: Sequence[str], changed: Sequence[str]
 ) -> tuple[Maps, np.ndarray]:
-    """The maps of one texture set and its occlusion with what a person painted into `folder`/textures.
+    """The maps and occlusion of one texture set with a person's edits in `folder`/textures.
 
     `taken_up` names files whose content an earlier run took up, `changed` those that changed since and win. Where both
     the .png and the .exr of a map changed, the .exr counts.

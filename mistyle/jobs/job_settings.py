@@ -8,7 +8,7 @@ LEAST_OVERLAP = 0.8  # of the mesh's outline with alpha or masks, below which a 
 
 
 class ReadSettings(BaseModel):
-    """How the mesh is read."""
+    """Settings of reading the mesh."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -67,7 +67,7 @@ def allowed(settings: Any) -> Allowed:
     if most is None:
         return Allowed(float("inf"), "", False)
     gb = SHARE * most / 1e9
-    return Allowed(gb, f"there are {most / 1e9:.1f} GB of memory here, {gb:.1f} GB of them for a job", False)
+    return Allowed(gb, f"this machine has {most / 1e9:.1f} GB of memory, {gb:.1f} GB of them for a job", False)
 
 
 class Counts(NamedTuple):

@@ -108,5 +108,5 @@ def describe_plan(estimate: dict[str, Any]) -> str:
     lines.append(f"  in all about {estimate['seconds']} s for {sets}, without reused stages")
     files = ", large arrays in files" if estimate["in_files"] else ""
     lines.append(f"  memory at most about {estimate['memory_gb']} GB{files}")
-    lines.append(f"  disk about {estimate['disk_gb']} GB; free there: {estimate['free_gb']} GB")
+    lines.append(f"  disk about {estimate['disk_gb']} GB; free disk: {estimate['free_gb']} GB")
     return "\n".join(lines)

@@ -56,7 +56,7 @@ class Progress:
         """Report that a stage is reused from an earlier run."""
         self.reused.append(name)
         self.seconds[name] = 0.0
-        self.say(f"{what}: done before, taken over")
+        self.say(f"{what}: reused from an earlier run")
 
 
 def grouped(notes: Iterable[tuple[str, str]]) -> list[str]:

@@ -155,7 +155,7 @@ class Run(Generic[Work]):
         """Add the edits of a reused stage to its key; the keys of all later stages depend on it."""
         if name not in edits.EDITABLE:
             return
-        taken_up, changed = edits.found(keeper.root / name, name)
+        taken_up, changed = edits.edits_of(keeper.root / name, name)
         if taken_up | changed:
             self.plain[name] = self.keys[name]
             self.edited[name], self.changed[name] = taken_up | changed, changed
@@ -165,7 +165,7 @@ class Run(Generic[Work]):
         """Set a folder with edited files aside before its replacement, and note that."""
         if name not in edits.EDITABLE:
             return
-        taken_up, changed = edits.found(keeper.root / name, name)
+        taken_up, changed = edits.edits_of(keeper.root / name, name)
         if taken_up | changed:
             done = atomic.done(keeper.root / name)
             place = output.move_aside(

@@ -33,7 +33,7 @@ LIGHT_STEPS = 8  # pictures of the HDRI's rotation on the sheet
 
 
 class LookSettings(BaseModel):
-    """How the sheet and the turntables are drawn."""
+    """Settings of the sheet and the turntables."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -7,9 +7,9 @@ from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
 from mistyle.solver.settings import joint_steps
 
-# A fit to pictures without the cache of their samples, which takes up to `recover.memory` and is not wholly returned
-# to the system after the stage. Measured by `fit_512` and `fit_200` of `python -m benchmarks.photographs`; the report
-# by `fit_256`, the terms of large pictures by `large`.
+# A fit to pictures without the cache of their samples. That takes up to `recover.memory`, which the system does not
+# regain completely after the stage. Measured by `fit_512` and `fit_200` of `python -m benchmarks.photographs`, the
+# report by `fit_256`, the terms of large pictures by `large`.
 MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
@@ -91,12 +91,12 @@ def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: i
         left -= between_gb(settings, pixels)
     elif (whole := material_gb(settings, pixels, faces, sets, own)) > budget.gb >= needed:
         raise UsageError(
-            f"{budget.who}: the fit needs {whole:.2f} GB; give it --memory {rounded_up(needed)}G or more, with which "
-            f"it keeps fewer of the pictures' samples, or {smaller_setting(settings, least, FITTED)}"
+            f"{budget.who}: the fit needs {whole:.2f} GB; give it --memory {rounded_up(needed)}G or more, with a "
+            f"smaller cache of the pictures' samples, or {smaller_setting(settings, least, FITTED)}"
         )
     if needed > budget.gb or left <= 0:
         raise UsageError(
-            f"{budget.who}: the fit needs {needed:.2f} GB even if it keeps nothing of the pictures' "
+            f"{budget.who}: the fit needs {needed:.2f} GB even without a cache of the pictures' "
             f"samples; give it --memory {rounded_up(needed)}G or more, or {smaller_setting(settings, least, FITTED)}"
         )
     return with_setting(settings, "recover.memory", min(settings.recover.memory, left)) if budget.given else settings

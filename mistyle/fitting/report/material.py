@@ -150,8 +150,8 @@ def steps(results: Any) -> tuple[Step, ...]:
     parts, longest = list(zip(results.asset.mesh.parts, results.texels, strict=True)), Sizes().of(kind_in_step(2))
     trust = Step(
         "Confidence",
-        "How well the references determine each texel's material (dark blue: not at all, yellow: well), and how many "
-        "pictures see it.",
+        "Confidence of each texel's material (dark blue: undetermined, yellow: well determined), and the number of "
+        "pictures that see it.",
         shots=tuple(
             ReportPicture(picture, f"{name}: {what}", sharp=True)
             for k, (name, t) in enumerate(parts)

@@ -37,7 +37,7 @@ def layer(
 
 
 def coverage(seen: Int[np.ndarray, "h w"], views: int, texels: Texels, longest: int) -> Overlay:
-    """How many of the views see each texel."""
+    """The number of views that see each texel."""
 
     def rows(at: slice) -> np.ndarray:
         share = np.sqrt(seen[at] / max(views, 1)).astype(np.float32)
@@ -48,7 +48,7 @@ def coverage(seen: Int[np.ndarray, "h w"], views: int, texels: Texels, longest: 
 
 
 def confidence(values: Float[np.ndarray, "h w"], texels: Texels, longest: int) -> Overlay:
-    """How well the references determine each texel, 0..1."""
+    """The confidence of each texel, 0 undetermined to 1."""
 
     def rows(at: slice) -> np.ndarray:
         share = values[at]
@@ -74,7 +74,7 @@ def struggle(
     low, high = np.quantile(mean[looked], [0.5, HIGHEST])
     share = np.clip((mean - low) / max(float(high - low), 1e-20), 0, 1).astype(np.float32)
     colours = np.stack([np.ones_like(share), 0.75 * (1 - share), np.zeros_like(share)], axis=-1)
-    legend = "clear: settled like most; yellow to red: the fit kept pulling at its colour"
+    legend = "clear: converged as most; yellow to red: large albedo gradients at the end of the fit"
     alpha = OPACITY * np.sqrt(share)
     picture = in_bands(share.shape, lambda at: layer(colours[at], alpha[at], covered[at]), longest, sharp=True)
     return Overlay("struggle", picture, legend)
@@ -103,4 +103,4 @@ def repaired(mask: Bool[np.ndarray, "h w"], texels: Texels, longest: int) -> Ove
         return layer(np.ascontiguousarray(colours), 0.65 * share, texels.covered[at])
 
     picture = in_bands(mask.shape, rows, longest, sharp=True)
-    return Overlay("repaired", picture, "magenta: painted again after the fit (masks/ has it as a picture to edit)")
+    return Overlay("repaired", picture, "magenta: painted again after the fit (edit it in masks/)")

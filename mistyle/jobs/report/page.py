@@ -130,7 +130,7 @@ class File:
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence that the reader should know; a warning is set apart."""
+    """A note to the reader; the page highlights a warning."""
 
     text: str
     warning: bool = False
