@@ -111,7 +111,7 @@ def test_the_machines_memory_cuts_nothing_of_a_fit(monkeypatch):
     monkeypatch.setattr(memory, "limit", lambda: int((whole + 0.1) / budget.SHARE * 1e9))
     assert material_budget.check_material(settings, pixels) is settings
     monkeypatch.setattr(memory, "limit", lambda: int((whole - 1) / budget.SHARE * 1e9))
-    with pytest.raises(UsageError, match=r"the fit needs .* GB; give it --memory .* smaller cache of the pictures' samples"):
+    with pytest.raises(UsageError, match=r"the fit needs .* GB; give it --memory .* smaller cache of the pictures"):
         material_budget.check_material(settings, pixels)
     assert material_budget.check_material(settings.model_copy(update={"memory": whole - 1}), pixels).recover.memory < 4
     monkeypatch.setattr(memory, "limit", lambda: int(0.6e9))
