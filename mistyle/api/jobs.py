@@ -192,7 +192,7 @@ def lookdev(
     """A look-dev sheet of a mesh file or run folder: three lights, five sides, balls, chart, AOVs, and turntables.
 
     hdri       an .hdr or .exr environment map for the third light
-    date       date of the burn-in; None: the day of the asset file's last change, UTC
+    date       stands in the burn-in; None: the day on which the asset's file was last changed, UTC
     mp4        write the turntables as mp4 too (needs mistyle[video])
     overwrite  replace files in `out` that mistyle did not write
     quiet      False: progress on stderr
