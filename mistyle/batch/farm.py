@@ -51,7 +51,7 @@ def export(plan: BatchPlan, folder: Path, form: Form, needs: ShardNeeds) -> list
     elif form == "sbatch":
         files = {"mistyle.sbatch": _sbatch(plan, needs)}
     else:
-        lines = [_line(plan, needs, str(k)) for k in range(len(plan.jobs))]
+        lines = [_shell_command(plan, needs, str(k)) for k in range(len(plan.jobs))]
         files = {"commands.txt": "\n".join(lines) + "\n"}
 
     def fill(new: Path) -> None:
@@ -68,7 +68,7 @@ def _options(plan: BatchPlan, needs: ShardNeeds) -> list[str]:
     return [*maps, *["--overwrite"] * plan.overwrite]
 
 
-def _line(plan: BatchPlan, needs: ShardNeeds, index: str) -> str:
+def _shell_command(plan: BatchPlan, needs: ShardNeeds, index: str) -> str:
     """The shell command of one shard; `index` may be a shell variable."""
     from mistyle.batch.plan import replaced
 
@@ -97,7 +97,7 @@ def _sbatch(plan: BatchPlan, needs: ShardNeeds) -> str:
             "#!/bin/bash",
             *(f"#SBATCH {option}" for option in options),
             # `exec`: the signal reaches the shard itself.
-            f"exec {_line(plan, needs, '${SLURM_ARRAY_TASK_ID}')}",
+            f"exec {_shell_command(plan, needs, '${SLURM_ARRAY_TASK_ID}')}",
             "",
         ]
     )

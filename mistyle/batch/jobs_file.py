@@ -103,7 +103,7 @@ def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
     # Absolute, so that all paths below it are absolute and joining them again changes nothing.
     base = (path if path.is_dir() else path.parent).absolute()
     file = _folder_jobs(path) if path.is_dir() else _file_jobs(path)
-    jobs = [*file.job, *itertools.chain.from_iterable(_spread(grid, base, str(path)) for grid in file.grid)]
+    jobs = [*file.job, *itertools.chain.from_iterable(_grid_jobs(grid, base, str(path)) for grid in file.grid)]
     if not jobs:
         raise UsageError(
             f"{path}: found no job; expected [[job]] or [[grid]] entries, or a folder of meshes and pictures"
@@ -159,9 +159,9 @@ def _folder_jobs(folder: Path) -> JobsFile:
     return JobsFile(grid=[Grid(meshes=meshes, styles=styles)])
 
 
-def _spread(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
+def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
     """The jobs of a grid, meshes first."""
-    meshes, styles = _globbed(grid.meshes, base, origin), _globbed(grid.styles, base, origin)
+    meshes, styles = _expanded(grid.meshes, base, origin), _expanded(grid.styles, base, origin)
     result = []
     for mesh, style in itertools.product(meshes, styles):
         for preset in grid.presets or [None]:
@@ -173,7 +173,7 @@ def _spread(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
     return result
 
 
-def _globbed(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
+def _expanded(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
     paths: list[Path] = []
     for pattern in patterns:
         if any(c in pattern for c in "*?["):

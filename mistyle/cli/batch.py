@@ -204,7 +204,7 @@ def _shard(options: argparse.Namespace) -> int:
     plan = replace(read_plan(options.plan, path_maps(options.path_map)), overwrite=options.overwrite)
     chosen: Sequence[int] = indices(options.index, len(plan.jobs))
     if len(chosen) > 1:
-        return _several(options, chosen)
+        return _run_range(options, chosen)
     for index in chosen:
         farm = options.progress == "openjd"
         progress = FarmProgress(len(stages_of(plan.jobs[index]))) if farm else Progress()
@@ -213,7 +213,7 @@ def _shard(options: argparse.Namespace) -> int:
     return 0
 
 
-def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
+def _run_range(options: argparse.Namespace, chosen: Sequence[int]) -> int:
     """Run each shard of a range as a separate process, one after another; a failing shard does not stop the rest."""
     from mistyle.batch.engines import stopped
 

@@ -318,11 +318,11 @@ def _rig(options: argparse.Namespace) -> dict[str, Any]:
 def _stylize(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
-    _need(options, "mesh", "style", "out")
+    _require(options, "mesh", "style", "out")
     return _run_job(options, options.mesh, options.style, None)
 
 
-def _need(options: argparse.Namespace, *names: str) -> None:
+def _require(options: argparse.Namespace, *names: str) -> None:
     """UsageError for missing arguments, which only --print-config does not need."""
     missing = [name for name in names if getattr(options, name) is None]
     if missing:
@@ -398,7 +398,7 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
 def _render(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
-    _need(options, "mesh", "out")
+    _require(options, "mesh", "out")
     settings = _settings(options)
     if options.dry_run:
         from mistyle.stylization.pipeline.plan import plan_render
@@ -420,7 +420,7 @@ def _render(options: argparse.Namespace) -> int:
 def _bake(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
-    _need(options, "mesh", "views", "out")
+    _require(options, "mesh", "views", "out")
     settings, title = _settings(options), asset_name(options, options.mesh.stem)
     if options.dry_run:
         from mistyle.stylization.pipeline.plan import plan_bake

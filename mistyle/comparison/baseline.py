@@ -27,10 +27,12 @@ def approve(baseline: Path, tests: Path, patterns: Sequence[str], *, overwrite: 
     for pattern in patterns:
         matching = [name for name in available if fnmatchcase(name, pattern)]
         if not matching:
-            raise UsageError(f"--approve {pattern}: no picture of {tests} has this name; it has {_some(available)}")
+            raise UsageError(
+                f"--approve {pattern}: no picture of {tests} has this name; it has {_first_names(available)}"
+            )
         chosen += [name for name in matching if name not in chosen]
     approvals = _read(baseline)
-    older = {name: _older(baseline / name) for name in chosen}
+    older = {name: _same_stem(baseline / name) for name in chosen}
     if not overwrite:
         _refuse_unknown(older, approvals)
     for name in chosen:
@@ -47,7 +49,7 @@ def approve(baseline: Path, tests: Path, patterns: Sequence[str], *, overwrite: 
     return chosen
 
 
-def _older(stem: Path) -> list[Path]:
+def _same_stem(stem: Path) -> list[Path]:
     """The pictures of this name with any extension."""
     if not stem.parent.is_dir():
         return []
@@ -65,7 +67,7 @@ def _refuse_unknown(older: Mapping[str, Sequence[Path]], approvals: Mapping[str,
                 )
 
 
-def _some(names: Sequence[str] | dict) -> str:
+def _first_names(names: Sequence[str] | dict) -> str:
     ordered = sorted(names)
     return ", ".join(ordered[:5]) + (", …" if len(ordered) > 5 else "") if ordered else "none"
 

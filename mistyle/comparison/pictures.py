@@ -42,7 +42,7 @@ class PairPictures:
 def write_pictures(folder: Path, planes: Planes, maps: Mapping[str, np.ndarray], high: bool) -> PairPictures:
     """Write a pair's pictures into `folder`; `maps` are error maps (h w) by metric."""
     folder.mkdir(parents=True, exist_ok=True)
-    odd = _broken(planes)
+    odd = planes.odd
     looks = shown(planes)
     for name, picture in zip(("reference", "test"), looks, strict=True):
         save(folder / f"{name}.webp", picture, odd)
@@ -84,10 +84,6 @@ def thumbnail(path: Path, planes: Planes, error: np.ndarray | None) -> None:
     looks = [*shown(reduced), heat(small(error)) if error is not None else signed(reduced)[0]]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(webp(np.concatenate([_eight(p, reduced.odd) for p in looks], axis=1), 88))
-
-
-def _broken(planes: Planes) -> Bool[np.ndarray, "h w"]:
-    return planes.odd
 
 
 def shown(planes: Planes) -> list[np.ndarray]:

@@ -136,7 +136,7 @@ def _write_set(
 ) -> tuple[Pictures, list[tuple[Path, dict[str, Any]]]]:
     """The PNG files of one part for the GLB, and its texture files with their entries for the list."""
     maps, occlusion, texels = texture_set
-    alpha = None if cutout is None else _carried(asset, cutout, texels)
+    alpha = None if cutout is None else _source_alpha(asset, cutout, texels)
     pictures = encode_pictures(maps, occlusion, alpha)
     return pictures, _write_textures(new / "textures", stem, maps, occlusion, alpha, pictures)
 
@@ -193,7 +193,7 @@ def _earlier(folder: Path, name: str) -> set[str]:
     return {own, *(f for f, value in listed.items() if (folder / f).is_file() and sha256_file(folder / f) == value)}
 
 
-def _carried(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, "h w"]:
+def _source_alpha(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, "h w"]:
     """The source's alpha at every covered texel, sampled in the source's own UVs; the nearest value elsewhere."""
     rows, columns, face, weights = corner_weights(asset.mesh, texels)
     height, width = texels.covered.shape

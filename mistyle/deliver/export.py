@@ -77,10 +77,10 @@ def export(
             source,
         ]
     )
-    called, version = _called(out, request.name, fields_for(manifest, target), of)
+    called, version = _versioned_name(out, request.name, fields_for(manifest, target), of)
     space = light_space(request.colour)
     chosen = Delivery(formats, target, called, version, request.names, request.metres_per_unit, space, source)
-    if not _whole(out, called, of):
+    if not _is_current(out, called, of):
         inputs = [place, folder, *([source] if source else [])]
         claim(out, named_files(chosen), inputs=inputs, overwrite=overwrite)
         finished = read_finished(place)
@@ -105,7 +105,7 @@ def _check_request(request: DeliveryRequest) -> None:
         raise UsageError(str(error)) from None
 
 
-def _called(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tuple[str, int | None]:
+def _versioned_name(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tuple[str, int | None]:
     """The name, and its version where the pattern has one: the latest for an equal delivery, else the next."""
 
     most = 9999  # the longest version
@@ -125,12 +125,12 @@ def _called(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tupl
     versioned = re.compile(re.escape(shape).replace(mark, r"(\d+)", 1).replace(mark, r"\d+") + r"(?!\d)")
     matches = [versioned.match(p.name) for p in out.iterdir()] if out.is_dir() else []
     last = max((int(m[1]) for m in matches if m), default=0)
-    if last and _whole(out, filled(last), of):
+    if last and _is_current(out, filled(last), of):
         return filled(last), last
     return filled(last + 1), last + 1
 
 
-def _whole(out: Path, name: str, of: str) -> bool:
+def _is_current(out: Path, name: str, of: str) -> bool:
     """Whether the folder holds this very delivery with every file unchanged."""
     try:
         record = read_own(out / f"{name}.export.json")

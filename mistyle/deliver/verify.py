@@ -162,8 +162,8 @@ def _rendered(
                 pair = [r.draw(scene, shot, rendering.spp, [1 + 1000 * k + 100 * j]) for j, r in enumerate(both)]
                 pictures = [drawn.pictures[0] for drawn in pair]
                 difference, error = compared(shot.name, *pictures)
-                _keep(folder, shot.name, pictures, error)
-                checks.append(_judged(name, check, difference, " and ".join(drawn.version for drawn in pair)))
+                _write_pictures(folder, shot.name, pictures, error)
+                checks.append(_verdict(name, check, difference, " and ".join(drawn.version for drawn in pair)))
                 yield difference
         except MistyleError as error:
             checks.append(Check(name, check, "failed", str(error)[-300:]))
@@ -188,7 +188,7 @@ def compared(
     return Difference(shot, metrics.values["flip"], overlap(*inside), correlation, bright), metrics.maps["flip"]
 
 
-def _judged(name: str, check: str, d: Difference, versions: str) -> Check:
+def _verdict(name: str, check: str, d: Difference, versions: str) -> Check:
     fine = d.flip <= MOST_FLIP and d.overlap >= LEAST_OVERLAP and d.correlation >= LEAST_CORRELATION
     message = (
         f"{d.shot}: FLIP {d.flip:.4f}, silhouettes {d.overlap:.4f}, correlation {d.correlation:.4f}, "
@@ -197,7 +197,7 @@ def _judged(name: str, check: str, d: Difference, versions: str) -> Check:
     return Check(name, check, "passed" if fine else "failed", message)
 
 
-def _keep(folder: Path, shot: str, pictures: Sequence[np.ndarray], error: np.ndarray) -> None:
+def _write_pictures(folder: Path, shot: str, pictures: Sequence[np.ndarray], error: np.ndarray) -> None:
     from mistyle.core.image import srgb_from_linear
     from mistyle.jobs.report.false_colour import heat
 

@@ -37,13 +37,13 @@ def surface_checks(files: Sequence[Path], name: Callable[[Path], str]) -> Iterat
         sets = max(listing.sets, whole.get(listing.asset, ()), key=len)
         if listing.maps:
             summary = f"{len(sets)} texture sets, {len(listing.maps)} maps"
-            yield row(name(listing.path), CHECK, _lost(sets, listing.maps), summary)
+            yield row(name(listing.path), CHECK, _list_errors(sets, listing.maps), summary)
         for model in listing.models if sets else ():
             path = listing.path.parent / model
             expected[path] = min(len(sets), expected.get(path, len(sets)))  # several lists name one look layer
     for path in files:
         if path in expected:
-            yield _shown(path, name(path), expected[path])
+            yield _model_check(path, name(path), expected[path])
 
 
 def _list(path: Path) -> List | None:
@@ -66,7 +66,7 @@ def _list(path: Path) -> List | None:
         return None  # not a list of ours, or a damaged one, which verify_checks.listed_files reports
 
 
-def _lost(sets: Sequence[str], maps: Sequence[tuple[str, str, str]]) -> list[str]:
+def _list_errors(sets: Sequence[str], maps: Sequence[tuple[str, str, str]]) -> list[str]:
     """Errors of a list: maps that only some sets have, and files that are listed as two maps."""
     kinds, present = sorted({kind for _, kind, _ in maps}), {(s, kind) for s, kind, _ in maps}
     errors = [f"{s} has no file for its {kind}" for s in sets for kind in kinds if (s, kind) not in present]
@@ -78,7 +78,7 @@ def _lost(sets: Sequence[str], maps: Sequence[tuple[str, str, str]]) -> list[str
     return errors
 
 
-def _shown(path: Path, name: str, expected: int) -> Check:
+def _model_check(path: Path, name: str, expected: int) -> Check:
     """Whether a model has at least `expected` materials on its faces, and no two maps share a file."""
     reader = _usd if path.suffix.lower() in USD else SURFACES[path.suffix.lower()]
     try:

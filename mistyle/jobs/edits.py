@@ -150,20 +150,20 @@ def edited_maps(
     the .png and the .exr of a map changed, the .exr counts.
     """
     for names, endings in ((taken_up, (".exr",)), (changed, (".png", ".exr"))):
-        kinds = [k for k in ("albedo", "normal", "orm", "roughness") if _any(names, stem, k)]
+        kinds = [k for k in ("albedo", "normal", "orm", "roughness") if _has_edit(names, stem, k)]
         for kind in kinds:
             files = [f"textures/{stem}_{kind}{e}" for e in endings]
             # Both files hold the edits of earlier runs; the .exr has the higher precision.
             file = next(name for name in reversed(files) if name in names or names is taken_up)
-            maps, occlusion = _with(maps, occlusion, kind, folder / file)
+            maps, occlusion = _apply_edit(maps, occlusion, kind, folder / file)
     return maps, occlusion
 
 
-def _any(names: Sequence[str], stem: str, kind: str) -> bool:
+def _has_edit(names: Sequence[str], stem: str, kind: str) -> bool:
     return any(f"textures/{stem}_{kind}.{ending}" in names for ending in ("png", "exr"))
 
 
-def _with(maps: Maps, occlusion: np.ndarray, kind: str, path: Path) -> tuple[Maps, np.ndarray]:
+def _apply_edit(maps: Maps, occlusion: np.ndarray, kind: str, path: Path) -> tuple[Maps, np.ndarray]:
     from mistyle.io.read import read_exr, read_picture
 
     if path.suffix == ".exr":

@@ -24,7 +24,7 @@ VISIBLE = ("views", "stylized", "masks", "asset", "scene", "report", "preview")
 
 
 @runtime_checkable
-class Kept(Protocol):
+class StagedJob(Protocol):
     """The part of any job that a run reads: its folder, and the settings that its keys and stages depend on."""
 
     @property
@@ -40,7 +40,7 @@ class Kept(Protocol):
     def overwrite(self) -> bool: ...
 
 
-Work = TypeVar("Work", bound=Kept)
+JobT = TypeVar("Work", bound=StagedJob)
 
 
 @cache
@@ -50,17 +50,17 @@ def program() -> str:
     return digest({str(p.relative_to(PACKAGE)): p.read_bytes() for p in files})
 
 
-def claim_run(job: Kept, stages: Iterable[str], inputs: Sequence[Path]) -> None:
+def claim_run(job: StagedJob, stages: Iterable[str], inputs: Sequence[Path]) -> None:
     """UsageError where a run of `stages` would overwrite an input, or a file in the job's folder that is not ours."""
     deliver, folders = job.settings.deliver, [name for name in VISIBLE if name in stages]
     targets = [f"delivered/{target}" for target in deliver.chosen_targets] if deliver.wanted else []
     output.claim(job.out, ["run.json"], [*folders, "work", *targets], inputs, aside=True, overwrite=job.overwrite)
 
 
-class Run(Generic[Work]):
+class Run(Generic[JobT]):
     """Keeps the stages of one run folder; a class because it holds the folder's locks until it is closed."""
 
-    def __init__(self, job: Work, progress: Progress, stages: Mapping[str, str]) -> None:
+    def __init__(self, job: JobT, progress: Progress, stages: Mapping[str, str]) -> None:
         if job.redo_from is not None and job.redo_from not in stages:
             raise UsageError(f"--from {job.redo_from}: there is no such stage; choose one of {', '.join(stages)}")
         self.job, self.progress, self.stages = job, progress, stages
@@ -111,9 +111,9 @@ class Run(Generic[Work]):
         if reused is not None:
             self.progress.skip(name, self.stages[name])
             self.progress.note(*keeper.notes(name))
-            self._take_note(keeper, name)
+            self._add_edits_to_key(keeper, name)
             return reused
-        self._spare(keeper, name)
+        self._set_edits_aside(keeper, name)
 
         def fill(folder: Path) -> None:
             write(folder, report)
@@ -136,7 +136,7 @@ class Run(Generic[Work]):
         The final result replaces it like an older one: a person's edits are set aside.
         """
         stopping.check()
-        self._spare(self.visible, name)
+        self._set_edits_aside(self.visible, name)
         with self.progress.stage(f"first {name}", what) as report:
             self.visible.put(name, key, lambda folder: write(folder, report), about=about)
 
@@ -151,7 +151,7 @@ class Run(Generic[Work]):
         with self.progress.stage(name, self.stages[name]) as report:
             return keeper.put(name, self.plain[name], fill, edited=edited, about=about)
 
-    def _take_note(self, keeper: Keeper, name: str) -> None:
+    def _add_edits_to_key(self, keeper: Keeper, name: str) -> None:
         """Add the edits of a reused stage to its key; the keys of all later stages depend on it."""
         if name not in edits.EDITABLE:
             return
@@ -161,7 +161,7 @@ class Run(Generic[Work]):
             self.edited[name], self.changed[name] = taken_up | changed, changed
             self.keys[name] = digest([self.keys[name], self.edited[name]])
 
-    def _spare(self, keeper: Keeper, name: str) -> None:
+    def _set_edits_aside(self, keeper: Keeper, name: str) -> None:
         """Set a folder with edited files aside before its replacement, and note that."""
         if name not in edits.EDITABLE:
             return

@@ -188,8 +188,8 @@ def _system(bundled: Bundle, radiance: Radiance, values: Values, *, follow: bool
         matrix[own, own], gradient[own] = part.T @ part, part.T @ residual[:, c]
     if follow:
         by_texel = _by_texel(bundled, values, [linear @ radiance[:, c] for c in range(3)]) * weight[:, None, None]
-        by_texel *= ~_stuck(bundled, values)[bundled.owner, None]
-        schur, slope = _followed(bundled, values, by_texel, by_light, residual)
+        by_texel *= ~_at_bounds(bundled, values)[bundled.owner, None]
+        schur, slope = _schur_terms(bundled, values, by_texel, by_light, residual)
         matrix -= schur
         gradient -= slope
     return matrix, gradient
@@ -209,14 +209,14 @@ def _by_texel(bundled: Bundle, values: Values, shine: Sequence[np.ndarray]) -> F
     return result
 
 
-def _stuck(bundled: Bundle, values: Values) -> Bool[np.ndarray, "t 7"]:
+def _at_bounds(bundled: Bundle, values: Values) -> Bool[np.ndarray, "t 7"]:
     """Unknowns at their bounds, which the Schur complement leaves out."""
     low, high = np.zeros(7), np.ones(7)
     low[TILT], low[ROUGHNESS] = -1, bundled.problem.options.floor
     return (values < low + 1e-5) | (values > high - 1e-5)
 
 
-def _followed(
+def _schur_terms(
     bundled: Bundle, values: Values, by_texel: np.ndarray, by_light: Sequence[np.ndarray], residual: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The texels' part of the Schur complement: subtracted from the light's matrix and gradient."""

@@ -76,16 +76,16 @@ def find_light(
 
     cells = light_cells.even_cells()
     bundled = light_solve.bundle(traced, observed, normal, cells, options)
-    state = _begin(bundled)
+    state = _start_state(bundled)
     record(state)
-    state = light_solve.solve_light_and_texels(bundled, state, _conventional, STEPS[0], record)
+    state = light_solve.solve_light_and_texels(bundled, state, _conventional_mean, STEPS[0], record)
     cells, radiance = light_cells.refined(cells, state.radiance)
     bundled = light_solve.bundle(traced, observed, normal, cells, options)
     values = state.values
     for _ in range(3):
         radiance = light_solve.light_over(bundled, radiance, values)
     state = light_solve.texels_under(bundled, radiance, values, 8)
-    state = light_solve.solve_light_and_texels(bundled, state, _conventional, STEPS[1], record)
+    state = light_solve.solve_light_and_texels(bundled, state, _conventional_mean, STEPS[1], record)
     progress(1.0)
     light = light_cells.environment_of(cells, state.radiance)
     return FoundLight(light, tuple(residuals), _maps(state, observed, texels))
@@ -98,7 +98,7 @@ def _observations(
     from mistyle.render.deferred.image_samples import tangents_of
 
     chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
-    cameras, pictures, masks = zip(*(_small(captures, int(k)) for k in chosen), strict=True)
+    cameras, pictures, masks = zip(*(_downsampled(captures, int(k)) for k in chosen), strict=True)
     lit = in_memory(cameras, [(Ambient((1.0, 1.0, 1.0)),)] * len(cameras), pictures, masks)
     mesh, tangents = traced.mesh, tangents_of(traced.mesh, settings.frame)
 
@@ -121,7 +121,7 @@ def _observations(
     return texels, observed
 
 
-def _begin(bundled: Bundle) -> State:
+def _start_state(bundled: Bundle) -> State:
     """The start state: light for grey texels, then texels under that light, scaled to the convention."""
     values = light_solve.first_values(bundled)
     middle = float(np.median(bundled.observed.observations.rgb))
@@ -144,7 +144,7 @@ def _factor(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
     return np.maximum(colour, 1e-3) * BRIGHT / max(bright, 1e-6)
 
 
-def _conventional(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
+def _conventional_mean(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
     """The mean radiance of a state's light under the convention."""
     return bundled.cells.mean(state.radiance) / _factor(bundled, state)
 
@@ -158,7 +158,7 @@ def _maps(state: State, observed: TexelObservations, texels: Sequence[Texels]) -
     return tuple(replace(m, known=known[p].reshape(m.known.shape)) for m, p in zip(maps, atlas.parts, strict=True))
 
 
-def _small(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+def _downsampled(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Picture k downsampled to SIDE pixels by means of valid pixels; a result needs more than 90 % valid pixels."""
     rgb, mask = captures.load(k)
     height, width = mask.shape

@@ -37,14 +37,14 @@ def material_counts(settings: Any, pixels: Sequence[int], faces: int = 0, sets: 
     while solved > 2 * settings.recover.solver_texels:
         solved //= 4
     looks = 0 if settings.recover.solver == "pictures" else solved * len(pixels)
-    looked = looked_at(settings, pixels)
+    averaged = averaged_pixels(settings, pixels)
     return Counts(
-        texel, sum(looked), face=faces, drawn=drawn, frame=frame, look=looks,
-        picture=max(looked, default=0), photograph=max(pixels, default=0), own=own,
+        texel, sum(averaged), face=faces, drawn=drawn, frame=frame, look=looks,
+        picture=max(averaged, default=0), photograph=max(pixels, default=0), own=own,
     )  # fmt: skip
 
 
-def looked_at(settings: Any, pixels: Sequence[int]) -> list[int]:
+def averaged_pixels(settings: Any, pixels: Sequence[int]) -> list[int]:
     """Pixels of each picture after block averaging (solver/validate.py).
 
     By the setting. Otherwise for an object that fills SHOWN of each picture and COVERED of its atlas, of which one
@@ -60,18 +60,18 @@ def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int 
     gb_of = peaks(MATERIAL, count)
     samples = max(settings.recover.subsamples, joint_steps(settings.recover) and settings.recover.joint_subsamples)
     cached = min(settings.recover.memory, SAMPLE * count.view * samples / 1e9)
-    cached += between_gb(settings, pixels)
+    cached += indirect_gb(settings, pixels)
     gb_of |= {stage: gb_of[stage] + cached for stage in KEEPING}
     return round(max(gb_of.values()), 2)
 
 
-def between_gb(settings: Any, pixels: Sequence[int]) -> float:
+def indirect_gb(settings: Any, pixels: Sequence[int]) -> float:
     """GB of the indirect light of all pictures: three floats per pixel of the estimate."""
     from mistyle.solver.indirect import MOST
 
     if settings.recover.solver == "pictures" or not settings.recover.bounces:
         return 0.0
-    return 12 * sum(min(n, MOST**2) for n in looked_at(settings, pixels)) / 1e9
+    return 12 * sum(min(n, MOST**2) for n in averaged_pixels(settings, pixels)) / 1e9
 
 
 def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> Any:
@@ -88,7 +88,7 @@ def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: i
     needed, left = least(settings), float(settings.recover.memory)
     if budget.given:
         left = budget.gb - max(peaks(MATERIAL, material_counts(settings, pixels, faces, sets, own)).values())
-        left -= between_gb(settings, pixels)
+        left -= indirect_gb(settings, pixels)
     elif (whole := material_gb(settings, pixels, faces, sets, own)) > budget.gb >= needed:
         raise UsageError(
             f"{budget.who}: the fit needs {whole:.2f} GB; give it --memory {rounded_up(needed)}G or more, with a "

@@ -21,8 +21,8 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.fitting.pipeline.budget import check_material
 from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
-from mistyle.fitting.pipeline.outlines import fix_of, tell_placed
-from mistyle.fitting.pipeline.pictures import look_through, looked
+from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
+from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs import checkpoint
@@ -109,9 +109,9 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         key_inputs += [s.references, s.seed, key_of(s.colour)]
         placed = run.record("cameras", ["mesh"], key_inputs, lambda r: place(job, asset, captures, shots, r))
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
-        tell_placed(placed, progress)
+        report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
-        captures, notes = no_finer(run, texels, whole)
+        captures, notes = average_pictures(run, texels, whole)
         placed = replace(placed, notes=(*placed.notes, *notes))
         if job.lights == "unknown":
             captures = with_light(run, asset, captures)
@@ -225,20 +225,20 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     overlaps = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done))
     ours = camera_space(job.references) == "working" and not chosen.align
     names = [camera.name for camera in captures.cameras]
-    warnings = overlap_notes(names, overlaps, chosen.overlap, fix_of(chosen), trusted=ours)
+    warnings = overlap_notes(names, overlaps, chosen.overlap, camera_advice(chosen), trusted=ours)
     if np.isfinite(overlaps.overlap).any():
         mean, least = float(np.nanmean(overlaps.overlap)), float(np.nanmin(overlaps.overlap))
         figures |= {"outline_overlap": mean, "outline_overlap_least": least}
     return Placed(captures.cameras, captures.lights, (*notes, *warnings), figures, overlaps.overlap)
 
 
-def no_finer(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:
+def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:
     """The captures at about the resolution of the texels, and notes about them."""
     average = run.job.settings.references.average
     folder = run.stage(
-        "pictures", ["texels", "cameras"], [], lambda f, r: look_through(f, texels, captures, average, r)
+        "pictures", ["texels", "cameras"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
     )
-    return looked(folder, captures)
+    return read_averaged(folder, captures)
 
 
 def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
@@ -292,8 +292,8 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
         start = [start_maps(m, t, s.atlas.size) for m, t in zip(asset.materials, texels, strict=True)]
     folder = checkpoint.place(run.job.out, run.keys["recover"])
     # The cache of the pictures' samples changes only the time of the fit.
-    looked_at = with_setting(s, "references.average", 1)  # the pictures are averaged already
-    bounded = check_material(looked_at, pixels_of(captures), *size_of(asset))
+    unaveraged = with_setting(s, "references.average", 1)  # the pictures are averaged already
+    bounded = check_material(unaveraged, pixels_of(captures), *size_of(asset))
     return recover(
         asset.mesh,
         texels,
@@ -324,12 +324,12 @@ def measure(
     errors: list[float] = []
     shown: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     converted: list[float] = []
-    looked_at = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
+    shown_pictures = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
     for k in range(len(captures)):
         one = subset(captures, [k])
         rendered = [
             picture_of(traced, one, sizes, table, model, chosen)
-            for model in ([chosen.model, second_model] if k in looked_at else [chosen.model])
+            for model in ([chosen.model, second_model] if k in shown_pictures else [chosen.model])
         ]
         rgb, valid = captures.load(k)
         valid = valid & (rendered[0][1] > 0.999)
@@ -337,7 +337,7 @@ def measure(
             errors.append(psnr(srgb_from_linear(rgb)[valid], srgb_from_linear(rendered[0][0])[valid]))
         else:
             errors.append(float("nan"))
-        if k in looked_at:
+        if k in shown_pictures:
             shown[k] = (np.where(valid[..., None], rgb, 0).astype(np.float32), rendered[0][0])
             scale = float(rendered[0][0][valid].mean()) if valid.any() else 0.0
             if scale > 0:

@@ -8,7 +8,7 @@ from mistyle.fitting.settings.material import ReferenceSettings
 from mistyle.jobs.progress import Progress
 
 
-def fix_of(chosen: ReferenceSettings) -> str:
+def camera_advice(chosen: ReferenceSettings) -> str:
     """The advice for cameras that do not fit, without the options already in use."""
     options = [f"--{name.replace('_', '-')}" for name in ("align", "refine_poses") if not getattr(chosen, name)]
     start = f"Try {' and '.join(options)}; check" if options else "Check"
@@ -18,7 +18,7 @@ def fix_of(chosen: ReferenceSettings) -> str:
     )
 
 
-def tell_placed(placed: Any, progress: Progress) -> None:
+def report_placement(placed: Any, progress: Progress) -> None:
     """Print every picture's outline overlap, and warnings about cameras at once, since the fit takes long."""
     from mistyle.solver.cameras.outline_check import overlap_line
 

@@ -29,8 +29,8 @@ class Looked:
     notes: tuple[str, ...]
 
 
-def look_through(folder: Path, texels: Sequence[Texels], captures: Captures, average: int, report: Report) -> None:
-    """Write the averaged pictures for `looked` into `folder`. InputRefused where no picture has usable pixels."""
+def write_averaged(folder: Path, texels: Sequence[Texels], captures: Captures, average: int, report: Report) -> None:
+    """Write the averaged pictures into `folder`. InputRefused where no picture has usable pixels."""
     from mistyle.io.cameras.captures import check_pixels
     from mistyle.solver.validate import downsampling_factors
 
@@ -49,8 +49,8 @@ def look_through(folder: Path, texels: Sequence[Texels], captures: Captures, ave
     save_record(folder / "record", Looked(tuple(by), (*notes, *_average_notes(by))))
 
 
-def looked(folder: Path, captures: Captures) -> tuple[Captures, tuple[str, ...]]:
-    """The captures of `look_through` at the resolution of the fit, and notes about them."""
+def read_averaged(folder: Path, captures: Captures) -> tuple[Captures, tuple[str, ...]]:
+    """The captures of `write_averaged` at the resolution of the fit, and notes about them."""
     record: Looked = load_record(folder / "record")
     small = shrunk(captures, record.by)
 

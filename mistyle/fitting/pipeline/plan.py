@@ -7,8 +7,8 @@ from mistyle.fitting.pipeline.budget import (
     MATERIAL,
     SEEN,
     SHOWN,
+    averaged_pixels,
     check_material,
-    looked_at,
     material_counts,
     material_gb,
 )
@@ -47,8 +47,8 @@ def plan_material(job: Any) -> dict[str, Any]:
     sizes = pixels_of(references_of(job))
     texels = extent.sets * s.atlas.size**2
     chosen = check_material(s, sizes, *size)
-    averaged = looked_at(s, sizes)
-    looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
+    averaged = averaged_pixels(s, sizes)
+    sampled, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
     rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
     begun = solves * (1 + len(estimated[0]))
@@ -63,12 +63,12 @@ def plan_material(job: Any) -> dict[str, Any]:
         "texels": texels * PER_TEXEL,
         "cameras": 1,
         "pictures": sum(sizes) * PER_READ_PIXEL,
-        "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
+        "recover": (rounds + 2 + steps / len(sizes)) * sampled * PER_LOOK
         + (begun * len(STARTS) / 2 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
         + paths * PER_BOUNCED_PATH
         + joint * max(1, len(again)) * SHOWN * sum(averaged) * PER_JOINT
         + smoothings * COVERED * texels * PER_SMOOTHED,
-        "measure": 2 * looked * PER_LOOK,
+        "measure": 2 * sampled * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,
         "scene": 2 * texels * PER_TEXEL,
         "report": 5 + s.report.frames * s.report.resolution**2 * s.report.spp * PER_SAMPLE_RAY,

@@ -105,7 +105,7 @@ def _fit(
     settings = job.settings.model_dump(mode="json")
     inputs = [sorted(file.defines.items()), list(keys), list(numbers), list(paths), settings]
     key = digest([program(), values(file.scene), *inputs])
-    fitted = _descended(job, file, keys, numbers, read, key, progress)
+    fitted = _run_fit(job, file, keys, numbers, read, key, progress)
     written: list[Any] = []
     with progress.stage("scene", "write the scene"):
         keeper.put(
@@ -134,7 +134,7 @@ def _fit(
         "settings": job.settings.model_dump(mode="json"),
     }
     shown = [
-        (every_name(file.scene, k), rgb, picture) for k, (rgb, _, _), picture in zip(numbers, read, drawn, strict=True)
+        (sensor_name(file.scene, k), rgb, picture) for k, (rgb, _, _), picture in zip(numbers, read, drawn, strict=True)
     ]
     arguments = (job.scene.name, job.references.name, fitted, shown, summary)
     keeper.put("report", key, lambda new: write_page(new / "index.html", *arguments))
@@ -144,7 +144,7 @@ def _fit(
     return summary
 
 
-def _descended(job: SceneJob, file: Any, keys, numbers, read, key: str, progress: Progress) -> Any:
+def _run_fit(job: SceneJob, file: Any, keys, numbers, read, key: str, progress: Progress) -> Any:
     """Run the fit, with checkpoints in the run folder."""
     from mistyle.solver.scene.fit import fit_scene as run
 
@@ -200,7 +200,7 @@ def draw(scene: Any, numbers: Sequence[int], seed: int, report: Any) -> list[Flo
     return result
 
 
-def every_name(scene: Any, k: int) -> str:
+def sensor_name(scene: Any, k: int) -> str:
     """A sensor's id; a generated id becomes `sensor<k>`."""
     name = scene.sensors()[k].id()
     return f"sensor{k}" if not name or name.startswith(("__", "object_")) else name
@@ -211,6 +211,6 @@ def write_pictures(folder: Path, scene: Any, numbers: Sequence[int], drawn: Sequ
     from mistyle.io.images.write import write_exr, write_png
 
     for k, picture in zip(numbers, drawn, strict=True):
-        name = every_name(scene, k)
+        name = sensor_name(scene, k)
         write_exr(folder / f"{name}.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)))
         write_png(folder / f"{name}.png", np.clip(srgb_from_linear(np.nan_to_num(picture)), 0, 1))

@@ -99,7 +99,7 @@ def studio_light() -> Float[np.ndarray, "h w 3"]:
 
 
 def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
-    """Visibility of the environment at the texels of every texture set, SKY_TEXELS a side: as fine as the mesh."""
+    """Sky visibility of every texture set, SKY_TEXELS a side, since it has no finer detail than the mesh."""
     from mistyle.atlas.texels import rasterise
     from mistyle.render.lookdev.studio import StudioSky
     from mistyle.render.mitsuba.occlusion import open_sky

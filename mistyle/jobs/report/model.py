@@ -70,7 +70,7 @@ def packed(model: PageModel, longest: int) -> str:
             data, kind = shrink_picture(Path(model.name), builder.blobs[image["bufferView"]], longest, quality)
             builder.blobs[image["bufferView"]], image["mimeType"] = data, kind
     for texture in tree.get("textures", []):
-        # Basis Universal needs a decoder from the network; the extension requires a plain image as a fallback.
+        # Its decoder would need the network; a texture with this optional extension has a plain image as well.
         texture.get("extensions", {}).pop("KHR_texture_basisu", None)
     return base64.b64encode(gzip.compress(builder.pack(), 9, mtime=0)).decode()
 
