@@ -40,7 +40,7 @@ class StagedJob(Protocol):
     def overwrite(self) -> bool: ...
 
 
-JobT = TypeVar("Work", bound=StagedJob)
+JobT = TypeVar("JobT", bound=StagedJob)
 
 
 @cache
