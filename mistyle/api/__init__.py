@@ -1,4 +1,4 @@
-"""mistyle in Python: what `import mistyle` offers. Meshes, cameras and pictures in, records out; verbs that write."""
+"""The Python API, as `import mistyle` exports it: readers and solvers that return records, and verbs that write."""
 
 from mistyle.api.comparison import Comparison, compare
 from mistyle.api.drawing import Views, render_views

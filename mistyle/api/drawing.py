@@ -1,4 +1,4 @@
-"""Pictures of a mesh with a known material, in memory."""
+"""Renders of a mesh with a known material, in memory."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,12 +18,12 @@ from mistyle.core.mesh import Mesh
 from mistyle.core.view import View
 from mistyle.render.deferred.differentiable import lights_of_cameras
 
-WHOLE = 0.999  # coverage from which a pixel shows nothing but the mesh
+WHOLE = 0.999  # least coverage of a fully covered pixel
 
 
 @dataclass(frozen=True)
 class Views(Sequence[View]):
-    """Rendered views and what lit each of them; a sequence of `View` records."""
+    """Rendered views and the lights of each; a sequence of `View` records."""
 
     views: tuple[View, ...]
     lights: tuple[Lights, ...]
@@ -40,7 +40,7 @@ class Views(Sequence[View]):
 
     @property
     def captures(self) -> Captures:
-        """The views as references of `recover`; pixels count that the mesh covers wholly."""
+        """The views as references of `recover`; only fully covered pixels are valid."""
         cameras = [view.camera for view in self.views]
         pictures, masks = [v.rgb for v in self.views], [np.asarray(v.coverage >= WHOLE) for v in self.views]
         return in_memory(cameras, self.lights, pictures, masks)
@@ -69,17 +69,17 @@ def render_views(
 ) -> Views:
     """Render a mesh with `principled` materials from known cameras under known lights.
 
-    mesh        a mesh in working space, or an asset as `read_mesh` gives it
-    maps        `Maps` for each texture set (a single record where there is one); None: the asset's own albedo, normal,
+    mesh        a mesh in working space, or an asset of `read_mesh`
+    maps        `Maps` for each texture set (a single record for one set); None: the asset's own albedo, normal,
                 roughness and metallic, or neutral grey for a mesh
-    cameras     pinhole cameras (OpenCV axes, working units); `orbit` and `look_at` make them
+    cameras     pinhole cameras (OpenCV axes, working units), for example of `orbit` and `look_at`
     lights      a light, a rig of lights for all cameras, or a rig for each camera; linear Rec.709
-    spp         samples a pixel, rounded up to a power of two
-    integrator  "path" follows light over several surface points, "direct" leaves indirect light out
+    spp         samples per pixel, rounded up to a power of two
+    integrator  "path" with indirect light, "direct" without
 
-    `view.rgb` (h, w, 3) is linear Rec.709 radiance, premultiplied by `view.coverage`; environments light the mesh and
-    are not seen. Equal inputs, seed and threads give equal bytes. Opacity, emission, coats and transmission of an asset
-    are not shown (`mistyle.lookdev` shows them). Raises ValueError for light that only a scene file describes.
+    `view.rgb` (h, w, 3) is linear Rec.709 radiance, premultiplied by `view.coverage`; environments are invisible but
+    light the mesh. Equal inputs, seed and threads give equal bytes. Opacity, emission, coats and transmission of an
+    asset are not drawn (`mistyle.lookdev` draws them). Raises ValueError for light that only a scene file describes.
     """
     from mistyle.render.lookdev.scenes import material_maps
     from mistyle.render.mitsuba.lit_views import draw_lit_views

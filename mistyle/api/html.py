@@ -1,4 +1,4 @@
-"""What notebooks show of a result: tables and thumbnails as HTML that needs no file and no network."""
+"""HTML for notebooks: tables and thumbnails of results, self-contained."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
@@ -19,7 +19,7 @@ def number(value: Any) -> str:
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
-    """A table; every cell is escaped, numbers stand at the right."""
+    """A table; every cell is escaped, numbers are right-aligned."""
     top = "".join(f"<th style='text-align:left'>{escape(name)}</th>" for name in head)
     body = []
     for row in rows:
@@ -44,9 +44,9 @@ def thumbnails(pictures: Mapping[str, Shaped[np.ndarray, "h w *c"]], longest: in
 
 
 def page(title: str, *parts: str, notes: Sequence[str] = ()) -> str:
-    """A title, the parts that hold anything, and notes, in one block."""
-    said = "".join(f"<li>{escape(note)}</li>" for note in notes)
-    listed = f"<ul>{said}</ul>" if said else ""
+    """A title, parts and notes in one block."""
+    items = "".join(f"<li>{escape(note)}</li>" for note in notes)
+    listed = f"<ul>{items}</ul>" if items else ""
     return f"<div><strong>{escape(title)}</strong>{''.join(parts)}{listed}</div>"
 
 

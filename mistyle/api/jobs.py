@@ -15,21 +15,21 @@ MOST = 8  # thumbnails
 
 
 class JobResult(dict[str, Any]):
-    """Paths of what was written, and figures: the dictionary that `--json` prints, with a face for notebooks."""
+    """The written paths and the figures: the dictionary of `--json`, with an HTML display for notebooks."""
 
     @property
     def asset(self) -> Path:
-        """The model with its textures. KeyError for a verb that writes none."""
+        """The GLB with its textures. KeyError for a verb that writes none."""
         return Path(self["asset"])
 
     @property
     def figures(self) -> Mapping[str, float]:
-        """How good the result is; empty for verbs that do not measure."""
+        """Quality figures; empty for verbs that do not measure."""
         return self.get("figures", {})
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was left out, guessed or repaired."""
+        """Notes about omissions, guesses and repairs."""
         return tuple(self.get("notes", ()))
 
     def _repr_html_(self) -> str:
@@ -43,14 +43,14 @@ class JobResult(dict[str, Any]):
         )
 
     def _pictures(self) -> dict[str, np.ndarray]:
-        """What can be shown of the files; those that are gone are left out."""
+        """The files' pictures, at most MOST; missing and unreadable files are left out."""
         from mistyle.io.read import read_picture
 
         named = [Path(self[name]) for name in ("picture", "sheet") if name in self]
         folder = Path(self["textures"]) if "textures" in self else None
-        found = [*named, *(sorted(folder.glob("*.png")) if folder is not None else [])]
+        files = [*named, *(sorted(folder.glob("*.png")) if folder is not None else [])]
         pictures = {}
-        for path in [path for path in found if path.is_file()][:MOST]:
+        for path in [path for path in files if path.is_file()][:MOST]:
             try:
                 pictures[path.stem] = read_picture(path).rgb
             except InputRefused:
@@ -72,15 +72,15 @@ def stylize(
     """Mesh + one style picture -> stylized asset, textures and report in the folder `out` (the paper's section 4).
 
     mesh       OBJ, PLY, STL, OFF, GLB, glTF or USD
-    style      a picture file; the painting's colours are taken as sRGB unless its profile says otherwise
+    style      a picture file, in the colour space of its profile, else sRGB
     preset     "draft", "standard", "fine" or "paper"
     name       of the asset; None: of the mesh and the style
     overwrite  replace files in `out` that mistyle did not write
     quiet      False: progress on stderr
     settings   nested by stage as `mistyle stylize --print-config` prints them, for example `fit={"refine": "off"}`
 
-    Returns the paths of what was written and the figures of `run.json`; goes on from the last finished stage when
-    `out` holds an earlier run of the same job. Raises `mistyle.core.errors.MistyleError`.
+    Returns the written paths and the figures of `run.json`. If `out` holds an earlier run of the same job, it resumes
+    from the last finished stage. Raises `mistyle.core.errors.MistyleError`.
     """
     from mistyle.core.names import asset_name
     from mistyle.jobs.progress import Progress
@@ -110,7 +110,7 @@ def fit(
     """Albedo, normal, roughness (and metallic) of a mesh from pictures of known cameras under known light.
 
     pictures   a folder with a camera.json, a transforms.json or a COLMAP model, and the pictures
-    lights     a lights.json; None: the one in the folder; "unknown": an environment is solved for
+    lights     a lights.json; None: the one in the folder; "unknown": an environment is estimated
     masks      a folder with a picture of the same name for each view
     exposure   a JSON file with the factor or the stops of each picture
     preset     "draft" or "standard"
@@ -120,8 +120,8 @@ def fit(
     settings   nested by stage as `mistyle fit --print-config` prints them, for example `recover={"metallic": True}`
                or `references={"hold_out": 2}`
 
-    Returns the paths of what was written and the figures of `run.json`. `mistyle.recover` does the same in memory.
-    Raises `mistyle.core.errors.MistyleError`.
+    Returns the written paths and the figures of `run.json`. `mistyle.recover` does the same in memory. Raises
+    `mistyle.core.errors.MistyleError`.
     """
     from mistyle.core.names import asset_name
     from mistyle.fitting.pipeline.material import MaterialJob, fit_material
@@ -164,7 +164,7 @@ def bake(
     quiet      False: progress on stderr
     settings   nested by stage, for example `atlas={"size": 4096}`
 
-    Returns the asset's path, the share of each texture set that some view saw ("painted"), and notes. Raises
+    Returns the asset's path, the share of each texture set that any view sees ("painted"), and notes. Raises
     `mistyle.core.errors.MistyleError`.
     """
     from mistyle.core.names import asset_name
@@ -173,9 +173,9 @@ def bake(
     from mistyle.stylization.settings import resolve
 
     mesh, chosen = Path(mesh), resolve(preset, None, dict(settings))
-    called = asset_name(name, mesh.stem)
+    asset_title = asset_name(name, mesh.stem)
     progress = Progress(quiet=quiet)
-    return JobResult(bake_views(mesh, Path(views), Path(out), chosen, called, progress, overwrite=overwrite))
+    return JobResult(bake_views(mesh, Path(views), Path(out), chosen, asset_title, progress, overwrite=overwrite))
 
 
 def lookdev(
@@ -196,7 +196,7 @@ def lookdev(
     quiet      False: progress on stderr
     settings   size, spp, seed, frame, threads, variant, the frames of `turntable` and `hdri_turn` (0: none), and `mp4`
 
-    Returns the paths of what was written, and notes. Raises `mistyle.core.errors.MistyleError`.
+    Returns the written paths, and notes. Raises `mistyle.core.errors.MistyleError`.
     """
     from mistyle.deliver.lookdev.job import LookSettings
     from mistyle.deliver.lookdev.job import lookdev as run

@@ -23,15 +23,15 @@ class MaterialFit:
     """A fitted material, per texture set.
 
     maps        albedo linear Rec.709, normal in tangent space (+Y, MikkTSpace), roughness, metallic; `known` where a
-                picture saw the texel in the light. Texels beside the UV islands hold no meaning
-    confidence  0..1: 1 sure, 0 nothing seen. What the pictures leave open is low here
+                picture shows the texel lit. Texels outside the UV islands have no meaning
+    confidence  0..1: 1 well determined, 0 not seen
     spread      standard deviations of albedo, normal (radians of tilt), roughness and metallic, (h, w) by name
-    seen        how many pictures saw the texel in the light
-    texels      where on the surface each texel lies, and which are covered
+    seen        number of pictures that show the texel lit
+    texels      surface position and coverage of the texels
     figures     seen_share and confident_share of the covered texels; residual and worst_residual: root mean square of
                 reference - render, relative to the reference's, mean and largest over the pictures
-    residuals   the same of each picture, by its name
-    notes       what was left out, averaged or not determined
+    residuals   the relative residual of each picture, by its name
+    notes       omissions, averaging, and undetermined quantities
     """
 
     maps: tuple[Maps, ...]
@@ -70,18 +70,17 @@ def recover(
 ) -> MaterialFit:
     """Albedo, normal, roughness and metallic of a mesh from pictures of known cameras under known light.
 
-    mesh      in working space with UVs, as `read_mesh` gives it
+    mesh      in working space with UVs, for example of `read_mesh`
     captures  of `read_captures`, of `render_views(...).captures`, or of `captures_of(cameras, lights, pictures)`
-    size      texels along each side of every texture set
+    size      texels a side of every texture set
     settings  a `RecoverSettings` record or some of its fields, for example `{"metallic": True}`
     seed      equal inputs, settings, seed and threads give equal bytes
-    start     maps to begin from, `size` texels a side; their metallic stays where metallic is not fitted
-    progress  receives the share that is done, 0..1
+    start     start maps, `size` texels a side; their metallic stays where metallic is not fitted
+    progress  receives the completed share, 0..1
 
-    It is the solver of `mistyle fit`, with no folder, no checkpoints and nothing held out. Pictures much finer than
-    the texels are averaged in blocks first, and a note says so. Cameras and lights are taken as given; a common factor
-    of light and albedo cannot be told apart. Raises InputRefused where no picture can be used, UsageError for settings
-    that do not exist.
+    The solver of `mistyle fit` without a run folder, checkpoints and held-out pictures. Pictures much finer than the
+    texels are averaged in blocks first, with a note. Cameras and lights are not refined; a common scale of light and
+    albedo is not identifiable. Raises InputRefused where no picture is usable, UsageError for unknown settings.
     """
     from mistyle.atlas.texels import rasterise
     from mistyle.jobs.settings import validate
@@ -89,12 +88,12 @@ def recover(
     from mistyle.solver.validate import downsampling_factors
 
     shape = mesh.mesh if isinstance(mesh, Asset) else mesh
-    given = {} if settings is None else settings
-    chosen = given if isinstance(given, RecoverSettings) else validate(given, "recover", RecoverSettings)
+    requested = {} if settings is None else settings
+    chosen = requested if isinstance(requested, RecoverSettings) else validate(requested, "recover", RecoverSettings)
     unlit = [camera.name for camera, rig in zip(captures.cameras, captures.lights, strict=True) if not rig]
     if unlit:
         raise InputRefused(f"recover: found no light for the picture '{unlit[0]}', expected one for each. mistyle.fit"
-                           '(..., lights="unknown") solves for an unknown light.')  # fmt: skip
+                           '(..., lights="unknown") estimates an unknown light.')  # fmt: skip
     texels = tuple(rasterise(shape, part, size) for part in range(len(shape.parts)))
     by = downsampling_factors(texels, captures.cameras)
     done = solve(
@@ -138,10 +137,10 @@ def _figures(
     def share(masks: Sequence[np.ndarray]) -> float:
         return sum(int((m & c).sum()) for m, c in zip(masks, covered, strict=True)) / total
 
-    left = list(residuals.values())
+    errors = list(residuals.values())
     return {
         "seen_share": share([s > 0 for s in seen]),
         "confident_share": share([c > SURE for c in confidence]),
-        "residual": float(np.mean(left)),
-        "worst_residual": float(np.max(left)),
+        "residual": float(np.mean(errors)),
+        "worst_residual": float(np.max(errors)),
     }

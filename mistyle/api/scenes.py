@@ -11,7 +11,7 @@ from mistyle.solver.scene.result import FittedScene
 
 
 class SceneFit(FittedScene):
-    """A `FittedScene` with a face for notebooks."""
+    """A `FittedScene` with an HTML display for notebooks."""
 
     def _repr_html_(self) -> str:
         from mistyle.fitting.report.scene import changes, figures, row_text
@@ -49,42 +49,42 @@ def fit_scene(
     resume: Mapping[str, Any] | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> SceneFit:
-    """Fit parameters of a live `mi.Scene`, so that its renders look like pictures of known cameras.
+    """Fit parameters of a live `mi.Scene` so that its renders match pictures of known cameras.
 
-    scene             a live `mi.Scene`; it is changed, and holds the result afterwards
+    scene             a live `mi.Scene`; it is modified and then holds the result
     keys              of `mi.traverse`, or globs: "wall.bsdf.*"; `mistyle fit --scene FILE --list` shows them
-    sensors           `mi.Sensor`s or indices into the scene's; None takes all of the scene's
-    references        one a sensor, of the film's size: linear Rec.709 radiance (h, w, 3), or paths of pictures
+    sensors           `mi.Sensor`s or indices into the scene's sensors; None: all
+    references        one per sensor, of the film's size: linear Rec.709 radiance (h, w, 3), or paths of pictures
     loss              None: "relative", or "log_srgb_l1" where gradients come without Monte Carlo.
                       "relative": (I - R)² over the reference's mean square around the pixel; "l2": (I - R)². Render
                       noise does not move the minimum of these two. "log_srgb_l1": |s(I) - s(R)| with s(x) =
                       sRGB(log(1 + x)); noise moves its minimum by percents. Or a function (picture, reference) ->
-                      number on Mitsuba tensors (h, w, 3); pixels that do not count are equal in both
+                      number on Mitsuba tensors (h, w, 3); masked pixels are equal in both
     regularizers      functions ({key: value}) -> number on Mitsuba tensors and arrays, added to the loss (Adam only)
-    callback          (iteration, loss, values) after each step of Adam or round of Gauss–Newton; a true answer ends it
-    iterations        steps; each renders `sensors_per_step` cameras, every one once before any comes again
-    spp, spp_grad     samples a pixel of the picture and of its derivative, which are independent; spp_grad None takes 8
-                      for Gauss–Newton and 1 for Adam
-    rate              of Adam, for values in 0..1; what has no range is scaled by its first root mean square
+    callback          (iteration, loss, values) after each step of Adam or round of Gauss–Newton; returns True to stop
+    iterations        steps; each renders `sensors_per_step` cameras, all of them once before any repeats
+    spp, spp_grad     independent samples per pixel of the picture and of its derivative; spp_grad None: 8 for
+                      Gauss–Newton, 1 for Adam
+    rate              of Adam, for values in 0..1; values without a range are scaled by their initial root mean square
     pyramid           False: plain Adam on the texels
     seed              every random choice follows from it
     solver            "auto": Gauss–Newton for up to 32 numbers of literals and colours under a squared loss, else Adam;
                       "adam"; "gauss-newton"
-    integrator        an `mi.Integrator`, a plugin's name or a dictionary; None: the scene's own where it has gradients,
+    integrator        an `mi.Integrator`, a plugin's name or a dictionary; None: the scene's own if it has gradients,
                       else `prb` (`prbvolpath` in a scene with media) with the depth of the scene's own
-    fast              take gradients without Monte Carlo where that gives the scene's own pictures; a note says whether
-    masks             pixels that count, bool (h, w), one a sensor (None: all)
-    only              by key (or name): bool, which numbers of a value may change; all others keep their bytes
+    fast              gradients without Monte Carlo where the deferred renderer matches the scene's pictures; see notes
+    masks             valid pixels, bool (h, w), one per sensor (None: all)
+    only              by key (or name): bool mask of the numbers that may change; all others keep their bytes
     channels          of EXR references by path: a prefix ("image"), or three names with commas
-    save, resume      `save` receives a dictionary of arrays every `save_every` seconds, and when the callback ends or
-                      breaks off the fit; given back as `resume`, with all else as it was, the fit goes on to the same
-                      result (the same bytes with one thread)
-    progress          receives the share that is done, 0..1
+    save, resume      `save` receives a dictionary of arrays every `save_every` seconds, and when the callback stops or
+                      aborts the fit. Passed as `resume` with all else unchanged, it continues to the same result (equal
+                      bytes with one thread)
+    progress          receives the completed share, 0..1
 
-    Returns a `FittedScene`: values before and after by key, their standard errors, residuals with the share that is
-    render noise, what has not converged, and notes. A result worse than its start is undone, and said. A texel whose
-    gradient is not a number keeps its last good value from then on, and is reported. Raises UsageError for keys or
-    settings that cannot be, InputRefused for references and for what Mitsuba cannot render.
+    Returns a `FittedScene`: values before and after by key, their standard errors, residuals with their share of render
+    noise, unconverged parameters, and notes. A result worse than its start is undone, with a note. A texel with a NaN
+    gradient keeps its last good value from then on, and is reported. Raises UsageError for impossible keys or settings,
+    InputRefused for references and for scenes that Mitsuba cannot render.
     """
     from dataclasses import replace
     from pathlib import Path
@@ -95,13 +95,13 @@ def fit_scene(
 
     notes: list[str] = []
     pictures: list[Any] = []
-    counts: list[Any] = [None] * len(references) if masks is None else list(masks)
+    valid: list[Any] = [None] * len(references) if masks is None else list(masks)
     for k, picture in enumerate(references):
         if isinstance(picture, (str, PathLike)):
-            picture, usable, said = read_reference(Path(picture), channels)
-            notes += said
-            if k < len(counts):
-                counts[k] = usable if counts[k] is None else counts[k] & usable
+            picture, usable, read_notes = read_reference(Path(picture), channels)
+            notes += read_notes
+            if k < len(valid):
+                valid[k] = usable if valid[k] is None else valid[k] & usable
         pictures.append(picture)
     fitted = run(
         scene,
@@ -121,7 +121,7 @@ def fit_scene(
         solver=solver,
         integrator=integrator,
         fast=fast,
-        masks=counts,
+        masks=valid,
         only=only,
         save=save,
         save_every=save_every,

@@ -1,4 +1,4 @@
-"""The keyword settings of the verbs, by name: one mapping per stage, as `--print-config` prints them."""
+"""Typed keyword settings of the verbs: one mapping per stage, as `--print-config` prints them."""
 
 from collections.abc import Mapping
 from typing import Any, Literal, TypedDict
@@ -8,7 +8,7 @@ Variant = Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"]
 
 
 class StylizeSettings(TypedDict, total=False):
-    """Settings of `stylize` and `bake`; `mistyle stylize --print-config` lists what each stage takes."""
+    """Settings of `stylize` and `bake`; `mistyle stylize --print-config` lists those of each stage."""
 
     seed: int
     threads: int
@@ -37,7 +37,7 @@ class StylizeSettings(TypedDict, total=False):
 
 
 class FitSettings(TypedDict, total=False):
-    """Settings of `fit`; `mistyle fit --print-config` lists what each stage takes."""
+    """Settings of `fit`; `mistyle fit --print-config` lists those of each stage."""
 
     seed: int
     threads: int
@@ -54,7 +54,7 @@ class FitSettings(TypedDict, total=False):
 
 
 class LookdevSettings(TypedDict, total=False):
-    """Settings of `lookdev`: pixels and samples of its pictures, and how many frames of each turntable."""
+    """Settings of `lookdev`: pixels and samples of its pictures, and frames of each turntable."""
 
     size: int
     spp: int

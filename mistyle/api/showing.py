@@ -33,7 +33,7 @@ class Gallery:
         return buffer.getvalue()
 
     def save(self, path: str | PathLike) -> Path:
-        """Write the sheet as a PNG file, over one that is there; returns its path."""
+        """Write the sheet as a PNG file, replacing an existing one; returns its path."""
         from mistyle.io.store.atomic import atomic_write
 
         atomic_write(Path(path), self._repr_png_())
@@ -44,26 +44,26 @@ def gallery(rows: Mapping[str, Any], size: int = 160, *, names: Sequence[str] = 
     """Rows of pictures under their headings.
 
     rows      by heading: a `Maps` record (albedo, normal, roughness, metallic), `Views`, or a sequence of `View`s and
-              arrays. Arrays (h, w, 3) are linear Rec.709; (h, w) are data 0..1 and shown as they are
+              arrays. Arrays (h, w, 3) are linear Rec.709; (h, w) are data 0..1, shown unchanged
     size      pixels of the longer side of every picture; larger pictures are averaged, smaller ones enlarged
     names     captions of the arrays, column by column
     exposure  factor of the radiance of views and colour arrays
 
-    Colours above 1 clip; there is no tone curve.
+    Colours above 1 clip, without a tone curve.
     """
     from mistyle.deliver.lookdev.canvas import Panel, PanelRow, Sheet, compose, measures
 
     scale = size / 200
     gutter = measures(scale)["gutter"]
-    made = []
-    for heading, given in rows.items():
-        panels = [Panel(_fitted(picture, size), name) for name, picture in _pictures(given, names, exposure)]
-        made.append(PanelRow(heading, tuple(panels)))
-    widths = [sum(p.picture.shape[1] for p in row.panels) + gutter * (len(row.panels) - 1) for row in made]
-    # Equal distances: a shorter row is filled up to the width of the longest.
+    panel_rows = []
+    for heading, content in rows.items():
+        panels = [Panel(_fitted(picture, size), name) for name, picture in _pictures(content, names, exposure)]
+        panel_rows.append(PanelRow(heading, tuple(panels)))
+    widths = [sum(p.picture.shape[1] for p in row.panels) + gutter * (len(row.panels) - 1) for row in panel_rows]
+    # Equal gutters: a shorter row is padded to the width of the longest.
     full = [
         PanelRow(row.heading, (*row.panels, *_blank(row, max(widths) - width, gutter)))
-        for row, width in zip(made, widths, strict=True)
+        for row, width in zip(panel_rows, widths, strict=True)
     ]
     sheet = compose(Sheet("", (), tuple(full)), max(widths), scale)
     m = measures(scale)
@@ -83,21 +83,21 @@ def _blank(row: Any, missing: int, gutter: int) -> tuple[Any, ...]:
     return (Panel(np.full((height, missing - gutter, 3), BETWEEN, np.float32), ""),)
 
 
-def _pictures(given: Any, names: Sequence[str], exposure: float) -> list[tuple[str, np.ndarray]]:
+def _pictures(content: Any, names: Sequence[str], exposure: float) -> list[tuple[str, np.ndarray]]:
     """Captions and sRGB pictures, with or without alpha."""
-    if isinstance(given, Maps):
-        return list(html.map_pictures(given).items())
-    made = []
-    for k, one in enumerate(given.views if isinstance(given, Views) else given):
+    if isinstance(content, Maps):
+        return list(html.map_pictures(content).items())
+    pictures = []
+    for k, one in enumerate(content.views if isinstance(content, Views) else content):
         caption = names[k] if k < len(names) else one.camera.name if isinstance(one, View) else ""
         if isinstance(one, View):
             scaled = View(**{**vars(one), "rgb": (one.rgb * np.float32(exposure)).astype(np.float32)})
-            made.append((caption, straight(scaled)))
+            pictures.append((caption, straight(scaled)))
         elif one.ndim == 2:
-            made.append((caption, one.astype(np.float32)))
+            pictures.append((caption, one.astype(np.float32)))
         else:
-            made.append((caption, srgb_from_linear(np.asarray(one[..., :3] * exposure, np.float32))))
-    return made
+            pictures.append((caption, srgb_from_linear(np.asarray(one[..., :3] * exposure, np.float32))))
+    return pictures
 
 
 def _fitted(picture: np.ndarray, size: int) -> np.ndarray:

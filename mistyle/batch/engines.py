@@ -1,8 +1,8 @@
 """Engines that run the shards of a plan: processes of this machine, or a Ray cluster.
 
-Each shard is a process of its own (`mistyle shard`), so that a native crash of one takes nothing else along; the
-engine only starts it, waits, and starts it once more where it crashed, then on the plain path: no kernel is recorded
-(`MISTYLE_PLAIN`), and none is taken from Dr.Jit's cache on disk. A shard ends when its engine does, however that ended.
+Each shard is a separate process (`mistyle shard`), so that a native crash affects no other. The engine starts it and
+waits. After a crash it retries once on the plain path, without frozen kernels (`MISTYLE_PLAIN`) and with an empty
+Dr.Jit kernel cache. A shard ends with its engine, however the engine ended.
 """
 
 import os
@@ -24,7 +24,7 @@ from mistyle.batch.shard import SHARDS
 from mistyle.core.errors import EnvironmentMissing, MistyleError
 from mistyle.process.children import PARENT
 
-# Exit codes that a program gives itself; a shell reports a signal as 128 + its number.
+# Exit codes of crashes: a shell reports a signal as 128 + its number.
 CRASHES = tuple(128 + n for n in (4, 6, 7, 8, 9, 11))
 PATIENCE = 30.0  # seconds that a stopped shard gets to write its checkpoint
 STOPPED = 75
@@ -35,7 +35,7 @@ LOOPBACK = "127.0.0.1"
 
 @dataclass(frozen=True)
 class Ended:
-    """How a shard's process ended, after how many tries, and why where its own words do not say."""
+    """The end of a shard's process: exit code, number of tries, and the reason where its log has none."""
 
     index: int
     code: int
@@ -43,24 +43,24 @@ class Ended:
     why: str = ""
 
 
-# Called when a shard begins and when it has ended (None while it runs).
+# Called at the start (with None) and at the end of a shard.
 Watch = Callable[[int, Ended | None], None]
 
 
 def command(plan: BatchPlan, index: int, maps: Sequence[tuple[str, str]] = ()) -> list[str]:
-    """The process of one shard."""
+    """The command line of one shard."""
     options = [part for source, target in maps for part in ("--path-map", f"{source}={target}")]
     options += ["--overwrite"] * plan.overwrite
     return [sys.executable, "-m", "mistyle", "shard", str(plan.out / PLAN), "--index", str(index), *options]
 
 
 def log_of(plan: BatchPlan, index: int) -> Path:
-    """Where a shard's words go."""
+    """The log file of a shard."""
     return plan.out / SHARDS / f"{plan.jobs[index].name}.log"
 
 
 def crashed(code: int) -> bool:
-    """Whether the process was ended by a signal that nobody sent on purpose."""
+    """Whether the exit code reports a signal other than SIGTERM and SIGINT."""
     return code in CRASHES or (code < 0 and -code not in (signal.SIGTERM, signal.SIGINT))
 
 
@@ -69,13 +69,13 @@ def local(
 ) -> list[Ended]:
     """Run shards as processes of this machine, `workers` at a time; their threads are a setting of each job.
 
-    On Ctrl-C or a request to stop, every shard is asked to stop and given time for its checkpoint.
+    On Ctrl-C or a request to stop, every shard receives a stop request and has PATIENCE seconds for its checkpoint.
     """
     children = _Children()
 
     def one(index: int) -> Ended:
         watch(index, None)
-        ended = _tried(index, lambda plain: children.run(plan, index, plain, timeout), timeout)
+        ended = _run_with_retry(index, lambda plain: children.run(plan, index, plain, timeout), timeout)
         watch(index, ended)
         return ended
 
@@ -90,7 +90,7 @@ def local(
             raise
 
 
-def _tried(index: int, run: Callable[[bool], int], timeout: float | None) -> Ended:
+def _run_with_retry(index: int, run: Callable[[bool], int], timeout: float | None) -> Ended:
     """Run a shard; a crash is followed by another try on the plain path, a timeout is not."""
     killed, code, late, tries = _killed_for_memory(), 0, False, 0
     for plain in (False, True):
@@ -109,19 +109,19 @@ def _tried(index: int, run: Callable[[bool], int], timeout: float | None) -> End
 
 
 def reason(code: int, memory: bool = False) -> str:
-    """What a crash's exit code says, in words; nothing for other codes. `memory`: the system has since killed some
-    process for lack of memory."""
+    """The message for a crash's exit code; empty for other codes. `memory`: the system has since killed a process for
+    lack of memory."""
     if not crashed(code):
         return ""
     name = signal.Signals(-code if code < 0 else code - 128).name
     if name != "SIGKILL":
         return f"the process crashed in native code ({name})"
-    by = "by the system, which had run out of memory" if memory else "most likely by the system, for lack of memory"
-    return f"the process was killed ({name}), {by}: run fewer at a time (--workers), or use a smaller atlas"
+    cause = "by the system, which had run out of memory" if memory else "most likely by the system, for lack of memory"
+    return f"the process was killed ({name}), {cause}: run fewer at a time (--workers), or use a smaller atlas"
 
 
 def _killed_for_memory() -> int:
-    """How many processes this machine has ended for lack of memory so far, where it tells."""
+    """The number of processes that the kernel has killed for lack of memory so far; 0 where unknown."""
     try:
         lines = Path("/proc/vmstat").read_text().splitlines()
     except OSError:
@@ -131,36 +131,36 @@ def _killed_for_memory() -> int:
 
 @dataclass
 class _Children:
-    """The processes that run now."""
+    """The running processes; mutable, shared between threads under `lock`."""
 
     running: set = field(default_factory=set)
     stopping: bool = False
     lock: threading.Lock = field(default_factory=threading.Lock)
 
     def run(self, plan: BatchPlan, index: int, plain: bool, timeout: float | None) -> int:
-        with _surroundings(plain) as environment:
+        with _shard_environment(plain) as environment:
             with self.lock:
                 if self.stopping:
                     return STOPPED
-                child = _started(command(plan, index), log_of(plan, index), environment)
+                child = _start(command(plan, index), log_of(plan, index), environment)
                 self.running.add(child)
             try:
-                return _waited(child, timeout)
+                return _wait(child, timeout)
             finally:
                 self.running.discard(child)
 
     def stop(self) -> None:
         with self.lock:
             self.stopping = True
-            left = list(self.running)
-        for child in left:
-            _ask(child)
-        for child in left:
+            remaining = list(self.running)
+        for child in remaining:
+            _request_stop(child)
+        for child in remaining:
             stopped(child)
 
 
-def _ask(child: subprocess.Popen) -> None:
-    """Ask a process to stop. Windows knows no SIGTERM: Ctrl-Break, which reaches the child's own group."""
+def _request_stop(child: subprocess.Popen) -> None:
+    """Send a stop request: SIGTERM, on Windows Ctrl-Break to the child's own process group."""
     if sys.platform == "win32":
         child.send_signal(signal.CTRL_BREAK_EVENT)
     else:
@@ -168,8 +168,8 @@ def _ask(child: subprocess.Popen) -> None:
 
 
 def stopped(child: subprocess.Popen) -> int:
-    """Ask a process to stop, wait for its checkpoint, then end it."""
-    _ask(child)
+    """Request a process to stop, wait for its checkpoint, then kill it; returns the exit code."""
+    _request_stop(child)
     try:
         return child.wait(PATIENCE)
     except subprocess.TimeoutExpired:
@@ -178,9 +178,9 @@ def stopped(child: subprocess.Popen) -> int:
 
 
 @contextmanager
-def _surroundings(plain: bool) -> Iterator[dict[str, str]]:
-    """What a shard finds in its environment; on the plain path it has an empty kernel cache of its own."""
-    # Python's stack stands in the log when a library ends the process.
+def _shard_environment(plain: bool) -> Iterator[dict[str, str]]:
+    """The environment variables of a shard; on the plain path with an empty kernel cache."""
+    # faulthandler writes Python's stack to the log when a library ends the process.
     environment = os.environ | {PARENT: str(os.getpid()), "PYTHONFAULTHANDLER": "1"}
     if not plain:
         yield environment
@@ -189,26 +189,26 @@ def _surroundings(plain: bool) -> Iterator[dict[str, str]]:
         yield environment | {PLAIN: "1", "DRJIT_CACHE_DIR": folder}
 
 
-def _started(line: list[str], log: Path, environment: dict[str, str]) -> subprocess.Popen:
-    """A shard's process, its words in the log; a second try goes on in the log of the first.
+def _start(arguments: list[str], log: Path, environment: dict[str, str]) -> subprocess.Popen:
+    """Start a shard's process with its output in `log`; a second try appends to the log.
 
-    It is a group of its own: Ctrl-C reaches the engine only, which asks each shard once.
+    It has its own process group: Ctrl-C reaches only the engine, which stops each shard once.
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     plain = PLAIN in environment
-    apart: dict[str, Any] = (
+    group: dict[str, Any] = (
         {"process_group": 0} if sys.platform != "win32" else {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     )
     with open(log, "ab" if plain else "wb") as out:
         if plain:
             out.write(f"\n{ONCE_MORE}\n".encode())
             out.flush()
-        given: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": out, "env": environment}
-        return subprocess.Popen(line, **(given | apart))
+        streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": out, "stderr": out, "env": environment}
+        return subprocess.Popen(arguments, **(streams | group))
 
 
-def _waited(child: subprocess.Popen, timeout: float | None) -> int:
-    """Its exit code; one that takes longer is asked to stop."""
+def _wait(child: subprocess.Popen, timeout: float | None) -> int:
+    """The exit code of a process; after `timeout` seconds it is stopped."""
     try:
         return child.wait(timeout)
     except subprocess.TimeoutExpired:
@@ -216,7 +216,7 @@ def _waited(child: subprocess.Popen, timeout: float | None) -> int:
 
 
 def last_lines(plan: BatchPlan, index: int, count: int = 5) -> str:
-    """The end of a shard's log, for a person; where it crashed, Python's innermost calls. The last try's."""
+    """The last lines of a shard's log, from the last try; after a crash, Python's innermost calls."""
     try:
         text = log_of(plan, index).read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -228,12 +228,12 @@ def last_lines(plan: BatchPlan, index: int, count: int = 5) -> str:
 
 @dataclass(frozen=True)
 class RayCluster:
-    """A Ray cluster and the share of it that each shard takes.
+    """A Ray cluster and the resources of each shard.
 
     address  of a running cluster ("auto"); None starts one on this machine
     threads  cores of a shard
     gpus     GPUs of a shard; fractions are allowed
-    wait     seconds after which a cluster that has begun no shard counts as unable to serve
+    wait     seconds without a started shard after which the batch fails
     """
 
     address: str | None = None
@@ -247,15 +247,15 @@ def ray(
 ) -> list[Ended]:
     """Run shards on a Ray cluster.
 
-    A lost worker's shard is started again, three times at most. MistyleError where no shard has begun after
-    `cluster.wait` seconds. A cluster of our own listens on the loopback address only and asks for a token. All machines
-    must see the plan's folder at the same place.
+    A lost worker's shard is retried, three times at most. MistyleError where no shard has started after
+    `cluster.wait` seconds. Our own cluster listens only on the loopback address and requires a token. All machines must
+    see the plan's folder under the same path.
     """
     address = cluster.address
     if address is None:
-        # Read when Ray is imported; without it Ray takes 127.0.0.1 for the machine's own address and listens on all.
+        # Ray reads this at import; without it Ray replaces 127.0.0.1 by the machine's address and listens on all.
         os.environ["RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER"] = "0"
-        # Ray's workers step back behind everything else by default: a shard is no less urgent here than by itself.
+        # Ray's workers run at low priority by default; a shard gets normal priority, as with the engine 'local'.
         os.environ.setdefault("RAY_worker_niceness", "0")
     try:
         import ray as library
@@ -263,11 +263,11 @@ def ray(
         raise EnvironmentMissing("the engine 'ray' needs Ray: pip install 'mistyle[ray]'") from None
     if address is None:
         library.init(_node_ip_address=LOOPBACK, include_dashboard=False, log_to_driver=False, num_cpus=os.cpu_count())
-        if (where := library.util.get_node_ip_address()) != LOOPBACK:
+        if (listening := library.util.get_node_ip_address()) != LOOPBACK:
             library.shutdown()
             raise MistyleError(
-                f"Ray's cluster listens on {where}, not on {LOOPBACK} alone, as Ray was imported before; "
-                "start a cluster yourself and name it with --address, or use --engine processes"
+                f"Ray's cluster listens on {listening}, not on {LOOPBACK} alone, since Ray was imported before; "
+                "start a cluster yourself and name it with --address, or use --engine local"
             )
     else:
         library.init(address=address, log_to_driver=False)
@@ -283,14 +283,14 @@ def _on_ray(
     """`ray` on the cluster that `library` is connected to."""
     threads, gpus, wait = cluster.threads, cluster.gpus, cluster.wait
     offered = library.cluster_resources()
-    for name, asked in (("CPU", threads), ("GPU", gpus)):
-        if asked > offered.get(name, 0):
+    for name, needed in (("CPU", threads), ("GPU", gpus)):
+        if needed > offered.get(name, 0):
             raise MistyleError(
-                f"the Ray cluster offers {offered.get(name, 0):g} {name}s, each shard needs {asked:g}: it would "
-                "wait for ever. Add machines, or request less (--threads, --gpus)"
+                f"the Ray cluster offers {offered.get(name, 0):g} {name}s, each shard needs {needed:g}: no shard could "
+                "start. Add machines, or request less (--threads, --gpus)"
             )
     task = library.remote(num_cpus=threads, num_gpus=gpus, max_retries=3)(_ray_shard)
-    begun = {index: _begun(plan, index) for index in todo}
+    begun = {index: _begun_file(plan, index) for index in todo}
     for path in begun.values():
         path.unlink(missing_ok=True)
     waiting = {task.remote(k, command(plan, k), str(log_of(plan, k)), str(begun[k]), timeout): k for k in todo}
@@ -312,23 +312,23 @@ def _on_ray(
             begun[index].unlink(missing_ok=True)
         if not started and not ended and time.monotonic() - since > wait:
             raise MistyleError(
-                f"no shard has begun within {wait:g} s on the Ray cluster: it is busy, or no machine has {threads} "
-                f"free cores and {gpus:g} GPUs. Look at `ray status`, request less, or raise --wait"
+                f"no shard has started within {wait:g} s on the Ray cluster: it is busy, or no machine has {threads} "
+                f"free cores and {gpus:g} GPUs. Check `ray status`, request less, or raise --wait"
             )
     return ended
 
 
-def _ray_shard(index: int, line: list[str], log: str, begun: str, timeout: float | None) -> Ended:
-    """What a Ray worker does: the same process as everywhere, and once more where it crashes."""
+def _ray_shard(index: int, arguments: list[str], log: str, begun: str, timeout: float | None) -> Ended:
+    """The task of a Ray worker: run the shard's process, with one retry after a crash."""
     Path(begun).parent.mkdir(parents=True, exist_ok=True)
     Path(begun).touch()
 
     def run(plain: bool) -> int:
-        with _surroundings(plain) as environment:
-            return _waited(_started(line, Path(log), environment), timeout)
+        with _shard_environment(plain) as environment:
+            return _wait(_start(arguments, Path(log), environment), timeout)
 
-    return _tried(index, run, timeout)
+    return _run_with_retry(index, run, timeout)
 
 
-def _begun(plan: BatchPlan, index: int) -> Path:
+def _begun_file(plan: BatchPlan, index: int) -> Path:
     return plan.out / SHARDS / f".{plan.jobs[index].name}.begun"

@@ -1,6 +1,7 @@
-"""A plan as files for a farm's own queue: Open Job Description, a Slurm array, or plain command lines.
+"""Submission files for a farm's queue: Open Job Description, a Slurm array, or plain command lines.
 
-Every form runs the same shards (`mistyle shard`), which skip what is done, so a job may be submitted again at any time.
+Every form runs the same shards (`mistyle shard`). Finished shards are skipped, so a job may be submitted again at any
+time.
 """
 
 import json
@@ -17,17 +18,17 @@ from mistyle.io.store.output import claim, keep_folder, replace_files
 
 Form = Literal["openjd", "sbatch", "commands"]
 BUNDLE = ("template.yaml", "parameter_values.yaml", "asset_references.yaml")
-SHARD_GRACE = 60  # seconds between the request to stop and the end
+SHARD_GRACE = 60  # seconds between the stop request and the kill
 
 
 @dataclass(frozen=True)
 class ShardNeeds:
-    """Each shard's share of a worker, and how the worker calls mistyle.
+    """The resources of each shard, and the worker's command and paths.
 
     threads, memory_gb, gpus  of one shard
-    chunk                     shards of a task at first (Open Job Description)
-    program                   the command by which a worker calls mistyle
-    maps                      this machine's folders, and where workers see them
+    chunk                     default number of shards per task (Open Job Description)
+    program                   the worker's command for mistyle
+    maps                      (folder on this machine, folder on the workers)
     """
 
     threads: int
@@ -39,7 +40,7 @@ class ShardNeeds:
 
 
 def export(plan: BatchPlan, folder: Path, form: Form, needs: ShardNeeds) -> list[Path]:
-    """Write the plan and the files that a queue needs into `folder`; returns the files."""
+    """Write the plan, and the submission files into `folder`; returns these files."""
     names = {"openjd": BUNDLE, "sbatch": ("mistyle.sbatch",), "commands": ("commands.txt",)}[form]
     claim_batch(plan)
     claim(folder, names, overwrite=plan.overwrite)
@@ -50,7 +51,7 @@ def export(plan: BatchPlan, folder: Path, form: Form, needs: ShardNeeds) -> list
     elif form == "sbatch":
         files = {"mistyle.sbatch": _sbatch(plan, needs)}
     else:
-        lines = [_line(plan, needs, str(k)) for k in range(len(plan.jobs))]
+        lines = [_shell_command(plan, needs, str(k)) for k in range(len(plan.jobs))]
         files = {"commands.txt": "\n".join(lines) + "\n"}
 
     def fill(new: Path) -> None:
@@ -62,13 +63,13 @@ def export(plan: BatchPlan, folder: Path, form: Form, needs: ShardNeeds) -> list
 
 
 def _options(plan: BatchPlan, needs: ShardNeeds) -> list[str]:
-    """The options of `mistyle shard` that every shard of the plan gets."""
+    """The common options of all `mistyle shard` commands of the plan."""
     maps = [part for source, target in needs.maps for part in ("--path-map", f"{source}={target}")]
     return [*maps, *["--overwrite"] * plan.overwrite]
 
 
-def _line(plan: BatchPlan, needs: ShardNeeds, index: str) -> str:
-    """One shard as a line for a shell; `index` may be a variable of that shell."""
+def _shell_command(plan: BatchPlan, needs: ShardNeeds, index: str) -> str:
+    """The shell command of one shard; `index` may be a shell variable."""
     from mistyle.batch.plan import replaced
 
     place, options = replaced(str(plan.out / PLAN), needs.maps), shlex.join(_options(plan, needs))
@@ -86,7 +87,7 @@ def _sbatch(plan: BatchPlan, needs: ShardNeeds) -> str:
         f"--cpus-per-task={needs.threads}",
         f"--mem={round(needs.memory_gb * 1024)}M",
         *([f"--gres=gpu:{needs.gpus}"] if needs.gpus else []),
-        # Asked to stop early enough to write a checkpoint; the array task then counts as failed and may be resubmitted.
+        # SIGTERM leaves time for a checkpoint; the array task then counts as failed and may be resubmitted.
         f"--signal=B:TERM@{SHARD_GRACE}",
         "--requeue",
         f"--output={logs}/slurm-%A_%a.log",
@@ -96,7 +97,7 @@ def _sbatch(plan: BatchPlan, needs: ShardNeeds) -> str:
             "#!/bin/bash",
             *(f"#SBATCH {option}" for option in options),
             # `exec`: the signal reaches the shard itself.
-            f"exec {_line(plan, needs, '${SLURM_ARRAY_TASK_ID}')}",
+            f"exec {_shell_command(plan, needs, '${SLURM_ARRAY_TASK_ID}')}",
             "",
         ]
     )
@@ -133,11 +134,11 @@ def _job_template(plan: BatchPlan, needs: ShardNeeds) -> dict[str, Any]:
         "range": f"0-{len(plan.jobs) - 1}",
         "chunks": {"defaultTaskCount": needs.chunk, "rangeConstraint": "CONTIGUOUS"},
     }
-    words = shlex.split(needs.program)
+    program = shlex.split(needs.program)
     shard = ["shard", "{{Param.Plan}}", "--index", "{{Task.Param.Index}}", "--progress", "openjd"]
     run = {
-        "command": words[0],
-        "args": [*words[1:], *shard, *_options(plan, needs)],
+        "command": program[0],
+        "args": [*program[1:], *shard, *_options(plan, needs)],
         "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": SHARD_GRACE},
     }
     step = {
@@ -156,7 +157,7 @@ def _job_template(plan: BatchPlan, needs: ShardNeeds) -> dict[str, Any]:
 
 
 def _amounts(needs: ShardNeeds) -> list[dict[str, Any]]:
-    """What Open Job Description asks a worker for: cores, MiB of memory, GPUs."""
+    """The worker requirements of Open Job Description: cores, MiB of memory, GPUs."""
     amounts: list[dict[str, Any]] = [
         {"name": "amount.worker.vcpu", "min": needs.threads},
         {"name": "amount.worker.memory", "min": round(needs.memory_gb * 1024)},

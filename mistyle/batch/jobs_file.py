@@ -1,7 +1,7 @@
-"""What a batch is to do: a list, a grid or a folder, as records that are checked before anything runs.
+"""Jobs files of a batch: a list, a grid or a folder, resolved to records that are checked before any job runs.
 
-    # jobs.toml (or .yaml with the same keys); paths are relative to the file, those in settings too
-    preset = "draft"                       # of every job that says nothing else
+    # jobs.toml (or .yaml with the same keys); paths, also those in settings, are relative to the file
+    preset = "draft"                       # default of every job
     settings = { "report.frames" = 12 }
 
     [[job]]                                # one line each ...
@@ -17,7 +17,7 @@
     styles = ["starry_night.jpg", "woodcut.jpg"]
     variants = [{ seed = 0 }, { seed = 1 }]
 
-A folder is a grid of the meshes and the pictures in it (or in its folders `meshes` and `styles`).
+A folder is a grid of the meshes and the pictures in it (or in its subfolders `meshes` and `styles`).
 """
 
 import itertools
@@ -35,23 +35,23 @@ from mistyle.jobs.settings import merge, validate
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 MOST_JOBS = 100_000
-MOST_TOLD = 20
+MOST_LISTED = 20
 
 
 class BatchJob(BaseModel):
-    """One job as a jobs file says it: a mesh with a style picture, or with references to fit its material to."""
+    """One job of a jobs file: a mesh with a style picture, or with references for a fit."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     mesh: Path
     style: Path | None = None
     references: Path | None = None
-    lights: str | None = Field(default=None, description="of a fit: a lights.json, or 'unknown'")
+    lights: str | None = Field(default=None, description="lights of a fit: a lights.json, or 'unknown'")
     masks: Path | None = None
     exposure: Path | None = None
     name: str | None = Field(default=None, description="name of the asset and of the job's folder")
     preset: str | None = None
-    settings: dict[str, Any] = Field(default={}, description="nested, or dotted names as --set takes them")
+    settings: dict[str, Any] = Field(default={}, description="nested, or with dotted names as for --set")
 
 
 class Grid(BaseModel):
@@ -66,7 +66,7 @@ class Grid(BaseModel):
 
 
 class JobsFile(BaseModel):
-    """A jobs file; `preset` and `settings` are those of every job that says nothing else."""
+    """A jobs file; `preset` and `settings` are the defaults of every job."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -80,7 +80,7 @@ Kind = Literal["stylize", "fit"]
 
 
 class Record(BaseModel):
-    """One job, resolved: what `mistyle shard` runs. Paths are absolute, settings complete."""
+    """One resolved job for `mistyle shard`. Paths are absolute, settings complete."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -96,39 +96,39 @@ class Record(BaseModel):
 
 
 def read_jobs(path: Path, threads: int) -> tuple[Record, ...]:
-    """Every job of a jobs file or a folder, checked: all that is wrong is told at once, before anything runs.
+    """Every job of a jobs file or a folder, checked before any job runs; one error lists all refused jobs.
 
-    `threads` is what each job may use where its settings say nothing. Raises UsageError or InputRefused.
+    `threads` is the default of each job's settings. Raises UsageError or InputRefused.
     """
-    # Made absolute here, once: whatever is placed under it is absolute, and placing it again changes nothing.
+    # Absolute, so that all paths below it are absolute and joining them again changes nothing.
     base = (path if path.is_dir() else path.parent).absolute()
-    file = _of_folder(path) if path.is_dir() else _of_file(path)
-    jobs = [*file.job, *itertools.chain.from_iterable(_spread(grid, base, str(path)) for grid in file.grid)]
+    file = _folder_jobs(path) if path.is_dir() else _file_jobs(path)
+    jobs = [*file.job, *itertools.chain.from_iterable(_grid_jobs(grid, base, str(path)) for grid in file.grid)]
     if not jobs:
         raise UsageError(
             f"{path}: found no job; expected [[job]] or [[grid]] entries, or a folder of meshes and pictures"
         )
     if len(jobs) > MOST_JOBS:
         raise UsageError(f"{path}: found {len(jobs)} jobs; expected {MOST_JOBS} at most. Split the file.")
-    records, wrong, code = [], [], UsageError
+    records, refusals, code = [], [], UsageError
     names = _names(jobs)
     for job, name in zip(jobs, names, strict=True):
         try:
             records.append(_record(job, name, file, base, threads))
         except MistyleError as error:
-            wrong.append(f"{name}: {error}")
+            refusals.append(f"{name}: {error}")
             code = InputRefused if isinstance(error, InputRefused) else code
-    if wrong:
-        more = f"\n  and {len(wrong) - MOST_TOLD} more" if len(wrong) > MOST_TOLD else ""
+    if refusals:
+        more = f"\n  and {len(refusals) - MOST_LISTED} more" if len(refusals) > MOST_LISTED else ""
         raise code(
-            f"{path}: {len(wrong)} of {len(jobs)} jobs cannot run; nothing was started\n  "
-            + "\n  ".join(wrong[:MOST_TOLD])
+            f"{path}: {len(refusals)} of {len(jobs)} jobs cannot run; nothing was started\n  "
+            + "\n  ".join(refusals[:MOST_LISTED])
             + more
         )
     return tuple(records)
 
 
-def _of_file(path: Path) -> JobsFile:
+def _file_jobs(path: Path) -> JobsFile:
     from mistyle.io.read import read_toml, read_yaml
 
     if not path.is_file():
@@ -145,7 +145,7 @@ def _of_file(path: Path) -> JobsFile:
     return validate(values, str(path), JobsFile)
 
 
-def _of_folder(folder: Path) -> JobsFile:
+def _folder_jobs(folder: Path) -> JobsFile:
     def inside(name: str, kinds: Sequence[str]) -> list[str]:
         place = folder / name if (folder / name).is_dir() else folder
         return sorted(str(p.relative_to(folder)) for p in place.iterdir() if p.suffix.lower() in kinds and p.is_file())
@@ -153,15 +153,15 @@ def _of_folder(folder: Path) -> JobsFile:
     meshes, styles = inside("meshes", tuple(MESHES)), inside("styles", PICTURES)
     if not meshes or not styles:
         raise InputRefused(
-            f"{folder}: found {len(meshes)} meshes and {len(styles)} pictures; expected at least one of each, there or "
-            "in its folders meshes/ and styles/"
+            f"{folder}: found {len(meshes)} meshes and {len(styles)} pictures; expected at least one of each, in it or "
+            "in its subfolders meshes/ and styles/"
         )
     return JobsFile(grid=[Grid(meshes=meshes, styles=styles)])
 
 
-def _spread(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
+def _grid_jobs(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
     """The jobs of a grid, meshes first."""
-    meshes, styles = _globbed(grid.meshes, base, origin), _globbed(grid.styles, base, origin)
+    meshes, styles = _expanded(grid.meshes, base, origin), _expanded(grid.styles, base, origin)
     result = []
     for mesh, style in itertools.product(meshes, styles):
         for preset in grid.presets or [None]:
@@ -173,8 +173,8 @@ def _spread(grid: Grid, base: Path, origin: str) -> list[BatchJob]:
     return result
 
 
-def _globbed(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
-    found: list[Path] = []
+def _expanded(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
+    paths: list[Path] = []
     for pattern in patterns:
         if any(c in pattern for c in "*?["):
             place = Path(pattern)
@@ -187,14 +187,14 @@ def _globbed(patterns: Sequence[str], base: Path, origin: str) -> list[Path]:
                 raise InputRefused(f"{origin}: '{pattern[:200]}' is not a pattern of file names ({error})") from None
             if not matches:
                 raise InputRefused(f"{origin}: '{pattern}' matches no file in {base}; check the pattern")
-            found += matches
+            paths += matches
         else:
-            found.append(base / pattern)
-    return list(dict.fromkeys(found))
+            paths.append(base / pattern)
+    return list(dict.fromkeys(paths))
 
 
 def _names(jobs: Sequence[BatchJob]) -> list[str]:
-    """A name for each job that no other has and that is safe as the name of a folder; equal ones get -2, -3, …"""
+    """Distinct names of the jobs, safe as names of folders; equal ones get -2, -3, …"""
 
     def base(job: BatchJob) -> str:
         second = job.style.stem if job.style is not None else "fit"
@@ -205,7 +205,7 @@ def _names(jobs: Sequence[BatchJob]) -> list[str]:
 
 def _record(job: BatchJob, name: str, file: JobsFile, base: Path, threads: int) -> Record:
     if (job.style is None) == (job.references is None):
-        raise UsageError("expected either a style (stylize) or references (fit), found " + _said(job))
+        raise UsageError("expected either a style (stylize) or references (fit), found " + _both_or_neither(job))
     if job.style is not None and (job.lights or job.masks or job.exposure):
         raise UsageError("lights, masks and exposure belong to a fit to references; this job has a style")
 
@@ -222,7 +222,7 @@ def _record(job: BatchJob, name: str, file: JobsFile, base: Path, threads: int) 
     if references is not None and not references.is_dir():
         raise InputRefused(f"{references}: found no folder, expected one with cameras and pictures; check the path")
     lights = job.lights if job.lights in (None, "unknown") else str(placed(Path(job.lights)))
-    said = merge(nested(file.settings), nested(job.settings))
+    chosen = merge(nested(file.settings), nested(job.settings))
     kind: Kind = "stylize" if style is not None else "fit"
     return Record(
         name=name,
@@ -233,16 +233,16 @@ def _record(job: BatchJob, name: str, file: JobsFile, base: Path, threads: int) 
         lights=lights,
         masks=placed(job.masks),
         exposure=placed(job.exposure),
-        settings=resolved(kind, job.preset or file.preset, said, threads, base),
+        settings=resolved(kind, job.preset or file.preset, chosen, threads, base),
     )
 
 
-def _said(job: BatchJob) -> str:
+def _both_or_neither(job: BatchJob) -> str:
     return "both" if job.style is not None else "neither"
 
 
 def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings with dotted names as nested ones."""
+    """Settings with dotted names as nested dictionaries."""
     result: dict[str, Any] = {}
     for key, value in settings.items():
         leaf: Any = nested(value) if isinstance(value, Mapping) else value
@@ -252,10 +252,10 @@ def nested(settings: Mapping[str, Any]) -> dict[str, Any]:
     return result
 
 
-def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int, base: Path) -> dict[str, Any]:
-    """All settings of a job, as JSON has them; with `threads` where they say nothing.
+def resolved(kind: Kind, preset: str, chosen: Mapping[str, Any], threads: int, base: Path) -> dict[str, Any]:
+    """All settings of a job as JSON values, with `threads` as the default.
 
-    Files that `said` names are relative to `base`, those of the environment to the working folder; all end absolute.
+    Files in `chosen` are relative to `base`, those of the environment to the working folder; all become absolute.
     """
     from mistyle.jobs.settings import resolve
 
@@ -268,15 +268,15 @@ def resolved(kind: Kind, preset: str, said: Mapping[str, Any], threads: int, bas
         from mistyle.stylization.settings import PRESETS, Settings
 
         root, presets = Settings, PRESETS
-    settings = resolve(preset, None, placed_files(said, root, base), root=root, presets=presets)
+    settings = resolve(preset, None, placed_files(chosen, root, base), root=root, presets=presets)
     values = placed_files(settings.model_dump(mode="json"), root, Path.cwd())
     return values | {"threads": values["threads"] or threads}
 
 
 def placed_files(values: Mapping[str, Any], model: type[BaseModel], base: Path) -> dict[str, Any]:
-    """Settings of `model` with the files that they name relative to `base`; absolute ones stay.
+    """Settings of `model` with their relative files joined to `base`; absolute ones stay.
 
-    Of a style slot (SLOT=PICTURE) the picture is a file, and SLOT where `base` has a file of that name.
+    In a style slot (SLOT=PICTURE) the picture is a file, and SLOT is one if `base` has a file of that name.
     """
     result = dict(values)
     for name, field in model.model_fields.items():
@@ -291,8 +291,8 @@ def placed_files(values: Mapping[str, Any], model: type[BaseModel], base: Path) 
 
 
 def _placed_slot(slot: Any, base: Path) -> Any:
-    where, equals, picture = str(slot).rpartition("=")
-    if not equals or not where or not picture:
+    slot_name, equals, picture = str(slot).rpartition("=")
+    if not equals or not slot_name or not picture:
         return slot  # refused with the job's other settings
-    mask = base / where
-    return f"{mask if mask.is_file() else where}={base / picture}"
+    mask = base / slot_name
+    return f"{mask if mask.is_file() else slot_name}={base / picture}"

@@ -1,12 +1,12 @@
-"""`mistyle pack`: everything that an offline machine needs, in one folder.
+"""`mistyle pack`: an offline installer of mistyle in one folder.
 
-    DIR/wheels/       mistyle and all it stands on, in the exact versions of mistyle/constraints.txt
-    DIR/llvm/         the LLVM that works here, with the libraries beside it
-    DIR/install.sh    ./install.sh /opt/mistyle: no network, no root; the result may then be made read-only
+    DIR/wheels/       mistyle and its dependencies, in the exact versions of mistyle/constraints.txt
+    DIR/llvm/         the libLLVM of this machine, with its own libraries
+    DIR/install.sh    ./install.sh /opt/mistyle: no network, no root; the installed folder may be read-only
     DIR/SHA256SUMS    of every file
 
-The installed program writes nothing beside itself: kernels and notes go to $MISTYLE_SCRATCH (default
-$TMPDIR/mistyle-UID), which should be a local disk. A pack fits the system, processor and Python it was made with.
+The installed program writes nothing into its own folder: kernels and caches go to $MISTYLE_SCRATCH (default
+$TMPDIR/mistyle-UID), which should be a local disk. A pack fits the system, processor and Python version that built it.
 """
 
 import os
@@ -45,7 +45,7 @@ echo "installed: $target/mistyle"
 """
 
 START = """#!/bin/sh
-# mistyle from a place that may be read-only; what it keeps for later runs goes to local scratch.
+# mistyle in a folder that may be read-only; caches go to local scratch.
 here=$(CDPATH= cd -- "$(dirname -- "$(readlink -f -- "$0")")" && pwd)
 scratch=${{MISTYLE_SCRATCH:-${{TMPDIR:-/tmp}}/mistyle-$(id -u)}}
 mkdir -p "$scratch"
@@ -56,9 +56,9 @@ exec "$here/bin/python" -m mistyle "$@"
 
 
 def pack(folder: Path, extras: Sequence[str], progress: Progress, *, overwrite: bool = False) -> Path:
-    """Make the pack's files anew; needs the network once, here.
+    """Write the pack's files; needs the network on this machine.
 
-    Raises EnvironmentMissing without a libLLVM to take along, UsageError where a file in `folder` is not ours.
+    Raises EnvironmentMissing without a libLLVM, UsageError where a file in `folder` is not ours.
     """
     library, beside = llvm_files()
     claim(folder, ["install.sh", "constraints.txt", "SHA256SUMS"], overwrite=overwrite)
@@ -68,18 +68,18 @@ def pack(folder: Path, extras: Sequence[str], progress: Progress, *, overwrite: 
 
 
 def llvm_files() -> tuple[Path, list[Path]]:
-    """The libLLVM in use, and the libraries that the set-up had to fetch with it."""
+    """The libLLVM in use, and the libraries that the set-up downloaded with it."""
     record = read_record(home()).get("llvm") or {}
-    found = os.environ.get("DRJIT_LIBLLVM_PATH") or record.get("library")
-    if not found or not Path(found).is_file():
-        raise EnvironmentMissing("a pack takes the LLVM in use along, and there is none here; see mistyle doctor")
+    library = os.environ.get("DRJIT_LIBLLVM_PATH") or record.get("library")
+    if not library or not Path(library).is_file():
+        raise EnvironmentMissing("a pack includes the libLLVM in use, and none was found; see mistyle doctor")
     folders = [Path(f) for f in record.get("folders", ())]
     beside = [p for f in folders for p in sorted(f.glob("*.so*")) if not p.is_symlink()]
-    return Path(found).resolve(), [p for p in beside if p.resolve() != Path(found).resolve()]
+    return Path(library).resolve(), [p for p in beside if p.resolve() != Path(library).resolve()]
 
 
 def scripts(extras: Sequence[str], library: str) -> str:
-    """install.sh."""
+    """The text of install.sh."""
     version = ".".join(platform.python_version_tuple()[:2])
     names = f"[{','.join(sorted(extras))}]" if extras else ""
     return INSTALL.format(version=__version__, python=version, extras=names, start=START.format(library=library))
@@ -95,7 +95,7 @@ def _fill(folder: Path, extras: Sequence[str], library: Path, beside: Sequence[P
         _pip("download", "-d", str(wheels), "-c", str(CONSTRAINTS), f"{mistyle}{names}")
     else:
         _pip("download", "-d", str(wheels), "-c", str(CONSTRAINTS), f"mistyle{names}=={__version__}")
-    # A source archive could not be built without a network.
+    # A source archive could not be built offline.
     sources = [p.name for p in wheels.iterdir() if p.suffix != ".whl"]
     if sources:
         raise MistyleError(f"no wheel for this system of {', '.join(sources)}; pack on a system that has one")
@@ -110,9 +110,9 @@ def _fill(folder: Path, extras: Sequence[str], library: Path, beside: Sequence[P
     (folder / "SHA256SUMS").write_text("".join(lines))
 
 
-def _pip(*words: str) -> None:
-    line = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *words]
-    done = subprocess.run(line, capture_output=True, text=True)
+def _pip(*arguments: str) -> None:
+    command = [sys.executable, "-m", "pip", "--disable-pip-version-check", "--quiet", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode != 0:
-        told = [row for row in done.stderr.splitlines() if row.strip()]
-        raise MistyleError(f"pip {words[0]} failed: {told[-1] if told else done.returncode}")
+        errors = [row for row in done.stderr.splitlines() if row.strip()]
+        raise MistyleError(f"pip {arguments[0]} failed: {errors[-1] if errors else done.returncode}")

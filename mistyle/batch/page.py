@@ -1,4 +1,4 @@
-"""OUT/batch.html: every asset of a batch on one sheet, with figures to sort by; opens from disk with no network."""
+"""OUT/batch.html: every asset of a batch on one page with a sortable table of figures; opens from disk."""
 
 import base64
 from io import BytesIO
@@ -43,7 +43,7 @@ for (const button of document.querySelectorAll('th button')) button.addEventList
 
 
 def write_page(plan: BatchPlan, summary: dict[str, Any]) -> Path:
-    """Write OUT/batch.html from a batch's summary; names and messages are escaped, and no connection is allowed."""
+    """Write OUT/batch.html from a batch's summary; names and messages are escaped, its policy forbids connections."""
     rows = [_row(plan, row) for row in summary["rows"]]
     names = sorted({name for row in rows for name in row["values"] if name not in COLUMNS})
     text = template(Path(__file__).with_name("batch.html.j2")).render(
@@ -77,13 +77,13 @@ def _row(plan: BatchPlan, row: dict[str, Any]) -> dict[str, Any]:
 
 
 def _thumbnail(path: Path) -> str:
-    """A small WebP of a picture of ours, base64; nothing where there is none."""
+    """A small WebP of a picture file of ours, base64; "" where the file is missing."""
     from PIL import Image
 
     if not path.is_file():
         return ""
     with Image.open(path) as picture:
         picture.thumbnail((THUMBNAIL, THUMBNAIL))
-        made = BytesIO()
-        picture.convert("RGB").save(made, "webp", quality=80)
-    return base64.b64encode(made.getvalue()).decode()
+        buffer = BytesIO()
+        picture.convert("RGB").save(buffer, "webp", quality=80)
+    return base64.b64encode(buffer.getvalue()).decode()

@@ -1,9 +1,9 @@
-"""`mistyle batch`: many jobs, one folder; what failed, why, and the command that retries only that.
+"""`mistyle batch`: many jobs in one folder, with a summary of failures and the command that retries them.
 
-OUT/plan.json                    the jobs, resolved
-OUT/<name>/                      the run folder of each, as `stylize` and `fit` make them
-OUT/shards/<name>.json, .log     markers and words of the workers
-OUT/batch.json, OUT/batch.html   the summary for programs and for people
+OUT/plan.json                    the resolved jobs
+OUT/<name>/                      the run folder of each, as `stylize` and `fit` write it
+OUT/shards/<name>.json, .log     markers and logs of the workers
+OUT/batch.json, OUT/batch.html   the summary, machine-readable and as a page
 """
 
 import json
@@ -29,7 +29,7 @@ from mistyle.process.cores import cores
 
 @dataclass(frozen=True)
 class Choices:
-    """How a batch is run."""
+    """The options of a batch run."""
 
     engine: str = "local"
     workers: int = 0
@@ -43,32 +43,32 @@ class Choices:
 
 
 def planned(jobs: Path, out: Path | None, choices: Choices) -> BatchPlan:
-    """The plan of a jobs file, a folder of meshes and pictures, or a plan (or its folder) that is there already."""
+    """The plan of a jobs file, of a folder of meshes and pictures, or an existing plan (or its folder)."""
     is_plan = jobs.name == PLAN or (jobs.is_dir() and (jobs / PLAN).is_file())
     if is_plan:
         plan = read_plan(jobs)
         if out is not None and out.absolute() != plan.out:
             raise UsageError(
-                f"{jobs}: this plan works in {plan.out}; leave out -o, or make a new plan from the jobs file"
+                f"{jobs}: this plan writes to {plan.out}; leave out -o, or write a new plan from the jobs file"
             )
         return plan
     if out is None:
-        raise UsageError(f"{jobs}: a new batch needs -o OUT, the folder for everything it makes")
+        raise UsageError(f"{jobs}: a new batch needs -o OUT, its output folder")
     return BatchPlan(out.absolute(), read_jobs(jobs, threads_each(choices)))
 
 
 def workers_of(choices: Choices) -> int:
-    """Shards at a time: as asked, else one per two cores, since one job alone does not fill many."""
+    """Shards at a time: as chosen, else one per two cores, since one job alone does not use many."""
     return choices.workers or max(1, cores() // (choices.threads or 2))
 
 
 def threads_each(choices: Choices) -> int:
-    """Threads of a shard: as asked, else the cores divided among the workers. The result of a job depends on it."""
+    """Threads of a shard: as chosen, else the cores divided by the workers. A job's result depends on it."""
     return choices.threads or max(1, cores() // workers_of(choices))
 
 
 def run_batch(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
-    """Run every job of the plan that is not done yet; returns the summary. One failing job never stops the others."""
+    """Run every unfinished job of the plan; returns the summary. A failing job never stops the others."""
     known = {job.name for job in plan.jobs}
     unknown = [name for name in choices.only if name not in known]
     if unknown:
@@ -106,7 +106,7 @@ def _run(plan: BatchPlan, todo: Sequence[int], choices: Choices, reused: int) ->
 
 
 def summarise(plan: BatchPlan, ended: dict[int, engines.Ended], seconds: float, reused: int) -> dict[str, Any]:
-    """How every job of the plan stands, and the command that retries what failed."""
+    """The summary: the state of every job of the plan, and the command that retries the failed ones."""
     rows = [_row(plan, k, job, ended.get(k)) for k, job in enumerate(plan.jobs)]
     failed = [row["name"] for row in rows if row["state"] == "failed"]
     retry = ["mistyle", "batch", str(plan.out / PLAN), *(["--only", *failed] if failed else [])]
@@ -124,24 +124,24 @@ def summarise(plan: BatchPlan, ended: dict[int, engines.Ended], seconds: float, 
 
 
 def _row(plan: BatchPlan, index: int, job: Record, ended: engines.Ended | None) -> dict[str, Any]:
-    found = outcome(plan, job)
-    state, told = found.state, found.told
+    result = outcome(plan, job)
+    state, content = result.state, result.told
     if ended is not None and ended.code != 0:
         state = "failed" if ended.code not in (75, 130) else "open"
     row: dict[str, Any] = {"name": job.name, "kind": job.kind, "state": state, "index": index}
     if state == "done":
-        row |= {k: told[k] for k in ("seconds", "peak_gb", "figures")} | {"notes": told.get("notes", [])}
+        row |= {k: content[k] for k in ("seconds", "peak_gb", "figures")} | {"notes": content.get("notes", [])}
     if state == "failed":
-        code = ended.code if ended is not None else told.get("exit_code", 1)
+        code = ended.code if ended is not None else content.get("exit_code", 1)
         error = ended.why if ended is not None else ""
-        # A marker from before this try says nothing of a crash.
-        error = error or told.get("error") or f"the process ended with {code}"
+        # A marker of an earlier try does not describe this crash.
+        error = error or content.get("error") or f"the process ended with {code}"
         row |= {"exit_code": code, "error": error, "last_lines": engines.last_lines(plan, index)}
     return row
 
 
 def describe(summary: dict[str, Any]) -> str:
-    """The summary as a person reads it."""
+    """The summary as text for the terminal."""
     lines = [
         f"{summary['done']} of {summary['jobs']} done ({summary['reused']} before), {summary['failed']} failed, "
         f"{summary['open']} open, {summary['seconds']:.0f} s"
@@ -154,13 +154,13 @@ def describe(summary: dict[str, Any]) -> str:
     notes = grouped((row["name"], text) for row in summary["rows"] for text in row.get("notes", ()))
     lines += [f"note      {text}" for text in notes]
     if summary["retry"]:
-        lines.append(f"retry what failed: {summary['retry']}")
-    lines.append(f"all of them: {Path(summary['out']) / 'batch.html'}")
+        lines.append(f"retry failed jobs: {summary['retry']}")
+    lines.append(f"all jobs: {Path(summary['out']) / 'batch.html'}")
     return "\n".join(lines)
 
 
 def dry_run(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
-    """What the batch would do: estimated seconds, disk and memory of every job that is not done yet."""
+    """The estimate of a batch: seconds, disk and memory of every unfinished job."""
     from mistyle.fitting.pipeline.plan import plan_material
     from mistyle.stylization.pipeline.plan import plan as plan_style
 
@@ -169,34 +169,35 @@ def dry_run(plan: BatchPlan, choices: Choices) -> dict[str, Any]:
         done = finished(plan, job) is not None
         row: dict[str, Any] = {"name": job.name, "kind": job.kind, "done": done, "refused": None}
         try:
-            told = (plan_material if job.kind == "fit" else plan_style)(job_of(plan, job))
+            estimate = (plan_material if job.kind == "fit" else plan_style)(job_of(plan, job))
         except MistyleError as error:
-            told = {"seconds": 0, "disk_gb": 0.0, "memory_gb": 0.0}
+            estimate = {"seconds": 0, "disk_gb": 0.0, "memory_gb": 0.0}
             row["refused"] = str(error)
-        rows.append(row | {key: told[key] for key in ("seconds", "disk_gb", "memory_gb")})
-    left = [row for row in rows if not row["done"]]
-    workers = min(workers_of(choices), max(len(left), 1))
+        rows.append(row | {key: estimate[key] for key in ("seconds", "disk_gb", "memory_gb")})
+    remaining = [row for row in rows if not row["done"]]
+    workers = min(workers_of(choices), max(len(remaining), 1))
     return {
         "out": str(plan.out),
         "jobs": rows,
         "workers": workers,
-        "seconds": round(sum(row["seconds"] for row in left) / workers),
-        "disk_gb": round(sum(row["disk_gb"] for row in left), 2),
-        "memory_gb": round(sum(sorted((row["memory_gb"] for row in left), reverse=True)[:workers]), 1),
+        "seconds": round(sum(row["seconds"] for row in remaining) / workers),
+        "disk_gb": round(sum(row["disk_gb"] for row in remaining), 2),
+        "memory_gb": round(sum(sorted((row["memory_gb"] for row in remaining), reverse=True)[:workers]), 1),
     }
 
 
-def describe_dry_run(told: dict[str, Any]) -> str:
-    """The same as a person reads it."""
+def describe_dry_run(estimate: dict[str, Any]) -> str:
+    """The estimate as text for the terminal."""
     lines = []
-    for row in told["jobs"]:
-        cost = "done before" if row["done"] else f"about {row['seconds']} s, {row['disk_gb']} GB of disk"
+    for row in estimate["jobs"]:
+        cost = "finished" if row["done"] else f"about {row['seconds']} s, {row['disk_gb']} GB of disk"
         if row["refused"]:
             cost = f"will be refused: {row['refused']}"
         lines.append(f"  {row['name']:<40} {row['kind']:<8} {cost}")
     lines.append(
-        f"{sum(not row['done'] for row in told['jobs'])} jobs, {told['workers']} at a time: about {told['seconds']} s, "
-        f"{told['disk_gb']} GB of disk, {told['memory_gb']} GB of memory -> {told['out']}"
+        f"{sum(not row['done'] for row in estimate['jobs'])} jobs, {estimate['workers']} at a time: "
+        f"about {estimate['seconds']} s, {estimate['disk_gb']} GB of disk, {estimate['memory_gb']} GB of memory "
+        f"-> {estimate['out']}"
     )
     return "\n".join(lines)
 

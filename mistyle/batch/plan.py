@@ -1,7 +1,7 @@
-"""The plan of a batch: one file that every worker reads, wherever it runs.
+"""The plan of a batch: one file that every worker reads.
 
-OUT/plan.json holds the resolved jobs in order; shard number I is job I. A worker on a machine that sees the files
-elsewhere says so with path maps.
+OUT/plan.json holds the resolved jobs in order; shard number I is job I. Path maps serve workers on machines that see
+the files under other paths.
 """
 
 import json
@@ -24,9 +24,9 @@ MAX_PLAN_BYTES = 1 << 30  # some hundred thousand jobs
 
 @dataclass(frozen=True)
 class BatchPlan:
-    """The jobs of a batch, and the folder that their run folders lie in.
+    """The jobs of a batch, and the parent of their run folders.
 
-    `overwrite` is how this call was asked to treat files there that are not mistyle's; plan.json does not hold it.
+    `overwrite` allows this call to replace files in it that are not mistyle's; plan.json does not hold it.
     """
 
     out: Path
@@ -35,7 +35,7 @@ class BatchPlan:
 
 
 def write_plan(plan: BatchPlan) -> Path:
-    """OUT/plan.json; the same jobs give the same bytes. An edited one is set aside; UsageError for a user's file."""
+    """Write OUT/plan.json; equal jobs give equal bytes. An edited plan is set aside; UsageError for a user's file."""
     values = {
         "version": VERSION,
         "mistyle": __version__,
@@ -47,7 +47,7 @@ def write_plan(plan: BatchPlan) -> Path:
 
 
 def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> BatchPlan:
-    """A plan (the file or its folder), with its paths as this machine sees them. Raises InputRefused or UsageError."""
+    """A plan (the file or its folder), with its paths mapped to this machine. Raises InputRefused or UsageError."""
     path = path / PLAN if path.is_dir() else path
     try:
         values = read_own(path, MAX_PLAN_BYTES)
@@ -56,13 +56,13 @@ def read_plan(path: Path, maps: Sequence[tuple[str, str]] = ()) -> BatchPlan:
     except (OSError, ValueError) as error:
         raise InputRefused(f"{path}: not a plan: {error}") from None
     if not isinstance(values, dict) or values.get("version") != VERSION or not isinstance(values.get("jobs"), list):
-        raise InputRefused(f"{path}: found no plan of version {VERSION}; write it anew with `mistyle batch`")
+        raise InputRefused(f"{path}: found no plan of version {VERSION}; write it again with `mistyle batch`")
     jobs = tuple(mapped(validate(job, str(path), Record), maps) for job in values["jobs"])
     return BatchPlan(Path(replaced(str(values["out"]), maps)), jobs)
 
 
 def mapped(job: Record, maps: Sequence[tuple[str, str]]) -> Record:
-    """A job with its paths mapped, and those inside its settings."""
+    """A job with all paths mapped, also those inside its settings."""
     if not maps:
         return job
     changed: dict[str, Any] = {"settings": _mapped_values(job.settings, maps)}
@@ -84,7 +84,7 @@ def _mapped_values(value: Any, maps: Sequence[tuple[str, str]]) -> Any:
 
 
 def replaced(text: str, maps: Sequence[tuple[str, str]]) -> str:
-    """`text` with the longest of the mapped folders that it lies in replaced; only whole names count."""
+    """The path `text` with its longest mapped parent folder replaced; only whole path components match."""
     for source, target in sorted(maps, key=lambda pair: -len(pair[0])):
         start = source.rstrip("/\\")
         rest = text[len(start) :]
@@ -107,30 +107,30 @@ def path_maps(pairs: Sequence[str]) -> tuple[tuple[str, str], ...]:
 
 def indices(text: str, count: int) -> tuple[int, ...]:
     """'3', '0-7' or '0-3,8' as numbers, in order. Raises UsageError."""
-    found: list[int] = []
+    numbers: list[int] = []
     for piece in text.split(","):
         first, dash, last = piece.strip().partition("-")
         if not first.isdigit() or (dash and not last.isdigit()):
             raise UsageError(f"--index {text}: expected numbers such as 3, 0-7 or 0-3,8")
-        found += range(int(first), int(last if dash else first) + 1)
-    wrong = [n for n in found if n >= count]
-    if wrong:
-        raise UsageError(f"--index {text}: the plan has {count} shards, numbered from 0; found {wrong[0]}")
-    return tuple(dict.fromkeys(found))
+        numbers += range(int(first), int(last if dash else first) + 1)
+    missing = [n for n in numbers if n >= count]
+    if missing:
+        raise UsageError(f"--index {text}: the plan has {count} shards, numbered from 0; found {missing[0]}")
+    return tuple(dict.fromkeys(numbers))
 
 
-def with_delivery(plan: BatchPlan, said: Mapping[str, Any]) -> BatchPlan:
-    """A batch's plan in which every job delivers what the command line says. UsageError where a job cannot."""
+def with_delivery(plan: BatchPlan, delivery: Mapping[str, Any]) -> BatchPlan:
+    """The plan with the command line's delivery settings in every job. UsageError where a job cannot deliver."""
     from mistyle.deliver import export as deliver
     from mistyle.fitting.settings.material import MaterialSettings
     from mistyle.stylization.settings import Settings
 
-    if not said:
+    if not delivery:
         return plan
     jobs = []
     for job in plan.jobs:
         root = MaterialSettings if job.kind == "fit" else Settings
-        settings = validate(merge(job.settings, said), "command line", root)
+        settings = validate(merge(job.settings, delivery), "command line", root)
         deliver.check(settings)
         jobs.append(job.model_copy(update={"settings": settings.model_dump(mode="json")}))
     return replace(plan, jobs=tuple(jobs))

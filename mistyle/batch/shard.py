@@ -1,8 +1,8 @@
 """One job of a plan as one process: `mistyle shard PLAN --index I`.
 
-It may be run any number of times, anywhere, by any queue: a job whose marker OUT/shards/<name>.json has the key of the
-job and whose files still have their hashes is done; anything else is run, and goes on from its last finished stage.
-A failure leaves OUT/shards/<name>.failed.json, which the next success removes; a shard that was stopped leaves neither.
+It may run any number of times, on any machine, by any queue. A job is finished if its marker OUT/shards/<name>.json has
+the job's key and its files have their hashes. Any other job resumes from its last finished stage. A failure leaves
+OUT/shards/<name>.failed.json, which the next success removes; a stopped shard leaves neither.
 """
 
 import contextlib
@@ -33,46 +33,46 @@ SHARDS = "shards"
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a shard stands: "done", "failed" or "open"; `told` is its marker's content."""
+    """The state of a shard, "done", "failed" or "open"; `told` is the content of its marker."""
 
     state: str
     told: dict[str, Any]
 
 
 def key_of(job: Record) -> str:
-    """What the result depends on: the files, the settings, the program."""
+    """The digest of everything that the result depends on: files, settings, program."""
     files = [list(input_files(job.mesh)), job.style, job.references, job.masks, job.exposure]
     lights = Path(job.lights) if job.lights not in (None, "unknown") else job.lights
     return digest([program(), job.kind, job.name, files, lights, job.settings])
 
 
 def marker(plan: BatchPlan, job: Record, failed: bool = False) -> Path:
-    """Where it is written that a job is done, or why it is not."""
+    """The marker file of a finished job, or of its failure."""
     return plan.out / SHARDS / f"{job.name}{'.failed' if failed else ''}.json"
 
 
 def outcome(plan: BatchPlan, job: Record) -> Outcome:
-    """How a job stands by its markers alone, which is quick; `finished` looks at the files."""
+    """The state of a job by its markers alone, which is fast; `finished` also checks the files."""
     for state, failed in (("done", False), ("failed", True)):
-        told = _read(marker(plan, job, failed))
-        if told is not None:
-            return Outcome(state, told)
+        content = _read(marker(plan, job, failed))
+        if content is not None:
+            return Outcome(state, content)
     return Outcome("open", {})
 
 
 def finished(plan: BatchPlan, job: Record, key: str | None = None) -> dict[str, Any] | None:
-    """The marker of a job that is done under its present key, with every file as it was written; else None."""
-    told = _read(marker(plan, job))
-    if told is None or told.get("key") != (key or key_of(job)):
+    """The marker of a job that is finished under its present key, with all files unchanged; else None."""
+    content = _read(marker(plan, job))
+    if content is None or content.get("key") != (key or key_of(job)):
         return None
-    files = told.get("files", {})
-    whole = all((plan.out / p).is_file() and sha256_file(plan.out / p) == h for p, h in files.items())
-    return told if whole and files else None
+    files = content.get("files", {})
+    unchanged = all((plan.out / p).is_file() and sha256_file(plan.out / p) == h for p, h in files.items())
+    return content if unchanged and files else None
 
 
 def claim_batch(plan: BatchPlan) -> None:
-    """UsageError where the batch would cover an input or a file that mistyle did not write, in any job's folder."""
-    every = [given for job in plan.jobs for given in (job.mesh, job.style, job.references) if given is not None]
+    """UsageError where the batch would overwrite an input, or a file in any job's folder that is not mistyle's."""
+    every = [path for job in plan.jobs for path in (job.mesh, job.style, job.references) if path is not None]
     claim(plan.out, ("plan.json", "batch.json", "batch.html"), [SHARDS], every, aside=True, overwrite=plan.overwrite)
     for job in plan.jobs:
         stages = MATERIAL_STAGES if job.kind == "fit" else STAGES
@@ -80,18 +80,18 @@ def claim_batch(plan: BatchPlan) -> None:
 
 
 def run_shard(plan: BatchPlan, index: int, progress: Progress) -> dict[str, Any]:
-    """Run job `index` unless it is done; returns its marker's content. Raises what the job raises."""
+    """Run job `index` unless it is finished; returns its marker's content. Raises the job's errors."""
     job = plan.jobs[index]
     claim(plan.out, folders=[SHARDS], overwrite=plan.overwrite)
     keep_folder(plan.out, SHARDS)
-    key = key_of(job)  # of the files as they are now: one that changes meanwhile makes another job
-    told = finished(plan, job, key)
-    if told is not None:
-        progress.say(f"{job.name}: done before, taken over")
-        return told | {"reused": True}
+    key = key_of(job)  # of the present files: a file that changes during the run changes the key
+    content = finished(plan, job, key)
+    if content is not None:
+        progress.say(f"{job.name}: reused from an earlier run")
+        return content | {"reused": True}
     start = time.monotonic()
     failure = marker(plan, job, failed=True)
-    marker(plan, job).unlink(missing_ok=True)  # it is of another key, or its files are not as they were
+    marker(plan, job).unlink(missing_ok=True)  # it has another key, or its files have changed
     _wait_for_folder(plan.out / job.name, progress)
     try:
         summary = _run(plan, job, progress)
@@ -102,38 +102,40 @@ def run_shard(plan: BatchPlan, index: int, progress: Progress) -> dict[str, Any]
         known = expected if isinstance(expected, MistyleError) else None
         code, text = (known.exit_code, str(known)) if known else (1, f"{type(error).__name__}: {error}")
         note = {"name": job.name, "exit_code": code, "error": text, "seconds": round(time.monotonic() - start, 2)}
-        with contextlib.suppress(MistyleError, OSError):  # a full disk takes no note either; the log has it
+        with contextlib.suppress(MistyleError, OSError):  # on a full disk only the log has the error
             _write(failure, note)
         raise
-    made = [p for p in sorted((plan.out / job.name / "asset").rglob("*")) if p.is_file()]
-    made += [p for p in (plan.out / job.name / "report").glob("*.html")]
-    made += [Path(p) for files in summary.get("delivered", {}).values() for p in files if not p.endswith("_look.usda")]
-    told = {
+    written = [p for p in sorted((plan.out / job.name / "asset").rglob("*")) if p.is_file()]
+    written += [p for p in (plan.out / job.name / "report").glob("*.html")]
+    written += [
+        Path(p) for files in summary.get("delivered", {}).values() for p in files if not p.endswith("_look.usda")
+    ]
+    content = {
         "name": job.name,
         "key": key,
-        "files": {p.relative_to(plan.out).as_posix(): sha256_file(p) for p in made},
+        "files": {p.relative_to(plan.out).as_posix(): sha256_file(p) for p in written},
         "seconds": round(time.monotonic() - start, 2),
         "peak_gb": round(float(summary["peak_gb"]), 3),
         "figures": summary["figures"],
         "stages": summary["seconds"],
         "notes": summary["notes"],
     }
-    _write(marker(plan, job), told)
+    _write(marker(plan, job), content)
     failure.unlink(missing_ok=True)
-    return told
+    return content
 
 
 def _wait_for_folder(folder: Path, progress: Progress, seconds: float = 30.0) -> None:
-    """The shard of an engine that was killed may take a moment to end: wait for its folder rather than be refused."""
+    """Wait for the folder's lock: the shard of a killed engine may take a moment to end."""
     since = time.monotonic()
     while lock.busy(folder / LOCK) and time.monotonic() - since < seconds:
         if time.monotonic() - since < 0.1:
-            progress.say(f"{folder}: another process works there; waiting up to {seconds:g} s")
+            progress.say(f"{folder}: another process uses this folder; waiting up to {seconds:g} s")
         time.sleep(0.2)
 
 
 def job_of(plan: BatchPlan, record: Record) -> Any:
-    """The `Job` or `MaterialJob` that a record of the plan says."""
+    """The `Job` or `MaterialJob` of a record of the plan."""
     out = plan.out / record.name
     if record.kind == "fit":
         from mistyle.fitting.pipeline.job import MaterialJob
@@ -142,8 +144,8 @@ def job_of(plan: BatchPlan, record: Record) -> Any:
         assert record.references is not None
         lights = record.lights if record.lights in (None, "unknown") else Path(record.lights)
         settings = MaterialSettings.model_validate(record.settings)
-        given = (record.mesh, record.references, out, settings, record.name, lights, record.masks, record.exposure)
-        return MaterialJob(*given, overwrite=plan.overwrite)
+        arguments = (record.mesh, record.references, out, settings, record.name, lights, record.masks, record.exposure)
+        return MaterialJob(*arguments, overwrite=plan.overwrite)
     from mistyle.stylization.pipeline.job import Job
     from mistyle.stylization.settings import Settings
 
@@ -163,12 +165,12 @@ def _run(plan: BatchPlan, record: Record, progress: Progress) -> dict[str, Any]:
 
 
 def stages_of(job: Record) -> Sequence[str]:
-    """The stages a job goes through, for those who show how far it is."""
+    """The stages of a job, for progress displays."""
     return tuple(MATERIAL_STAGES if job.kind == "fit" else STAGES)
 
 
 class FarmProgress(Progress):
-    """Says how far a shard is in the words of Open Job Description, one line each on stdout."""
+    """Progress of a shard in the stdout messages of Open Job Description."""
 
     def __init__(self, stages: int) -> None:
         super().__init__()
@@ -182,10 +184,10 @@ class FarmProgress(Progress):
 
 def _read(path: Path) -> dict[str, Any] | None:
     try:
-        told = read_own(path)
+        content = read_own(path)
     except (OSError, ValueError):
         return None
-    return told if isinstance(told, dict) else None
+    return content if isinstance(content, dict) else None
 
 
 def _write(path: Path, values: dict[str, Any]) -> None:

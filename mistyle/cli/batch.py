@@ -35,7 +35,7 @@ def _add_batch(verbs: Any) -> None:
         **examples(
             """
             mistyle batch jobs.toml -o OUT/                        [[job]] and [[grid]] entries; also .yaml
-            mistyle batch props/ -o OUT/ --dry-run                 every mesh in it with every picture in it
+            mistyle batch props/ -o OUT/ --dry-run                 every mesh of the folder with every picture
             mistyle batch jobs.toml -o OUT/ --workers 8 --watch    eight at a time, with a live table
             mistyle batch OUT/plan.json                            resume unfinished jobs
             mistyle batch jobs.toml -o /share/OUT --engine ray --address auto --gpus 0.5
@@ -45,8 +45,10 @@ def _add_batch(verbs: Any) -> None:
     verb.add_argument("jobs", type=Path, metavar="JOBS", help="a .toml or .yaml file, a folder, or a plan.json")
     verb.add_argument("-o", "--out", type=Path, metavar="OUT", help="folder of the whole batch")
     _add_machine_options(verb)
-    verb.add_argument("--engine", choices=["local", "ray"], default="local", help="processes here, or a Ray cluster")
-    verb.add_argument("--address", help="Ray: address of a running cluster, or auto; without it one of this machine")
+    verb.add_argument(
+        "--engine", choices=["local", "ray"], default="local", help="processes of this machine, or a Ray cluster"
+    )
+    verb.add_argument("--address", help="Ray: address of a running cluster, or auto (default: a new one, local)")
     verb.add_argument("--gpus", type=float, default=0.0, metavar="X", help="Ray: GPUs of each job, a share is allowed")
     verb.add_argument(
         "--wait", type=float, default=300.0, metavar="S", help="Ray: seconds without a started job before giving up"
@@ -64,7 +66,7 @@ def _add_batch(verbs: Any) -> None:
 
 def _pattern(text: str) -> str:
     if "{" not in text:
-        raise argparse.ArgumentTypeError(f"'{text}' would name every job alike; write {{mesh}}, {{style}} or {{v:03}}")
+        raise argparse.ArgumentTypeError(f"'{text}' names all jobs alike; write {{mesh}}, {{style}} or {{v:03}}")
     return text
 
 
@@ -145,13 +147,13 @@ def _add_pack(verbs: Any) -> None:
         help="write a folder that installs mistyle without a network",
         **examples(
             """
-            mistyle pack -o mistyle-offline/                   then there: ./install.sh /opt/mistyle
+            mistyle pack -o mistyle-offline/                   then, on the other machine: ./install.sh /opt/mistyle
             mistyle pack -o mistyle-offline/ --extras ray farm
             """
         ),
     )
     verb.add_argument("-o", "--out", type=Path, required=True, metavar="DIR")
-    verb.add_argument("--extras", nargs="+", default=[], metavar="NAME", help="optional parts to take along")
+    verb.add_argument("--extras", nargs="+", default=[], metavar="NAME", help="optional dependencies to include")
     add_overwrite_option(verb)
     verb.set_defaults(command=_pack)
 
@@ -181,11 +183,11 @@ def _batch(options: argparse.Namespace) -> int:
     )
     from mistyle.batch.plan import with_delivery
 
-    given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
-    plan = with_delivery(given, given_settings(options, DELIVERY_OPTIONS))
+    base = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
+    plan = with_delivery(base, given_settings(options, DELIVERY_OPTIONS))
     if options.dry_run:
-        told = dry_run(plan, choices)
-        print(json.dumps(told) if options.json else describe_dry_run(told))
+        estimate = dry_run(plan, choices)
+        print(json.dumps(estimate) if options.json else describe_dry_run(estimate))
         return 0
     summary = run_batch(plan, choices)
     if options.json:
@@ -202,7 +204,7 @@ def _shard(options: argparse.Namespace) -> int:
     plan = replace(read_plan(options.plan, path_maps(options.path_map)), overwrite=options.overwrite)
     chosen: Sequence[int] = indices(options.index, len(plan.jobs))
     if len(chosen) > 1:
-        return _several(options, chosen)
+        return _run_range(options, chosen)
     for index in chosen:
         farm = options.progress == "openjd"
         progress = FarmProgress(len(stages_of(plan.jobs[index]))) if farm else Progress()
@@ -211,17 +213,17 @@ def _shard(options: argparse.Namespace) -> int:
     return 0
 
 
-def _several(options: argparse.Namespace, chosen: Sequence[int]) -> int:
-    """Each shard of a range as a process of its own, one after the other; a failing one does not stop the rest."""
+def _run_range(options: argparse.Namespace, chosen: Sequence[int]) -> int:
+    """Run each shard of a range as a separate process, one after another; a failing shard does not stop the rest."""
     from mistyle.batch.engines import stopped
 
     worst = 0
     maps = [part for pair in options.path_map for part in ("--path-map", pair)]
     maps += ["--overwrite"] * options.overwrite
     for index in chosen:
-        line = [sys.executable, "-m", "mistyle", "shard", str(options.plan), "--index", str(index)]
+        command = [sys.executable, "-m", "mistyle", "shard", str(options.plan), "--index", str(index)]
         own = os.environ | {PARENT: str(os.getpid())}
-        child = subprocess.Popen([*line, "--progress", options.progress, *maps], env=own)
+        child = subprocess.Popen([*command, "--progress", options.progress, *maps], env=own)
         try:
             code = child.wait()
         except BaseException:
@@ -237,8 +239,8 @@ def _farm(options: argparse.Namespace) -> int:
     from mistyle.batch.plan import path_maps, with_delivery
 
     choices = Choices(workers=options.workers, threads=options.threads)
-    given = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
-    plan = with_delivery(given, given_settings(options, DELIVERY_OPTIONS))
+    base = replace(planned(options.jobs, options.out, choices), overwrite=options.overwrite)
+    plan = with_delivery(base, given_settings(options, DELIVERY_OPTIONS))
     needs = ShardNeeds(
         threads_each(choices),
         options.memory,

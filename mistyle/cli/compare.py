@@ -39,7 +39,7 @@ def add_compare(verbs: Any) -> None:
 def add_converge(verbs: Any) -> None:
     verb = verbs.add_parser(
         "converge",
-        help="measure how fast renderers converge: error against samples and seconds",
+        help="measure how fast renderers converge: error over samples and seconds",
         **examples(
             """
             mistyle converge room.xml --with mitsuba:path,mitsuba:direct -o curves/
@@ -97,17 +97,17 @@ def _converge(options: argparse.Namespace) -> int:
         overwrite=options.overwrite,
     )
     progress = Progress()
-    _tell_curves(options, converge(job, progress))
+    _print_curves(options, converge(job, progress))
     progress.tell_notes()
     return 0
 
 
 def _split(text: str) -> list[str]:
-    """A,B at commas; a command, which may hold commas of its own, stands alone."""
+    """A,B split at commas; a command (with '=') stays whole, since it may contain commas."""
     return [text] if "=" in text else text.split(",")
 
 
-def _tell_curves(options: argparse.Namespace, record: dict[str, Any]) -> None:
+def _print_curves(options: argparse.Namespace, record: dict[str, Any]) -> None:
     """Print the errors, slopes and efficiencies of every renderer."""
     from mistyle.comparison.converge import METRICS, without_nan
 
@@ -128,27 +128,27 @@ def _tell_curves(options: argparse.Namespace, record: dict[str, Any]) -> None:
 
 
 def _add_what(verb: argparse.ArgumentParser) -> None:
-    what = verb.add_argument_group("pictures and metrics")
-    what.add_argument("--metrics", metavar="A,B", help="only these (default: all; --list-metrics defines them)")
-    what.add_argument("--list-metrics", action="store_true", help="every metric with its definition, and stop")
-    what.add_argument("--layer", action="append", default=[], metavar="NAME", help="only this layer; may be repeated")
-    what.add_argument("--mask", metavar="alpha|FILE", help="pixels that count: the reference's alpha, or a picture")
-    what.add_argument(
+    group = verb.add_argument_group("pictures and metrics")
+    group.add_argument("--metrics", metavar="A,B", help="only these (default: all; --list-metrics defines them)")
+    group.add_argument("--list-metrics", action="store_true", help="every metric with its definition, and stop")
+    group.add_argument("--layer", action="append", default=[], metavar="NAME", help="only this layer; may be repeated")
+    group.add_argument("--mask", metavar="alpha|FILE", help="pixels to compare: the reference's alpha, or a picture")
+    group.add_argument(
         "--window", choices=["display", "overlap"], default="display", help="overlap: where both have data"
     )
-    what.add_argument(
+    group.add_argument(
         "--protocol", choices=["stanford-orb", "tensoir", "idiff"], help="the metrics of that evaluation code instead"
     )
-    what.add_argument("--ppd", type=float, metavar="N", help="pixels per degree for FLIP (default 67.02)")
-    what.add_argument("--peak", type=float, default=1.0, metavar="X", help="peak of the linear PSNR (default 1)")
-    what.add_argument(
+    group.add_argument("--ppd", type=float, metavar="N", help="pixels per degree for FLIP (default 67.02)")
+    group.add_argument("--peak", type=float, default=1.0, metavar="X", help="peak of the linear PSNR (default 1)")
+    group.add_argument(
         "--exposures", metavar="FIRST,LAST,N", help="stops for HDR-FLIP (default: derived from the reference)"
     )
-    what.add_argument(
+    group.add_argument(
         "--lpips", nargs=2, type=Path, metavar=("BACKBONE", "HEADS"), help="weights of LPIPS-squeeze v0.1"
     )
-    what.add_argument("--show", type=int, default=48, metavar="N", help="pictures of the N worst rows (default 48)")
-    what.add_argument("--crop", metavar="X,Y,W,H", help="also draw the inset figure: inset.png, inset.pdf")
+    group.add_argument("--show", type=int, default=48, metavar="N", help="pictures of the N worst rows (default 48)")
+    group.add_argument("--crop", metavar="X,Y,W,H", help="also draw the inset figure: inset.png, inset.pdf")
 
 
 def _add_limits(verb: argparse.ArgumentParser) -> None:
@@ -160,8 +160,8 @@ def _add_limits(verb: argparse.ArgumentParser) -> None:
     limits.add_argument(
         "--allow-missing", action="store_true", help="pictures that only one folder has do not fail the gate"
     )
-    limits.add_argument("--baseline", type=Path, metavar="DIR", help="the approved pictures: REFERENCE is not given")
-    limits.add_argument("--approve", action="append", default=[], metavar="NAME", help="take TEST's NAME into DIR")
+    limits.add_argument("--baseline", type=Path, metavar="DIR", help="the approved pictures, instead of REFERENCE")
+    limits.add_argument("--approve", action="append", default=[], metavar="NAME", help="copy TEST's NAME into DIR")
 
 
 def _add_render(verb: argparse.ArgumentParser) -> None:
@@ -201,7 +201,7 @@ def run_compare(options: argparse.Namespace) -> int:
     from mistyle.comparison.pipeline import compare
     from mistyle.jobs.progress import Progress
 
-    return told(options, compare(job, Progress()))
+    return print_record(options, compare(job, Progress()))
 
 
 def _compare_renders(options: argparse.Namespace) -> int:
@@ -227,7 +227,7 @@ def _compare_renders(options: argparse.Namespace) -> int:
         blender=options.blender,
         overwrite=options.overwrite,
     )
-    return told(options, compare_renders(job, partial(job_of, options), Progress()))
+    return print_record(options, compare_renders(job, partial(job_of, options), Progress()))
 
 
 def _list() -> int:
@@ -252,13 +252,13 @@ def _approve(options: argparse.Namespace) -> int:
 
 
 def job_of(options: argparse.Namespace, reference: Path | None = None, tests: tuple[Path, ...] = ()) -> Any:
-    """The job that the command line describes; with `reference`, of those pictures instead of the given ones."""
+    """The job of the command line; `reference` and `tests` replace the pictures of the command line."""
     from mistyle.comparison.limits import checked, parse, read_limits
     from mistyle.comparison.records import CompareJob
     from mistyle.measure.pictures.metrics import COLOUR, DATA, METRICS
 
     if reference is None:
-        reference, tests = _given(options)
+        reference, tests = _pictures_of(options)
     if options.out is None:
         raise UsageError("compare needs -o OUT")
     metrics = COLOUR + DATA
@@ -266,8 +266,10 @@ def job_of(options: argparse.Namespace, reference: Path | None = None, tests: tu
         metrics = tuple(checked(n.strip(), list(METRICS), "--metrics") for n in options.metrics.split(",") if n.strip())
     known = _protocol_names(options.protocol) if options.protocol else [n for n in metrics if _measured(n, options)]
     file = _limits_file(options, reference)
-    general, some = read_limits(file, known) if file is not None else ([], [])
-    said = [parse(text, "max", known) for text in options.max] + [parse(text, "min", known) for text in options.min]
+    general, specific = read_limits(file, known) if file is not None else ([], [])
+    from_options = [parse(text, "max", known) for text in options.max] + [
+        parse(text, "min", known) for text in options.min
+    ]
     safe(options.out, [reference, *tests])
     return CompareJob(
         reference=reference,
@@ -279,7 +281,7 @@ def job_of(options: argparse.Namespace, reference: Path | None = None, tests: tu
         mask=options.mask,
         viewing=_viewing(options),
         protocol=options.protocol,
-        limits=(*general, *said, *some),
+        limits=(*general, *from_options, *specific),
         allow_nonfinite=options.allow_nonfinite,
         allow_missing=options.allow_missing,
         pictures=options.show,
@@ -288,15 +290,15 @@ def job_of(options: argparse.Namespace, reference: Path | None = None, tests: tu
     )
 
 
-def _given(options: argparse.Namespace) -> tuple[Path, tuple[Path, ...]]:
-    given = list(options.pictures)
+def _pictures_of(options: argparse.Namespace) -> tuple[Path, tuple[Path, ...]]:
+    pictures = list(options.pictures)
     if options.baseline is not None:
-        if not given:
+        if not pictures:
             raise UsageError("--baseline DIR needs the new pictures: mistyle compare --baseline DIR TEST -o OUT")
-        return options.baseline, tuple(given)
-    if len(given) < 2:
+        return options.baseline, tuple(pictures)
+    if len(pictures) < 2:
         raise UsageError("compare needs REFERENCE and TEST; see mistyle compare --help")
-    return given[0], tuple(given[1:])
+    return pictures[0], tuple(pictures[1:])
 
 
 def _protocol_names(protocol: str) -> list[str]:
@@ -312,7 +314,7 @@ def _measured(name: str, options: argparse.Namespace) -> bool:
 
 
 def _limits_file(options: argparse.Namespace, reference: Path) -> Path | None:
-    """--limits, or the compare.toml that lies in the reference's folder."""
+    """--limits, or a compare.toml in the reference's folder."""
     if options.limits is not None:
         return options.limits
     beside = reference / "compare.toml"
@@ -320,7 +322,7 @@ def _limits_file(options: argparse.Namespace, reference: Path) -> Path | None:
 
 
 def safe(out: Path, inputs: list[Path]) -> None:
-    """UsageError where OUT holds an input: the next comparison would take this one's pictures for it."""
+    """UsageError where OUT contains an input: the next comparison would read this one's pictures as inputs."""
     for path in inputs:
         if path.resolve().is_relative_to(out.resolve()):
             raise UsageError(f"-o {out}: holds the input {path}; choose another folder")
@@ -366,7 +368,7 @@ def _crop(text: str | None) -> tuple[int, int, int, int] | None:
     return x, y, width, height
 
 
-def told(options: argparse.Namespace, record: dict[str, Any]) -> int:
+def print_record(options: argparse.Namespace, record: dict[str, Any]) -> int:
     """Print the record and return the exit code: 5 if a limit failed."""
     if options.json:
         print(json.dumps(record))
@@ -387,7 +389,9 @@ def _print(record: dict[str, Any], out: Path) -> None:
             continue
         print(f"{part['test']} [{part['layer']}], {part['images']} image(s), {part['failed']} failed")
         for name, value in part["values"].items():
-            mean, worst = (v if isinstance(v, str) else "n/a" if v is None else f"{v:.5g}" for v in _two(value))
+            mean, worst = (
+                v if isinstance(v, str) else "n/a" if v is None else f"{v:.5g}" for v in _mean_and_worst(value)
+            )
             several = f"   worst {worst}" if part["images"] > 1 else ""
             print(f"  {name:<12} {mean:>10}{several}")
     print("definitions of the metrics:")
@@ -396,5 +400,5 @@ def _print(record: dict[str, Any], out: Path) -> None:
     print(f"page      {out / 'index.html'}\ntables    {out / 'compare.csv'}, compare.json, junit.xml")
 
 
-def _two(value: dict[str, Any]) -> tuple[Any, Any]:
+def _mean_and_worst(value: dict[str, Any]) -> tuple[Any, Any]:
     return value["mean"], value["worst"]

@@ -15,11 +15,11 @@ MakeJob = Callable[..., Any]
 
 
 def add_demo(verbs: Any, add_options: Callable[[argparse.ArgumentParser], None]) -> argparse.ArgumentParser:
-    """`mistyle demo` with the options of `stylize` (`add_options`); its --style names a painting of ours instead."""
+    """`mistyle demo` with the options of `stylize` (`add_options`); its --style names a painting of `scenes/`."""
     verb = verbs.add_parser(
         "demo",
         conflict_handler="resolve",
-        help="stylize a mesh with a painting, both of which come with mistyle",
+        help="stylize a mesh with a painting, both included in mistyle",
         **examples(
             f"""
             mistyle demo                                 {PAINTINGS[DEFAULT].mesh} and {DEFAULT}, into mistyle-demo/
@@ -32,8 +32,8 @@ def add_demo(verbs: Any, add_options: Callable[[argparse.ArgumentParser], None])
     )
     verb.add_argument("-o", "--out", type=Path, default=Path("mistyle-demo"), help="run folder (default mistyle-demo)")
     add_options(verb)
-    words = "; ".join(f"{name}: {painting.words}" for name, painting in PAINTINGS.items())
-    verb.add_argument("--style", dest="painting", choices=list(PAINTINGS), help=f"{words} (default {DEFAULT})")
+    descriptions = "; ".join(f"{name}: {painting.words}" for name, painting in PAINTINGS.items())
+    verb.add_argument("--style", dest="painting", choices=list(PAINTINGS), help=f"{descriptions} (default {DEFAULT})")
     pairs = ", ".join(f"{p.mesh} for {name}" for name, p in PAINTINGS.items())
     verb.add_argument("--mesh", choices=list(MESHES), help=f"the mesh to paint (default: {pairs})")
     verb.add_argument("--all", action="store_true", help="all four paintings: OUT/STYLE/ for each, and OUT/demo.png")
@@ -41,13 +41,13 @@ def add_demo(verbs: Any, add_options: Callable[[argparse.ArgumentParser], None])
 
 
 def demo(options: argparse.Namespace, make_job: MakeJob, run_job: Callable[..., int]) -> int:
-    """Run the job or jobs that the options name. `make_job` and `run_job` take options, mesh, style, preset, name."""
+    """Run the job or jobs of the options. `make_job` and `run_job` take options, mesh, style, preset, name."""
     if not options.all:
         mesh, style = demo_files(options.painting, options.mesh)
         return run_job(options, mesh, style, "demo", asset_name(options, "demo"))
     if options.painting or options.variations:
-        other = "--style" if options.painting else "--variations"
-        raise UsageError(f"--all runs every painting once; leave out {other}, or --all")
+        option = "--style" if options.painting else "--variations"
+        raise UsageError(f"--all runs every painting once; leave out {option}, or --all")
     jobs = []
     for name in PAINTINGS:
         mesh, style = demo_files(name, options.mesh)
@@ -73,13 +73,13 @@ def _all(options: argparse.Namespace, jobs: list[Any]) -> int:
     from mistyle.jobs.progress import Progress
 
     progress = Progress()
-    made = run_all(jobs, options.out, progress, overwrite=options.overwrite)
+    results = run_all(jobs, options.out, progress, overwrite=options.overwrite)
     if options.json:
-        print(json.dumps(made))
+        print(json.dumps(results))
     else:
-        if made["sheet"]:
-            print(f"sheet     {made['sheet']}", file=sys.stderr)
-        for run in made["runs"]:
+        if results["sheet"]:
+            print(f"sheet     {results['sheet']}", file=sys.stderr)
+        for run in results["runs"]:
             print(f"report    {run['report']}", file=sys.stderr)
     progress.tell_notes()
     return 0

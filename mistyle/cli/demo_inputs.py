@@ -1,4 +1,4 @@
-"""What `mistyle demo` has to show: the meshes and paintings of `scenes/`, and all four results on one sheet."""
+"""Inputs of `mistyle demo`, the meshes and paintings of `scenes/`; and its sheet of all four results."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ ROW = 480  # pixels of a row of the sheet
 
 @dataclass(frozen=True)
 class DemoPainting:
-    """A painting of `scenes/`: its file, the mesh that it is shown on by default, and a few words."""
+    """A painting of `scenes/`: its file, its default mesh, and a short description."""
 
     file: str
     mesh: str
@@ -31,13 +31,13 @@ DEFAULT = "mosaic"
 
 
 def demo_files(style: str | None, mesh: str | None) -> tuple[Path, Path]:
-    """Mesh and painting for the names on the command line; None leaves the choice to us."""
+    """The files of a mesh and a painting by name; None: the default."""
     painting = PAINTINGS[style or DEFAULT]
     return scenes() / MESHES[mesh or painting.mesh], scenes() / painting.file
 
 
 def run_all(jobs: Sequence[Any], out: Path, progress: Any, *, overwrite: bool = False) -> dict[str, Any]:
-    """Run the jobs one after another and write OUT/demo.png, one row a job: mesh, painting, result.
+    """Run the jobs one after another and write OUT/demo.png, one row per job: mesh, painting, result.
 
     Returns the sheet's path ("" where no job wrote a report) and the summaries.
     """
@@ -60,7 +60,7 @@ def run_all(jobs: Sequence[Any], out: Path, progress: Any, *, overwrite: bool = 
 
 
 def _write_sheet(rows: Sequence[Path], folder: Path) -> None:
-    """The pictures below each other, ROW pixels high, on white, as wide as the widest."""
+    """Write the sheet: the pictures in a column on white, each ROW pixels high."""
     import numpy as np
     from PIL import Image
 

@@ -1,6 +1,6 @@
-"""`mistyle doctor`: what this machine has, what is missing, and the command that fixes each.
+"""`mistyle doctor`: present and missing parts of the environment, with the command that installs each.
 
-Runs on a Python that has nothing installed, too, since that is when it is asked.
+Runs also without installed packages, since it diagnoses that case.
 """
 
 import json as _json
@@ -16,33 +16,33 @@ ENVIRONMENT_MISSING = 4
 
 def main(json: bool = False) -> int:
     """Print the table (or one JSON object on stdout); 0 when the main job can run, else 4."""
-    found = facts.rows(cores())
+    rows = facts.rows(cores())
     if json:
-        table = [row._asdict() for row in found]
-        print(_json.dumps({"version": __version__, "works": works(found), "rows": table}, indent=1))
+        table = [row._asdict() for row in rows]
+        print(_json.dumps({"version": __version__, "works": works(rows), "rows": table}, indent=1))
     else:
-        _print(found)
-    return 0 if works(found) else ENVIRONMENT_MISSING
+        _print(rows)
+    return 0 if works(rows) else ENVIRONMENT_MISSING
 
 
-def _print(found: Sequence[Row]) -> None:
+def _print(rows: Sequence[Row]) -> None:
     try:
-        _print_rich(found)
+        _print_rich(rows)
     except ImportError:
-        width = max(len(row.name) for row in found)
-        for row in found:
+        width = max(len(row.name) for row in rows)
+        for row in rows:
             print(f"{row.state:<9} {row.name:<{width}}  {row.found}")
-    # Below the table, so that a terminal does not break the commands and they can be copied.
+    # Below the table, where a terminal does not wrap the commands and they can be copied.
     for title, state in (("To fix", "missing"), ("Optional", "optional")):
-        commands = [(row.name.strip(), row.fix) for row in found if row.state == state and row.fix]
+        commands = [(row.name.strip(), row.fix) for row in rows if row.state == state and row.fix]
         if commands:
             print(f"\n{title}:")
             for name, fix in commands:
                 print(f"  {name}: {fix}")
-    print("\nThe main job can run." if works(found) else "\nThe main job cannot run yet.")
+    print("\nThe main job can run." if works(rows) else "\nThe main job cannot run yet.")
 
 
-def _print_rich(found: Sequence[Row]) -> None:
+def _print_rich(rows: Sequence[Row]) -> None:
     from rich import box
     from rich.console import Console
     from rich.table import Table
@@ -52,7 +52,7 @@ def _print_rich(found: Sequence[Row]) -> None:
     table = Table(box=box.SIMPLE_HEAD)
     for title in ("", "what", "found"):
         table.add_column(title, overflow="fold")
-    for row in found:
+    for row in rows:
         table.add_row(Text(row.state, style=colours[row.state]), Text(row.name), Text(row.found))
     console = Console()
     console.print(table) if console.is_terminal else Console(width=160).print(table)

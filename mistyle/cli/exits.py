@@ -1,4 +1,4 @@
-"""How a command ends: its exit code, and one sentence on stderr for everything that was to be expected."""
+"""Exit codes of commands; every expected error becomes one sentence on stderr."""
 
 import argparse
 import json
@@ -12,7 +12,7 @@ Command = Callable[[argparse.Namespace], int]
 
 
 def run(command: Command, options: argparse.Namespace) -> int:
-    """Run a command, answering signals; returns the exit code. Only a mistake in mistyle itself shows a traceback."""
+    """Run a command with signal handling; returns the exit code. Only a bug of mistyle itself shows a traceback."""
     with stopping.listening():
         try:
             return command(options)

@@ -84,7 +84,7 @@ def add_verify(verbs: Any) -> None:
         help="open written files with independent readers, render them in Cycles and Mitsuba",
         **examples(
             """
-            mistyle verify out/                                  a run folder: its manifest, its GLB, what was delivered
+            mistyle verify out/                                  a run folder: its manifest, its GLB, its deliveries
             mistyle verify delivered/ --blender /opt/bpy/bin/python
             mistyle verify chair.glb -o checked/ --no-render
             """
@@ -112,8 +112,10 @@ def _verify(options: argparse.Namespace) -> int:
     rendering = None
     if not options.no_render:
         rendering = Rendering(options.views, options.size, options.spp, options.light, options.threads)
-    told = verify(options.asset, options.out, blender=options.blender, rendering=rendering, overwrite=options.overwrite)
+    record = verify(
+        options.asset, options.out, blender=options.blender, rendering=rendering, overwrite=options.overwrite
+    )
     if options.json:
-        print(json.dumps(told))
-    print(table(told), file=sys.stderr)
-    return 5 if told["failed"] else 0
+        print(json.dumps(record))
+    print(table(record), file=sys.stderr)
+    return 5 if record["failed"] else 0

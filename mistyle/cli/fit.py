@@ -56,7 +56,7 @@ def add_fit(verbs: Any) -> None:
         **examples(
             """
             mistyle fit chair.glb photographs/ -o fitted/                    camera.json or transforms.json, lights.json
-            mistyle fit chair.glb colmap/ -o fitted/ --align --light unknown  a COLMAP model, light not known
+            mistyle fit chair.glb colmap/ -o fitted/ --align --light unknown  a COLMAP model, unknown light
             mistyle fit helmet.glb renders/ -o fitted/ --uv new --metallic --material gltf
             mistyle fit chair.glb photographs/ -o fitted/ --dry-run          estimated time, memory and disk
             mistyle fit --scene room.xml --list                              parameters of a scene that can be fitted
@@ -84,40 +84,38 @@ def add_fit(verbs: Any) -> None:
 
 
 def _add_reference_options(verb: argparse.ArgumentParser) -> None:
-    given = verb.add_argument_group("the pictures")
-    given.add_argument(
+    group = verb.add_argument_group("the pictures")
+    group.add_argument(
         "--lights", type=Path, metavar="FILE", help="a lights.json (default: the one beside the cameras)"
     )
-    given.add_argument(
-        "--light", choices=["known", "unknown"], default="known", help="unknown: solve for the light too"
-    )
-    given.add_argument("--masks", type=Path, metavar="DIR", help="a mask per picture, by name; white counts")
-    given.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")
-    given.add_argument(
+    group.add_argument("--light", choices=["known", "unknown"], default="known", help="unknown: estimate the light too")
+    group.add_argument("--masks", type=Path, metavar="DIR", help="a mask per picture, by name; white pixels are valid")
+    group.add_argument("--exposure", type=Path, metavar="FILE", help="JSON: stops (ev) or factor of each picture")
+    group.add_argument(
         "--pictures", type=Path, metavar="DIR", help="folder of the pictures (default: the paths in the cameras' file)"
     )
-    given.add_argument(
+    group.add_argument(
         "--align", action="store_true", default=None, help="find the similarity from the mesh to the cameras' space"
     )
-    given.add_argument("--refine-poses", action="store_true", default=None, help="improve the cameras before fitting")
-    given.add_argument("--hold-out", type=int, metavar="N", help="hold N pictures out of the fit and measure them")
-    given.add_argument(
+    group.add_argument("--refine-poses", action="store_true", default=None, help="improve the cameras before fitting")
+    group.add_argument("--hold-out", type=int, metavar="N", help="hold N pictures out of the fit and measure them")
+    group.add_argument(
         "--hold-out-light", type=int, metavar="K", help="hold the pictures of the K-th light (from 0) out of the fit"
     )
 
 
 def _add_material_options(verb: argparse.ArgumentParser) -> None:
-    made = verb.add_argument_group("the material")
-    made.add_argument("--name", help=NAME_HELP.format(default=" (default: the mesh's)"))
-    made.add_argument("--atlas", type=int, metavar="N", help="texture size")
-    made.add_argument(
+    group = verb.add_argument_group("the material")
+    group.add_argument("--name", help=NAME_HELP.format(default=" (default: the mesh's)"))
+    group.add_argument("--atlas", type=int, metavar="N", help="texture size")
+    group.add_argument(
         "--material", choices=["principled", "gltf"], help="Mitsuba's principled (default), or glTF's for engines"
     )
-    made.add_argument("--frame", choices=["mikkt", "mitsuba"], help="tangent frame of the normal map (default mikkt)")
-    made.add_argument("--metallic", action="store_true", default=None, help="fit metalness too")
-    made.add_argument("--start", choices=["nothing", "own"], help="own: begin from the mesh's own material")
-    made.add_argument("--iterations", type=int, metavar="N", help="steps of the gradient stage")
-    made.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
+    group.add_argument("--frame", choices=["mikkt", "mitsuba"], help="tangent frame of the normal map (default mikkt)")
+    group.add_argument("--metallic", action="store_true", default=None, help="fit metalness too")
+    group.add_argument("--start", choices=["nothing", "own"], help="own: start from the mesh's own material")
+    group.add_argument("--iterations", type=int, metavar="N", help="steps of the gradient stage")
+    group.add_argument("--from", dest="redo_from", metavar="STAGE", help="redo this stage and all after it")
     add_report_option(verb)
     add_delivery_options(verb)
 
@@ -137,12 +135,12 @@ def _add_scene_options(verb: argparse.ArgumentParser) -> None:
         choices=["auto", "relative", "log_srgb_l1", "l2"],
         help="relative (default for noisy renders): squared, over the reference's square; free of noise bias",
     )
-    scene.add_argument("--spp", type=int, metavar="N", help="samples a pixel of a step's picture (default 16)")
+    scene.add_argument("--spp", type=int, metavar="N", help="samples per pixel of a step's picture (default 16)")
     scene.add_argument(
         "--spp-grad",
         type=int,
         metavar="N",
-        help="samples a pixel of its derivative (default 8 for numbers, 1 for textures)",
+        help="samples per pixel of the derivative (default 8 for numbers, 1 for textures)",
     )
     scene.add_argument(
         "--channels", metavar="PREFIX|A,B,C", help="channels of EXR references that hold more than R, G, B"
@@ -168,13 +166,13 @@ def run_fit(options: argparse.Namespace) -> int:
 
         sys.stdout.write(as_toml(settings))
         return 0
-    wrong = [f"--{name}" for name in _ONLY_SCENE if getattr(options, name)]
-    if wrong:
-        raise UsageError(f"{wrong[0].replace('_', '-')} belongs to --scene SCENE.xml; see mistyle fit --help")
+    misplaced = [f"--{name}" for name in _ONLY_SCENE if getattr(options, name)]
+    if misplaced:
+        raise UsageError(f"{misplaced[0].replace('_', '-')} belongs to --scene SCENE.xml; see mistyle fit --help")
     missing = [n for n in ("mesh", "references", "out") if getattr(options, n) is None]
     if missing:
-        wanted = ", ".join("-o OUT" if m == "out" else m.upper() for m in missing)
-        raise UsageError(f"fit needs {wanted} (or --scene SCENE.xml); see mistyle fit --help")
+        arguments = ", ".join("-o OUT" if m == "out" else m.upper() for m in missing)
+        raise UsageError(f"fit needs {arguments} (or --scene SCENE.xml); see mistyle fit --help")
     return _fit_mesh(options, settings)
 
 
@@ -183,8 +181,8 @@ def material_settings(options: argparse.Namespace) -> Any:
     from mistyle.fitting.settings.material import MATERIAL_PRESETS, MaterialSettings
     from mistyle.jobs.settings import resolve
 
-    said = given_settings(options, OPTIONS)
-    return resolve(options.preset, options.config, said, root=MaterialSettings, presets=MATERIAL_PRESETS)
+    chosen = given_settings(options, OPTIONS)
+    return resolve(options.preset, options.config, chosen, root=MaterialSettings, presets=MATERIAL_PRESETS)
 
 
 def _fit_scene(options: argparse.Namespace) -> int:
@@ -197,23 +195,23 @@ def _fit_scene(options: argparse.Namespace) -> int:
 
     if options.report is not None:
         raise UsageError("--report belongs to a fit of MESH and REFERENCES; fit --scene always writes its whole report")
-    said = given_settings(options, SCENE_OPTIONS)
-    settings = resolve(options.preset, options.config, said, root=SceneSettings, presets=SCENE_PRESETS)
+    chosen = given_settings(options, SCENE_OPTIONS)
+    settings = resolve(options.preset, options.config, chosen, root=SceneSettings, presets=SCENE_PRESETS)
     defines = given_defines(options.defines)
     if options.print_config:
         sys.stdout.write(as_toml(settings))
         return 0
     if options.list:
-        found = listed(loaded(options.scene, defines, settings))
-        print(json.dumps([list_row(p) for p in found]) if options.json else describe(found))
+        parameters = listed(loaded(options.scene, defines, settings))
+        print(json.dumps([list_row(p) for p in parameters]) if options.json else describe(parameters))
         return 0
     missing = [n for n, v in (("--references DIR", options.shots), ("-o OUT", options.out)) if v is None]
     if missing:
-        raise UsageError(f"fit --scene needs {' and '.join(missing)}; --list shows what can be fitted")
+        raise UsageError(f"fit --scene needs {' and '.join(missing)}; --list shows the parameters")
     name = names.asset_name(options.name, options.scene.stem)
-    given = (options.scene, options.shots, options.out, tuple(options.optimize), settings, name, defines)
+    arguments = (options.scene, options.shots, options.out, tuple(options.optimize), settings, name, defines)
     progress = Progress()
-    summary = fit_scene(SceneJob(*given, sensor=options.sensor, overwrite=options.overwrite), progress)
+    summary = fit_scene(SceneJob(*arguments, sensor=options.sensor, overwrite=options.overwrite), progress)
     if options.json:
         print(json.dumps(summary))
     else:

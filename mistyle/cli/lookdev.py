@@ -64,8 +64,8 @@ def _lookdev(options: argparse.Namespace) -> int:
     from mistyle.jobs.settings import validate
 
     names = LookSettings.model_fields
-    said = {name: value for name in names if (value := getattr(options, name, None)) is not None}
-    settings = validate(said, "lookdev", LookSettings)
+    chosen = {name: value for name in names if (value := getattr(options, name, None)) is not None}
+    settings = validate(chosen, "lookdev", LookSettings)
     progress = Progress()
     files = lookdev(
         options.asset,
@@ -76,14 +76,14 @@ def _lookdev(options: argparse.Namespace) -> int:
         date=options.date,
         overwrite=options.overwrite,
     )
-    told = files | {"notes": progress.notes}
-    print(json.dumps(told) if options.json else "\n".join(f"{k:<10} {v}" for k, v in files.items()))
+    record = files | {"notes": progress.notes}
+    print(json.dumps(record) if options.json else "\n".join(f"{k:<10} {v}" for k, v in files.items()))
     progress.tell_notes()
     return 0
 
 
 def report_of(place: Path) -> Path:
-    """The page of a run folder (or of its report folder, or the page itself), absolute."""
+    """The absolute path of the page of a run folder (or of its report folder, or of the page). Raises InputRefused."""
     candidates = [place] if place.suffix == ".html" else [place / "report" / "index.html", place / "index.html"]
     for path in candidates:
         if path.is_file():
@@ -95,7 +95,7 @@ def report_of(place: Path) -> Path:
 
 
 def has_display() -> bool:
-    """Whether a browser window can appear here."""
+    """Whether this machine can show a browser window."""
     if sys.platform in ("win32", "darwin"):
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY") or os.environ.get("BROWSER"))
@@ -116,7 +116,7 @@ def _view(options: argparse.Namespace) -> int:
     import socket
 
     print(
-        "no browser can open here. The report is one file that needs nothing else; bring it to a desk:\n"
+        "no browser on this machine. The report is one self-contained file; copy it to a desktop:\n"
         f"  scp {socket.gethostname()}:{page} .",
         file=sys.stderr,
     )

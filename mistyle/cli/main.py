@@ -1,4 +1,4 @@
-"""The command line. Nothing heavy is imported before a command runs, so that --help answers at once.
+"""The command line. Heavy modules are imported only when a command runs, so that --help answers at once.
 
 Exit codes: 0 done, 1 a job failed, 2 usage or settings, 3 input refused, 4 environment missing, 5 a quality gate
 failed, 75 stopped and resumable, 130 interrupted.
@@ -41,12 +41,12 @@ from mistyle.core.errors import UsageError
 Command = Callable[[argparse.Namespace], int]
 
 
-# What people use, in this order; --help lists every other verb after them.
+# The main verbs in the order of --help; the other verbs follow under "more".
 USED = ("demo", "stylize", "fit", "render", "bake", "compare", "lookdev", "batch", "export", "view")
 
 
 class _TwoGroups(argparse.RawDescriptionHelpFormatter):
-    """Lists the verbs of USED, then those left under "more"."""
+    """Lists the verbs of USED, then the others under "more"."""
 
     def _iter_indented_subactions(self, action: argparse.Action) -> Iterator[argparse.Action]:
         rank = {verb: k for k, verb in enumerate(USED)}
@@ -68,10 +68,10 @@ def parser() -> argparse.ArgumentParser:
         prog="mistyle",
         description="One mesh and one style picture in; the same mesh with stylized, physically based textures out.",
         epilog="examples:\n"
-        "  python3 -m mistyle demo                                 sets up and stylizes a mesh that comes along\n"
+        "  python3 -m mistyle demo                                 sets up and stylizes an included mesh\n"
         "  mistyle stylize bunny.obj starry_night.jpg -o out/      writes asset, textures and report\n"
         "  mistyle stylize --help                                  options and examples of a verb\n\n"
-        "mistyle doctor prints what this machine has, what is missing, and the command that fixes it.",
+        "mistyle doctor lists present and missing parts of the environment, with the commands that install them.",
         formatter_class=_TwoGroups,
     )
     top.add_argument("--version", action="version", version=f"mistyle {__version__}")
@@ -93,7 +93,7 @@ def parser() -> argparse.ArgumentParser:
     # Without help: the footer names it.
     doctor = verbs.add_parser(
         "doctor",
-        description="Prints what this machine has, what is missing, and the command that fixes it.",
+        description="Lists present and missing parts of the environment, with the commands that install them.",
         **examples("mistyle doctor --json"),
     )
     doctor.add_argument("--json", action="store_true", help="one JSON object on stdout")
@@ -318,16 +318,16 @@ def _rig(options: argparse.Namespace) -> dict[str, Any]:
 def _stylize(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
-    _need(options, "mesh", "style", "out")
+    _require(options, "mesh", "style", "out")
     return _run_job(options, options.mesh, options.style, None)
 
 
-def _need(options: argparse.Namespace, *names: str) -> None:
-    """UsageError for arguments that only --print-config does without."""
+def _require(options: argparse.Namespace, *names: str) -> None:
+    """UsageError for missing arguments, which only --print-config does not need."""
     missing = [name for name in names if getattr(options, name) is None]
     if missing:
-        wanted = ", ".join("-o OUT" if m == "out" else m.upper() for m in missing)
-        raise UsageError(f"{options.verb} needs {wanted}; see mistyle {options.verb} --help")
+        arguments = ", ".join("-o OUT" if m == "out" else m.upper() for m in missing)
+        raise UsageError(f"{options.verb} needs {arguments}; see mistyle {options.verb} --help")
 
 
 def _print_plan(options: argparse.Namespace, estimate: dict[str, Any]) -> int:
@@ -352,8 +352,8 @@ def _job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | Non
     from mistyle.stylization.pipeline.job import Job
 
     settings = _settings(options, preset)
-    called = name or asset_name(options, mesh.stem, style.stem)
-    return Job(mesh, style, options.out, settings, called, options.redo_from, options.overwrite)
+    title = name or asset_name(options, mesh.stem, style.stem)
+    return Job(mesh, style, options.out, settings, title, options.redo_from, options.overwrite)
 
 
 def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str | None, name: str | None = None) -> int:
@@ -367,19 +367,21 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
         return _print_plan(options, plan(job))
     progress = Progress()
     if options.preview and options.variations:
-        raise UsageError("--preview and --variations: give one of them; --variations shows several paintings")
+        raise UsageError("--preview and --variations exclude each other; --variations shows several paintings")
     if options.preview:
         from mistyle.stylization.pipeline.preview import preview
 
-        made = preview(job, progress)
-        print(json.dumps(made) if options.json else f"preview   {made['preview']}")
+        result = preview(job, progress)
+        print(json.dumps(result) if options.json else f"preview   {result['preview']}")
         progress.tell_notes()
         return 0
     if options.variations:
         from mistyle.stylization.pipeline.variations import sheet
 
-        made = sheet(mesh, style, options.out, settings, options.variations, progress, overwrite=options.overwrite)
-        print(json.dumps(made) if options.json else "\n".join([f"sheet     {made['sheet']}", *made["variations"]]))
+        result = sheet(mesh, style, options.out, settings, options.variations, progress, overwrite=options.overwrite)
+        print(
+            json.dumps(result) if options.json else "\n".join([f"sheet     {result['sheet']}", *result["variations"]])
+        )
         progress.tell_notes()
         return 0
     summary = stylize(job, progress)
@@ -396,7 +398,7 @@ def _run_job(options: argparse.Namespace, mesh: Path, style: Path, preset: str |
 def _render(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
-    _need(options, "mesh", "out")
+    _require(options, "mesh", "out")
     settings = _settings(options)
     if options.dry_run:
         from mistyle.stylization.pipeline.plan import plan_render
@@ -409,8 +411,8 @@ def _render(options: argparse.Namespace) -> int:
 
     progress = Progress()
     written = render_views(options.mesh, options.out, settings, progress, overwrite=options.overwrite)
-    told = {"views": [str(p) for p in written], "notes": progress.notes}
-    print(json.dumps(told) if options.json else f"views     {options.out}")
+    record = {"views": [str(p) for p in written], "notes": progress.notes}
+    print(json.dumps(record) if options.json else f"views     {options.out}")
     progress.tell_notes()
     return 0
 
@@ -418,20 +420,20 @@ def _render(options: argparse.Namespace) -> int:
 def _bake(options: argparse.Namespace) -> int:
     if options.print_config:
         return _print_config(options)
-    _need(options, "mesh", "views", "out")
-    settings, called = _settings(options), asset_name(options, options.mesh.stem)
+    _require(options, "mesh", "views", "out")
+    settings, title = _settings(options), asset_name(options, options.mesh.stem)
     if options.dry_run:
         from mistyle.stylization.pipeline.plan import plan_bake
         from mistyle.stylization.pipeline.single_stages import claim_baked
 
-        claim_baked(options.mesh, options.views, options.out, called, options.overwrite)
-        return _print_plan(options, plan_bake(options.mesh, options.views, options.out, settings, called))
+        claim_baked(options.mesh, options.views, options.out, title, options.overwrite)
+        return _print_plan(options, plan_bake(options.mesh, options.views, options.out, settings, title))
     from mistyle.jobs.progress import Progress
     from mistyle.stylization.pipeline.single_stages import bake_views
 
     progress = Progress()
     summary = bake_views(
-        options.mesh, options.views, options.out, settings, called, progress, overwrite=options.overwrite
+        options.mesh, options.views, options.out, settings, title, progress, overwrite=options.overwrite
     )
     print(json.dumps(summary) if options.json else f"asset     {summary['asset']}")
     progress.tell_notes()

@@ -1,4 +1,4 @@
-"""`mistyle models`: lists the models of the generative stages and fetches them on request."""
+"""`mistyle models`: lists, downloads, converts and adopts models of the generative stages."""
 
 import argparse
 import json
@@ -23,7 +23,7 @@ GENERATIVE_OPTIONS = {
 
 
 def add_model_options(verb: Any) -> None:
-    """Where models are found: for a verb, or a group of its options."""
+    """Options for the paths of models, on a verb or a group of its options."""
     verb.add_argument(
         "--models", type=Path, metavar="DIR", help="folder of models, as `mistyle models` lays it out (else HF's cache)"
     )
@@ -60,8 +60,8 @@ def add_models(verbs: Any) -> None:
             """
             mistyle models --models DIR                             present and missing models, and the layout
             mistyle models fetch sdxl depth canny --models DIR --allow-download
-            mistyle models convert position paint3d.bin --models DIR     a pickle once into safetensors
-            mistyle models adopt sdxl --models DIR                  take DIR/sdxl though it is not the published one
+            mistyle models convert position paint3d.bin --models DIR     a pickle into safetensors
+            mistyle models adopt sdxl --models DIR                  accept DIR/sdxl though its hashes differ
             """
         ),
     )
@@ -137,7 +137,7 @@ def _list(options: argparse.Namespace) -> int:
             print(f"  sha256 {value}{'…' * (len(value) < 64)}  {file}")
     print(
         "\nNothing is downloaded without --allow-download: mistyle models fetch NAME --models DIR --allow-download. "
-        "Each model's licence is yours to accept.\nRevisions and hashes come from other projects' lock files; they "
-        "are compared with what is fetched, and with what was copied there by hand."
+        "You accept each model's licence.\nRevisions and hashes come from other projects' lock files; downloaded and "
+        "copied files are checked against them."
     )
     return 0

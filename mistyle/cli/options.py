@@ -1,4 +1,4 @@
-"""Command line options that several verbs share, and how they become settings."""
+"""Command line options that several verbs share, and their conversion to settings."""
 
 import argparse
 import textwrap
@@ -10,7 +10,7 @@ from mistyle.core import names
 from mistyle.core.errors import UsageError
 
 PRESET_HELP = (
-    "draft: about a minute; standard (default); fine: 4096² and more steps; paper: the paper to the letter, with its "
+    "draft: about a minute; standard (default); fine: 4096² and more steps; paper: the paper's method with its "
     "diffusion models (see mistyle models)"
 )
 
@@ -27,7 +27,7 @@ def add_job_options(
     presets: Sequence[str] = ("draft", "standard", "fine", "paper"),
     preset_help: str = PRESET_HELP,
 ) -> None:
-    """Options that every job has; None: not given."""
+    """Options that every job has; None where the user sets nothing."""
     verb.add_argument("--preset", choices=presets, help=preset_help)
     verb.add_argument(
         "--config", type=Path, metavar="JOB.toml", help="settings from a file, as --print-config prints them"
@@ -47,7 +47,7 @@ def add_job_options(
 
 
 def add_overwrite_option(verb: argparse.ArgumentParser) -> None:
-    """Which files of an output folder may be replaced."""
+    """The option that allows replacing files of an output folder."""
     verb.add_argument(
         "--overwrite",
         action="store_true",
@@ -60,19 +60,17 @@ def gigabytes(text: str) -> float:
     number = text.strip().upper().removesuffix("B")
     factor = {"M": 1e-3, "G": 1.0, "T": 1e3}.get(number[-1:], 1.0)
     try:
-        found = float(number.rstrip("MGT")) * factor
+        size = float(number.rstrip("MGT")) * factor
     except ValueError:
-        found = 0.0
-    if not 0 < found < 1e5:
+        size = 0.0
+    if not 0 < size < 1e5:
         raise argparse.ArgumentTypeError(f"'{text}' is not a valid memory size; write 4G or 4096M")
-    return found
+    return size
 
 
 def add_memory_option(verb: argparse.ArgumentParser) -> None:
     """The memory budget of a job."""
-    verb.add_argument(
-        "--memory", type=gigabytes, metavar="4G", help="memory budget; a job that cannot keep it is refused"
-    )
+    verb.add_argument("--memory", type=gigabytes, metavar="4G", help="memory budget; a job that needs more is refused")
 
 
 # Option -> dotted setting, for `add_report_option`.
@@ -103,7 +101,7 @@ UNITS = {"mm": 0.001, "cm": 0.01, "m": 1.0, "": 1.0}
 
 
 def length(text: str) -> float:
-    """'3cm', '30mm', '0.03m' in metres; a bare number is in the mesh's own units, which are taken for metres."""
+    """'3cm', '30mm', '0.03m' in metres; a bare number is in the mesh's own units, which count as metres."""
     number = text.rstrip("cm")
     unit = text[len(number) :]
     try:
@@ -125,22 +123,22 @@ def add_paint_options(verb: argparse.ArgumentParser) -> None:
         "--style-mask", type=Path, metavar="MASK", help="use only the parts of the style where this picture is light"
     )
     verb.add_argument(
-        "--protect", type=Path, metavar="MASK", help="picture in the mesh's UVs: light parts keep their own look"
+        "--protect", type=Path, metavar="MASK", help="picture in the mesh's UVs: light parts keep their own material"
     )
     verb.add_argument(
         "--stroke-size",
         type=length,
         metavar="3cm",
-        help="width of a stroke (a 32nd of the picture) on the mesh, so that a set of props matches",
+        help="width of a stroke (a 32nd of the picture) on the mesh, equal for a set of props",
     )
     verb.add_argument(
-        "--keep-content", type=float, metavar="0..1", help="how far the mesh's own texture decides light and dark"
+        "--keep-content", type=float, metavar="0..1", help="weight of the mesh's own texture in light and dark"
     )
     verb.add_argument(
         "--palette-mix",
         type=float,
         metavar="0..1",
-        help="1 gives rare colours of the picture as much area as common ones",
+        help="1: rare colours of the picture cover as much area as common ones",
     )
     verb.add_argument(
         "--direction", choices=["curvature", "up", "around"], help="direction of strokes (default: the form)"
@@ -149,7 +147,7 @@ def add_paint_options(verb: argparse.ArgumentParser) -> None:
         "--direction-map",
         type=Path,
         metavar="PICTURE",
-        help="painted directions in the mesh's UVs, red along u and green along v (a flow map); grey: the form decides",
+        help="painted directions in the mesh's UVs, red along u and green along v (a flow map); grey: by the form",
     )
 
 
@@ -165,16 +163,16 @@ DELIVERY_OPTIONS = {
 
 def add_delivery_options(verb: argparse.ArgumentParser, where: str = "OUT/delivered/<target>") -> None:
     """Formats, targets and colour space of the files for other programs."""
-    made = verb.add_argument_group("for other programs", f"any of these writes files into {where}")
-    made.add_argument("--formats", action="append", metavar="F,F", help="glb,usd,mtlx,obj,maps (default maps,glb)")
-    made.add_argument(
+    group = verb.add_argument_group("for other programs", f"any of these writes files into {where}")
+    group.add_argument("--formats", action="append", metavar="F,F", help="glb,usd,mtlx,obj,maps (default maps,glb)")
+    group.add_argument(
         "--target", action="append", metavar="T,T", help="blender (default),unreal,unity-urp,unity-hdrp,houdini,arnold"
     )
-    made.add_argument(
+    group.add_argument(
         "--texture-name", metavar="PATTERN", help="texture files: {asset} {map} {udim} {ext} are filled in"
     )
-    made.add_argument("--metres-per-unit", type=float, metavar="X", help="metresPerUnit of USD (default 1)")
-    made.add_argument(
+    group.add_argument("--metres-per-unit", type=float, metavar="X", help="metresPerUnit of USD (default 1)")
+    group.add_argument(
         "--colorspace",
         metavar="NAME",
         help="linear space of EXR pictures in and EXR textures out, by its name in $OCIO or OpenColorIO's own config "
@@ -205,29 +203,29 @@ def add_mesh_options(verb: argparse.ArgumentParser) -> None:
 
 
 def given_settings(options: argparse.Namespace, names: Mapping[str, str]) -> dict[str, Any]:
-    """The settings given on the command line, nested; `names` maps options to dotted settings."""
+    """The settings of the command line, nested; `names` maps options to dotted settings."""
     from mistyle.jobs.settings import assignments, merge
 
-    said: dict[str, Any] = {}
+    result: dict[str, Any] = {}
     for option, key in names.items():
         value = getattr(options, option, None)
         if value is not None:
             leaf: Any = str(value) if isinstance(value, Path) else value
             for name in reversed(key.split(".")):
                 leaf = {name: leaf}
-            said = merge(said, leaf)
+            result = merge(result, leaf)
     name = getattr(options, "name", None)
     if name and "{" in name and "formats" in names:
-        said = merge(said, {"deliver": {"name": name}})
-    return merge(said, assignments(getattr(options, "set", []), "--set"))
+        result = merge(result, {"deliver": {"name": name}})
+    return merge(result, assignments(getattr(options, "set", []), "--set"))
 
 
 def given_defines(pairs: Sequence[str]) -> dict[str, str]:
-    """NAME=VALUE as -D has them."""
+    """The NAME=VALUE pairs of -D. Raises UsageError."""
     result = {}
     for pair in pairs:
         name, equals, value = pair.partition("=")
         if not equals or not name:
-            raise UsageError(f"-D {pair}: expected NAME=VALUE, as the mitsuba command has it")
+            raise UsageError(f"-D {pair}: expected NAME=VALUE, as for the mitsuba command")
         result[name] = value
     return result

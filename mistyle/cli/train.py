@@ -41,7 +41,7 @@ def add_train(verbs: Any) -> None:
     verb.add_argument("kind", nargs="?", choices=["style", "content"], help="style of a picture, or content of views")
     verb.add_argument("source", type=Path, nargs="?", metavar="PICTURE|VIEWS_DIR")
     verb.add_argument("-o", "--out", type=Path, metavar="DIR", help="folder of LoRAs; rerun to resume")
-    verb.add_argument("--word", help="the prompt's word for the picture (default [v] for style, [c] for content)")
+    verb.add_argument("--word", help="the prompt's token for the picture (default [v] for style, [c] for content)")
     verb.add_argument("--steps", type=int, metavar="N", help="steps of the first phase (default 1500)")
     add_model_options(verb)
     add_job_options(verb, ("draft", "standard"), "draft: a third of the steps; standard (default): ConsisLoRA's")
@@ -49,12 +49,12 @@ def add_train(verbs: Any) -> None:
 
 
 def run_train(options: argparse.Namespace) -> int:
-    """Train what is missing and print the files."""
+    """Train missing LoRAs and print the files."""
     from mistyle.jobs.settings import as_toml, resolve, thread_count
     from mistyle.stylization.diffusion.train_settings import TRAIN_PRESETS, TrainJobSettings
 
-    said = given_settings(options, OPTIONS)
-    settings = resolve(options.preset, options.config, said, root=TrainJobSettings, presets=TRAIN_PRESETS)
+    chosen = given_settings(options, OPTIONS)
+    settings = resolve(options.preset, options.config, chosen, root=TrainJobSettings, presets=TRAIN_PRESETS)
     if options.print_config:
         sys.stdout.write(as_toml(settings))
         return 0
@@ -73,8 +73,8 @@ def run_train(options: argparse.Namespace) -> int:
     progress = Progress()
     with bar(progress.say) as watch:
         folder = LoraFolder(options.out, options.overwrite)
-        made = make_all(settings.models, images, folder, settings.train, settings.seed, progress.say, watch)
-    files = [str(halves.style if options.kind == "style" else halves.content) for halves in made]
+        pairs = make_all(settings.models, images, folder, settings.train, settings.seed, progress.say, watch)
+    files = [str(halves.style if options.kind == "style" else halves.content) for halves in pairs]
     print(json.dumps({"loras": files}) if options.json else "\n".join(files))
     return 0
 
@@ -97,7 +97,7 @@ def training_set(kind: str, source: Path, word: str) -> "list[TrainingImage]":
 
 @contextmanager
 def bar(say: Callable[[str], None]) -> Iterator[Callable[[int, int, float], None]]:
-    """A progress bar with the mean loss over its weight on a terminal, a line now and then elsewhere."""
+    """A progress bar with the mean loss over its weight on a terminal, occasional lines elsewhere."""
     from mistyle.stylization.pipeline.generative import watcher
 
     if not sys.stderr.isatty():
@@ -114,7 +114,7 @@ def bar(say: Callable[[str], None]) -> Iterator[Callable[[int, int, float], None
 
         def watch(step: int, steps: int, loss: float) -> None:
             nonlocal mean
-            # Single steps' losses jump with their noise levels.
+            # The losses of single steps vary with their noise levels.
             mean = loss if mean == 0 else 0.98 * mean + 0.02 * loss
             bars.update(task, completed=step, total=steps, description=f"loss over weight {mean:.4f}")
 

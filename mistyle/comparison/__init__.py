@@ -1,1 +1,1 @@
-"""`mistyle compare` and `mistyle converge`: how renders differ, in numbers and pictures."""
+"""`mistyle compare` and `mistyle converge`: image metrics, error maps and convergence of renders."""

@@ -1,4 +1,4 @@
-"""Regression suites: a folder of approved pictures, and how a new picture gets into it."""
+"""Regression suites: a folder of approved pictures, and the approval of new ones."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -14,60 +14,62 @@ RECORD = "approved.json"
 
 
 def approve(baseline: Path, tests: Path, patterns: Sequence[str], *, overwrite: bool = False) -> list[str]:
-    """Copy the pictures of `tests` whose names fit one of `patterns` into `baseline`; returns their names.
+    """Copy the pictures of `tests` whose names match one of `patterns` into `baseline`; returns their names.
 
-    approved.json there notes the sha256 and the time of each. An older picture of the same name goes, whatever its
-    ending was. UsageError where a pattern fits nothing, and where an older picture is not as an approval left it,
-    unless `overwrite`.
+    approved.json in `baseline` records the sha256 and the time of each. Older pictures of the same name are removed,
+    whatever their extension. UsageError where a pattern matches nothing, and, without `overwrite`, where an older
+    picture has changed since its approval.
     """
     if not tests.is_dir():
-        raise UsageError(f"--approve takes pictures out of a folder; {tests} is none")
-    there = pictures_of(tests)
+        raise UsageError(f"--approve takes pictures from a folder; {tests} is not a folder")
+    available = pictures_of(tests)
     chosen: list[str] = []
     for pattern in patterns:
-        fitting = [name for name in there if fnmatchcase(name, pattern)]
-        if not fitting:
-            raise UsageError(f"--approve {pattern}: no picture of {tests} is called so; there are {_some(there)}")
-        chosen += [name for name in fitting if name not in chosen]
-    noted = _read(baseline)
-    older = {name: _older(baseline / name) for name in chosen}
+        matching = [name for name in available if fnmatchcase(name, pattern)]
+        if not matching:
+            raise UsageError(
+                f"--approve {pattern}: no picture of {tests} has this name; it has {_first_names(available)}"
+            )
+        chosen += [name for name in matching if name not in chosen]
+    approvals = _read(baseline)
+    older = {name: _same_stem(baseline / name) for name in chosen}
     if not overwrite:
-        _refuse_unknown(older, noted)
+        _refuse_unknown(older, approvals)
     for name in chosen:
-        target = baseline / f"{name}{there[name].suffix.lower()}"
-        atomic_write(target, there[name].read_bytes())
+        target = baseline / f"{name}{available[name].suffix.lower()}"
+        atomic_write(target, available[name].read_bytes())
         for old in older[name]:
             if old != target:
                 old.unlink()
-        noted[name] = {
+        approvals[name] = {
             "sha256": sha256_file(target),
             "approved": datetime.now(UTC).isoformat(timespec="seconds"),
         }
-    atomic_write(baseline / RECORD, (json.dumps(noted, indent=1, sort_keys=True) + "\n").encode())
+    atomic_write(baseline / RECORD, (json.dumps(approvals, indent=1, sort_keys=True) + "\n").encode())
     return chosen
 
 
-def _older(stem: Path) -> list[Path]:
-    """The pictures that are called like this one but for the ending."""
+def _same_stem(stem: Path) -> list[Path]:
+    """The pictures of this name with any extension."""
     if not stem.parent.is_dir():
         return []
     return [p for p in sorted(stem.parent.iterdir()) if p.suffix.lower() in ENDINGS and p.with_suffix("") == stem]
 
 
-def _refuse_unknown(older: Mapping[str, Sequence[Path]], noted: Mapping[str, Mapping[str, str]]) -> None:
-    """UsageError for the first picture that no approval wrote, or that has changed since."""
+def _refuse_unknown(older: Mapping[str, Sequence[Path]], approvals: Mapping[str, Mapping[str, str]]) -> None:
+    """UsageError for the first picture without an approval, or changed since its approval."""
     for name, pictures in older.items():
         for path in pictures:
-            if sha256_file(path) != noted.get(name, {}).get("sha256"):
+            if sha256_file(path) != approvals.get(name, {}).get("sha256"):
                 raise UsageError(
-                    f"{path}: no approval wrote this picture as it is ({RECORD} does not list it so), and it would be "
+                    f"{path}: no approval wrote this picture in its present form (see {RECORD}), and it would be "
                     "replaced. Move it away, or replace it with --overwrite"
                 )
 
 
-def _some(names: Sequence[str] | dict) -> str:
-    found = sorted(names)
-    return ", ".join(found[:5]) + (", …" if len(found) > 5 else "") if found else "none"
+def _first_names(names: Sequence[str] | dict) -> str:
+    ordered = sorted(names)
+    return ", ".join(ordered[:5]) + (", …" if len(ordered) > 5 else "") if ordered else "none"
 
 
 def _read(baseline: Path) -> dict[str, dict[str, str]]:

@@ -1,4 +1,4 @@
-"""`mistyle converge SCENE --with A,B`: error against samples and seconds, from independent seeds.
+"""`mistyle converge SCENE --with A,B`: error over samples and over seconds, from independent seeds.
 
 OUT/converge.json and .csv   every measurement; slopes, efficiency and their intervals
 OUT/index.html               the same with plots
@@ -36,7 +36,7 @@ FIRST_SEED = 1_000_003  # of the reference: none of the measured renders shares 
 
 @dataclass(frozen=True)
 class Measurement:
-    """One render: its renderer, samples a pixel, seed number, wall seconds of the render call, and its errors."""
+    """One render: its renderer, samples per pixel, seed, wall seconds of the render call, and its errors."""
 
     renderer: str
     spp: int
@@ -47,8 +47,8 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Converged:
-    """What is known of one renderer: per spp the mean and 95 % half-width of the error and seconds, the slope of
-    log error over log samples (mean and half-width over seeds), and log efficiency 1 / (relMSE · seconds) per seed."""
+    """Statistics of one renderer. Per spp: mean and 95 % half-width of the errors and seconds. Over seeds: mean and
+    half-width of the slope of log error over log samples. Per seed: log efficiency, log 1 / (relMSE · seconds)."""
 
     renderer: str
     spp: tuple[int, ...]
@@ -60,13 +60,13 @@ class Converged:
 
 @dataclass(frozen=True)
 class ConvergeJob:
-    """What is measured, how often, and where the result goes.
+    """A convergence measurement: the scene, the renderers, samples and seeds, and the output folder.
 
     renderers      as on the command line, such as mitsuba:path
     lights         of an asset: the name of a light, or a file
     sensor         of a scene file: the number of its sensor
     defines        of a scene file: its parameters
-    reference      the converged picture; None: the first renderer makes it with `reference_spp` samples a pixel
+    reference      the converged picture; None: the first renderer draws it with `reference_spp` samples per pixel
     reference_spp  0: 16 times max_spp
     threads        of blender:cycles, 0: all
     blender        the Python that has bpy
@@ -89,45 +89,45 @@ class ConvergeJob:
 
 
 def converge(job: ConvergeJob, progress: Progress) -> dict[str, Any]:
-    """Measure and write; returns what converge.json holds."""
+    """Measure and write; returns the content of converge.json."""
     chosen = [renderer(text, job.blender) for text in job.renderers]
     inputs = [path for path in (job.scene, job.reference) if path is not None]
     claim(job.out, FILES, inputs=inputs, overwrite=job.overwrite)
     counts = [2**k for k in range(int(math.log2(job.max_spp)) + 1)]
     with TemporaryDirectory(prefix="mistyle-") as work:
         path = _defined(job.scene, job.defines, Path(work))
-        what = subject(path, Path(work), chosen, job.threads)
-        shot = shots(what, [job.lights], 1, job.size)[job.sensor]
-        reference, said = _reference(job, what, shot, chosen[0], progress)
-        found, drew = measure(what, shot, chosen, counts, job.seeds, reference, progress)
-    missing = left_out(what) if any("mitsuba" in r.kind for r in chosen) else []
+        scene = subject(path, Path(work), chosen, job.threads)
+        shot = shots(scene, [job.lights], 1, job.size)[job.sensor]
+        reference, origin = _reference(job, scene, shot, chosen[0], progress)
+        measurements, renderer_versions = measure(scene, shot, chosen, counts, job.seeds, reference, progress)
+    missing = left_out(scene) if any("mitsuba" in r.kind for r in chosen) else []
     if missing:
-        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {job.scene.name} here.")
-    record = summary(found, [r.name for r in chosen], counts) | {
+        progress.note(f"Mitsuba does not draw {', '.join(missing)} of {job.scene.name}.")
+    record = summary(measurements, [r.name for r in chosen], counts) | {
         "scene": str(job.scene),
         "defines": [f"{name}={value}" for name, value in job.defines.items()],
         "shot": shot.name,
-        "reference": said,
+        "reference": origin,
         "definitions": definitions_of(),
-        "renderers": drew,
+        "renderers": renderer_versions,
         "versions": versions(),
         "notes": progress.notes,
     }
-    how = {"inputs": inputs, "overwrite": job.overwrite}
-    replace_files(job.out, "converge", lambda folder: write(folder, record, found), **how)
+    options = {"inputs": inputs, "overwrite": job.overwrite}
+    replace_files(job.out, "converge", lambda folder: write(folder, record, measurements), **options)
     return record
 
 
 def _defined(scene: Path, defines: Mapping[str, str], work: Path) -> Path:
-    """The scene file with its parameters as given, for every renderer; itself without any."""
+    """The scene file with its defines resolved, for every renderer; `scene` itself without defines."""
     if not defines:
         return scene
     from mistyle.render.live.source import resolved
 
     if scene.suffix.lower() != ".xml":
         name, value = next(iter(defines.items()))
-        said = f"-D {name}={value}"
-        raise UsageError(f"{said}: {scene.name} has no parameters; -D belongs to Mitsuba scene files (.xml)")
+        option = f"-D {name}={value}"
+        raise UsageError(f"{option}: {scene.name} has no parameters; -D belongs to Mitsuba scene files (.xml)")
     if not scene.is_file():
         raise InputRefused(f"{scene}: found nothing; expected a Mitsuba scene file. Check the path.")
     path = work / scene.name
@@ -135,26 +135,26 @@ def _defined(scene: Path, defines: Mapping[str, str], work: Path) -> Path:
     return path
 
 
-def _reference(job: ConvergeJob, what: Subject, shot: RenderView, first: Renderer, progress: Progress):
-    """The picture that errors are measured against, and a sentence about it."""
+def _reference(job: ConvergeJob, scene: Subject, shot: RenderView, first: Renderer, progress: Progress):
+    """The reference picture (linear), and a sentence about its origin."""
     if job.reference is not None:
         from mistyle.io.read import read_frame
 
         layer = read_frame(job.reference).layer("beauty")
         if layer is None:
             raise InputRefused(f"{job.reference}: found no R, G and B; expected the converged picture.")
-        return layer.values(), f"{job.reference.name}, as given"
+        return layer.values(), f"{job.reference.name}, from a file"
     spp = job.reference_spp or 16 * job.max_spp
     with progress.stage("reference", f"reference: {first.name}, {spp} samples a pixel"):
         parts = max(1, spp // 1024)
         seeds = [FIRST_SEED + k for k in range(parts)]
-        pictures = first.draw(what, shot, max(1, spp // parts), seeds).pictures
+        pictures = first.draw(scene, shot, max(1, spp // parts), seeds).pictures
     mean = np.mean(np.stack(pictures).astype(np.float64), axis=0)[..., :3].astype(np.float32)
     return mean, f"{first.name} with {spp} samples a pixel and seeds of its own"
 
 
 def measure(
-    what: Subject,
+    scene: Subject,
     shot: RenderView,
     chosen: Sequence[Renderer],
     counts: Sequence[int],
@@ -162,55 +162,55 @@ def measure(
     reference: Float[np.ndarray, "h w 3"],
     progress: Progress,
 ) -> tuple[list[Measurement], dict[str, str]]:
-    """Every render and its errors. At every number of samples a first render, which loads and compiles, counts not."""
+    """Every render with its errors, and each renderer's version. At every spp, a warm-up render is left out."""
     result: list[Measurement] = []
-    drew: dict[str, str] = {}
+    renderer_versions: dict[str, str] = {}
     whole = np.ones(reference.shape[:2], bool)
     with progress.stage("converge", f"{len(chosen)} renderers, {counts[-1]} samples a pixel at most") as report:
         done, total = 0.0, len(chosen) * sum(counts)
-        for j, how in enumerate(chosen):
+        for j, engine in enumerate(chosen):
             for spp in counts:
                 numbers = [1 + 1000 * j + s for s in range(seeds)]
-                found = how.draw(what, shot, spp, [FIRST_SEED - 1, *numbers])
-                drew[how.name] = found.version
-                drawn = zip(numbers, found.pictures[1:], found.seconds[1:], strict=True)
+                rendered = engine.draw(scene, shot, spp, [FIRST_SEED - 1, *numbers])
+                renderer_versions[engine.name] = rendered.version
+                drawn = zip(numbers, rendered.pictures[1:], rendered.seconds[1:], strict=True)
                 for seed, picture, seconds in drawn:
                     test = picture[..., :3]
                     if test.shape != reference.shape:
-                        raise InputRefused(f"{how.name}: found {test.shape} pixels; expected {reference.shape}.")
+                        raise InputRefused(f"{engine.name}: found {test.shape} pixels; expected {reference.shape}.")
                     counted = whole & np.isfinite(test).all(axis=-1)
                     values = dict(measure_colour(reference, test, counted, METRICS).values)
-                    result.append(Measurement(how.name, spp, seed, seconds, values))
+                    result.append(Measurement(engine.name, spp, seed, seconds, values))
                 done += spp
                 report(done / total)
-    return result, drew
+    return result, renderer_versions
 
 
-def converged(found: Sequence[Measurement], name: str, counts: Sequence[int]) -> Converged:
+def converged(measurements: Sequence[Measurement], name: str, counts: Sequence[int]) -> Converged:
     """The curves, slopes and efficiencies of one renderer."""
-    own = [m for m in found if m.renderer == name]
-    at = {spp: [m for m in own if m.spp == spp] for spp in counts}
+    own = [m for m in measurements if m.renderer == name]
+    by_spp = {spp: [m for m in own if m.spp == spp] for spp in counts}
     seeds = sorted({m.seed for m in own})
-    errors = {k: tuple(interval([m.values[k] for m in at[spp]]) for spp in counts) for k in METRICS}
+    errors = {k: tuple(interval([m.values[k] for m in by_spp[spp]]) for spp in counts) for k in METRICS}
     slopes = {}
     for key in METRICS:
-        each = [[next(m.values[key] for m in at[spp] if m.seed == seed) for spp in counts] for seed in seeds]
+        each = [[next(m.values[key] for m in by_spp[spp] if m.seed == seed) for spp in counts] for seed in seeds]
         slopes[key] = interval([slope(counts, line) for line in each])
-    last = at[counts[-1]]
+    last = by_spp[counts[-1]]
     efficiency = tuple(-math.log(max(m.values["relmse"] * m.seconds, 1e-300)) for m in last)
-    seconds = tuple(interval([m.seconds for m in at[spp]]) for spp in counts)
+    seconds = tuple(interval([m.seconds for m in by_spp[spp]]) for spp in counts)
     return Converged(name, tuple(counts), errors, seconds, slopes, efficiency)
 
 
-def summary(found: Sequence[Measurement], names: Sequence[str], counts: Sequence[int]) -> dict[str, Any]:
-    """The record: curves by renderer, and how many times as efficient as the first each of the others is."""
-    curves = [converged(found, name, counts) for name in names]
+def summary(measurements: Sequence[Measurement], names: Sequence[str], counts: Sequence[int]) -> dict[str, Any]:
+    """The record: curves per renderer, and the efficiency of each renderer relative to the first."""
+    curves = [converged(measurements, name, counts) for name in names]
     ratios = {}
-    for other in curves[1:]:
-        a, b = (np.array(c.efficiency) for c in (curves[0], other))
+    for curve in curves[1:]:
+        a, b = (np.array(c.efficiency) for c in (curves[0], curve))
         mean = float(b.mean() - a.mean())
         half = math.hypot(interval(a.tolist())[1], interval(b.tolist())[1])
-        ratios[other.renderer] = {"ratio": math.exp(mean), "low": math.exp(mean - half), "high": math.exp(mean + half)}
+        ratios[curve.renderer] = {"ratio": math.exp(mean), "low": math.exp(mean - half), "high": math.exp(mean + half)}
     rows = [
         {
             "renderer": c.renderer,
@@ -229,19 +229,19 @@ def definitions_of() -> dict[str, str]:
 
     return definitions(Viewing(), METRICS) | {
         "slope": "least squares of log error over log samples, per seed; mean and 95 % interval over seeds (Student's "
-        "t); a renderer that converges to another picture than the reference levels off",
-        "efficiency": "1 / (relMSE · seconds) at the most samples, over the first renderer's; the interval joins both "
-        "renderers' 95 % intervals of its logarithm",
+        "t); the curve of a biased renderer levels off",
+        "efficiency": "1 / (relMSE · seconds) at the most samples, relative to the first renderer; its interval joins "
+        "both renderers' 95 % intervals of its logarithm",
         "seconds": "wall time of the render call; loading and compilation happen before",
     }
 
 
-def write(out: Path, record: dict[str, Any], found: Sequence[Measurement]) -> None:
-    """converge.json, converge.csv and the page."""
+def write(out: Path, record: dict[str, Any], measurements: Sequence[Measurement]) -> None:
+    """Write converge.json, converge.csv and the page."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["renderer", "spp", "seed", "seconds", *METRICS])
-    for m in found:
+    for m in measurements:
         writer.writerow([m.renderer, m.spp, m.seed, repr(m.seconds), *(repr(m.values[k]) for k in METRICS)])
     atomic_write(out / "converge.csv", text.getvalue().encode())
     atomic_write(out / "converge.json", (json.dumps(without_nan(record), indent=1, allow_nan=False) + "\n").encode())
@@ -257,7 +257,7 @@ def without_nan(value: Any) -> Any:
 
 
 def charts(record: dict[str, Any]) -> list[Chart]:
-    """Each error over samples and over seconds, both by their logarithms."""
+    """Each error over samples and over seconds, on logarithmic axes."""
     result = []
     for key in METRICS:
         for label, axis in (("samples a pixel, log2", "spp"), ("seconds, log2", "seconds")):
@@ -266,7 +266,7 @@ def charts(record: dict[str, Any]) -> list[Chart]:
 
 
 def _chart(record: dict[str, Any], key: str, label: str, axis: str) -> Chart:
-    """Renderers differ in their seconds: every curve is laid onto the union of the axes, with gaps bridged."""
+    """One chart. Renderers differ in their seconds: every curve is interpolated on the union of the axes."""
     places = {}
     for row in record["curves"]:
         x = [math.log2(max(v[0] if axis == "seconds" else v, 1e-9)) for v in row[axis]]
@@ -281,19 +281,19 @@ def _chart(record: dict[str, Any], key: str, label: str, axis: str) -> Chart:
 
 
 def page(record: dict[str, Any]) -> str:
-    """The page as text; every text is escaped, scripts and connections are forbidden."""
+    """The page as HTML; every text is escaped, its policy forbids scripts and connections."""
     from markupsafe import Markup
 
     from mistyle.comparison.page import figure
     from mistyle.jobs.report.charts import svg
 
-    here = Path(__file__).parent
+    folder = Path(__file__).parent
 
     def number(value: Any) -> str:
         return figure(None if isinstance(value, float) and not math.isfinite(value) else value)
 
-    style = (here / "compare.css").read_text(encoding="utf-8")
-    return template(here / "converge.html.j2", figure=number).render(
+    style = (folder / "compare.css").read_text(encoding="utf-8")
+    return template(folder / "converge.html.j2", figure=number).render(
         record=record,
         metrics=METRICS,
         charts=[Markup(svg(chart)) for chart in charts(record)],  # the chart escapes its own texts

@@ -1,4 +1,4 @@
-"""The inset figure that papers print: the whole reference with a frame, and the framed crop of every picture."""
+"""The inset figure of --crop: the whole reference with a frame, and the crop of every picture."""
 
 import io
 from collections.abc import Sequence
@@ -29,7 +29,7 @@ def inset(job: CompareJob, pairs: Sequence[Match], folder: Path) -> None:
         raise ValueError("an inset figure needs a crop")
     whole = [m for m in pairs if m.reference is not None and m.test is not None]
     if not whole:
-        raise UsageError("--crop: no picture that both the reference and a test have")
+        raise UsageError("--crop: the reference and the tests have no picture in common")
     cells = []
     for match in (m for m in whole if m.name == whole[0].name):
         if match.reference is None or match.test is None:
@@ -47,8 +47,8 @@ def inset(job: CompareJob, pairs: Sequence[Match], folder: Path) -> None:
 
 
 def draw(cells: Sequence[tuple[str, Planes]], crop: tuple[int, int, int, int], ppd: float) -> Any:
-    """The figure as a Pillow image: the reference, then a column per picture with its crop, its LDR-FLIP map there
-    and the crop's mean FLIP (colours) or mean absolute difference."""
+    """The figure as a Pillow image: the reference, then a column per picture with the crop, its LDR-FLIP map (data
+    layers: absolute difference), and the mean of that map."""
     from PIL import Image, ImageDraw
 
     x, y, width, height = crop
@@ -81,7 +81,7 @@ def draw(cells: Sequence[tuple[str, Planes]], crop: tuple[int, int, int, int], p
 
 
 def _error(both: Planes, window: tuple[slice, slice], ppd: float) -> tuple[UInt8[np.ndarray, "h w 3"], str]:
-    """The error of the crop as a picture, and its mean in words; FLIP is taken of the whole picture, then cut."""
+    """The error map of the crop, and its mean as text; FLIP is computed on the whole picture, then cropped."""
     if both.kind == "colour":
         error = flip_map(*shown(both), ppd=ppd)[window]
         return heat(error), f"FLIP {error.mean():.4f}"
@@ -94,7 +94,7 @@ def _bytes(picture: np.ndarray) -> UInt8[np.ndarray, "h w 3"]:
 
 
 def _write(pen: Any, at: tuple[int, int], text: str, width: int) -> None:
-    """Text cut to the column."""
+    """Draw text, truncated to `width` pixels."""
     from PIL import ImageFont
 
     font = ImageFont.load_default(16)

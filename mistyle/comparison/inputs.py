@@ -1,4 +1,4 @@
-"""What is compared with what: files and folders by name, layers by name, windows laid over each other."""
+"""Pairs to compare: files and folders matched by name, layers matched by name, windows aligned."""
 
 import re
 from collections.abc import Sequence
@@ -28,10 +28,10 @@ class Match:
 
 @dataclass(frozen=True)
 class Planes:
-    """One layer of both pictures over the same pixels, float32 (h w c), and which pixels are compared.
+    """One layer of both pictures over the same pixels, float32 (h w c), and the mask of compared pixels.
 
-    `odd` marks pixels of which a channel is NaN or infinite in one picture (data layers: where the other has another
-    value there); they are not in `mask`. `bad` counts NaN and infinite pixels of the reference and of the test.
+    `odd` marks pixels with a NaN or infinite channel in either picture (data layers: only where the pictures differ);
+    `mask` excludes them. `bad` counts NaN and infinite pixels of the reference and of the test.
     """
 
     layer: str
@@ -44,29 +44,29 @@ class Planes:
 
 
 def matches(reference: Path, tests: Sequence[Path]) -> list[Match]:
-    """Every pair to compare, test by test; folders match by relative name, with other endings, or by frame number.
+    """Every pair to compare, test by test; folders match by relative name without extension, or by frame number.
 
-    A picture that only one folder has becomes a Match with None. InputRefused where there is nothing at all.
+    A picture that only one folder has becomes a Match with None. InputRefused without any pair.
     """
     names = labels(tests)
     if reference.is_dir():
-        wrong = [t for t in tests if not t.is_dir()]
-        if wrong:
-            raise UsageError(f"{reference} is a folder and {wrong[0]} is not: give folders, or one picture each")
+        files = [t for t in tests if not t.is_dir()]
+        if files:
+            raise UsageError(f"{reference} is a folder and {files[0]} is not: give folders, or one picture each")
         return [m for name, test in zip(names, tests, strict=True) for m in _folders(reference, test, name)]
     for path in (reference, *tests):
         if not path.exists():
             raise InputRefused(f"{path}: found nothing; expected a picture or a folder of frames. Check the path.")
-    found = []
+    pairs = []
     for name, test in zip(names, tests, strict=True):
         if test.is_dir():
             raise UsageError(f"{test} is a folder and {reference} is not: give folders, or one picture each")
-        found.append(Match(reference.stem, name, reference, test))
-    return found
+        pairs.append(Match(reference.stem, name, reference, test))
+    return pairs
 
 
 def labels(tests: Sequence[Path]) -> list[str]:
-    """Short names of the tests that tell them apart: the last parts of their paths."""
+    """Short distinct names of the tests: the last parts of their paths."""
     for depth in (1, 2, 3):
         names = ["/".join(t.with_suffix("").parts[-depth:]) if t.suffix else "/".join(t.parts[-depth:]) for t in tests]
         if len(set(names)) == len(names):
@@ -85,23 +85,23 @@ def _folders(reference: Path, test: Path, label: str) -> list[Match]:
             right = {by_number[0].get(number, name): right[name] for number, name in by_number[1].items()}
         else:
             raise InputRefused(
-                f"{test}: found {len(right)} pictures, none called like one of {reference} "
+                f"{test}: found {len(right)} pictures, none named as one of {reference} "
                 f"({', '.join(sorted(left)[:3])}); expected equal names, or one frame number each. Rename them."
             )
     return [Match(name, label, left.get(name), right.get(name)) for name in sorted({*left, *right})]
 
 
 def pictures_of(folder: Path) -> dict[str, Path]:
-    """Relative name without ending -> file; of two files that differ in the ending only, the EXR."""
+    """Relative name without extension -> file; EXR takes precedence over other extensions."""
     if not folder.is_dir():
         raise InputRefused(f"{folder}: found no folder; expected one with pictures. Check the path.")
-    found: dict[str, Path] = {}
+    pictures: dict[str, Path] = {}
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in ENDINGS and path.is_file() and not path.name.startswith("."):
             name = path.relative_to(folder).with_suffix("").as_posix()
-            if name not in found or path.suffix.lower() == ".exr":
-                found[name] = path
-    return found
+            if name not in pictures or path.suffix.lower() == ".exr":
+                pictures[name] = path
+    return pictures
 
 
 def _number(name: str) -> str | None:
@@ -110,20 +110,20 @@ def _number(name: str) -> str | None:
 
 
 def chosen_layers(
-    reference: LayeredPicture, test: LayeredPicture, wanted: Sequence[str]
+    reference: LayeredPicture, test: LayeredPicture, requested: Sequence[str]
 ) -> tuple[list[str], list[str]]:
-    """The names of the layers to compare, and sentences about those that only one picture has.
+    """The names of the layers to compare, and notes about layers that only one picture has.
 
-    `wanted` names them (InputRefused where a picture lacks one); empty: all that both have.
+    `requested` names them (InputRefused where a picture lacks one); empty: all common layers.
     """
     names = [layer.name for layer in reference.layers]
-    if wanted:
-        for name in wanted:
+    if requested:
+        for name in requested:
             for frame in (reference, test):
                 if frame.layer(name) is None:
-                    there = ", ".join(layer.name for layer in frame.layers)
-                    raise InputRefused(f"{frame.path}: found layers {there}; expected {name!r}. Name one of them.")
-        return list(wanted), []
+                    available = ", ".join(layer.name for layer in frame.layers)
+                    raise InputRefused(f"{frame.path}: found layers {available}; expected {name!r}. Name one of them.")
+        return list(requested), []
     both = [name for name in names if test.layer(name) is not None]
     if not both:
         theirs = ", ".join(layer.name for layer in test.layers)
@@ -144,12 +144,12 @@ def planes(
 ) -> Planes:
     """One layer of both frames over the same window. InputRefused where sizes, channels or colour spaces differ.
 
-    window  "display": the display window, which must have the same size, zero where a file has no data (as OpenEXR
-            means it); "overlap": only the pixels that both files have
+    window  "display": the display window, of equal size in both, zero outside a data window (as OpenEXR defines it);
+            "overlap": the intersection of the data windows
+    mask    (h w) of the display window: pixels to compare; None: all
 
-    Pixels of display windows of one size are matched from their top left corners, wherever those stand; of windows of
-    different sizes by absolute coordinates.
-    mask    (h w) of the display window: pixels that count; None: all
+    Display windows of equal size are aligned at their top left corners, windows of different size by absolute
+    coordinates.
     """
     a, b = _layer(reference, name), _layer(test, name)
     if a.channels != b.channels:
@@ -163,24 +163,24 @@ def planes(
     area = _window(a, b, reference, test, window)
     left, right = a.values(area), b.values(area)
     counted = np.ones(left.shape[:2], bool) if mask is None else _cut(mask, a.display, area, test.path)
-    return _sorted_out(name, a.kind, left, right, counted)
+    return _compared_pixels(name, a.kind, left, right, counted)
 
 
 def _layer(frame: LayeredPicture, name: str) -> Layer:
     layer = frame.layer(name)
     if layer is None:
-        raise InputRefused(f"{frame.path}: found no layer {name!r}; expected it, as the other picture has it.")
+        raise InputRefused(f"{frame.path}: found no layer {name!r}; expected it, since the other picture has it.")
     return layer
 
 
-def _window(a: Layer, b: Layer, reference: LayeredPicture, test: LayeredPicture, how: str) -> Window:
-    if how == "display":
+def _window(a: Layer, b: Layer, reference: LayeredPicture, test: LayeredPicture, mode: str) -> Window:
+    if mode == "display":
         if a.display == b.display:
             return a.display
         found, expected = (f"{w} x {h}" for _, _, w, h in (b.display, a.display))
         raise InputRefused(
             f"{test.path}: found {found} pixels; expected {expected} as {reference.path} has. Nothing is resampled: "
-            "render both at one size, or compare with --window overlap what the files have in common"
+            "render both at one size, or compare their common pixels with --window overlap"
         )
     x, y = max(a.window[0], b.window[0]), max(a.window[1], b.window[1])
     right = min(w[0] + w[2] for w in (a.window, b.window))
@@ -198,7 +198,7 @@ def _cut(mask: np.ndarray, display: Window, area: Window, path: Path) -> np.ndar
     return layer.values(area)[..., 0] > 0.5
 
 
-def _sorted_out(name: str, kind, left: np.ndarray, right: np.ndarray, counted: np.ndarray) -> Planes:
+def _compared_pixels(name: str, kind, left: np.ndarray, right: np.ndarray, counted: np.ndarray) -> Planes:
     bad = {}
     for who, values in (("reference", left), ("test", right)):
         bad[f"nan_{who}"] = int((np.isnan(values).any(axis=-1) & counted).sum())
@@ -206,24 +206,24 @@ def _sorted_out(name: str, kind, left: np.ndarray, right: np.ndarray, counted: n
     broken = ~(np.isfinite(left).all(axis=-1) & np.isfinite(right).all(axis=-1))
     odd = broken & counted
     if kind == "data" and odd.any():
-        # Depth is infinite where there is nothing; that is no error where both pictures say so.
+        # Background depth is infinite; equal infinities are not an error.
         same = ((left == right) | (np.isfinite(left) & np.isfinite(right))).all(axis=-1)
         odd &= ~same
     return Planes(name, kind, left, right, counted & ~broken, odd, bad)
 
 
 def read_mask(path: Path, frame: LayeredPicture) -> Bool[np.ndarray, "h w"]:
-    """A mask file: its luminance above one half, or its alpha where it has one that is not everywhere 1."""
+    """A mask file above one half: its alpha where that is not everywhere 1, else its sRGB-encoded grey value."""
     from mistyle.io.read import read_frame
 
-    given = read_frame(path)
-    layer = given.layer("alpha") or given.layer(BEAUTY) or given.layers[0]
+    picture = read_frame(path)
+    layer = picture.layer("alpha") or picture.layer(BEAUTY) or picture.layers[0]
     values = layer.values()
     return np.asarray(values.mean(axis=-1) > 0.5 if layer.kind == "data" else values.mean(axis=-1) > 0.2140)
 
 
 def alpha_mask(frame: LayeredPicture) -> Bool[np.ndarray, "h w"]:
-    """Where a picture's own alpha is above one half."""
+    """The pixels whose alpha exceeds one half. InputRefused without alpha."""
     alpha = frame.layer("alpha")
     if alpha is None:
         raise InputRefused(f"{frame.path}: found no alpha channel; expected one for --mask alpha. Give a mask file.")
@@ -231,7 +231,7 @@ def alpha_mask(frame: LayeredPicture) -> Bool[np.ndarray, "h w"]:
 
 
 def reduced(frame: LayeredPicture, test: LayeredPicture, factor: int) -> LayeredPicture:
-    """The frame at the test's size by means over `factor` x `factor` pixels, where it is exactly so much larger."""
+    """The frame averaged over `factor` x `factor` pixels, if it is exactly `factor` times the test's size."""
     wide, high = test.layers[0].display[2:]
     if any(x.display != (0, 0, wide * factor, high * factor) for x in frame.layers):
         return frame

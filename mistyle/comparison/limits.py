@@ -1,4 +1,4 @@
-"""Limits that a comparison must keep: from the command line and from compare.toml, for all images or for some."""
+"""Limits on the metrics of a comparison, from the command line and from compare.toml, for all images or some."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ EXPECTED = """expected tables of limits, as
 
 @dataclass(frozen=True)
 class Limit:
-    """`metric` may be at most (`max`) or must be at least (`min`) `value`, where both patterns fit."""
+    """An upper (`max`) or lower (`min`) bound on `metric`, for images and layers that match the patterns."""
 
     metric: str
     side: Side
@@ -29,13 +29,13 @@ class Limit:
     image: str = "*"
     layer: str = "*"
 
-    def kept(self, found: float) -> bool:
-        """NaN keeps no limit."""
-        return found <= self.value if self.side == "max" else found >= self.value
+    def holds(self, value: float) -> bool:
+        """Whether a value keeps the limit; NaN never does."""
+        return value <= self.value if self.side == "max" else value >= self.value
 
 
 def parse(text: str, side: Side, known: Sequence[str]) -> Limit:
-    """`flip=0.05` as a limit; UsageError names the metrics that there are."""
+    """`flip=0.05` as a limit; UsageError lists the known metrics."""
     name, equals, value = text.partition("=")
     try:
         number = float(value)
@@ -48,12 +48,12 @@ def parse(text: str, side: Side, known: Sequence[str]) -> Limit:
 
 def checked(name: str, known: Sequence[str], where: str) -> str:
     if name not in known:
-        raise UsageError(f"{where}: {name!r} is not measured here; expected one of {', '.join(known)}")
+        raise UsageError(f"{where}: {name!r} is not measured; expected one of {', '.join(known)}")
     return name
 
 
 def read_limits(path: Path, known: Sequence[str]) -> tuple[list[Limit], list[Limit]]:
-    """Of a compare.toml: the limits for all images, and those for some images or layers, in the file's order."""
+    """A compare.toml: the limits for all images, and those for some images or layers, in the file's order."""
     from mistyle.io.read import read_toml
 
     try:
@@ -78,7 +78,7 @@ def _table(value: Any, path: Path, where: str) -> Mapping[str, Any]:
 
 
 def _limits(table: Any, path: Path, where: str, known: Sequence[str], **patterns: str) -> list[Limit]:
-    found: list[Limit] = []
+    parsed: list[Limit] = []
     for side, values in _table(table, path, where).items():
         if side not in ("max", "min"):
             raise InputRefused(f"{path}: found {side!r} at {where}; {EXPECTED}")
@@ -86,14 +86,14 @@ def _limits(table: Any, path: Path, where: str, known: Sequence[str], **patterns
             if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
                 raise InputRefused(f"{path}: found {value!r} at {where}.{side}.{name}; expected a number")
             checked(name, known, f"{path}: {where}.{side}")
-            found.append(Limit(name, "max" if side == "max" else "min", float(value), **patterns))
-    return found
+            parsed.append(Limit(name, "max" if side == "max" else "min", float(value), **patterns))
+    return parsed
 
 
 def broken(limits: Sequence[Limit], image: str, layer: str, values: Mapping[str, float]) -> list[str]:
-    """Sentences about the limits that an image's layer does not keep; of several that fit, the last one counts.
+    """Messages about the limits that an image's layer exceeds; the last matching limit per metric and side counts.
 
-    A limit on a metric that this kind of layer does not have is passed over.
+    Limits on metrics that the layer does not have are ignored.
     """
     chosen: dict[tuple[str, str], Limit] = {}
     for limit in limits:
@@ -101,16 +101,16 @@ def broken(limits: Sequence[Limit], image: str, layer: str, values: Mapping[str,
             chosen[limit.metric, limit.side] = limit
     result = []
     for limit in chosen.values():
-        if limit.metric in values and not limit.kept(values[limit.metric]):
-            word = "above" if limit.side == "max" else "below"
-            found = values[limit.metric]
-            said = "could not be measured" if math.isnan(found) else f"is {found:.5g}, {word} {limit.value:g}"
-            result.append(f"{limit.metric} {said}")
+        if limit.metric in values and not limit.holds(values[limit.metric]):
+            direction = "above" if limit.side == "max" else "below"
+            value = values[limit.metric]
+            text = "could not be measured" if math.isnan(value) else f"is {value:.5g}, {direction} {limit.value:g}"
+            result.append(f"{limit.metric} {text}")
     return result
 
 
 def without_effect(limits: Sequence[Limit], rows: Sequence[tuple[str, str, Mapping[str, float]]]) -> list[str]:
-    """Sentences about limits that met no row at all: a typing mistake there would pass unseen."""
+    """Messages about limits that match no row, which are probably misspelt."""
     result = []
     for limit in limits:
         met = any(
@@ -119,5 +119,5 @@ def without_effect(limits: Sequence[Limit], rows: Sequence[tuple[str, str, Mappi
         )
         if not met:
             where = f" of images {limit.image!r}, layers {limit.layer!r}"
-            result.append(f"the limit {limit.side} {limit.metric}={limit.value:g}{where} met nothing that was compared")
+            result.append(f"the limit {limit.side} {limit.metric}={limit.value:g}{where} matched nothing")
     return result

@@ -1,4 +1,4 @@
-"""The comparison's page: one HTML file and the pictures beside it, from disk, with no network.
+"""The page of a comparison: one HTML file and a folder of pictures, usable from disk without a network.
 
 Every text is escaped (jinja2; the data block has no `<`). The content-security policy allows the page's own script and
 style by their hashes, pictures from its own folder, and nothing else.
@@ -16,18 +16,18 @@ from mistyle.measure.pictures.protocols import PROTOCOL_BETTER
 
 
 def page(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -> str:
-    """The page as text; `record` is compare.json's content, `written` says what pictures each folder has."""
+    """The page as HTML; `record` is compare.json's content, `written` maps a folder to its pictures."""
     from markupsafe import Markup
 
-    here = Path(__file__).parent
-    style, script = ((here / name).read_text(encoding="utf-8") for name in ("compare.css", "compare.js"))
+    folder = Path(__file__).parent
+    style, script = ((folder / name).read_text(encoding="utf-8") for name in ("compare.css", "compare.js"))
     names = list(dict.fromkeys(name for row in record["rows"] for name in row["values"]))
-    return template(here / "compare.html.j2", figure=figure).render(
+    return template(folder / "compare.html.j2", figure=figure).render(
         record=record,
         names=names,
         better={n: METRICS[n].better if n in METRICS else PROTOCOL_BETTER[n] for n in names},
         data=Markup(data_block(record, written)),
-        # Both files are ours and hold no text of others.
+        # Both files belong to mistyle and hold no foreign text.
         style=Markup(style),
         script=Markup(script),
         style_hash=csp_hash(style),
@@ -36,18 +36,18 @@ def page(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -> str:
 
 
 def data_block(record: Mapping[str, Any], written: Mapping[str, PairPictures]) -> str:
-    """JSON that cannot end the script element it stands in."""
+    """The page's data as JSON that cannot close its script element."""
     rows = [{**row, **_pictures(written.get(row["folder"]))} for row in record["rows"]]
     text = json.dumps({"rows": rows, "wide": WIDE, "stops": STOPS, "grey": GREY}, ensure_ascii=True, allow_nan=False)
     return text.replace("<", "\\u003c").replace(">", "\\u003e").replace("&", "\\u0026")
 
 
-def _pictures(found: PairPictures | None) -> dict[str, Any]:
-    return {} if found is None else {"wide": found.wide, "span": found.span, "maps": list(found.maps)}
+def _pictures(written: PairPictures | None) -> dict[str, Any]:
+    return {} if written is None else {"wide": written.wide, "span": written.span, "maps": list(written.maps)}
 
 
 def figure(value: Any) -> str:
-    """A number of the record as people read it."""
+    """A number of the record as text."""
     if value is None:
         return "–"
     if isinstance(value, str):

@@ -1,8 +1,8 @@
-"""The pictures beside a comparison's page: both renders, their difference, false colours, error maps, a histogram.
+"""Pictures of a comparison's page: both renders, their difference, false colours, error maps, a histogram.
 
-Everything is WebP that a browser shows from disk. NaN and infinite pixels are magenta in every picture. A render is
-stored twice where its values go beyond 1: as it looks at exposure 0, and with the curve (x / M)^(1 / WIDE) in eight
-bits, which the page's exposure filter undoes; M is the largest value worth showing.
+All are WebP. NaN and infinite pixels are magenta in every picture. A render with values above 1 is stored twice: at
+exposure 0, and with the curve (x / M)^(1 / WIDE) in 8 bits, which the page's exposure filter inverts. M is the 99.9th
+percentile of the reference, within 1..1024.
 """
 
 import io
@@ -21,7 +21,7 @@ from mistyle.jobs.report.false_colour import DIVERGING, RAINBOW, heat, mapped
 from mistyle.measure.pictures.metrics import encoded
 
 WIDE = 4.4
-LOSSLESS = 2_200_000  # pixels; larger pictures are stored with losses that are not seen
+LOSSLESS = 2_200_000  # pixels; larger pictures are stored with invisible losses
 LONGEST = 4096
 THUMB = 200
 NOT_A_NUMBER = (255, 0, 255)
@@ -31,8 +31,8 @@ GREY = 0.18
 
 @dataclass(frozen=True)
 class PairPictures:
-    """What the page must know of a pair's pictures: M of the wide curve (0: there is none), the range of the signed
-    difference, whether there is an error map, and the names of the maps."""
+    """A pair's pictures: M of the wide curve (0: no such picture), the range of the signed difference, and the names of
+    the error maps."""
 
     wide: float
     span: float
@@ -40,13 +40,13 @@ class PairPictures:
 
 
 def write_pictures(folder: Path, planes: Planes, maps: Mapping[str, np.ndarray], high: bool) -> PairPictures:
-    """Fill `folder` with a pair's pictures; `maps` are error maps (h w) by metric."""
+    """Write a pair's pictures into `folder`; `maps` are error maps (h w) by metric."""
     folder.mkdir(parents=True, exist_ok=True)
-    odd = _broken(planes)
+    odd = planes.odd
     looks = shown(planes)
     for name, picture in zip(("reference", "test"), looks, strict=True):
         save(folder / f"{name}.webp", picture, odd)
-    del looks  # of large pictures two more would not fit
+    del looks  # frees the memory of two large pictures
     wide = 0.0
     if high and planes.kind == "colour":
         wide = _most(planes)
@@ -69,30 +69,26 @@ def thumbnail(path: Path, planes: Planes, error: np.ndarray | None) -> None:
     size = (THUMB, max(1, min(4 * THUMB, round(height * THUMB / width))))
 
     def small(values: np.ndarray) -> np.ndarray:
-        found = cv2.resize(np.nan_to_num(values, posinf=1.0, neginf=0.0), size, interpolation=cv2.INTER_AREA)
-        return found.reshape(size[1], size[0], *values.shape[2:])
+        resized = cv2.resize(np.nan_to_num(values, posinf=1.0, neginf=0.0), size, interpolation=cv2.INTER_AREA)
+        return resized.reshape(size[1], size[0], *values.shape[2:])
 
-    # Averaged in linear light, and before anything is computed from every pixel of a large picture.
+    # Averaged in linear light, before any computation at the full size.
     odd = small(planes.odd.astype(np.float32)) > 0
-    few = replace(
+    reduced = replace(
         planes,
         reference=small(planes.reference),
         test=small(planes.test),
         mask=np.asarray(small(planes.mask.astype(np.float32)) > 0.5),
         odd=np.asarray(odd),
     )
-    looks = [*shown(few), heat(small(error)) if error is not None else signed(few)[0]]
+    looks = [*shown(reduced), heat(small(error)) if error is not None else signed(reduced)[0]]
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(webp(np.concatenate([_eight(p, few.odd) for p in looks], axis=1), 88))
-
-
-def _broken(planes: Planes) -> Bool[np.ndarray, "h w"]:
-    return planes.odd
+    path.write_bytes(webp(np.concatenate([_eight(p, reduced.odd) for p in looks], axis=1), 88))
 
 
 def shown(planes: Planes) -> list[np.ndarray]:
-    """How both pictures look, 0..1: colours sRGB-encoded and clipped, vectors as (v + 1) / 2, the rest spread over the
-    reference's range."""
+    """Both pictures for display, 0..1: colours sRGB-encoded and clipped, vectors as (v + 1) / 2, other data scaled to
+    the reference's range."""
     if planes.kind == "colour":
         return [encoded(np.nan_to_num(values, posinf=1.0)) for values in (planes.reference, planes.test)]
     low, high = _range(planes)
@@ -127,13 +123,13 @@ def _curve(values: np.ndarray, most: float) -> np.ndarray:
 
 
 def false_colours(linear: Float[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-    """Luminance in stops about middle grey 0.18, from STOPS[0] (dark blue) to STOPS[1] (dark red)."""
+    """Luminance in stops relative to middle grey 0.18, from STOPS[0] (dark blue) to STOPS[1] (dark red)."""
     bright = np.maximum(luminance(np.nan_to_num(linear, posinf=1e6)), 1e-9)
     return mapped((np.log2(bright / GREY) - STOPS[0]) / (STOPS[1] - STOPS[0]), RAINBOW)
 
 
 def signed(planes: Planes) -> tuple[UInt8[np.ndarray, "h w 3"], float]:
-    """Test minus reference (of colours: luminance), blue below and red above, and the range it is spread over."""
+    """Test minus reference (colours: luminance), blue below zero and red above, and the range of the colours."""
     a, b = (np.nan_to_num(v, posinf=0.0, neginf=0.0) for v in (planes.reference, planes.test))
     gap = luminance(b - a) if planes.kind == "colour" else (b - a).mean(axis=-1)
     inside = np.abs(gap[planes.mask])
@@ -150,13 +146,13 @@ def _eight(picture: np.ndarray, odd: np.ndarray | None) -> UInt8[np.ndarray, "h 
         picture = eight
     if odd is not None and odd.any():
         picture = picture.copy()
-        # A lone pixel would vanish when a large picture is scaled down.
+        # Dilated: a single pixel would vanish when a large picture is scaled down.
         picture[cv2.dilate(odd.view(np.uint8), np.ones((3, 3), np.uint8)) > 0] = NOT_A_NUMBER
     return np.ascontiguousarray(picture)
 
 
 def save(path: Path, picture: np.ndarray, odd: np.ndarray | None = None) -> None:
-    """A picture of floats 0..1 or bytes, at most LONGEST pixels wide or high."""
+    """Write a picture of floats 0..1 or bytes as WebP, at most LONGEST pixels wide or high."""
     eight = _eight(picture, odd)
     factor = LONGEST / max(eight.shape[:2])
     if factor < 1:
@@ -166,17 +162,17 @@ def save(path: Path, picture: np.ndarray, odd: np.ndarray | None = None) -> None
 
 
 def webp(eight: UInt8[np.ndarray, "h w 3"], quality: int | None) -> bytes:
-    """A WebP file; `quality` None stores every pixel as it is."""
+    """A WebP file; `quality` None is lossless."""
     from PIL import Image
 
     buffer = io.BytesIO()
-    how = dict(lossless=True, quality=0, method=0) if quality is None else dict(quality=quality, method=2)
-    Image.fromarray(eight).save(buffer, "WEBP", **how)
+    options = dict(lossless=True, quality=0, method=0) if quality is None else dict(quality=quality, method=2)
+    Image.fromarray(eight).save(buffer, "WEBP", **options)
     return buffer.getvalue()
 
 
 def histogram(planes: Planes) -> str:
-    """Both pictures' values as one SVG: colours by luminance in stops about 0.18, black pixels left out, the rest
+    """The histogram of both pictures as SVG: colours by luminance in stops relative to 0.18 without black pixels, data
     over the reference's range."""
     sides = []
     for values in (planes.reference[planes.mask], planes.test[planes.mask]):
@@ -209,18 +205,18 @@ def histogram(planes: Planes) -> str:
 def worst_regions(
     error: Float[np.ndarray, "h w"], mask: Bool[np.ndarray, "h w"], count: int = 5
 ) -> tuple[tuple[int, int, int, int, float], ...]:
-    """The windows (a sixteenth of the longer side, 16 pixels at least) of the largest mean error: x, y, width, height
-    and that mean; they do not overlap."""
+    """The disjoint windows of largest mean error (side: a sixteenth of the longer side, at least 16 pixels): x, y,
+    width, height and mean error."""
     height, width = error.shape
     side = min(max(16, max(height, width) // 16), height, width)
     masked = np.where(mask, error, 0).astype(np.float32)
     means = cv2.boxFilter(masked, -1, (side, side), anchor=(0, 0), borderType=cv2.BORDER_CONSTANT)
     means = means[: height - side + 1, : width - side + 1].copy()
-    found = []
+    regions = []
     for _ in range(count):
         y, x = np.unravel_index(int(means.argmax()), means.shape)
         if means[y, x] <= 0:
             break
-        found.append((int(x), int(y), side, side, float(means[y, x])))
+        regions.append((int(x), int(y), side, side, float(means[y, x])))
         means[max(0, y - side + 1) : y + side, max(0, x - side + 1) : x + side] = -1
-    return tuple(found)
+    return tuple(regions)

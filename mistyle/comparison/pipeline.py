@@ -1,7 +1,7 @@
 """`mistyle compare`: pictures against their references, one pair in memory at a time.
 
-OUT/index.html, OUT/pairs/   a page that works from disk and the pictures beside it
-OUT/compare.json, .csv, junit.xml   the same for machines
+OUT/index.html, OUT/pairs/   a page that works from disk, and its pictures
+OUT/compare.json, .csv, junit.xml   the same, machine-readable
 OUT/inset.png, inset.pdf     the figure of --crop
 """
 
@@ -31,21 +31,21 @@ from mistyle.measure.pictures import metrics, protocols
 from mistyle.measure.pictures.metrics import METRICS, MetricValues
 
 ALPHA = (
-    "EXR and HDR are taken as premultiplied; straight alpha (PNG, TIFF, WebP) is multiplied in, in linear light. "
-    "Pictures are compared over black; alpha is a layer of its own."
+    "EXR and HDR are treated as premultiplied; straight alpha (PNG, TIFF, WebP) is multiplied in linear light. "
+    "Pictures are compared over black; alpha is a separate layer."
 )
 NONFINITE = (
     "Pixels with a NaN or infinite channel are left out of every metric, magenta in every picture, and fail their row "
     "unless --allow-nonfinite; in data layers equal infinities (background depth) do not fail it."
 )
 FILES = ("compare.json", "compare.csv", "junit.xml", "index.html")
-# What a frame is ranked by: the first of these that it has.
+# The metric that ranks a frame: the first of these that it has.
 RANK = ("flip", "hdr_flip", "relmse", "psnr", "psnr_h", "rms_error", "rmse")
 
 
 @dataclass
 class ComparisonState:
-    """What has been compared so far (state: rows arrive one by one, and only the worst keep their pictures)."""
+    """The comparison so far: mutable, since rows arrive one by one and only the worst keep their pictures."""
 
     rows: list[ComparisonRow] = field(default_factory=list)
     written: dict[str, PairPictures] = field(default_factory=dict)
@@ -55,7 +55,7 @@ class ComparisonState:
 
 @dataclass(frozen=True)
 class _LayerPair:
-    """One layer of two pictures over the same window, and the files that it comes from."""
+    """One layer of two pictures over the same window, and its source files."""
 
     match: Match
     frames: tuple[LayeredPicture, LayeredPicture]
@@ -73,14 +73,14 @@ def compare(
     context: Mapping[str, Any] | None = None,
     extras: Callable[[Path], list[dict[str, Any]]] | None = None,
 ) -> dict[str, Any]:
-    """Compare everything, write the folder, and return what compare.json holds.
+    """Compare all pairs, write the folder, and return the content of compare.json.
 
-    `context` goes into it and onto the page (renderers, seeds, …). `extras` may add files to the folder and returns
-    pictures for the page: title, src (relative) and text. Failures are in the result's "failures"; nothing is raised
-    for them.
+    `context` appears in it and on the page (renderers, seeds, …). `extras` may add files to the folder and returns
+    pictures for the page: title, src (relative) and text. Failed rows do not raise; the result lists them in
+    "failures".
     """
     pairs = matches(job.reference, job.tests)
-    start, found = time.perf_counter(), ComparisonState()
+    start, state = time.perf_counter(), ComparisonState()
     result: dict[str, Any] = {}
 
     def write(folder: Path) -> None:
@@ -91,12 +91,14 @@ def compare(
                 inset(job, pairs, folder)
         with progress.stage("compare", f"compare {len(pairs)} picture{'s' * (len(pairs) != 1)}") as report:
             for k, match in enumerate(pairs):
-                _one(job, match, folder, found, lambda done, k=k: report((k + done) / len(pairs)), len(pairs) == 1)
+                _compare_pair(
+                    job, match, folder, state, lambda done, k=k: report((k + done) / len(pairs)), len(pairs) == 1
+                )
                 report((k + 1) / len(pairs))
-        overall = without_effect(job.limits, [(r.image, r.layer, r.values) for r in found.rows if r.size[0]])
-        result.update(_record(job, found, overall, time.perf_counter() - start, context or {}))
+        overall = without_effect(job.limits, [(r.image, r.layer, r.values) for r in state.rows if r.size[0]])
+        result.update(_record(job, state, overall, time.perf_counter() - start, context or {}))
         result["figures"] = extras(folder) if extras is not None else []
-        _write_files(folder, result, found, overall)
+        _write_files(folder, result, state, overall)
 
     inputs = [job.reference, *job.tests]
     claim(job.out, FILES, inputs=inputs, overwrite=job.overwrite)
@@ -104,13 +106,15 @@ def compare(
     return result
 
 
-def _one(job: CompareJob, match: Match, folder: Path, found: ComparisonState, report: Callable, alone: bool) -> None:
-    """Compare one picture; what is missing or refused becomes a failed row, except where it is all there is."""
+def _compare_pair(
+    job: CompareJob, match: Match, folder: Path, state: ComparisonState, report: Callable, alone: bool
+) -> None:
+    """Compare one pair. A missing or refused picture becomes a failed row; a refusal of the only pair is raised."""
     if match.reference is None or match.test is None:
         who = "the reference" if match.reference is None else "the test"
         missing = f"{who} has no picture of this name"
         failures = () if job.allow_missing else (missing,)
-        found.rows.append(ComparisonRow(match.name, match.test_name, "", failures=failures, notes=(missing,)))
+        state.rows.append(ComparisonRow(match.name, match.test_name, "", failures=failures, notes=(missing,)))
         return
     from mistyle.io.read import read_frame
 
@@ -122,12 +126,12 @@ def _one(job: CompareJob, match: Match, folder: Path, found: ComparisonState, re
         mask = _mask(job, reference)
         for k, name in enumerate(names):
             pair = _LayerPair(match, (reference, test), planes(reference, test, name, job.window, mask))
-            _layer(job, pair, notes, folder, found, lambda d, k=k: report((k + d) / len(names)))
+            _compare_layer(job, pair, notes, folder, state, lambda d, k=k: report((k + d) / len(names)))
             notes = []
     except InputRefused as error:
         if alone:
             raise
-        found.rows.append(ComparisonRow(match.name, match.test_name, "", failures=(f"refused: {error}",)))
+        state.rows.append(ComparisonRow(match.name, match.test_name, "", failures=(f"refused: {error}",)))
 
 
 def _mask(job: CompareJob, reference: LayeredPicture) -> np.ndarray | None:
@@ -136,17 +140,17 @@ def _mask(job: CompareJob, reference: LayeredPicture) -> np.ndarray | None:
     return alpha_mask(reference) if job.mask == "alpha" else read_mask(Path(job.mask), reference)
 
 
-def _layer(
+def _compare_layer(
     job: CompareJob,
     pair: _LayerPair,
     notes: Sequence[str],
     folder: Path,
-    found: ComparisonState,
+    state: ComparisonState,
     report: Callable[[float], None],
 ) -> None:
-    """Compare one layer: its row in `found`, and its pictures in `folder`."""
+    """Compare one layer: its row in `state`, and its pictures in `folder`."""
     match, frames, both, high = pair.match, pair.frames, pair.planes, pair.high
-    measured = _measure(job, pair, found, report)
+    measured = _measure(job, pair, state, report)
     odd = int(both.odd.sum())
     failures = [] if job.allow_nonfinite or not odd else [_nonfinite(both)]
     if not both.mask.any():
@@ -169,16 +173,16 @@ def _layer(
         failures=tuple(failures),
         notes=(*notes, *frames[0].notes, *frames[1].notes),
     )
-    place = f"pairs/{len(found.rows):05d}"
+    place = f"pairs/{len(state.rows):05d}"
     thumbnail(folder / f"{place}.webp", both, error)
-    if _worth_showing(job, row, place, folder, found):
-        found.written[place] = write_pictures(folder / place, both, measured.maps, high)
+    if _worth_showing(job, row, place, folder, state):
+        state.written[place] = write_pictures(folder / place, both, measured.maps, high)
         row = replace(row, folder=place)
-    found.rows.append(row)
+    state.rows.append(row)
 
 
 def _measure(
-    job: CompareJob, pair: _LayerPair, found: ComparisonState, report: Callable[[float], None]
+    job: CompareJob, pair: _LayerPair, state: ComparisonState, report: Callable[[float], None]
 ) -> MetricValues:
     both = pair.planes
     if job.protocol is not None:
@@ -191,10 +195,10 @@ def _measure(
     viewing = job.viewing
     if "hdr_flip" in names and viewing.exposures is None:
         key = (pair.match.name, both.layer)
-        if key not in found.exposures:
+        if key not in state.exposures:
             usable = (both.mask | both.odd) & np.isfinite(both.reference).all(axis=-1)
-            found.exposures[key] = metrics.flip_exposures(both.reference, usable)
-        viewing = replace(viewing, exposures=found.exposures[key])
+            state.exposures[key] = metrics.flip_exposures(both.reference, usable)
+        viewing = replace(viewing, exposures=state.exposures[key])
     return metrics.measure_colour(both.reference, both.test, both.mask, names, viewing, report)
 
 
@@ -210,7 +214,7 @@ def _protocol(job: CompareJob, frames: tuple[LayeredPicture, LayeredPicture], bo
 
 
 def _straight(frame: LayeredPicture, layer: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """sRGB-encoded colours that are not premultiplied, and alpha of the finished picture."""
+    """sRGB-encoded colours without premultiplication, and the alpha of the beauty layer."""
     alpha = frame.layer("alpha") if layer == BEAUTY else None
     if alpha is None:
         return metrics.encoded(values), None
@@ -219,7 +223,7 @@ def _straight(frame: LayeredPicture, layer: str, values: np.ndarray) -> tuple[np
 
 
 def _stored(frame: LayeredPicture, layer: str, values: np.ndarray) -> np.ndarray:
-    """What idiff sees: an EXR's values, another picture's encoded ones times alpha; alpha is a channel."""
+    """The channels for idiff: an EXR's values, else encoded colours times alpha; alpha is a channel."""
     if frame.high:
         alpha = frame.layer("alpha") if layer == BEAUTY else None
         return values if alpha is None else np.concatenate([values, alpha.values()], axis=2)
@@ -238,8 +242,8 @@ def _over_white(frame: LayeredPicture, layer: str, values: np.ndarray) -> np.nda
 
 
 def _nonfinite(both: Planes) -> str:
-    said = ", ".join(f"{n} {key.replace('_', ' in the ')}" for key, n in both.bad.items() if n)
-    return f"{int(both.odd.sum())} pixels are not finite ({said})"
+    counts = ", ".join(f"{n} {key.replace('_', ' in the ')}" for key, n in both.bad.items() if n)
+    return f"{int(both.odd.sum())} pixels are not finite ({counts})"
 
 
 def _plain_error(both: Planes) -> np.ndarray:
@@ -251,7 +255,7 @@ def _plain_error(both: Planes) -> np.ndarray:
 
 
 def badness(row: ComparisonRow) -> float:
-    """What rows are ordered by: larger is worse; failures and pixels that are not finite first."""
+    """The sort key of rows: larger is worse; failures and rows without metrics come first."""
     for name in RANK:
         if name in row.values:
             value = row.values[name]
@@ -263,27 +267,27 @@ def badness(row: ComparisonRow) -> float:
     return 1e9
 
 
-def _worth_showing(job: CompareJob, row: ComparisonRow, place: str, folder: Path, found: ComparisonState) -> bool:
-    """Whether the row is among the worst so far; the least bad of those loses its pictures where there are too many."""
+def _worth_showing(job: CompareJob, row: ComparisonRow, place: str, folder: Path, state: ComparisonState) -> bool:
+    """Whether the row is among the `job.pictures` worst so far; the best of those then loses its pictures."""
     if job.pictures <= 0:
         return False
-    entry = (badness(row), len(found.rows), place)
-    if len(found.heap) < job.pictures:
-        heapq.heappush(found.heap, entry)
+    entry = (badness(row), len(state.rows), place)
+    if len(state.heap) < job.pictures:
+        heapq.heappush(state.heap, entry)
         return True
-    if entry <= found.heap[0]:
+    if entry <= state.heap[0]:
         return False
-    _, index, gone = heapq.heapreplace(found.heap, entry)
-    shutil.rmtree(folder / gone, ignore_errors=True)
-    found.written.pop(gone, None)
-    found.rows[index] = replace(found.rows[index], folder="")
+    _, index, dropped = heapq.heapreplace(state.heap, entry)
+    shutil.rmtree(folder / dropped, ignore_errors=True)
+    state.written.pop(dropped, None)
+    state.rows[index] = replace(state.rows[index], folder="")
     return True
 
 
 def _record(
-    job: CompareJob, found: ComparisonState, overall: Sequence[str], seconds: float, context: Mapping
+    job: CompareJob, state: ComparisonState, overall: Sequence[str], seconds: float, context: Mapping
 ) -> dict[str, Any]:
-    rows = found.rows
+    rows = state.rows
     failed = [r for r in rows if r.failures]
     names = columns(rows)
     if job.protocol is None:
@@ -301,7 +305,7 @@ def _record(
         "limits": [f"{x.side} {x.metric}={x.value:g} of {x.image} [{x.layer}]" for x in job.limits],
         "summary": summary(rows),
         "rows": [row_record(r) for r in rows],
-        "failures": [f"{_called(r)}: {text}" for r in failed for text in r.failures] + list(overall),
+        "failures": [f"{_row_title(r)}: {text}" for r in failed for text in r.failures] + list(overall),
         "passed": not failed and not overall,
         "notes": grouped((r.image, text) for r in rows for text in r.notes),
         "context": dict(context),
@@ -311,7 +315,7 @@ def _record(
     }
 
 
-def _called(row: ComparisonRow) -> str:
+def _row_title(row: ComparisonRow) -> str:
     return f"{row.test}: {row.image}" + (f" [{row.layer}]" if row.layer else "")
 
 
@@ -322,15 +326,15 @@ def _mask_text(job: CompareJob) -> str:
 
 
 def summary(rows: Sequence[ComparisonRow]) -> list[dict[str, Any]]:
-    """Per test and layer: how many rows, how many failed, and the mean and worst of every metric."""
+    """Per test and layer: the number of rows and of failed rows, and the mean and worst of every metric."""
     result = []
     for test, layer in dict.fromkeys((r.test, r.layer) for r in rows):
         own = [r for r in rows if (r.test, r.layer) == (test, layer)]
         values: dict[str, Any] = {}
         for name in columns(own):
-            found = np.array([r.values[name] for r in own if name in r.values])
+            measured = np.array([r.values[name] for r in own if name in r.values])
             better = METRICS[name].better if name in METRICS else protocols.PROTOCOL_BETTER[name]
-            known = found[~np.isnan(found)]
+            known = measured[~np.isnan(measured)]
             worst = (known.max() if better == "lower" else known.min()) if len(known) else math.nan
             mean = known.mean() if len(known) else math.nan
             values[name] = {"mean": number(float(mean)), "worst": number(float(worst)), "better": better}
@@ -339,11 +343,11 @@ def summary(rows: Sequence[ComparisonRow]) -> list[dict[str, Any]]:
     return result
 
 
-def _write_files(folder: Path, record: dict[str, Any], found: ComparisonState, overall: Sequence[str]) -> None:
+def _write_files(folder: Path, record: dict[str, Any], state: ComparisonState, overall: Sequence[str]) -> None:
     from mistyle.comparison.page import page
 
     text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
     atomic_write(folder / "compare.json", text.encode("utf-8", "replace"))
-    atomic_write(folder / "compare.csv", csv_text(found.rows).encode("utf-8", "replace"))
-    atomic_write(folder / "junit.xml", junit_text(found.rows, overall).encode("utf-8", "replace"))
-    atomic_write(folder / "index.html", page(record, found.written).encode("utf-8", "replace"))
+    atomic_write(folder / "compare.csv", csv_text(state.rows).encode("utf-8", "replace"))
+    atomic_write(folder / "junit.xml", junit_text(state.rows, overall).encode("utf-8", "replace"))
+    atomic_write(folder / "index.html", page(record, state.written).encode("utf-8", "replace"))

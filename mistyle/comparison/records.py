@@ -1,4 +1,4 @@
-"""What a comparison is told and what it finds, and the files for machines: compare.json, compare.csv, junit.xml."""
+"""Records of a comparison: the job, its rows, and their machine-readable files compare.json, compare.csv, junit.xml."""
 
 import csv
 import io
@@ -19,15 +19,15 @@ Protocol = Literal["stanford-orb", "tensoir", "idiff"]
 class CompareJob:
     """One comparison.
 
-    metrics   names of measure/pictures/metrics.py; of a protocol, its own are measured instead
-    layers    layers to compare; empty: all that both pictures have
+    metrics   names of measure/pictures/metrics.py; a protocol replaces them by its own
+    layers    layers to compare; empty: all common layers
     window    "display" or "overlap" (comparison/inputs.py)
     mask      None, "alpha" (the reference's alpha above one half) or a mask file
-    limits    in order, the last one that fits an image counts
-    pictures  how many pictures the page shows, the worst ones
+    limits    in order; the last one that matches an image counts
+    pictures  number of pictures on the page, worst first
     crop      x, y, width, height of the inset figure
-    titles    what reference and tests are called on the page; empty: their paths
-    overwrite whether files of the same names that mistyle did not write are replaced in `out`
+    titles    titles of reference and tests on the page; empty: their paths
+    overwrite whether to replace files in `out` that mistyle did not write
     """
 
     reference: Path
@@ -52,10 +52,10 @@ class CompareJob:
 class ComparisonRow:
     """One layer of one picture of one test.
 
-    values     metric -> number; a metric that this layer does not have is not there
+    values     metric -> number, for the metrics of this kind of layer
     worst      x, y, width, height, error of the worst regions, worst first
-    folder     where its pictures are, relative to the page; "" without pictures
-    failures   sentences; empty where it passed
+    folder     folder of its pictures, relative to the page; "" without pictures
+    failures   messages; empty if it passed
     """
 
     image: str
@@ -82,7 +82,7 @@ def number(value: float) -> float | str | None:
 
 
 def row_record(row: ComparisonRow) -> dict[str, Any]:
-    """A row as compare.json and the page have it."""
+    """A row as a record of compare.json and of the page."""
     return {
         "image": row.image,
         "test": row.test,
@@ -107,7 +107,7 @@ def columns(rows: Sequence[ComparisonRow]) -> list[str]:
 
 
 def csv_text(rows: Sequence[ComparisonRow]) -> str:
-    """One line a row; cells that a spreadsheet would take for a formula begin with an apostrophe."""
+    """One line per row; an apostrophe protects cells that a spreadsheet could read as a formula."""
     names = columns(rows)
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
@@ -117,8 +117,8 @@ def csv_text(rows: Sequence[ComparisonRow]) -> str:
         values = ["" if name not in row.values else repr(float(row.values[name])) for name in names]
         counts = [row.bad.get(name, 0) for name in bad]
         status = "failed" if row.failures else "passed"
-        who = [_cell(text) for text in (row.image, row.test, row.layer)]
-        writer.writerow([*who, *row.size, row.pixels, *values, *counts, status, _cell("; ".join(row.failures))])
+        labels = [_cell(text) for text in (row.image, row.test, row.layer)]
+        writer.writerow([*labels, *row.size, row.pixels, *values, *counts, status, _cell("; ".join(row.failures))])
     return text.getvalue()
 
 
@@ -127,7 +127,7 @@ def _cell(text: str) -> str:
 
 
 def junit_text(rows: Sequence[ComparisonRow], overall: Sequence[str] = ()) -> str:
-    """JUnit XML: a suite per test, a case per image and layer; `overall` failures stand in a case of their own."""
+    """JUnit XML: a suite per test, a case per image and layer, and a separate case for `overall` failures."""
     root = ElementTree.Element("testsuites", name="mistyle compare")
     for test in dict.fromkeys(row.test for row in rows):
         own = [row for row in rows if row.test == test]
@@ -150,10 +150,10 @@ def _case(suite: ElementTree.Element, name: str, test: str, failures: Sequence[s
         text = "; ".join(failures)
         ElementTree.SubElement(case, "failure", message=_xml(text)).text = _xml(text)
     if values:
-        said = "\n".join(f"{k} = {v:.6g}" for k, v in values.items())
-        ElementTree.SubElement(case, "system-out").text = said
+        lines = "\n".join(f"{k} = {v:.6g}" for k, v in values.items())
+        ElementTree.SubElement(case, "system-out").text = lines
 
 
 def _xml(text: str) -> str:
-    """Without the control characters that XML cannot hold."""
+    """The text with U+FFFD for control characters that XML forbids."""
     return "".join(c if c in "\t\n" or 0x20 <= ord(c) < 0xD800 or 0xE000 <= ord(c) < 0xFFFE else "�" for c in text)

@@ -1,1 +1,1 @@
-"""Finished assets in the files that other programs open, and their verification."""
+"""Finished assets in the formats of other programs, and their verification."""

@@ -1,4 +1,4 @@
-"""The last stage: everything another program needs, in one folder.
+"""The asset folder, as every job writes it: GLB, textures, and a list of all files.
 
     <name>.glb                                       the asset with its textures inside
     textures/<name>_{albedo,normal,roughness,orm}.png   8 bits: albedo sRGB, the others linear
@@ -59,7 +59,7 @@ def write_asset(
     *,
     provenance: dict[str, Any],
 ) -> dict[str, Any]:
-    """`write_sets` of maps, occlusions and texels that are there already, one entry per part of the mesh each."""
+    """`write_sets` for sequences of maps, occlusions and texels, one entry per part of the mesh each."""
     return write_sets(folder, name, asset, zip(maps, occlusion, texels, strict=True), provenance=provenance)
 
 
@@ -73,14 +73,14 @@ def write_sets(
 ) -> dict[str, Any]:
     """Write GLB, textures and the list of files into `folder`; returns the list (the content of <name>.json).
 
-    `sets` gives maps, occlusion (1 is open) and texels of every part of the mesh in turn; one set is written before the
-    next is taken, and only its PNG files are kept. The maps arrive padded around their islands. glTF sources are
-    patched, all others written anew. `provenance` must hold JSON values and nothing that differs from run to run (no
-    times): it goes into the GLB and the list, and equal inputs give equal bytes.
+    `sets` yields maps, occlusion (1 is open) and texels of every part of the mesh in turn. One set is written before
+    the next is read; only its PNG files stay in memory. The maps are padded around their islands. A glTF source is
+    patched, any other format gets a new GLB. `provenance` holds JSON values that do not change between runs (no
+    times): it goes into the GLB and the list, so that equal inputs give equal bytes.
 
-    The folder is filled beside its place and put there when complete; what an earlier export of the same name wrote
-    and nobody edited goes, all other files stay. Raises UsageError for a name that is no file name, and where a file
-    that no export wrote has the name of a new one.
+    The folder is filled in a temporary place and moved when complete. Unedited files of an earlier export of the same
+    name are removed, all other files stay. UsageError for a name that is not a file name, and where a new file would
+    replace a file that no export wrote.
     """
     name = checked(name)
     result: dict[str, Any] = {}
@@ -94,14 +94,14 @@ def write_sets(
 
 def _write(new: Path, name: str, asset: Asset, sets, provenance: dict[str, Any]) -> dict[str, Any]:
     stems = part_stems(name, asset.mesh.parts)
-    found = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
+    alpha_by_part = cutouts(asset) if asset.source.kind in ("glb", "gltf") else {}
     pictures: list[Pictures] = []
     files: list[dict[str, Any]] = []
-    given = iter(sets)
+    remaining = iter(sets)
     for part, stem in enumerate(stems):
-        # No name here holds a set: it can go before the next one is made.
-        made, written = _write_set(new, stem, asset, found.get(part), next(given))
-        pictures.append(made)
+        # No variable of the loop holds a set: its memory is free before the next one is computed.
+        encoded, written = _write_set(new, stem, asset, alpha_by_part.get(part), next(remaining))
+        pictures.append(encoded)
         files += [_entry(new, path, part=asset.mesh.parts[part], **about) for path, about in written]
     write = patch_glb if asset.source.kind in ("glb", "gltf") else write_glb
     glb = new / f"{name}.glb"
@@ -132,11 +132,11 @@ def asset_names(name: str, parts: Sequence[str]) -> list[str]:
 
 
 def _write_set(
-    new: Path, stem: str, asset: Asset, cutout: Cutout | None, given: tuple[Maps, np.ndarray, Texels]
+    new: Path, stem: str, asset: Asset, cutout: Cutout | None, texture_set: tuple[Maps, np.ndarray, Texels]
 ) -> tuple[Pictures, list[tuple[Path, dict[str, Any]]]]:
-    """The PNG files of one part for the GLB, and its texture files with what to say about each."""
-    maps, occlusion, texels = given
-    alpha = None if cutout is None else _carried(asset, cutout, texels)
+    """The PNG files of one part for the GLB, and its texture files with their entries for the list."""
+    maps, occlusion, texels = texture_set
+    alpha = None if cutout is None else _source_alpha(asset, cutout, texels)
     pictures = encode_pictures(maps, occlusion, alpha)
     return pictures, _write_textures(new / "textures", stem, maps, occlusion, alpha, pictures)
 
@@ -144,8 +144,8 @@ def _write_set(
 def _write_textures(
     folder: Path, stem: str, maps: Maps, occlusion: np.ndarray, alpha: np.ndarray | None, pictures: Pictures
 ) -> list[tuple[Path, dict[str, Any]]]:
-    """The eight texture files of one part, and what to say about each."""
-    # One after another: of large atlases each takes much memory.
+    """The eight texture files of one part, each with its entry for the list."""
+    # One at a time: each array of a large atlas takes much memory.
     arrays = {
         "albedo": lambda: maps.albedo if alpha is None else np.concatenate([maps.albedo, alpha[..., None]], axis=-1),
         "normal": lambda: normal_colours(maps.normal),
@@ -181,20 +181,20 @@ def _entry(folder: Path, path: Path, **about: Any) -> dict[str, Any]:
 
 
 def _earlier(folder: Path, name: str) -> set[str]:
-    """What an earlier export of this name wrote, by its list, as far as it is there unchanged."""
+    """The unchanged files of an earlier export of this name, by its list."""
     own = f"{name}.json"
     try:
-        told = read_own(folder / own)
-        listed = {str(entry["file"]): entry["sha256"] for entry in told["files"]}
-        if not str(told["generator"]).startswith("mistyle "):
+        manifest = read_own(folder / own)
+        listed = {str(entry["file"]): entry["sha256"] for entry in manifest["files"]}
+        if not str(manifest["generator"]).startswith("mistyle "):
             return set()
     except (OSError, ValueError, LookupError, TypeError):
         return set()
     return {own, *(f for f, value in listed.items() if (folder / f).is_file() and sha256_file(folder / f) == value)}
 
 
-def _carried(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, "h w"]:
-    """Sample the file's alpha at every covered texel's place in the file's own UVs; around islands the nearest one."""
+def _source_alpha(asset: Asset, cutout: Cutout, texels: Texels) -> Float[np.ndarray, "h w"]:
+    """The source's alpha at every covered texel, sampled in the source's own UVs; the nearest value elsewhere."""
     rows, columns, face, weights = corner_weights(asset.mesh, texels)
     height, width = texels.covered.shape
     place = (weights[..., None] * cutout.uvs[face]).sum(axis=1)

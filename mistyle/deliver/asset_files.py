@@ -1,4 +1,4 @@
-"""The asset that other programs open, as every kind of job writes it."""
+"""The asset stage of every kind of job: occlusion, padding, edits, and the asset folder."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -24,30 +24,36 @@ def write(
     edited: Edited,
     own: int = 0,
 ) -> None:
-    """The files of the texture sets, each finished and written before the next is taken; `edited` holds textures that
-    a person painted over, `own` is as in `pad_maps`."""
+    """Write the asset, one texture set after another; `edited` holds textures that a person painted over, `own` is
+    that of `pad_maps`."""
     from mistyle.deliver.asset import write_sets
 
-    told = {**provenance, **edited.provenance}
-    write_sets(folder, job.name, asset, _finished(job, asset, sets, report, edited, own), provenance=told)
+    merged = {**provenance, **edited.provenance}
+    write_sets(folder, job.name, asset, _finished(job, asset, sets, report, edited, own), provenance=merged)
 
 
 def _finished(
     job: Any, asset: Asset, sets: Iterable[tuple[Texels, Maps]], report: Report, edited: Edited, own: int
 ) -> Iterator[tuple[Maps, np.ndarray, Texels]]:
-    """Each set with its occlusion, its islands continued outwards and a person's edits in it."""
-    stems, given = part_stems(job.name, asset.mesh.parts), iter(sets)
+    """Each set with occlusion, padding around its islands, and a person's edits."""
+    stems, remaining = part_stems(job.name, asset.mesh.parts), iter(sets)
     for part, stem in enumerate(stems):
-        # No name here holds a set: it can go before the next one is made.
-        yield _finish(job, asset, part, stem, next(given), report, (edited, own))
+        # No variable of the loop holds a set: its memory is free before the next one is computed.
+        yield _finish(job, asset, part, stem, next(remaining), report, (edited, own))
 
 
 def _finish(
-    job: Any, asset: Asset, part: int, stem: str, given: tuple[Texels, Maps], report: Report, how: tuple[Edited, int]
+    job: Any,
+    asset: Asset,
+    part: int,
+    stem: str,
+    texture_set: tuple[Texels, Maps],
+    report: Report,
+    options: tuple[Edited, int],
 ) -> tuple[Maps, np.ndarray, Texels]:
     from mistyle.atlas.texels import pad_maps
 
-    (texels, maps), (edited, own), s = given, how, job.settings
+    (texels, maps), (edited, own), s = texture_set, options, job.settings
     occlusion = ambient(asset, part, s.atlas.size, s.seed, report)
     (padded,), (occlusion,) = edited([stem], [pad_maps(maps, texels, s.atlas.padding, own)], [occlusion])
     return padded, occlusion, texels

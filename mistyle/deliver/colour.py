@@ -1,4 +1,4 @@
-"""Where colours come in: pictures in the spaces that the settings name, taken to what the program works in."""
+"""Input colour management: pictures in the colour spaces of the settings, converted to the working spaces."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -24,34 +24,34 @@ def light_space(colour: ColourSettings) -> Any:
 
 
 def picture_space(colour: ColourSettings) -> Any:
-    """The ColourSpace of encoded pictures, None where their profiles, else sRGB, are believed."""
+    """The ColourSpace of encoded pictures; None: their profiles, else sRGB."""
     from mistyle.io.images.ocio import colour_space
 
     return None if colour.pictures is None else colour_space(colour.pictures, colour.config, linear=False)
 
 
 def key_of(colour: ColourSettings) -> list[Any]:
-    """What the result depends on: the names, and the config's content where it is a file."""
+    """The part of a stage's key: the names of the spaces, and the config (by content if it is a file)."""
     named = colour.space or colour.pictures
     config = Path(colour.config) if named and colour.config and "://" not in colour.config else colour.config
     return [colour.space, colour.pictures, config if named else None]
 
 
 def read_style(path: Path, colour: ColourSettings) -> Picture:
-    """A style picture, sRGB-encoded Rec.709 as every stage wants it, whatever space it comes in.
+    """A style picture in any space, converted to sRGB-encoded Rec.709.
 
-    An .exr or .hdr is light in `colour.space` (linear Rec.709): it is clipped to 0..1, not tone-mapped, and `notes`
-    says so. Any other picture's numbers are taken as `colour.pictures` where that is set, profiles notwithstanding.
+    An .exr or .hdr is linear light in `colour.space` (default linear Rec.709): it is clipped to 0..1 without a tone
+    curve, with a note. Any other picture is in `colour.pictures` where that is set, whatever its profile.
     """
     from mistyle.io.read import read_picture
 
     if Path(path).suffix.lower() in LIGHT:
         return _style_of_light(Path(path), colour)
-    found, space = read_picture(path), picture_space(colour)
+    picture, space = read_picture(path), picture_space(colour)
     if space is None:
-        return found
+        return picture
     note = f"Colours were converted from '{space.name}' to sRGB."
-    return replace(found, rgb=srgb_from_linear(space.to_working(found.rgb)), notes=(*found.notes, note))
+    return replace(picture, rgb=srgb_from_linear(space.to_working(picture.rgb)), notes=(*picture.notes, note))
 
 
 def _style_of_light(path: Path, colour: ColourSettings) -> Picture:
@@ -75,7 +75,7 @@ def _style_of_light(path: Path, colour: ColourSettings) -> Picture:
 
 
 def in_working_space(captures: Captures, shots: Sequence[Any], colour: ColourSettings) -> Captures:
-    """References and the environment maps that lit them, as linear Rec.709; `shots` are the captures' files."""
+    """The captures with pictures and environment maps in linear Rec.709; `shots` are the captures' files."""
     light, encoded = light_space(colour), picture_space(colour)
     if light is None and encoded is None:
         return captures
@@ -86,7 +86,7 @@ def in_working_space(captures: Captures, shots: Sequence[Any], colour: ColourSet
             return (rgb if light is None else light.to_working(rgb)), counts
         if encoded is None:
             return rgb, counts
-        # What stands in the file, taken by its own curve instead of sRGB's.
+        # The reader decoded the file as sRGB: restore its values and decode them by their own curve.
         stored = srgb_from_linear(rgb * np.float32(shots[k].factor))
         return encoded.to_working(stored) / np.float32(shots[k].factor), counts
 
@@ -95,15 +95,15 @@ def in_working_space(captures: Captures, shots: Sequence[Any], colour: ColourSet
 
 
 def _converted(rigs: Sequence[Lights], space: Any) -> tuple[Lights, ...]:
-    """Environment maps that were read from files, each converted once."""
+    """The rigs with environment maps of EXR and HDR files converted to linear Rec.709, each once."""
     done: dict[int, Environment] = {}
 
-    def of(found: Any) -> Any:
-        if not isinstance(found, Environment) or Path(found.file or "").suffix.lower() not in LIGHT:
-            return found
-        if id(found) not in done:
-            radiance = np.maximum(space.to_working(found.radiance), 0).astype(np.float32)
-            done[id(found)] = replace(found, radiance=radiance)
-        return done[id(found)]
+    def convert(light: Any) -> Any:
+        if not isinstance(light, Environment) or Path(light.file or "").suffix.lower() not in LIGHT:
+            return light
+        if id(light) not in done:
+            radiance = np.maximum(space.to_working(light.radiance), 0).astype(np.float32)
+            done[id(light)] = replace(light, radiance=radiance)
+        return done[id(light)]
 
-    return tuple(tuple(of(x) for x in rig) for rig in rigs)
+    return tuple(tuple(convert(x) for x in rig) for rig in rigs)

@@ -1,11 +1,11 @@
-"""`mistyle export`, and the end of every job: a finished asset in the files that other programs want.
+"""`mistyle export`, and the last step of every job: a finished asset in the formats of other programs.
 
-OUT/<name>.glb .usda .usdz .mtlx .obj/.mtl         the formats asked for
+OUT/<name>.glb .usda .usdz .mtlx .obj/.mtl         the requested formats
 OUT/<mesh>_look.usda                               instead of .usda and .usdz, where the mesh came as USD
-OUT/textures/<name>_<map>[.<udim>].<ext>           packed as the target wants them
+OUT/textures/<name>_<map>[.<udim>].<ext>           packed for the target
 OUT/<name>.export.json                             every file with sha256, colour space and channels
 
-Deliveries of other names lie in the same folder untouched; the same name again replaces its own files.
+Deliveries of several names share the folder; a new delivery of the same name replaces only its own files.
 """
 
 import json
@@ -31,13 +31,13 @@ from mistyle.jobs.stages import program
 
 @dataclass(frozen=True)
 class DeliveryRequest:
-    """What is to be delivered.
+    """One delivery to a target.
 
     name             pattern of the delivered name: {asset} {mesh} {style} {target}, and {v}, one more than the highest
-                     version there; the latest version stays where asset, settings and program are the same
+                     version in the folder; the latest version stays for the same asset, settings and program
     names            pattern of texture files: {asset} (the delivered name), {map}, {ext}, and {udim} for tiles
-    metres_per_unit  what USD says of the mesh's units
-    source           where the mesh file of a USD look lies now, if it was moved
+    metres_per_unit  metresPerUnit of USD
+    source           path of the mesh file of a USD look, if it was moved
     """
 
     formats: Sequence[str]
@@ -52,26 +52,35 @@ class DeliveryRequest:
 def export(
     place: Path,
     out: Path,
-    wanted: DeliveryRequest,
+    request: DeliveryRequest,
     *,
     overwrite: bool = False,
     note: Callable[..., None] = lambda *sentences: None,
 ) -> list[Path]:
-    """Deliver the asset found at `place` into the folder `out`; returns the delivery's files.
+    """Deliver the asset at `place` into the folder `out`; returns the delivery's files.
 
-    `note` gets sentences about the files. UsageError for a request that cannot be met.
+    `note` receives notes about the files. UsageError for an unknown format, target or name pattern.
     """
-    _check_request(wanted)
-    formats, target, source = tuple(wanted.formats), wanted.target, wanted.source
+    _check_request(request)
+    formats, target, source = tuple(request.formats), request.target, request.source
     folder, manifest = read_listing(place)
     files = [p for p in sorted(folder.rglob("*")) if p.is_file() and p.name != "done.json"]
     of = digest(
-        [program(), files, list(formats), target, wanted.names, wanted.metres_per_unit, key_of(wanted.colour), source]
+        [
+            program(),
+            files,
+            list(formats),
+            target,
+            request.names,
+            request.metres_per_unit,
+            key_of(request.colour),
+            source,
+        ]
     )
-    called, version = _called(out, wanted.name, fields_for(manifest, target), of)
-    space = light_space(wanted.colour)
-    chosen = Delivery(formats, target, called, version, wanted.names, wanted.metres_per_unit, space, source)
-    if not _whole(out, called, of):
+    called, version = _versioned_name(out, request.name, fields_for(manifest, target), of)
+    space = light_space(request.colour)
+    chosen = Delivery(formats, target, called, version, request.names, request.metres_per_unit, space, source)
+    if not _is_current(out, called, of):
         inputs = [place, folder, *([source] if source else [])]
         claim(out, named_files(chosen), inputs=inputs, overwrite=overwrite)
         finished = read_finished(place)
@@ -84,22 +93,22 @@ def export(
     return sorted([out / f"{called}.export.json", *(out / str(e["file"]) for e in record["files"])])
 
 
-def _check_request(wanted: DeliveryRequest) -> None:
-    wrong = [f for f in wanted.formats if f not in FORMATS]
-    if wrong or wanted.target not in TARGETS:
+def _check_request(request: DeliveryRequest) -> None:
+    unknown = [f for f in request.formats if f not in FORMATS]
+    if unknown or request.target not in TARGETS:
         offered = f"formats {', '.join(FORMATS)}; targets {', '.join(TARGETS)}"
-        raise UsageError(f"'{wrong[0] if wrong else wanted.target}' cannot be written; expected {offered}")
+        raise UsageError(f"'{unknown[0] if unknown else request.target}' cannot be written; expected {offered}")
     try:
-        checked_name(wanted.name)
-        checked_textures(wanted.names)
+        checked_name(request.name)
+        checked_textures(request.names)
     except ValueError as error:
         raise UsageError(str(error)) from None
 
 
-def _called(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tuple[str, int | None]:
-    """The name, and its version where the pattern has one: the latest if that is the same delivery, else the next."""
+def _versioned_name(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tuple[str, int | None]:
+    """The name, and its version where the pattern has one: the latest for an equal delivery, else the next."""
 
-    most = 9999  # a version that takes as much room as any will
+    most = 9999  # the longest version
     plain = {field: safe_name(text, FILE_NAME) for field, text in fields.items()}
     short = shortened(pattern, plain | {"v": most}, ("asset", "mesh", "style"), ASSET)
 
@@ -110,19 +119,19 @@ def _called(out: Path, pattern: str, fields: Mapping[str, str], of: str) -> tupl
         return filled(0), None
     if len(pattern.format(**short | {"v": most}).encode()) > ASSET:
         raise UsageError(f"--name {pattern!r}: {filled(1)} is cut off before its version; choose a shorter name")
-    # A word that no name has stands for the number while the rest is made safe.
+    # A placeholder marks the version while safe_name works on the rest.
     mark = "0VERSION0"
     shape = safe_name(re.sub(r"\{v[^}]*\}", mark, pattern).format(**short), FILE_NAME)
-    wanted = re.compile(re.escape(shape).replace(mark, r"(\d+)", 1).replace(mark, r"\d+") + r"(?!\d)")
-    there = [wanted.match(p.name) for p in out.iterdir()] if out.is_dir() else []
-    last = max((int(m[1]) for m in there if m), default=0)
-    if last and _whole(out, filled(last), of):
+    versioned = re.compile(re.escape(shape).replace(mark, r"(\d+)", 1).replace(mark, r"\d+") + r"(?!\d)")
+    matches = [versioned.match(p.name) for p in out.iterdir()] if out.is_dir() else []
+    last = max((int(m[1]) for m in matches if m), default=0)
+    if last and _is_current(out, filled(last), of):
         return filled(last), last
     return filled(last + 1), last + 1
 
 
-def _whole(out: Path, name: str, of: str) -> bool:
-    """Whether this very delivery is there with every file as it was written."""
+def _is_current(out: Path, name: str, of: str) -> bool:
+    """Whether the folder holds this very delivery with every file unchanged."""
     try:
         record = read_own(out / f"{name}.export.json")
         files = record["files"] if record["of"] == of else None
@@ -135,7 +144,7 @@ def _whole(out: Path, name: str, of: str) -> bool:
 
 
 def _deliver(new: Path, out: Path, finished: FinishedAsset, chosen: Delivery, of: str) -> None:
-    """Fill the folder. UsageError where this delivery would replace a file of another one."""
+    """Write the delivery into `new`. UsageError where it would replace a file of another one."""
     record: dict[str, Any] = write_delivery(new, out, finished, chosen) | {"of": of}
     path = new / f"{chosen.name}.export.json"
     atomic_write(path, (json.dumps(record, indent=1) + "\n").encode())
@@ -151,14 +160,14 @@ def _deliver(new: Path, out: Path, finished: FinishedAsset, chosen: Delivery, of
 
 
 def named_files(chosen: Delivery) -> list[str]:
-    """The files of a delivery that are called like it; those of textures hang on the asset."""
+    """The files of a delivery that have its name; the names of textures depend on the asset."""
     endings = {"glb": (".glb",), "usd": (".usda", ".usdz"), "mtlx": (".mtlx",), "obj": (".obj", ".mtl")}
     every = (".export.json", *(e for f in chosen.formats for e in endings.get(f, ())))
     return [f"{chosen.name}{ending}" for ending in every]
 
 
 def check(settings: Any) -> None:
-    """Refuse, before the work begins, what the end of a job could not deliver. EnvironmentMissing, UsageError."""
+    """Check, before a job starts, that its delivery is possible. EnvironmentMissing, UsageError."""
     light_space(settings.colour)
     picture_space(settings.colour)
     if settings.deliver.wanted and "usd" in settings.deliver.formats:
@@ -168,11 +177,11 @@ def check(settings: Any) -> None:
 
 
 def deliver(job: Any, progress: Any) -> dict[str, dict[str, list[str]]]:
-    """The end of a job: what its settings want delivered, in OUT/delivered/<target>; {"delivered": {target: files}}."""
+    """Deliver a job's asset as its settings require, to OUT/delivered/<target>; {"delivered": {target: files}}."""
     chosen = job.settings.deliver
     if not chosen.wanted:
         return {}
-    made: dict[str, list[str]] = {}
+    delivered: dict[str, list[str]] = {}
     with progress.stage("deliver", "write the files for " + ", ".join(chosen.chosen_targets)) as report:
         for target in chosen.chosen_targets:
             keep_folder(job.out, f"delivered/{target}")
@@ -191,6 +200,6 @@ def deliver(job: Any, progress: Any) -> dict[str, dict[str, list[str]]]:
                 overwrite=job.overwrite,
                 note=progress.note,
             )
-            made[target] = [str(path) for path in files]
-            report(len(made) / len(chosen.chosen_targets))
-    return {"delivered": made}
+            delivered[target] = [str(path) for path in files]
+            report(len(delivered) / len(chosen.chosen_targets))
+    return {"delivered": delivered}

@@ -1,4 +1,4 @@
-"""The files of one delivery: textures packed for a program, and the materials that refer to them."""
+"""The files of one delivery: textures packed for a target program, and materials that refer to them."""
 
 import shutil
 from collections.abc import Mapping, Sequence
@@ -27,15 +27,15 @@ from mistyle.io.meshes.obj_write import write_obj
 from mistyle.io.sandbox.bounds import USD
 from mistyle.io.store.atomic import sha256_file
 
-# What materials in files refer to: every map by itself, whatever the target packs.
+# The maps that materials in files refer to: unpacked, whatever the target packs.
 SINGLE = ("albedo", "normal", "roughness", "metallic")
 LONGEST_MAP = "metallicsmoothness"
-SHORTEST = 24  # bytes of a texture's name that tell one set from another
+SHORTEST = 24  # bytes of a texture's name that make sets distinct
 
 
 @dataclass(frozen=True)
 class Delivery:
-    """One delivery: what is written, for whom, under which name. `source` is the mesh file that the look lies on."""
+    """One delivery: formats, target and name. `source` is the USD file below a look layer."""
 
     formats: tuple[str, ...]
     target: str
@@ -48,10 +48,10 @@ class Delivery:
 
 
 def fields_for(manifest: Mapping[str, Any], target: str) -> dict[str, str]:
-    """What a pattern for delivered names is filled with."""
-    told = manifest.get("provenance", {})
-    mesh = Path(str(told.get("mesh") or manifest.get("source") or manifest["name"])).stem
-    style = Path(str(told.get("style") or told.get("references") or "")).stem
+    """The values of the fields of a name pattern."""
+    provenance = manifest.get("provenance", {})
+    mesh = Path(str(provenance.get("mesh") or manifest.get("source") or manifest["name"])).stem
+    style = Path(str(provenance.get("style") or provenance.get("references") or "")).stem
     return {"asset": str(manifest["name"]), "mesh": mesh, "style": style or "look", "target": target}
 
 
@@ -77,12 +77,12 @@ def write_delivery(folder: Path, out: Path, finished: FinishedAsset, chosen: Del
         shared = _materials(folder, out, finished, chosen, _looks(finished, chosen, pattern, labels, slots))
     if "glb" in chosen.formats:
         shutil.copy2(finished.folder / f"{finished.manifest['name']}.glb", folder / f"{chosen.name}.glb")
-    told = {e["file"]: e for e in written}
+    textures_by_file = {e["file"]: e for e in written}
     listed = []
     for path in sorted(p for p in folder.rglob("*") if p.is_file()):
         file = path.relative_to(folder).as_posix()
-        said = {"shared": True} if file in shared else {"sha256": sha256_file(path), "bytes": path.stat().st_size}
-        listed.append(told.get(file, {"file": file}) | said)
+        checksum = {"shared": True} if file in shared else {"sha256": sha256_file(path), "bytes": path.stat().st_size}
+        listed.append(textures_by_file.get(file, {"file": file}) | checksum)
     record = {"name": chosen.name, "asset": finished.manifest["name"], "version": chosen.version}
     record |= {"target": chosen.target, "about": target.about, "formats": list(chosen.formats), "files": listed}
     record |= {"sets": [s.name for s in finished.sets], "maps": sorted({s.map for s in slots})}
@@ -91,17 +91,17 @@ def write_delivery(folder: Path, out: Path, finished: FinishedAsset, chosen: Del
 
 
 def _slots(formats: Sequence[str], target: Target, referring: bool) -> list[Any]:
-    """The textures to write: the target's, and single maps where materials in files refer to them."""
+    """The textures of the delivery: the target's, and unpacked maps where materials in files refer to them."""
     slots = [*target.slots] if "maps" in formats or referring else []
     if referring:
-        there = {slot.map for slot in slots if slot.map != "normal" or target.normal == "+Y"}
+        present = {slot.map for slot in slots if slot.map != "normal" or target.normal == "+Y"}
         extra = {s.map: s for s in TARGETS["blender"].slots}
-        slots += [extra[m] for m in SINGLE if m not in there]
+        slots += [extra[m] for m in SINGLE if m not in present]
     return slots
 
 
 def notes(finished: FinishedAsset, chosen: Delivery) -> tuple[str, ...]:
-    """What is to be said of the delivered files."""
+    """Notes about the delivered files."""
     turned = [text for text in finished.manifest.get("notes", ()) if TURNED in text]
     if not turned or "obj" not in chosen.formats:
         return ()
@@ -109,7 +109,7 @@ def notes(finished: FinishedAsset, chosen: Delivery) -> tuple[str, ...]:
 
 
 def _is_down(slot: Any, target: Target) -> bool:
-    """Whether the slot is the target's own normal map of DirectX: a material in a file wants +Y."""
+    """Whether the slot is the target's own DirectX normal map (-Y); materials in files need +Y."""
     return slot.map == "normal" and slot in target.slots and target.normal == "-Y"
 
 
@@ -121,19 +121,20 @@ def _tiled(pattern: str, sets: Sequence[TextureSet]) -> str:
 
 
 def set_labels(pattern: str, name: str, finished: FinishedAsset) -> list[str]:
-    """The {asset} of every texture set: the delivered name, with the material's where several have textures.
+    """The {asset} of every texture set: the delivered name, with the material's name where there are several.
 
-    Tiles of one material share it; all others differ even without case, and leave room for the rest of the pattern.
+    Tiles of one material share a label. All others differ even without case, and leave room for the rest of the
+    pattern. UsageError where the pattern leaves too little room.
     """
     split = [split_tile(s.name) for s in finished.sets]
     groups = list(dict.fromkeys((base, bool(tile)) for base, tile in split))
     own = str(finished.manifest["name"])
-    wanted = [name if len(groups) == 1 else name + base.removeprefix(own) for base, _ in groups]
+    names = [name if len(groups) == 1 else name + base.removeprefix(own) for base, _ in groups]
     rest = len(pattern.format(asset="", map=LONGEST_MAP, ext="png", udim=1001).encode())
     room = (WRITTEN - rest) // max(uses(pattern, "asset"), 1)
     if room < SHORTEST:
         raise UsageError(f"--texture-name {pattern[:60]!r}: found {rest} bytes, expected at most {WRITTEN - SHORTEST}")
-    labels = dict(zip(groups, distinct(wanted, limit=min(room, STEM)), strict=True))
+    labels = dict(zip(groups, distinct(names, limit=min(room, STEM)), strict=True))
     return [labels[base, bool(tile)] for base, tile in split]
 
 
@@ -145,15 +146,15 @@ def texture_name(pattern: str, label: str, tile: int, kind: str, ext: str) -> st
 def _texture_files(
     pattern: str, labels: Sequence[str], sets: Sequence[TextureSet], slots: Sequence[Any], target: Target, both: bool
 ) -> list[list[str]]:
-    """The file of every slot of every set; `both` where both kinds of normal map are written. UsageError where two
-    would be one file."""
+    """The file of every slot of every set; `both` where both kinds of normal map are written. UsageError where two maps
+    would share a file."""
     kinds = ["normal_dx" if both and _is_down(slot, target) else slot.map for slot in slots]
     files = [
         [texture_name(pattern, label, s.tile, kind, slot.ext) for kind, slot in zip(kinds, slots, strict=True)]
         for label, s in zip(labels, sets, strict=True)
     ]
     flat = [(folded(file), file) for names in files for file in names]
-    clash = next((file for k, (key, file) in enumerate(flat) if key in {other for other, _ in flat[:k]}), None)
+    clash = next((file for k, (key, file) in enumerate(flat) if key in {earlier for earlier, _ in flat[:k]}), None)
     if clash is not None:
         lacking = [f"{{{f}}}" for f in ("asset", "udim") if f"{{{f}}}" not in pattern]
         raise UsageError(
@@ -166,7 +167,7 @@ def _texture_files(
 def _looks(
     finished: FinishedAsset, chosen: Delivery, pattern: str, labels: Sequence[str], slots: Sequence[Any]
 ) -> list[TexturedMaterial]:
-    """The material of every part, by the files of its single maps."""
+    """The material of every part with the files of its unpacked maps."""
     exr = any((s.map, s.ext) == ("albedo", "exr") for s in slots)
     parts = finished.asset.mesh.parts
     names = distinct([identifier(part) for part in parts], limit=IDENTIFIER)
@@ -181,7 +182,7 @@ def _looks(
 def _materials(
     folder: Path, out: Path, finished: FinishedAsset, chosen: Delivery, looks: Sequence[TexturedMaterial]
 ) -> list[str]:
-    """USD, MaterialX and OBJ, which all refer to the single maps; returns the files that deliveries share."""
+    """Write USD, MaterialX and OBJ, which refer to the unpacked maps; returns the files that deliveries share."""
     tiles = [textures.tile for textures in finished.sets]
     mesh, positions = finished.asset.mesh, finished.asset.source.user_positions
     if "obj" in chosen.formats:
@@ -202,19 +203,19 @@ def _materials(
 def _look_layer(
     folder: Path, out: Path, finished: FinishedAsset, chosen: Delivery, looks: Sequence[TexturedMaterial]
 ) -> list[str]:
-    """A USD mesh gets its look as a layer over the file it came from, one variant per style."""
+    """Write the look of a USD mesh as a layer over its source file, one variant per style."""
     from mistyle.io.store.records import load_record
     from mistyle.io.usd.look import write_look
 
     record = finished.folder.parent / "work" / "mesh" / "record"
     if not record.is_dir():
         raise InputRefused(
-            f"{record}: found nothing, expected the mesh as the run read it; a look layer needs the whole run folder"
+            f"{record}: found nothing, expected the run's record of its mesh; a look layer needs the whole run folder"
         )
     asset = load_record(record)
     source = chosen.source or asset.source.path
     if not source.is_file():
-        raise UsageError(f"{source}: the USD file that this run read is not there; give its path with --source")
+        raise UsageError(f"{source}: the USD file of this run is missing; give its path with --source")
     layer = f"{identifier(source.stem)}_look.usda"
     fields = fields_for(finished.manifest, chosen.target)
     variant = identifier(fields["style"]) + (f"_v{chosen.version:03}" if chosen.version is not None else "")

@@ -1,4 +1,4 @@
-"""A finished asset read back from a run folder, edits of its textures included."""
+"""Reader of a finished asset in a run folder, with edits of its textures."""
 
 import re
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from mistyle.io.images.packing import TextureSet
 
 @dataclass(frozen=True)
 class FinishedAsset:
-    """An asset folder of ours, read back: the mesh, its texture sets, and what its list says."""
+    """An asset folder of mistyle: the mesh, its texture sets, and the content of its list."""
 
     asset: Asset
     sets: tuple[TextureSet, ...]
@@ -44,7 +44,7 @@ def read_finished(place: Path) -> FinishedAsset:
 
 
 def read_listing(place: Path) -> tuple[Path, dict[str, Any]]:
-    """The asset folder and its list of files."""
+    """The asset folder and its list of files. Raises InputRefused."""
     from mistyle.io.read import read_json
 
     listing = _listing(place)
@@ -66,9 +66,9 @@ def _listing(place: Path) -> Path:
     if place.suffix == ".json":
         return place
     for folder in (place / "asset", place):
-        found = [p for p in sorted(folder.glob("*.json")) if p.name != "done.json"] if folder.is_dir() else []
-        if found:
-            return found[0]
+        listings = [p for p in sorted(folder.glob("*.json")) if p.name != "done.json"] if folder.is_dir() else []
+        if listings:
+            return listings[0]
     raise InputRefused(
         f"{place}: found no asset; expected a run folder of mistyle, its asset folder, or its <name>.json"
     )
@@ -83,7 +83,7 @@ def _texture_set(folder: Path, part: str, stem: str) -> TextureSet:
     albedo, normal, roughness, orm = (planes(kind) for kind in ("albedo", "normal", "roughness", "orm"))
     tile = re.search(r"\.(1\d{3})$", part)
     rgb = np.stack([albedo[c] for c in "RGB"], axis=-1)
-    # The PNG is what everyone else sees, edits included; a changed one takes the EXR's place.
+    # Other programs read the PNG, which may hold edits; where it differs, it replaces the EXR.
     shown = linear_from_srgb(read_picture(folder / f"{stem}_albedo.png").rgb)
     if shown.shape == rgb.shape and np.abs(shown - np.clip(rgb, 0, 1)).max() > 0.02:
         rgb = shown

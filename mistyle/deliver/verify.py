@@ -1,7 +1,7 @@
-"""`mistyle verify`: what was written, opened by other people's readers and rendered by two renderers.
+"""`mistyle verify`: written files opened by independent readers, and rendered by Cycles and Mitsuba.
 
 OUT/verify.json       every check with its outcome, and the figures of the renders
-OUT/<shot>.png        Cycles, Mitsuba, and where they differ (FLIP, 0 black to 1 white-yellow)
+OUT/<shot>.png        Cycles, Mitsuba, and the FLIP map of their difference (0 black to 1 white-yellow)
 OUT/renders/*.exr     the renders, linear Rec.709
 """
 
@@ -23,13 +23,13 @@ from mistyle.io.store.atomic import DONE
 from mistyle.io.store.output import claim, replace_files
 from mistyle.render.external.blender import BLENDER, find_blender
 
-# Two right renderers differ by noise (FLIP 0.05 to 0.09 at 64 samples) and by their pixel filters.
+# Two correct renderers differ by noise (FLIP 0.05 to 0.09 at 64 samples) and by their pixel filters.
 MOST_FLIP, LEAST_OVERLAP, LEAST_CORRELATION = 0.15, 0.98, 0.95
 
 
 @dataclass(frozen=True)
 class Rendering:
-    """How the comparison is rendered: cameras all round, pixels along each side, samples, light (as for compare)."""
+    """The renders of the comparison: number of cameras, pixels a side, samples per pixel, light (as for compare)."""
 
     views: int = 3
     size: int = 256
@@ -40,7 +40,7 @@ class Rendering:
 
 @dataclass(frozen=True)
 class Difference:
-    """How one shot differs between the renderers, over the pixels that either covers.
+    """The difference of one shot between the renderers, over the union of their silhouettes.
 
     flip         mean LDR-FLIP, 0..1
     overlap      intersection over union of the silhouettes
@@ -65,23 +65,23 @@ def verify(
 ) -> dict[str, Any]:
     """Check a run, an asset or a delivered folder, or one file; returns the content of verify.json.
 
-    Nothing is fetched: a reader that is not installed gives the outcome "not checked". `rendering` None leaves the
-    renders out.
+    Nothing is downloaded: a reader that is not installed gives the outcome "not checked". `rendering` None leaves the
+    renders out. Raises InputRefused where `place` is missing or holds no file of ours.
     """
     if not place.exists():
         raise InputRefused(f"{place}: found nothing, expected a run, an asset, a delivered folder, or one file")
     out = out or (place if place.is_dir() else place.parent) / "verify"
     claim(out, ["verify.json"], overwrite=overwrite)
-    found = find_blender(blender)
+    executable = find_blender(blender)
     files = _files(place, out)
     if not files:
         raise InputRefused(f"{place}: found none of our files; expected models ({' '.join(MODELS)}) or their lists")
-    checks = list(file_checks(place, files, found))
-    told: dict[str, Any] = {}
+    checks = list(file_checks(place, files, executable))
+    record: dict[str, Any] = {}
 
     def fill(folder: Path) -> None:
-        renders = list(_rendered(place, files, folder, found, rendering, checks)) if rendering else []
-        told.update(
+        renders = list(_rendered(place, files, folder, executable, rendering, checks)) if rendering else []
+        record.update(
             asset=str(place),
             failed=sum(c.outcome == "failed" for c in checks),
             not_checked=sum(c.outcome == "not checked" for c in checks),
@@ -90,27 +90,27 @@ def verify(
             limits={"flip": MOST_FLIP, "overlap": LEAST_OVERLAP, "correlation": LEAST_CORRELATION},
             out=str(out),
         )
-        (folder / "verify.json").write_text(json.dumps(told, indent=1) + "\n", encoding="utf-8")
+        (folder / "verify.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
 
     replace_files(out, "verify", fill, inputs=[place], overwrite=overwrite)
-    return told
+    return record
 
 
 def _files(place: Path, out: Path) -> list[Path]:
-    """What there is to check: of a run folder its asset, what it delivered, and its stages' markers."""
+    """The files to check; for a run folder its asset, its deliveries, and the markers of its stages."""
     if place.is_file():
         return [place]
     folders = [p for p in (place / "asset", place / "delivered") if p.is_dir()] or [place]
-    found = [p for folder in folders for p in sorted(folder.rglob("*")) if p.is_file() and out not in p.parents]
+    paths = [p for folder in folders for p in sorted(folder.rglob("*")) if p.is_file() and out not in p.parents]
     if folders != [place]:
-        stages = sorted({*place.glob(f"*/{DONE}"), *place.glob(f"work/*/{DONE}")} - set(found))
-        found += [p for p in stages if ".broken-" not in p.parent.name]  # what was set aside is no part of the run
-    wanted = (*READERS, ".json", ".png", ".exr")
-    return [p for p in found if p.suffix.lower() in wanted]
+        stages = sorted({*place.glob(f"*/{DONE}"), *place.glob(f"work/*/{DONE}")} - set(paths))
+        paths += [p for p in stages if ".broken-" not in p.parent.name]  # folders set aside do not belong to the run
+    suffixes = (*READERS, ".json", ".png", ".exr")
+    return [p for p in paths if p.suffix.lower() in suffixes]
 
 
 def file_checks(place: Path, files: Sequence[Path], blender: str | None) -> Iterator[Check]:
-    """Every file by every reader that there is for it."""
+    """The checks of every file by each of its readers."""
     base = place if place.is_dir() else place.parent
 
     def name(path: Path) -> str:
@@ -135,9 +135,9 @@ def file_checks(place: Path, files: Sequence[Path], blender: str | None) -> Iter
 
 
 def _rendered(
-    place: Path, files: Sequence[Path], folder: Path, blender: str | None, how: Rendering, checks: list[Check]
+    place: Path, files: Sequence[Path], folder: Path, blender: str | None, rendering: Rendering, checks: list[Check]
 ) -> Iterator[Difference]:
-    """Render the first GLB (a mesh of any kind where there is none) by both; adds a row for each shot."""
+    """Render the first GLB (else the first model) with both renderers; adds a row to `checks` for each shot."""
     models = [p for p in files if p.suffix.lower() in (".glb", ".gltf")] or [
         p for p in files if p.suffix.lower() in MODELS and not p.name.endswith("_look.usda")
     ]
@@ -146,24 +146,24 @@ def _rendered(
     base = place if place.is_dir() else place.parent
     name, check = models[0].relative_to(base).as_posix(), "Cycles against Mitsuba"
     if blender is None:
-        checks.append(Check(name, check, "not checked", f"no Blender here (name it with --blender or {BLENDER})"))
+        checks.append(Check(name, check, "not checked", f"Blender not found (name it with --blender or {BLENDER})"))
         return
     from mistyle.render.external.renderers import left_out, renderer, shots, subject
 
     both = [renderer("blender:cycles", blender), renderer("mitsuba:path")]
     with TemporaryDirectory(prefix="mistyle-") as work:
         try:
-            what = subject(models[0], Path(work), both, how.threads)
-            missing = left_out(what)
+            scene = subject(models[0], Path(work), both, rendering.threads)
+            missing = left_out(scene)
             if missing:
-                checks.append(Check(name, check, "not checked", f"{', '.join(missing)}: not drawn by Mitsuba here"))
+                checks.append(Check(name, check, "not checked", f"{', '.join(missing)}: not drawn by Mitsuba"))
                 return
-            for k, shot in enumerate(shots(what, [how.light], how.views, how.size)):
-                pair = [r.draw(what, shot, how.spp, [1 + 1000 * k + 100 * j]) for j, r in enumerate(both)]
+            for k, shot in enumerate(shots(scene, [rendering.light], rendering.views, rendering.size)):
+                pair = [r.draw(scene, shot, rendering.spp, [1 + 1000 * k + 100 * j]) for j, r in enumerate(both)]
                 pictures = [drawn.pictures[0] for drawn in pair]
                 difference, error = compared(shot.name, *pictures)
-                _keep(folder, shot.name, pictures, error)
-                checks.append(_judged(name, check, difference, " and ".join(drawn.version for drawn in pair)))
+                _write_pictures(folder, shot.name, pictures, error)
+                checks.append(_verdict(name, check, difference, " and ".join(drawn.version for drawn in pair)))
                 yield difference
         except MistyleError as error:
             checks.append(Check(name, check, "failed", str(error)[-300:]))
@@ -180,40 +180,40 @@ def compared(
     inside = [p[..., 3] > 0.5 for p in (reference, test)]
     seen = (reference[..., 3] > 0) | (test[..., 3] > 0)
     both = inside[0] & inside[1]
-    found = measure_colour(a, b, seen, ("flip",))
+    metrics = measure_colour(a, b, seen, ("flip",))
     first, second = luminance(a)[both], luminance(b)[both]
     varies = len(first) > 1 and first.std() > 0 and second.std() > 0
-    alike = float(np.corrcoef(first, second)[0, 1]) if varies else float(np.array_equal(first, second))
+    correlation = float(np.corrcoef(first, second)[0, 1]) if varies else float(np.array_equal(first, second))
     bright = float(second.mean() / first.mean()) if len(first) and first.mean() > 0 else float("nan")
-    return Difference(shot, found.values["flip"], overlap(*inside), alike, bright), found.maps["flip"]
+    return Difference(shot, metrics.values["flip"], overlap(*inside), correlation, bright), metrics.maps["flip"]
 
 
-def _judged(name: str, check: str, d: Difference, versions: str) -> Check:
+def _verdict(name: str, check: str, d: Difference, versions: str) -> Check:
     fine = d.flip <= MOST_FLIP and d.overlap >= LEAST_OVERLAP and d.correlation >= LEAST_CORRELATION
-    said = (
+    message = (
         f"{d.shot}: FLIP {d.flip:.4f}, silhouettes {d.overlap:.4f}, correlation {d.correlation:.4f}, "
         f"brightness {d.brightness:.4f} ({versions})"
     )
-    return Check(name, check, "passed" if fine else "failed", said)
+    return Check(name, check, "passed" if fine else "failed", message)
 
 
-def _keep(folder: Path, shot: str, pictures: Sequence[np.ndarray], error: np.ndarray) -> None:
+def _write_pictures(folder: Path, shot: str, pictures: Sequence[np.ndarray], error: np.ndarray) -> None:
     from mistyle.core.image import srgb_from_linear
     from mistyle.jobs.report.false_colour import heat
 
     for who, picture in zip(("cycles", "mitsuba"), pictures, strict=True):
         planes = dict(zip("RGBA", np.moveaxis(picture, -1, 0), strict=False))
         write_exr(folder / "renders" / f"{shot}_{who}.exr", planes)
-    # On a middle grey, so that a dark and a missing part differ.
+    # Over middle grey, so that dark and missing parts differ.
     shown = [srgb_from_linear(p[..., :3] + 0.18 * (1 - p[..., 3:4])) for p in pictures]
     write_png(folder / f"{shot}.png", np.concatenate([*shown, heat(error) / np.float32(255)], axis=1))
 
 
-def table(told: dict[str, Any]) -> str:
-    """The checks as a person reads them: file, check, outcome."""
-    rows = [(c["outcome"], c["file"], c["check"], c["said"]) for c in told["checks"]]
+def table(record: dict[str, Any]) -> str:
+    """The checks as a text table: outcome, file, check, message."""
+    rows = [(c["outcome"], c["file"], c["check"], c["said"]) for c in record["checks"]]
     widths = [max((len(row[k]) for row in rows), default=0) for k in range(3)]
     lines = ["  ".join([*(row[k].ljust(widths[k]) for k in range(3)), row[3]]) for row in rows]
-    passed = len(rows) - told["failed"] - told["not_checked"]
-    lines.append(f"{passed} passed, {told['failed']} failed, {told['not_checked']} not checked: {told['out']}")
+    passed = len(rows) - record["failed"] - record["not_checked"]
+    lines.append(f"{passed} passed, {record['failed']} failed, {record['not_checked']} not checked: {record['out']}")
     return "\n".join(lines)

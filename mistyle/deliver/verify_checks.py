@@ -1,4 +1,4 @@
-"""The checks of `mistyle verify`: files opened by readers that are not ours, each outcome one row."""
+"""The checks of `mistyle verify` by independent readers: one row per file and reader."""
 
 import json
 import os
@@ -32,7 +32,7 @@ validator.validateBytes(new Uint8Array(fs.readFileSync(file)), {
 
 @dataclass(frozen=True)
 class Check:
-    """What was looked at, by whom, and how it came out."""
+    """One check of a file: its reader, the outcome and the message."""
 
     file: str
     check: str
@@ -48,8 +48,8 @@ def row(file: str, check: str, complaints: Sequence[str], fine: str) -> Check:
 
 
 def listed_files(listing: Path, name: str) -> Check | None:
-    """The files that a list of ours (an asset's, a delivery's, a stage's) names, by their sha256; None for a JSON file
-    that is no list."""
+    """The sha256 of all files in a list of ours (an asset's, a delivery's, a stage's); None for a JSON file that is not
+    a list."""
     from mistyle.io.read import read_json
 
     try:
@@ -57,26 +57,26 @@ def listed_files(listing: Path, name: str) -> Check | None:
     except InputRefused as error:
         return Check(name, "JSON", "failed", str(error))
     try:
-        given = content["files"]
-        pairs = given.items() if isinstance(given, dict) else [(e["file"], e.get("sha256")) for e in given]
-        wanted = {str(file): value for file, value in pairs if value is not None}
+        entries = content["files"]
+        pairs = entries.items() if isinstance(entries, dict) else [(e["file"], e.get("sha256")) for e in entries]
+        hashes = {str(file): value for file, value in pairs if value is not None}
     except (KeyError, TypeError, AttributeError):
         return None
-    wrong = []
-    for file, value in wanted.items():
+    errors = []
+    for file, value in hashes.items():
         path = listing.parent / file
         if not path.is_file():
-            wrong.append(f"{file} is missing")
+            errors.append(f"{file} is missing")
         elif sha256_file(path) != value:
-            wrong.append(f"{file} has changed")
-    return row(name, "sha256 of the files it lists", wrong, f"{len(wanted)} files as they were written")
+            errors.append(f"{file} has changed")
+    return row(name, "sha256 of the files it lists", errors, f"{len(hashes)} files as they were written")
 
 
 def validator_home() -> Path | str:
-    """The node_modules with Khronos' validator in it, or why there is none. Nothing is fetched."""
+    """The node_modules with Khronos' validator, or the reason for its absence. Nothing is downloaded."""
     node = which("node")
     if node is None:
-        return "no node here"
+        return "node not found"
     places = [Path(p) for p in os.environ.get("NODE_PATH", "").split(os.pathsep) if p] + [Path("node_modules")]
     cache = Path(os.environ.get("MISTYLE_CACHE") or Path.home() / ".cache" / "mistyle") / "npm"
     places += sorted(cache.glob("*")) if cache.is_dir() else []
@@ -84,8 +84,8 @@ def validator_home() -> Path | str:
     if npm is not None:
         done = subprocess.run([npm, "root", "-g"], capture_output=True, text=True, timeout=60)
         places += [Path(done.stdout.strip())] if done.returncode == 0 and done.stdout.strip() else []
-    found = next((p for p in places if (p / "gltf-validator").is_dir()), None)
-    return found.resolve() if found else "node is here, gltf-validator is not (npm install -g gltf-validator)"
+    modules = next((p for p in places if (p / "gltf-validator").is_dir()), None)
+    return modules.resolve() if modules else "node found, gltf-validator not found (npm install -g gltf-validator)"
 
 
 def gltf(path: Path, name: str) -> Iterator[Check]:
@@ -103,36 +103,36 @@ def gltf(path: Path, name: str) -> Iterator[Check]:
             name, "Khronos glTF validator", "failed", done.stderr.strip()[-300:] or f"ended with {done.returncode}"
         )
         return
-    told = json.loads(done.stdout)
-    issues = told["issues"]
+    result = json.loads(done.stdout)
+    issues = result["issues"]
     errors = [f"{m['code']} {m.get('pointer', '')}".strip() for m in issues["messages"] if m["severity"] == 0]
     counts = f"{issues['numErrors']} errors, {issues['numWarnings']} warnings, {issues['numInfos']} notes"
     if issues["numErrors"] and not errors:
         errors = [counts]
-    yield row(name, f"Khronos glTF validator {told['version']}", errors, counts)
+    yield row(name, f"Khronos glTF validator {result['version']}", errors, counts)
 
 
 def by_trimesh(path: Path, name: str) -> Iterator[Check]:
-    """Faces, finite vertices, UVs and textures as trimesh finds them."""
+    """Faces, finite vertices and UVs by trimesh."""
     import trimesh
 
     check = f"trimesh {trimesh.__version__}"
     try:
         scene: Any = trimesh.load(path, process=False, force="scene")
         parts = [g for g in scene.geometry.values() if hasattr(g, "faces")]
-    except Exception as error:  # whatever a reader of strangers says about the file is its finding
+    except Exception as error:  # any error of a foreign reader is a result of the check
         yield Check(name, check, "failed", f"{type(error).__name__}: {str(error)[:200]}")
         return
     faces = sum(len(part.faces) for part in parts)
-    wrong = [] if faces else ["no faces"]
-    wrong += [f"{key} is not finite" for key, g in scene.geometry.items() if not np.isfinite(g.vertices).all()]
+    errors = [] if faces else ["no faces"]
+    errors += [f"{key} is not finite" for key, g in scene.geometry.items() if not np.isfinite(g.vertices).all()]
     bare = [g for g in parts if getattr(g.visual, "uv", None) is None]
-    wrong += [f"{len(bare)} meshes without UVs"] if bare else []
-    yield row(name, check, wrong, f"{len(parts)} meshes, {faces} triangles, UVs on all")
+    errors += [f"{len(bare)} meshes without UVs"] if bare else []
+    yield row(name, check, errors, f"{len(parts)} meshes, {faces} triangles, UVs on all")
 
 
 def usd(path: Path, name: str) -> Iterator[Check]:
-    """USD's own validators, and whether every texture that it names is there."""
+    """USD's own validators, and whether every texture exists."""
     try:
         from mistyle.io.usd.write import complaints, heard, library
 
@@ -140,28 +140,28 @@ def usd(path: Path, name: str) -> Iterator[Check]:
     except MistyleError as error:
         yield Check(name, "UsdValidation", "not checked", str(error))
         return
-    with heard(pxr) as said:
+    with heard(pxr) as warnings:
         try:
             stage = pxr.Usd.Stage.Open(str(path))
-            wrong = [str(error).strip().splitlines()[0] for error in stage.GetCompositionErrors()] + complaints(path)
+            errors = [str(error).strip().splitlines()[0] for error in stage.GetCompositionErrors()] + complaints(path)
         except pxr.Tf.ErrorException as error:
             yield Check(name, "UsdValidation", "failed", str(error).strip().splitlines()[-1][:300])
             return
     named = [p.GetAttribute("inputs:file").Get() for p in stage.Traverse() if p.HasAttribute("inputs:file")]
-    wrong += [f"{asset.path} is not there" for asset in named if asset and not asset.resolvedPath]
+    errors += [f"{asset.path} is not there" for asset in named if asset and not asset.resolvedPath]
     meshes = sum(p.IsA(pxr.UsdGeom.Mesh) for p in stage.Traverse())
     version = ".".join(map(str, pxr.Usd.GetVersion()[1:]))
-    warned = [f"USD warns: {text[:300]}" for text in dict.fromkeys(said)]
+    warned = [f"USD warns: {text[:300]}" for text in dict.fromkeys(warnings)]
     fine = "; ".join([f"no errors; {meshes} meshes, {len(named)} textures resolved", *warned[:3]])
-    yield row(name, f"UsdValidation {version}", wrong, fine)
+    yield row(name, f"UsdValidation {version}", errors, fine)
 
 
 def materialx(path: Path, name: str) -> Iterator[Check]:
-    """MaterialX's own validation, a definition for every node, and whether its images are there."""
+    """MaterialX's own validation, a definition for every node, and whether its images exist."""
     try:
         mx: Any = import_module("MaterialX")
     except ImportError:
-        yield Check(name, "MaterialX", "not checked", "no MaterialX here (pip install 'mistyle[usd]')")
+        yield Check(name, "MaterialX", "not checked", "MaterialX not found (pip install 'mistyle[usd]')")
         return
     check = f"MaterialX {mx.getVersionString()}"
     document, nodes = mx.createDocument(), mx.createDocument()
@@ -174,12 +174,12 @@ def materialx(path: Path, name: str) -> Iterator[Check]:
     mx.loadLibraries(mx.getDefaultDataLibraryFolders(), mx.getDefaultDataSearchPath(), nodes)
     document.setDataLibrary(nodes)
     valid, message = document.validate()
-    wrong = [] if valid else [message.strip()[:200]]
-    wrong += [f"{n.getNamePath()} has no definition" for n in own if n.getNodeDef() is None]
+    errors = [] if valid else [message.strip()[:200]]
+    errors += [f"{n.getNamePath()} has no definition" for n in own if n.getNodeDef() is None]
     files = [n.getInput("file").getValueString() for n in own if n.getCategory() == "image"]
-    wrong += [f"{file} is not there" for file in files if not (path.parent / file).is_file()]
+    errors += [f"{file} is not there" for file in files if not (path.parent / file).is_file()]
     surfaces = sum(n.getType() == "surfaceshader" for n in own)
-    yield row(name, check, wrong, f"valid; {surfaces} surfaces, {len(files)} images there")
+    yield row(name, check, errors, f"valid; {surfaces} surfaces, {len(files)} images there")
 
 
 def png(paths: Sequence[Path], name: str) -> Iterator[Check]:
@@ -187,39 +187,39 @@ def png(paths: Sequence[Path], name: str) -> Iterator[Check]:
     import PIL
     from PIL import Image
 
-    wrong = []
+    errors = []
     for path in paths:
         try:
             with Image.open(path) as picture:
                 picture.load()
         except (OSError, SyntaxError, ValueError) as error:
-            wrong.append(f"{path.name}: {str(error)[:100]}")
-    yield row(name, f"Pillow {PIL.__version__}", wrong, f"{len(paths)} PNG decoded")
+            errors.append(f"{path.name}: {str(error)[:100]}")
+    yield row(name, f"Pillow {PIL.__version__}", errors, f"{len(paths)} PNG decoded")
 
 
 def exr(paths: Sequence[Path], name: str) -> Iterator[Check]:
-    """Every EXR decoded by OpenImageIO, with the colour space that it found."""
+    """Every EXR decoded by OpenImageIO, with its colour space."""
     try:
         import OpenImageIO as oiio  # pyright: ignore[reportMissingImports]
     except ImportError:
-        yield Check(name, "OpenImageIO", "not checked", "no OpenImageIO here (pip install openimageio)")
+        yield Check(name, "OpenImageIO", "not checked", "OpenImageIO not found (pip install openimageio)")
         return
-    wrong, spaces = [], set()
+    errors, spaces = [], set()
     for path in paths:
-        found = oiio.ImageInput.open(str(path))
-        if found is None or found.read_image() is None:
-            wrong.append(f"{path.name}: {oiio.geterror()[:100]}")
+        source = oiio.ImageInput.open(str(path))
+        if source is None or source.read_image() is None:
+            errors.append(f"{path.name}: {oiio.geterror()[:100]}")
         else:
-            spaces.add(str(found.spec().getattribute("colorInteropID") or "no colour space"))
-    told = f"{len(paths)} EXR decoded: {', '.join(sorted(spaces))}"
-    yield row(name, f"OpenImageIO {oiio.VERSION_STRING}", wrong, told)
+            spaces.add(str(source.spec().getattribute("colorInteropID") or "no colour space"))
+    summary = f"{len(paths)} EXR decoded: {', '.join(sorted(spaces))}"
+    yield row(name, f"OpenImageIO {oiio.VERSION_STRING}", errors, summary)
 
 
 def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None) -> Iterator[Check]:
-    """Every model opened by Blender's importers: meshes there, no image missing."""
+    """Every model opened by Blender's importers: it has meshes, and no image is missing."""
     if blender is None:
-        told = f"no Blender here (name it with --blender or {BLENDER})"
-        yield from (Check(name, "Blender", "not checked", told) for name in names)
+        reason = f"Blender not found (name it with --blender or {BLENDER})"
+        yield from (Check(name, "Blender", "not checked", reason) for name in names)
         return
     from mistyle.render.external.render_files import run_job
 
@@ -230,15 +230,15 @@ def by_blender(paths: Sequence[Path], names: Sequence[str], blender: str | None)
     except MistyleError as error:
         yield from (Check(name, "Blender", "failed", str(error)[-300:]) for name in names)
         return
-    for name, found in zip(names, done["found"], strict=True):
-        wrong = [found["error"]] if "error" in found else []
-        wrong += [] if wrong or found["meshes"] and found["triangles"] else ["no mesh was imported"]
-        wrong += [f"image {image} is missing" for image in found.get("missing", [])]
-        fine = "" if wrong else "{meshes} meshes, {triangles} triangles, {materials} materials, {images} images"
-        yield row(name, f"Blender {done['blender']}", wrong, fine.format(**found))
+    for name, result in zip(names, done["found"], strict=True):
+        errors = [result["error"]] if "error" in result else []
+        errors += [] if errors or result["meshes"] and result["triangles"] else ["no mesh was imported"]
+        errors += [f"image {image} is missing" for image in result.get("missing", [])]
+        fine = "" if errors else "{meshes} meshes, {triangles} triangles, {materials} materials, {images} images"
+        yield row(name, f"Blender {done['blender']}", errors, fine.format(**result))
 
 
-# Who reads a model of which kind.
+# File extension -> readers of a model.
 READERS: dict[str, tuple[Callable[[Path, str], Iterator[Check]], ...]] = {
     **dict.fromkeys((".glb", ".gltf"), (gltf, by_trimesh)),
     ".obj": (by_trimesh,),

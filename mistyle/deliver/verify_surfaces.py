@@ -1,4 +1,4 @@
-"""Whether a model shows every material of its asset with maps of its own, by what the file itself names."""
+"""Check of `mistyle verify`: a model shows every material of its asset, each with its own maps."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -18,7 +18,7 @@ MAPS = ("map_kd", "map_pr", "map_pm", "norm")
 
 @dataclass(frozen=True)
 class List:
-    """What a list of ours (an asset's or a delivery's) says: texture sets, and each map's file as (set, map, file)."""
+    """The content of an asset's or a delivery's list: texture sets, and each map's file as (set, map, file)."""
 
     path: Path
     asset: str
@@ -28,22 +28,22 @@ class List:
 
 
 def surface_checks(files: Sequence[Path], name: Callable[[Path], str]) -> Iterator[Check]:
-    """A row for every list of ours, and for every model that a list names."""
-    lists = [found for path in files if path.suffix == ".json" and (found := _list(path)) is not None]
-    whole = {found.asset: found.sets for found in lists if found.path.name == f"{found.asset}.json"}
-    wanted: dict[Path, int] = {}
-    for found in lists:
-        # Lists of older versions name only the sets whose files are left; the asset's own list knows them all.
-        sets = max(found.sets, whole.get(found.asset, ()), key=len)
-        if found.maps:
-            said = f"{len(sets)} texture sets, {len(found.maps)} maps"
-            yield row(name(found.path), CHECK, _lost(sets, found.maps), said)
-        for model in found.models if sets else ():
-            path = found.path.parent / model
-            wanted[path] = min(len(sets), wanted.get(path, len(sets)))  # a look layer is on several lists
+    """A row for every list of ours, and for every model in a list."""
+    lists = [listing for path in files if path.suffix == ".json" and (listing := _list(path)) is not None]
+    whole = {listing.asset: listing.sets for listing in lists if listing.path.name == f"{listing.asset}.json"}
+    expected: dict[Path, int] = {}
+    for listing in lists:
+        # Lists of older versions name only the sets with remaining files; the asset's own list names all.
+        sets = max(listing.sets, whole.get(listing.asset, ()), key=len)
+        if listing.maps:
+            summary = f"{len(sets)} texture sets, {len(listing.maps)} maps"
+            yield row(name(listing.path), CHECK, _list_errors(sets, listing.maps), summary)
+        for model in listing.models if sets else ():
+            path = listing.path.parent / model
+            expected[path] = min(len(sets), expected.get(path, len(sets)))  # several lists name one look layer
     for path in files:
-        if path in wanted:
-            yield _shown(path, name(path), wanted[path])
+        if path in expected:
+            yield _model_check(path, name(path), expected[path])
 
 
 def _list(path: Path) -> List | None:
@@ -56,30 +56,30 @@ def _list(path: Path) -> List | None:
         if parts is not None:  # an asset's
             sets = {str(part["name"]): str(part["textures"]) for part in parts}
             maps = [(sets[e["part"]], e["map"], f) for e, f in zip(entries, names, strict=True) if "map" in e]
-            found = tuple(sets.values())
+            names_of_sets = tuple(sets.values())
         else:
             maps = [(str(e["set"]), str(e["map"]), f) for e, f in zip(entries, names, strict=True) if "set" in e]
-            found = tuple(content.get("sets") or dict.fromkeys(s for s, *_ in maps))
+            names_of_sets = tuple(content.get("sets") or dict.fromkeys(s for s, *_ in maps))
         models = tuple(f for f in names if f.endswith((*MODELS, ".mtlx")))
-        return List(path, str(content.get("asset", content["name"])), found, tuple(maps), models)
+        return List(path, str(content.get("asset", content["name"])), names_of_sets, tuple(maps), models)
     except (InputRefused, KeyError, TypeError, AttributeError):
-        return None  # no list of ours, or a damaged one, which verify_checks.listed_files reports
+        return None  # not a list of ours, or a damaged one, which verify_checks.listed_files reports
 
 
-def _lost(sets: Sequence[str], maps: Sequence[tuple[str, str, str]]) -> list[str]:
-    """Maps that a set does not have although others do, and files that are listed as two maps."""
-    kinds, there = sorted({kind for _, kind, _ in maps}), {(s, kind) for s, kind, _ in maps}
-    wrong = [f"{s} has no file for its {kind}" for s in sets for kind in kinds if (s, kind) not in there]
+def _list_errors(sets: Sequence[str], maps: Sequence[tuple[str, str, str]]) -> list[str]:
+    """Errors of a list: maps that only some sets have, and files that are listed as two maps."""
+    kinds, present = sorted({kind for _, kind, _ in maps}), {(s, kind) for s, kind, _ in maps}
+    errors = [f"{s} has no file for its {kind}" for s in sets for kind in kinds if (s, kind) not in present]
     owners: dict[str, tuple[str, str]] = {}
     for s, kind, file in maps:
         first = owners.setdefault(folded(file), (s, kind))
         if first != (s, kind):
-            wrong.append(f"{file} is {first[1]} of {first[0]} and {kind} of {s}")
-    return wrong
+            errors.append(f"{file} is {first[1]} of {first[0]} and {kind} of {s}")
+    return errors
 
 
-def _shown(path: Path, name: str, wanted: int) -> Check:
-    """Whether a model has `wanted` materials on its faces, with files that no two maps share."""
+def _model_check(path: Path, name: str, expected: int) -> Check:
+    """Whether a model has at least `expected` materials on its faces, and no two maps share a file."""
     reader = _usd if path.suffix.lower() in USD else SURFACES[path.suffix.lower()]
     try:
         materials = reader(path)
@@ -87,59 +87,59 @@ def _shown(path: Path, name: str, wanted: int) -> Check:
         return Check(name, CHECK, "not checked", str(error))
     except (OSError, ValueError, LookupError, TypeError, ElementTree.ParseError) as error:
         return Check(name, CHECK, "failed", f"{type(error).__name__}: {str(error)[:200]}")
-    wrong = [] if len(materials) >= wanted else [f"{len(materials)} materials on its faces, expected {wanted}"]
-    wrong += [f"{material} names no map" for material, maps in materials.items() if not maps]
+    errors = [] if len(materials) >= expected else [f"{len(materials)} materials on its faces, expected {expected}"]
+    errors += [f"{material} names no map" for material, maps in materials.items() if not maps]
     owners: dict[str, list[str]] = {}
     for material, maps in materials.items():
         for file in maps:
             owners.setdefault(folded(file), []).append(material)
     if reader is not _gltf:
         shared = {file: " and ".join(dict.fromkeys(of)) for file, of in owners.items() if len(of) > 1}
-        wrong += [f"{file} is several maps of {of}" for file, of in shared.items()]
-    elif len(owners) < wanted:  # other scenes of the user's own file may share what they like
-        wrong.append(f"{len(owners)} base colour images, expected {wanted}")
-    return row(name, CHECK, wrong, f"{len(materials)} materials, {len(owners)} maps of their own")
+        errors += [f"{file} is several maps of {of}" for file, of in shared.items()]
+    elif len(owners) < expected:  # materials of other scenes in the user's file may share images
+        errors.append(f"{len(owners)} base colour images, expected {expected}")
+    return row(name, CHECK, errors, f"{len(materials)} materials, {len(owners)} maps of their own")
 
 
 def _gltf(path: Path) -> dict[str, list[str]]:
-    """The base colour images of the materials that triangles wear; one image may hold several other maps."""
+    """The base colour images of the materials on triangles; other maps may share one image."""
     data = path.read_bytes()
     text = data[20 : 20 + int.from_bytes(data[12:16], "little")] if data[:4] == b"glTF" else data
     tree: dict[str, Any] = json.loads(text)
     used = {p["material"] for m in tree["meshes"] for p in m["primitives"] if "material" in p and p.get("mode", 4) > 3}
     result = {}
     for k in sorted(used):
-        shown = tree["materials"][k].get("pbrMetallicRoughness", {}).get("baseColorTexture")
-        if shown is not None:
-            texture = tree["textures"][shown["index"]]
+        texture_info = tree["materials"][k].get("pbrMetallicRoughness", {}).get("baseColorTexture")
+        if texture_info is not None:
+            texture = tree["textures"][texture_info["index"]]
             result[f"material {k}"] = [f"image {texture.get('source', texture)}"]
     return result
 
 
 def _obj(path: Path) -> dict[str, list[str]]:
-    """The materials that faces use, with what the library says of them."""
+    """The materials that faces use, with the map files of their library."""
     used, current, libraries = set(), "", []
     with open(path, encoding="utf-8") as file:
         for line in file:
             if line.startswith("f "):
                 used.add(current)
             elif line.startswith(("usemtl ", "mtllib ")):
-                word, rest = line.split(None, 1)
-                current, libraries = (rest.strip(), libraries) if word == "usemtl" else (current, [*libraries, rest])
+                keyword, rest = line.split(None, 1)
+                current, libraries = (rest.strip(), libraries) if keyword == "usemtl" else (current, [*libraries, rest])
     known: dict[str, list[str]] = {}
     for library in libraries:
         name = ""
         for line in (path.parent / library.strip()).read_text(encoding="utf-8").splitlines():
-            word, _, rest = line.strip().partition(" ")
-            if word == "newmtl":
+            keyword, _, rest = line.strip().partition(" ")
+            if keyword == "newmtl":
                 name = rest.strip()
-            elif word.lower() in MAPS:
+            elif keyword.lower() in MAPS:
                 known.setdefault(name, []).append(rest.strip())
     return {name: known.get(name, []) for name in sorted(used)}
 
 
 def _materialx(path: Path) -> dict[str, list[str]]:
-    """The images of every material's surface, which lie in its node graph."""
+    """The images in the node graph of every material's surface."""
     root, place = ElementTree.parse(path).getroot(), "image/input[@name='file']"
     graphs = {g.get("name"): [i.get("value", "") for i in g.iterfind(place)] for g in root.iterfind("nodegraph")}
     shaders = root.iterfind("open_pbr_surface")
@@ -152,11 +152,11 @@ def _materialx(path: Path) -> dict[str, list[str]]:
 
 
 def _usd(path: Path) -> dict[str, list[str]]:
-    """The textures of every material that is bound to faces."""
+    """The textures of every material bound to faces."""
     from mistyle.io.usd.write import heard, library
 
     pxr = library()
-    api, found = pxr.UsdShade.MaterialBindingAPI, {}
+    api, textures = pxr.UsdShade.MaterialBindingAPI, {}
     with heard(pxr):
         try:
             stage = pxr.Usd.Stage.Open(str(path))
@@ -171,8 +171,8 @@ def _usd(path: Path) -> dict[str, list[str]]:
                 if material:
                     below = pxr.Usd.PrimRange(material.GetPrim())
                     named = [p.GetAttribute("inputs:file").Get() for p in below if p.HasAttribute("inputs:file")]
-                    found[str(material.GetPath())] = [asset.path for asset in named if asset]
-    return found
+                    textures[str(material.GetPath())] = [asset.path for asset in named if asset]
+    return textures
 
 
 SURFACES: Mapping[str, Callable[[Path], dict[str, list[str]]]] = {

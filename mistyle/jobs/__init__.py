@@ -1,1 +1,1 @@
-"""What every job has: settings, stage cache, progress, plans, summaries."""
+"""The common parts of all jobs: settings, stage cache, progress, plans, summaries."""

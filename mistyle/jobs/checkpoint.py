@@ -12,12 +12,12 @@ from mistyle.io.store.records import load_record, save_record
 
 
 def place(out: Path, key: str) -> Path:
-    """Where the checkpoint of the fit with this key lies in a run folder."""
+    """The folder of the checkpoint of the fit with this key."""
     return out / "work" / f"checkpoint-{key[:16]}"
 
 
 def save(folder: Path, arrays: dict[str, np.ndarray]) -> None:
-    """Replace the checkpoint; a process that dies meanwhile leaves the older one."""
+    """Replace the checkpoint atomically; a process that dies meanwhile leaves the older one."""
 
     def write(new: Path) -> None:
         save_record(new / "record", arrays)
@@ -27,7 +27,7 @@ def save(folder: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def load(folder: Path, say: Callable[[str], None] = lambda text: None) -> dict[str, np.ndarray] | None:
-    """The checkpoint, or None where there is none whose hashes hold: the fit then begins again, and says why."""
+    """The checkpoint, or None if it is missing or its hashes differ; `say` reports a damaged one."""
     if not folder.is_dir():
         return None
     try:
@@ -35,11 +35,11 @@ def load(folder: Path, say: Callable[[str], None] = lambda text: None) -> dict[s
             return load_record(folder / "record")
     except InputRefused:
         pass
-    say(f"{folder}: this checkpoint is damaged; the fit begins again")
+    say(f"{folder}: this checkpoint is damaged; the fit starts again")
     return None
 
 
 def clear(out: Path) -> None:
-    """Remove the checkpoints of a run folder, those of other settings too: what they led to is kept or given up."""
+    """Remove the checkpoints of a run folder, those of other settings too: their fits have ended."""
     for folder in (out / "work").glob("checkpoint-*"):
         shutil.rmtree(folder, ignore_errors=True)

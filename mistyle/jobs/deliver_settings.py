@@ -1,4 +1,4 @@
-"""What a job hands to other programs, and the colour spaces at its edges: two records that every kind of job has."""
+"""Settings that every kind of job has: delivery to other programs, and the colour spaces of inputs and outputs."""
 
 import re
 import string
@@ -13,7 +13,7 @@ TEXTURE_FIELDS = frozenset({"asset", "map", "ext", "udim"})
 
 
 def listed(value: Any) -> Any:
-    """'glb,usd' and ['glb,usd', 'maps'] as lists of words; anything else as it is."""
+    """'glb,usd' and ['glb,usd', 'maps'] as a tuple of names, each once; anything else unchanged."""
     if isinstance(value, str):
         value = [value]
     if isinstance(value, (list, tuple)) and all(isinstance(v, str) for v in value):
@@ -22,15 +22,15 @@ def listed(value: Any) -> Any:
 
 
 def fields_of(pattern: str) -> dict[str, str]:
-    """The plain {fields} of a pattern and their format specifications. ValueError for anything cleverer."""
-    found: dict[str, str] = {}
+    """The plain {fields} of a pattern and their format specifications. ValueError for conversions and other formats."""
+    fields: dict[str, str] = {}
     for _, name, spec, conversion in string.Formatter().parse(pattern):
         if name is None:
             continue
         if not re.fullmatch(r"[a-z]+", name) or conversion or not re.fullmatch(r"|0?[1-9]d?", spec or ""):
             raise ValueError(f"'{{{name}}}' is not a plain field such as {{v}} or {{v:03}}")
-        found[name] = spec or ""
-    return found
+        fields[name] = spec or ""
+    return fields
 
 
 def _tried(pattern: str) -> set[str] | None:
@@ -53,8 +53,8 @@ def checked_textures(pattern: str) -> str:
     """A pattern for texture files: {map} and {ext}, and maybe {asset} and {udim}."""
     fields = _tried(pattern)
     if fields is None or not {"map", "ext"} <= fields or fields - TEXTURE_FIELDS or "/" in pattern or "\\" in pattern:
-        wanted = "a file name with {map} and {ext}, and maybe {asset}, {udim}"
-        raise ValueError(f"--texture-name {pattern!r}: expected {wanted}")
+        expected = "a file name with {map} and {ext}, and maybe {asset}, {udim}"
+        raise ValueError(f"--texture-name {pattern!r}: expected {expected}")
     return pattern
 
 
@@ -63,7 +63,7 @@ Program = Literal["blender", "unreal", "unity-urp", "unity-hdrp", "houdini", "ar
 
 
 class DeliverSettings(BaseModel):
-    """The files for other programs that a job leaves in OUT/delivered/<target>; none where nothing is said."""
+    """The files for other programs in OUT/delivered/<target>; none while all fields keep their defaults."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -75,8 +75,8 @@ class DeliverSettings(BaseModel):
     )
     name: Annotated[str, BeforeValidator(checked_name)] = Field(
         default="{asset}",
-        description="pattern of the delivered name: {asset} {mesh} {style} {target}; {v:03} counts up, so that nothing "
-        "delivered before is overwritten",
+        description="pattern of the delivered name: {asset} {mesh} {style} {target}; {v:03} counts up, so that no "
+        "earlier delivery is overwritten",
     )
     textures: Annotated[str, BeforeValidator(checked_textures)] = Field(
         default=TEXTURES, description="pattern of texture files: {asset} {map} {udim} {ext}"
@@ -85,7 +85,7 @@ class DeliverSettings(BaseModel):
 
     @property
     def wanted(self) -> bool:
-        """Whether anything is delivered: as soon as any of this is said."""
+        """Whether anything is delivered: formats, a target or a name pattern is set."""
         return bool(self.formats or self.target or self.name != "{asset}" or self.textures != TEXTURES)
 
     @property
@@ -98,7 +98,7 @@ class DeliverSettings(BaseModel):
 
 
 class ColourSettings(BaseModel):
-    """Colour spaces at the edges; inside everything is linear Rec.709. Names are those of an OpenColorIO config."""
+    """Colour spaces of inputs and outputs, by their OpenColorIO names; all computation is in linear Rec.709."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -1,11 +1,11 @@
-"""Edit and go on: what a person may change in a run folder, and how the next run takes it up.
+"""Edits of a run folder: the files that a person may change, and how the next run uses them.
 
     stylized/<view>.png (.exr, or a .jpg, .webp, .tif beside it)   a view painted over
-    masks/<set>.png                                                which texels are painted again after the fit
+    masks/<set>.png                                                the texels that are painted again after the fit
     asset/textures/<set>_<map>.png or .exr                         a finished map
 
-An edited file is noticed by its sha256, stays as it is, and what depends on it is made anew. Nothing else in a run
-folder may be edited: a finished stage with another changed file is set aside and made again.
+The sha256 detects an edit. The edited file stays unchanged; the stages that depend on it run again. No other file may
+be edited: a finished stage with another changed file is set aside and runs again.
 """
 
 import re
@@ -28,7 +28,7 @@ EDITABLE = {
     "masks": re.compile(r"[^/]+\.png"),
     "asset": re.compile(r"textures/[^/]+\.(png|exr)"),
 }
-# What is made anew, in words.
+# Stage -> the consequence of an edit, for the note to the user.
 REDONE = {
     "stylized": "new paint is baked into the texture; fit, repair, asset and report are redone",
     "masks": "repair, asset and report are redone",
@@ -42,11 +42,10 @@ def editable(stage: str, name: str) -> bool:
     return pattern is not None and pattern.fullmatch(name) is not None
 
 
-def found(folder: Path, stage: str) -> tuple[dict[str, str], dict[str, str]]:
+def edits_of(folder: Path, stage: str) -> tuple[dict[str, str], dict[str, str]]:
     """A person's edits of a finished stage's folder, name to sha256: (taken up by an earlier run, changed since).
 
-    Changed are files that differ from what the stage wrote, and added ones that are called like a file of it but for
-    the ending.
+    A file counts as changed if it differs from the stage's own, or was added with the stem of a stage's file.
     """
     try:
         done = read_own(folder / DONE)
@@ -61,7 +60,7 @@ def found(folder: Path, stage: str) -> tuple[dict[str, str], dict[str, str]]:
 
 
 def sentence(stage: str, names: Sequence[str], new: bool) -> str:
-    """What is said of a stage's edited files; `new` where no earlier run had taken them up."""
+    """The note about a stage's edited files; `new` where no earlier run had taken them up."""
     files = ", ".join(f"{stage}/{name}" for name in names)
     return f"{files} {'was' if len(names) == 1 else 'were'} edited: {REDONE[stage] if new else 'kept'}."
 
@@ -76,21 +75,21 @@ class Edited:
 
     @property
     def provenance(self) -> dict[str, list[str]]:
-        """What the asset says of them."""
+        """The entry of the asset's provenance."""
         names = sorted({*self.taken_up, *self.changed})
         return {"edited": names} if names else {}
 
     def __call__(
         self, stems: Sequence[str], maps: Sequence[Maps], occlusion: Sequence[np.ndarray] | None = None
     ) -> tuple[list[Maps], list[np.ndarray]]:
-        """The maps and occlusions of all texture sets with the edits in them."""
-        made = list(maps)
+        """The maps and occlusions of all texture sets with the edits applied."""
+        edited_sets = list(maps)
         shade = [np.ones_like(m.roughness) for m in maps] if occlusion is None else list(occlusion)
         if self.folder is not None:
             for part, stem in enumerate(stems):
-                given = (self.folder, stem, made[part], shade[part], self.taken_up, self.changed)
-                made[part], shade[part] = edited_maps(*given)
-        return made, shade
+                arguments = (self.folder, stem, edited_sets[part], shade[part], self.taken_up, self.changed)
+                edited_sets[part], shade[part] = edited_maps(*arguments)
+        return edited_sets, shade
 
 
 UNEDITED = Edited()
@@ -102,10 +101,10 @@ def asset_stage(
     write: Callable[[Path, Edited, Callable[[float], None]], object],
     about: Mapping[str, Any] | None = None,
 ) -> tuple[Path, Edited]:
-    """The stage 'asset': its folder, and the edits that a person made there.
+    """The stage 'asset': its folder, and a person's edits of it.
 
-    `write(folder, edited, report)` writes the asset; an asset whose textures were edited since is written again with
-    them, into the GLB and into the other file of each map. `about` is what else the stage's marker says.
+    `write(folder, edited, report)` writes the asset. If its textures were edited since, it is written again with them:
+    the GLB and the other file of each map change. `about` holds further entries of the stage's marker.
     """
     about = about or {}
     folder = run.stage("asset", after, [run.job.name], lambda f, r: write(f, UNEDITED, r), about)
@@ -119,8 +118,8 @@ def asset_stage(
 
 
 def tell_edits(run: Any) -> None:
-    """Say which files of the run folder are a person's, and what that meant."""
-    # The first stage that hangs on an edited one; an asset is its own.
+    """Note the files of the run folder that a person edited, and the consequence."""
+    # The first stage that depends on an edited one; an asset depends on itself.
     next_one = {"stylized": "retouch", "masks": "repair", "asset": "asset"}
     for stage, files in run.edited.items():
         run.progress.note(sentence(stage, sorted(files), next_one[stage] not in run.progress.reused))
@@ -145,41 +144,41 @@ def read_mask(path: Path, like: np.ndarray) -> np.ndarray:
 def edited_maps(
     folder: Path, stem: str, maps: Maps, occlusion: np.ndarray, taken_up: Sequence[str], changed: Sequence[str]
 ) -> tuple[Maps, np.ndarray]:
-    """The maps of one texture set and its occlusion with what a person painted into `folder`/textures.
+    """The maps and occlusion of one texture set with a person's edits in `folder`/textures.
 
     `taken_up` names files whose content an earlier run took up, `changed` those that changed since and win. Where both
     the .png and the .exr of a map changed, the .exr counts.
     """
     for names, endings in ((taken_up, (".exr",)), (changed, (".png", ".exr"))):
-        kinds = [k for k in ("albedo", "normal", "orm", "roughness") if _any(names, stem, k)]
+        kinds = [k for k in ("albedo", "normal", "orm", "roughness") if _has_edit(names, stem, k)]
         for kind in kinds:
             files = [f"textures/{stem}_{kind}{e}" for e in endings]
-            # What was taken up stands in both files alike, and the .exr has it in finer steps.
+            # Both files hold the edits of earlier runs; the .exr has the higher precision.
             file = next(name for name in reversed(files) if name in names or names is taken_up)
-            maps, occlusion = _with(maps, occlusion, kind, folder / file)
+            maps, occlusion = _apply_edit(maps, occlusion, kind, folder / file)
     return maps, occlusion
 
 
-def _any(names: Sequence[str], stem: str, kind: str) -> bool:
+def _has_edit(names: Sequence[str], stem: str, kind: str) -> bool:
     return any(f"textures/{stem}_{kind}.{ending}" in names for ending in ("png", "exr"))
 
 
-def _with(maps: Maps, occlusion: np.ndarray, kind: str, path: Path) -> tuple[Maps, np.ndarray]:
+def _apply_edit(maps: Maps, occlusion: np.ndarray, kind: str, path: Path) -> tuple[Maps, np.ndarray]:
     from mistyle.io.read import read_exr, read_picture
 
     if path.suffix == ".exr":
         planes = read_exr(path)
-        wanted: Mapping[str, str] = {"roughness": "Y"}
-        if any(c not in planes for c in wanted.get(kind, "RGB")):
-            found = ", ".join(planes)
-            raise InputRefused(f"{path}: found channels {found}, expected {', '.join(wanted.get(kind, 'RGB'))}.")
-        values = np.stack([planes[c] for c in (wanted.get(kind, "RGB") * 3)[:3]], axis=-1)
+        channels: Mapping[str, str] = {"roughness": "Y"}
+        if any(c not in planes for c in channels.get(kind, "RGB")):
+            present = ", ".join(planes)
+            raise InputRefused(f"{path}: found channels {present}, expected {', '.join(channels.get(kind, 'RGB'))}.")
+        values = np.stack([planes[c] for c in (channels.get(kind, "RGB") * 3)[:3]], axis=-1)
     else:
         values = read_picture(path).rgb
         values = linear_from_srgb(values) if kind == "albedo" else values
     _same_size(path, values.shape[:2], maps.roughness.shape)
     if not np.isfinite(values).all():
-        raise InputRefused(f"{path}: found numbers that are not finite. Paint it again.")
+        raise InputRefused(f"{path}: found values that are not finite. Paint it again.")
     values = values.astype(np.float32)
     if kind == "albedo":
         return replace(maps, albedo=values), occlusion
@@ -195,9 +194,9 @@ def _with(maps: Maps, occlusion: np.ndarray, kind: str, path: Path) -> tuple[Map
     return replace(maps, **parts), np.ascontiguousarray(values[..., 0])
 
 
-def _same_size(path: Path, found: tuple[int, ...], wanted: tuple[int, ...]) -> None:
-    if tuple(found[:2]) != tuple(wanted[:2]):
+def _same_size(path: Path, found: tuple[int, ...], expected: tuple[int, ...]) -> None:
+    if tuple(found[:2]) != tuple(expected[:2]):
         raise InputRefused(
-            f"{path}: found {found[1]} x {found[0]} pixels, expected {wanted[1]} x {wanted[0]} as it was written. "
-            "Save it in that size, or delete it to have it made again."
+            f"{path}: found {found[1]} x {found[0]} pixels, expected {expected[1]} x {expected[0]} as it was written. "
+            "Save it in that size, or delete it to have it written again."
         )

@@ -1,4 +1,4 @@
-"""Which files a mesh file stands on: the file itself and those it names, so that a change in any of them is noticed."""
+"""The files that a mesh depends on: the file itself and those that it names. Stage keys hash all of them."""
 
 from pathlib import Path
 

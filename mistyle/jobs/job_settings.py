@@ -1,4 +1,4 @@
-"""How any kind of job reads its mesh and shows its result: two records of settings that several kinds have."""
+"""Settings that several kinds of job share: reading the mesh, and the pictures of the report."""
 
 from typing import Literal
 
@@ -8,7 +8,7 @@ LEAST_OVERLAP = 0.8  # of the mesh's outline with alpha or masks, below which a 
 
 
 class ReadSettings(BaseModel):
-    """How the mesh is read."""
+    """Settings of reading the mesh."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -27,8 +27,8 @@ class ReportSettings(BaseModel):
 
     detail: Literal["none", "page", "full"] = Field(
         default="full",
-        description="full also writes the turntable's frames and a path-traced picture; page only the page and its "
-        "overview; none nothing",
+        description="full: page, turntable frames and a path-traced picture; page: the page and its overview; none: "
+        "no report",
     )
     frames: int = Field(default=24, ge=4, le=240, description="turntable frames")
     resolution: int = Field(default=448, ge=64, le=4096, description="pixels of a turntable frame")

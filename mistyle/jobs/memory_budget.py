@@ -1,8 +1,8 @@
-"""How much memory a job will need, stage by stage, from counts alone; and whether it keeps the budget it was given.
+"""Memory model of a job: the peak of each stage from counts alone, and the check against the budget.
 
-A stage's peak is what the program itself takes, plus bytes of each count of the job: see `Need`. The needs and counts
-of a verb stand in `pipeline/budget.py` and `pipeline/budget.py`. They hold on the processor, with two threads and the
-embedded filter bank: VGG-19 and the stylizers that need models count their own (stylization/pipeline/generative.py).
+A stage's peak is the program's own memory plus bytes per count of the job: see `Need`. The needs and counts of a verb
+lie in the `budget.py` of its pipeline. They hold on the CPU, with two threads and the embedded filter bank. VGG-19 and
+the stylizers that need models have models of their own (stylization/pipeline/generative.py).
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,43 +17,39 @@ from mistyle.process import memory
 
 
 class Need(NamedTuple):
-    """A stage's peak: GB of the program, then bytes a texel, view pixel, crop pixel, surface sample, face, texel of the
-    textures as the views draw them (kept by the renderer) and as the report's close-ups do, pixel of the turntable's
-    frames, texel times picture where texels are solved one by one, pixel of the largest picture, as the fit looks at it
-    and as it was taken, and sample of a pass of it; byte of the file's own maps; texel whose PNG file is kept;
-    texel of one texture set, for what only one set takes at a time; and pixel of a step's crops of the finish."""
+    """A stage's peak: the program's own GB, then bytes per unit of each count."""
 
     program: float
     texel: float = 0
-    view: float = 0
-    crop: float = 0
-    sample: float = 0
+    view: float = 0  # pixel of a view
+    crop: float = 0  # pixel of a crop
+    sample: float = 0  # sample of the surface
     face: float = 0
-    viewed: float = 0
-    drawn: float = 0
-    frame: float = 0
-    look: float = 0
-    picture: float = 0
-    photograph: float = 0
-    lane: float = 0
-    own: float = 0
-    packed: float = 0
-    one: float = 0
-    vgg: float = 0
+    viewed: float = 0  # texel of the textures at the size of the views, which the renderer holds
+    drawn: float = 0  # texel of the textures at the size of the report's close-ups
+    frame: float = 0  # pixel of the turntable's frames
+    look: float = 0  # texel times picture, where texels are solved one by one
+    picture: float = 0  # pixel of the largest picture at the size of the fit
+    photograph: float = 0  # pixel of the largest picture as it was taken
+    lane: float = 0  # sample of a pass of the largest picture
+    own: float = 0  # byte of the file's own maps
+    packed: float = 0  # texel whose PNG file stays in memory
+    one: float = 0  # texel of one texture set, for work on one set at a time
+    vgg: float = 0  # pixel of the crops of a step of the finish
 
 
-# Pages come in during a call into the renderer, faster than they are let go: a budget must be that much larger.
+# A call into the renderer touches pages faster than they are released: the budget must exceed the need by this factor.
 MARGIN = 1.03
 
 
-# Settings whose half saves memory, and their least values.
+# Settings that save memory when halved, and their least values.
 HALVES = {"atlas.size": 16, "surface.samples": 1000, "fit.crop_size": 32, "recover.subsamples": 1}
 HALVES |= {"rig.resolution": 16, "draw.spp": 1}
-SHARE = 0.9  # of the machine's memory, where no budget is given: the rest is the system's
+SHARE = 0.9  # of the machine's memory, without a budget: the system needs the rest
 
 
 class Allowed(NamedTuple):
-    """How many GB a job may take, and who says so."""
+    """The GB that a job may take, and the source of the limit."""
 
     gb: float
     who: str
@@ -61,7 +57,7 @@ class Allowed(NamedTuple):
 
 
 def allowed(settings: Any) -> Allowed:
-    """What `--memory` gives, else SHARE of what the machine and its control group have; no bound where nothing tells.
+    """The value of `--memory`, else SHARE of the machine's and its control group's memory; infinite if unknown.
 
     The second kind of budget refuses a job or puts its arrays into files; it changes no setting and no result.
     """
@@ -71,11 +67,11 @@ def allowed(settings: Any) -> Allowed:
     if most is None:
         return Allowed(float("inf"), "", False)
     gb = SHARE * most / 1e9
-    return Allowed(gb, f"there are {most / 1e9:.1f} GB of memory here, {gb:.1f} GB of them for a job", False)
+    return Allowed(gb, f"this machine has {most / 1e9:.1f} GB of memory, {gb:.1f} GB of them for a job", False)
 
 
 class Counts(NamedTuple):
-    """What the memory of a job hangs on, by the names of Need."""
+    """The counts that a job's memory depends on, by the names of Need."""
 
     texel: int
     view: int
@@ -102,12 +98,12 @@ def shown(settings: Any, sets: int) -> tuple[int, int]:
 
 
 def as_drawn(size: int, pixels: int) -> int:
-    """Texels of a texture of `size` a side that are drawn in pictures of so many pixels a side."""
+    """Texels of a texture of `size` a side, as drawn in pictures of `pixels` a side."""
     return (size // coarser(size, pixels)) ** 2
 
 
 def peaks(needs: Mapping[str, Need], count: Counts) -> dict[str, float]:
-    """GB of every stage; of the finish only where there is one."""
+    """GB of every stage; the finish counts only where the job has one."""
     return {
         stage: need.program + sum(getattr(need, each) * getattr(count, each) for each in Counts._fields) / 1e9
         for stage, need in needs.items()
@@ -116,8 +112,8 @@ def peaks(needs: Mapping[str, Need], count: Counts) -> dict[str, float]:
 
 
 def within_gb(settings: Any, count: Counts, plain: Mapping[str, Need], tiled: Mapping[str, Need]) -> float:
-    """Peak memory, GB, with every array in memory, or, where the budget asks for that, in files: then what is in memory
-    is let go near the budget, and the peak lies below it."""
+    """Peak memory, GB. Where the budget requires it, arrays lie in files: their pages are released near the budget, and
+    the peak lies below it."""
     whole, least = (max(peaks(needs, count).values()) for needs in (plain, tiled))
     return round(min(whole, max(least, allowed(settings).gb)), 2)
 
@@ -131,9 +127,9 @@ def must_tile(
 ) -> bool:
     """Whether a job's large arrays must lie in files for its budget; `count` gives its counts for any settings.
 
-    Raises UsageError where even that is not enough, with the need, the limit, and which of the settings `keys` helps. A
-    budget that nobody gave leaves out the stage 'mesh': what reading takes is bounded in io/sandbox/bounds.py, and its
-    need here is that of unwrapping.
+    Raises UsageError where even files do not suffice, with the need, the limit, and the most useful of the settings
+    `keys`. Without an explicit budget the stage 'mesh' is left out: io/sandbox/bounds.py bounds reading, and the need
+    of that stage is the need of unwrapping.
     """
     budget = allowed(settings)
     if not budget.given:
@@ -141,11 +137,11 @@ def must_tile(
     whole = max(peaks(plain, count(settings)).values())
     if whole <= budget.gb:
         return False
-    more = " or more" if budget.given else ", if there is as much all the same"
+    more = " or more" if budget.given else ", if the machine has that much"
     if not memory.possible():
         raise UsageError(
-            f"{budget.who}: the job needs {whole:.2f} GB, and less only on Linux, where its large arrays can lie in "
-            f"files; give it --memory {rounded_up(whole)}G{more}"
+            f"{budget.who}: the job needs {whole:.2f} GB. Only Linux needs less, with large arrays in files; "
+            f"give it --memory {rounded_up(whole)}G{more}"
         )
     needed = {stage: MARGIN * gb for stage, gb in peaks(tiled, count(settings)).items()}
     worst = max(needed, key=lambda stage: needed[stage])
@@ -162,19 +158,19 @@ def must_tile(
 
 
 def rounded_up(gb: float) -> float:
-    """To the next tenth of a GB."""
+    """`gb` rounded up to a tenth of a GB."""
     return int(gb * 10 + 0.999) / 10
 
 
 def smaller_setting(settings: Any, least: Callable[[Any], float], keys: Sequence[str]) -> str:
-    """The one setting of which half saves most, and what is needed then."""
-    there = [key for key in keys if hasattr(settings, key.split(".")[0])]
-    tried = {
+    """The setting that saves most when halved, and the GB needed then."""
+    available = [key for key in keys if hasattr(settings, key.split(".")[0])]
+    candidates = {
         key: (half := max(_value(settings, key) // 2, HALVES[key]), least(with_setting(settings, key, half)))
-        for key in there
+        for key in available
     }
-    best = min(tried, key=lambda key: tried[key][1])
-    return f"--set {best}={tried[best][0]}, which needs {rounded_up(tried[best][1])} GB"
+    best = min(candidates, key=lambda key: candidates[key][1])
+    return f"--set {best}={candidates[best][0]}, which needs {rounded_up(candidates[best][1])} GB"
 
 
 def _value(settings: Any, key: str) -> int:
@@ -200,9 +196,9 @@ def kept(
     tiled: Mapping[str, Need],
     keys: Sequence[str],
 ) -> Iterator[Look]:
-    """Inside, a job keeps its budget, with large arrays in files of `work` where they must; refused beforehand where it
-    cannot. Yields a function that looks again, given the mesh's faces, texture sets and bytes of own maps, once they
-    are known. `count(settings, faces, sets, own)` and the needs are those of the verb."""
+    """Enforce the memory budget of a job, with large arrays in files of `work` where necessary. UsageError where the
+    budget cannot hold. Yields a function that checks again with the mesh's faces, texture sets and bytes of own maps.
+    `count(settings, faces, sets, own)` and the needs are those of the verb."""
     with ExitStack() as stack:
 
         def look(faces: int, sets: int, own: int) -> None:
@@ -215,6 +211,6 @@ def kept(
 
 
 def size_of(asset: Asset) -> tuple[int, int, int]:
-    """Faces, texture sets and bytes of own maps of what was read."""
+    """Faces, texture sets and bytes of own maps of an asset."""
     maps = (m for one in asset.materials for m in (one.albedo, one.normal, one.roughness, one.metallic))
     return len(asset.mesh.faces), len(asset.mesh.parts), sum(m.nbytes for m in maps if m is not None)

@@ -1,8 +1,8 @@
-"""What a job will do and what it will cost, before it does it (`--dry-run`). Imports nothing heavy.
+"""Estimates of `--dry-run`: stages, time, memory and disk of a job. Imports nothing heavy.
 
-The times are products of counts and constants that were read off `python -m benchmarks.pipeline` and
-`benchmarks.photographs` on two cores of a server; they are guides of a factor of two, not promises. Memory is
-`jobs/memory_budget.py`'s. Disk is what stays in the run folder.
+The times are products of counts and constants, measured by `python -m benchmarks.pipeline` and
+`benchmarks.photographs` on two cores of a server. They hold within a factor of two. Memory comes from
+`jobs/memory_budget.py`. Disk is the final size of the run folder.
 """
 
 import shutil
@@ -24,14 +24,13 @@ PER_TEXEL = 1.0e-6
 PER_VIEW_PIXEL = 8.0e-7
 PER_CROP_PIXEL = 1.6e-6
 PER_VGG_PIXEL = 7e-6  # of a crop of the finish: twice forward, once back, to relu3_1
-# Of fits to pictures: a pixel read and made straight; a sample of one predicted, or stepped on; a texel in a picture; a
-# path of light between surfaces; a covered texel in one word of its neighbours.
-PER_READ_PIXEL = 8e-7
-PER_LOOK = 2e-7
-PER_OBSERVATION = 4e-7  # in one step of a solve; of one that begins anew, with two starts
-PER_BOUNCED_PATH = 1e-7
-PER_SMOOTHED = 1.5e-5
-PER_JOINT = 1.5e-5  # of a pixel that shows the object, for each joint step
+# Fits to pictures:
+PER_READ_PIXEL = 8e-7  # a pixel read and undistorted
+PER_LOOK = 2e-7  # a sample of a pixel, predicted or in a step
+PER_OBSERVATION = 4e-7  # a texel in a picture, in one step of a solve; a first solve has two starts
+PER_BOUNCED_PATH = 1e-7  # a path of light between surfaces
+PER_SMOOTHED = 1.5e-5  # a covered texel in one smoothing pass over its neighbours
+PER_JOINT = 1.5e-5  # a pixel that shows the object, in each joint step
 
 PER_TABLE_PIXEL = 4e-8  # of all views, for each texture set that is baked
 
@@ -40,7 +39,7 @@ BYTES_PER_VIEW_PIXEL = 60
 
 
 def extent_of(mesh: Path, settings: Any) -> Extent:
-    """How large the asset of a mesh file will be; the file is read, but nothing is unwrapped."""
+    """The size of a mesh file's asset; the file is read, but nothing is unwrapped."""
     files = input_files(mesh)
     stamps = tuple((str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files)
     return _extent(mesh, settings.read.uv, settings.read.max_faces, settings.atlas.size, stamps)
@@ -48,7 +47,7 @@ def extent_of(mesh: Path, settings: Any) -> Extent:
 
 @lru_cache(maxsize=64)  # a batch names few meshes many times
 def _extent(mesh: Path, uv: Literal["keep", "new", "auto"], max_faces: int, size: int, stamps: object) -> Extent:
-    """`stamps` tells a file that was changed from what it was."""
+    """`stamps` makes a changed file a new key of the cache."""
     from mistyle.io.read_mesh import read_extent
 
     return read_extent(mesh, uv=uv, max_faces=max_faces, size=size)
@@ -66,7 +65,7 @@ def needed_memory(
     tiled: Mapping[str, Need],
     keys: Sequence[str],
 ) -> dict[str, Any]:
-    """GB at most and of each stage, and whether large arrays will lie in files; refuses what the job would refuse."""
+    """Peak GB, GB of each stage, and whether large arrays will lie in files. Refuses as the job would."""
     tile = must_tile(settings, count, plain, tiled, keys)
     return {
         "memory_gb": within_gb(settings, count(settings), plain, tiled),
@@ -76,7 +75,7 @@ def needed_memory(
 
 
 def costs(job: Any, stages: Mapping[str, str], seconds: Mapping[str, float], sets: int) -> dict[str, Any]:
-    """What every plan says: folder, name, texture sets, seconds of each stage on the job's threads, free disk space."""
+    """The common part of plans: folder, name, texture sets, seconds of each stage on the job's threads, free GB."""
     scale = 2 / thread_count(job.settings)
     return {
         "out": str(job.out),
@@ -89,25 +88,25 @@ def costs(job: Any, stages: Mapping[str, str], seconds: Mapping[str, float], set
 
 
 def existing(folder: Path) -> Path:
-    """The folder, or the nearest one above it that is there."""
+    """The folder, or its nearest ancestor that exists."""
     folder = folder.absolute()
     return folder if folder.exists() else existing(folder.parent)
 
 
 def describe_plan(estimate: dict[str, Any]) -> str:
-    """The plan as a person reads it."""
+    """The plan as text for the terminal."""
     if "style" in estimate:
         relation = f"in the style of {estimate['style']}"
     elif "views" in estimate:
         relation = f"in {estimate['views']}"
     else:
-        told = f"{estimate['pictures']} pictures, {estimate['megapixels']} megapixels"
-        relation = f"from {told} of {estimate['references']}"
+        pictures = f"{estimate['pictures']} pictures, {estimate['megapixels']} megapixels"
+        relation = f"from {pictures} of {estimate['references']}"
     lines = [f"{estimate['mesh']} {relation} -> {estimate['out']}"]
     lines += [f"  {row['what']:<36} about {row['seconds']:7.1f} s" for row in estimate["stages"]]
     sets = "1 texture set" if estimate["texture_sets"] == 1 else f"{estimate['texture_sets']} texture sets"
     lines.append(f"  in all about {estimate['seconds']} s for {sets}, without reused stages")
     files = ", large arrays in files" if estimate["in_files"] else ""
     lines.append(f"  memory at most about {estimate['memory_gb']} GB{files}")
-    lines.append(f"  disk about {estimate['disk_gb']} GB; free there: {estimate['free_gb']} GB")
+    lines.append(f"  disk about {estimate['disk_gb']} GB; free disk: {estimate['free_gb']} GB")
     return "\n".join(lines)

@@ -1,4 +1,4 @@
-"""What a person sees while a job runs, on stderr: bars with the time left on a terminal, plain lines elsewhere."""
+"""Progress of a job on stderr: bars with the remaining time on a terminal, plain lines elsewhere."""
 
 import sys
 import time
@@ -11,9 +11,9 @@ Report = Callable[[float], None]
 
 
 class Progress:
-    """Names the stage that runs, times it and watches its memory.
+    """Names the running stage, measures its time and its peak memory.
 
-    `seconds` and `peaks` (GB) hold the finished stages, `notes` what the user has to know about the result.
+    `seconds` and `peaks` (GB) hold the finished stages, `notes` the user's warnings about the result.
     """
 
     def __init__(self, quiet: bool = False) -> None:
@@ -25,7 +25,7 @@ class Progress:
         self.notes: list[str] = []
 
     def note(self, *texts: str) -> None:
-        """Keep sentences about what was left out, guessed, repaired or not understood, each once, for `tell_notes`."""
+        """Add notes about omissions, guesses, repairs and unknown data, each once, for `tell_notes`."""
         self.notes += [text for text in dict.fromkeys(texts) if text not in self.notes]
 
     def tell_notes(self) -> None:
@@ -39,7 +39,7 @@ class Progress:
 
     @contextmanager
     def stage(self, name: str, what: str) -> Iterator[Report]:
-        """Runs a stage: yields the function that takes the share done, 0..1."""
+        """Run a stage: yields a callback for the completed share, 0..1."""
         start = time.perf_counter()
         with memory.watched() as most:
             if sys.stderr.isatty() and not self.quiet:
@@ -53,14 +53,14 @@ class Progress:
         self.say(f"{what}: {self.seconds[name]:.1f} s")
 
     def skip(self, name: str, what: str) -> None:
-        """Says that a stage is taken over from an earlier run."""
+        """Report that a stage is reused from an earlier run."""
         self.reused.append(name)
         self.seconds[name] = 0.0
-        self.say(f"{what}: done before, taken over")
+        self.say(f"{what}: reused from an earlier run")
 
 
 def grouped(notes: Iterable[tuple[str, str]]) -> list[str]:
-    """Sentences about many things (name, sentence), each once, with the first names that it holds for."""
+    """Notes (name, sentence) with each sentence once, behind the first three names that it holds for."""
     names: dict[str, list[str]] = {}
     for name, text in notes:
         names.setdefault(text, []).append(name)
@@ -87,7 +87,7 @@ def _bar(what: str) -> Iterator[Report]:
 
 
 def _lines(what: str, say: Callable[[str], None], every: float = 20.0) -> Report:
-    """A line when a stage is still running after every so many seconds: logs of a farm stay short."""
+    """A progress line every `every` seconds: logs of a farm stay short."""
     start = last = time.perf_counter()
 
     def report(done: float) -> None:

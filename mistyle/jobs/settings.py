@@ -1,4 +1,4 @@
-"""Settings of any kind of job from their layers: a root record lists one record per stage, and has presets.
+"""Settings of any kind of job, merged from layers: the root record has one record per stage, and presets.
 
 Precedence, lowest first: defaults, preset, `--config FILE`, the environment (MISTYLE_VGG, OCIO, MISTYLE_SET), the
 command line.
@@ -16,7 +16,7 @@ from pydantic import BaseModel, ValidationError
 from mistyle.core.errors import InputRefused, UsageError
 from mistyle.process.cores import cores
 
-# Settings, and tables of settings, by their earlier names.
+# Settings and tables of settings: earlier name -> present name.
 RENAMED = {"surface.style_scale": "surface.stroke_scale", "coat": "paint"}
 
 Root = TypeVar("Root", bound=BaseModel)
@@ -68,7 +68,7 @@ def known_keys(model: type[BaseModel], prefix: str = "") -> list[str]:
 
 
 def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
-    """Settings from nested values; refuses an unknown key with the nearest known one, a wrong value with its path."""
+    """Settings from nested values. UsageError names the nearest key for an unknown one, and the path of a bad value."""
     try:
         return root.model_validate(dict(values))
     except ValidationError as error:
@@ -84,8 +84,8 @@ def validate(values: Mapping[str, Any], origin: str, root: type[Root]) -> Root:
             near = difflib.get_close_matches(path, known_keys(root), n=1, cutoff=0.5)
             hint = f"; did you mean '{near[0]}'?" if near else ""
             raise UsageError(f"{origin}: there is no setting '{path}'{hint} (--print-config lists all)") from None
-        said = first["msg"].lower().removeprefix("value error, ")
-        raise UsageError(f"{origin}: {path} = {first['input']!r}: {said}") from None
+        message = first["msg"].lower().removeprefix("value error, ")
+        raise UsageError(f"{origin}: {path} = {first['input']!r}: {message}") from None
 
 
 def read_config(path: Path) -> dict[str, Any]:
@@ -93,11 +93,11 @@ def read_config(path: Path) -> dict[str, Any]:
     from mistyle.io.read import read_toml
 
     if not path.is_file():
-        raise UsageError(f"{path}: no such file; --config wants a TOML file")
+        raise UsageError(f"{path}: no such file; --config takes a TOML file")
     try:
         return read_toml(path)
     except InputRefused as error:
-        raise UsageError(f"{path}: not a TOML file that settings can be read from: {error}") from None
+        raise UsageError(f"{path}: not a TOML file of settings: {error}") from None
 
 
 def resolve(
@@ -109,7 +109,7 @@ def resolve(
     root: type[Root],
     presets: Mapping[str, Mapping[str, Any]],
 ) -> Root:
-    """The settings of a job after every layer; each layer is checked alone so that the message names the guilty one."""
+    """The settings of a job after every layer; each layer is validated alone, so that the message names its origin."""
     layers: list[tuple[str, Mapping[str, Any]]] = []
     if config is not None:
         values = read_config(config)

@@ -1,4 +1,4 @@
-"""The stages of a run and how each is kept: under a key made of everything it depends on."""
+"""The stage cache of a run folder: each stage is stored under a digest of everything that it depends on."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,13 +19,13 @@ from mistyle.jobs.settings import thread_count
 from mistyle.process import memory, stopping
 
 NOTHING: Mapping[str, Any] = MappingProxyType({})
-# These stand in the run folder itself, for people; the others in work/.
+# These lie in the run folder itself, for people; the others in work/.
 VISIBLE = ("views", "stylized", "masks", "asset", "scene", "report", "preview")
 
 
 @runtime_checkable
-class Kept(Protocol):
-    """What a run must know of any kind of job: where it works, and what its keys and stages hang on."""
+class StagedJob(Protocol):
+    """The part of any job that a run reads: its folder, and the settings that its keys and stages depend on."""
 
     @property
     def out(self) -> Path: ...
@@ -40,33 +40,33 @@ class Kept(Protocol):
     def overwrite(self) -> bool: ...
 
 
-Work = TypeVar("Work", bound=Kept)
+JobT = TypeVar("JobT", bound=StagedJob)
 
 
 @cache
 def program() -> str:
-    """A hash of mistyle itself: all of its files that could change a result, as they were when first asked for."""
+    """A hash of mistyle itself: all of its files that could change a result, read once per process."""
     files = sorted(p for p in PACKAGE.rglob("*") if p.suffix in (".py", ".j2", ".css", ".js"))
     return digest({str(p.relative_to(PACKAGE)): p.read_bytes() for p in files})
 
 
-def claim_run(job: Kept, stages: Iterable[str], inputs: Sequence[Path]) -> None:
-    """UsageError where a run of `stages` into the job's folder would cover an input or a file that is not mistyle's."""
+def claim_run(job: StagedJob, stages: Iterable[str], inputs: Sequence[Path]) -> None:
+    """UsageError where a run of `stages` would overwrite an input, or a file in the job's folder that is not ours."""
     deliver, folders = job.settings.deliver, [name for name in VISIBLE if name in stages]
     targets = [f"delivered/{target}" for target in deliver.chosen_targets] if deliver.wanted else []
     output.claim(job.out, ["run.json"], [*folders, "work", *targets], inputs, aside=True, overwrite=job.overwrite)
 
 
-class Run(Generic[Work]):
+class Run(Generic[JobT]):
     """Keeps the stages of one run folder; a class because it holds the folder's locks until it is closed."""
 
-    def __init__(self, job: Work, progress: Progress, stages: Mapping[str, str]) -> None:
+    def __init__(self, job: JobT, progress: Progress, stages: Mapping[str, str]) -> None:
         if job.redo_from is not None and job.redo_from not in stages:
             raise UsageError(f"--from {job.redo_from}: there is no such stage; choose one of {', '.join(stages)}")
         self.job, self.progress, self.stages = job, progress, stages
         self.redoing = False
         self.keys: dict[str, str] = {}
-        # Stage -> edited file -> sha256; and those of them that no earlier run took up.
+        # Stage -> edited file -> sha256; `changed` holds the edits that no earlier run took up.
         self.edited: dict[str, dict[str, str]] = {}
         self.changed: dict[str, dict[str, str]] = {}
         self.plain: dict[str, str] = {}
@@ -100,19 +100,20 @@ class Run(Generic[Work]):
         write: Callable[[Path, Report], object],
         about: Mapping[str, Any] = NOTHING,
     ) -> Path:
-        """The folder of stage `name`, taken over or made; it depends on `inputs` and on the stages `after`. `about` is
-        what else its marker says."""
+        """The folder of stage `name`, reused or computed; it depends on `inputs` and on the stages `after`.
+
+        `about` holds further entries of its marker."""
         stopping.check()
         key = self.keys[name] = digest([self.base, name, inputs, [self.keys[a] for a in after]])
         keeper = self.visible if name in VISIBLE else self.hidden
         self.redoing = self.redoing or name == self.job.redo_from
-        found = None if self.redoing else keeper.get(name, key, lambda file: edits.editable(name, file))
-        if found is not None:
+        reused = None if self.redoing else keeper.get(name, key, lambda file: edits.editable(name, file))
+        if reused is not None:
             self.progress.skip(name, self.stages[name])
             self.progress.note(*keeper.notes(name))
-            self._take_note(keeper, name)
-            return found
-        self._spare(keeper, name)
+            self._add_edits_to_key(keeper, name)
+            return reused
+        self._set_edits_aside(keeper, name)
 
         def fill(folder: Path) -> None:
             write(folder, report)
@@ -122,7 +123,7 @@ class Run(Generic[Work]):
             return keeper.put(name, key, fill, notes=lambda: self.progress.notes[before:], about=about)
 
     def skip(self, names: Sequence[str], after: Sequence[str]) -> None:
-        """Leave out stages that change nothing; those that stand on them stand on `after`."""
+        """Leave out stages that change nothing; later stages then depend on `after`."""
         self.redoing = self.redoing or self.job.redo_from in names
         for name in names:
             self.keys[name] = digest([self.base, name, "left out", [self.keys[a] for a in after]])
@@ -130,17 +131,17 @@ class Run(Generic[Work]):
     def early(
         self, name: str, key: str, what: str, write: Callable[[Path, Report], object], about: Mapping[str, Any]
     ) -> None:
-        """Write what stands in the place of the visible stage `name` until it comes, under a `key` of its own.
+        """Write a preliminary result of the visible stage `name`, under a `key` of its own.
 
-        It is replaced like an older result of the stage: edits of a person's are set aside.
+        The final result replaces it like an older one: a person's edits are set aside.
         """
         stopping.check()
-        self._spare(self.visible, name)
+        self._set_edits_aside(self.visible, name)
         with self.progress.stage(f"first {name}", what) as report:
             self.visible.put(name, key, lambda folder: write(folder, report), about=about)
 
     def absorb(self, name: str, write: Callable[[Path, Report], object], about: Mapping[str, Any] = NOTHING) -> Path:
-        """Write a taken-over stage anew with the edits that it was found with, which are then part of it."""
+        """Write a reused stage again with its folder's edits, which then belong to its result."""
         keeper, edited = self.visible, self.edited[name]
 
         def fill(folder: Path) -> None:
@@ -150,38 +151,38 @@ class Run(Generic[Work]):
         with self.progress.stage(name, self.stages[name]) as report:
             return keeper.put(name, self.plain[name], fill, edited=edited, about=about)
 
-    def _take_note(self, keeper: Keeper, name: str) -> None:
-        """Edits of a taken-over stage become part of its key, on which all later stages hang."""
+    def _add_edits_to_key(self, keeper: Keeper, name: str) -> None:
+        """Add the edits of a reused stage to its key; the keys of all later stages depend on it."""
         if name not in edits.EDITABLE:
             return
-        taken_up, changed = edits.found(keeper.root / name, name)
+        taken_up, changed = edits.edits_of(keeper.root / name, name)
         if taken_up | changed:
             self.plain[name] = self.keys[name]
             self.edited[name], self.changed[name] = taken_up | changed, changed
             self.keys[name] = digest([self.keys[name], self.edited[name]])
 
-    def _spare(self, keeper: Keeper, name: str) -> None:
-        """A folder with edited files that is about to be replaced is set aside, and that is said."""
+    def _set_edits_aside(self, keeper: Keeper, name: str) -> None:
+        """Set a folder with edited files aside before its replacement, and note that."""
         if name not in edits.EDITABLE:
             return
-        taken_up, changed = edits.found(keeper.root / name, name)
+        taken_up, changed = edits.edits_of(keeper.root / name, name)
         if taken_up | changed:
             done = atomic.done(keeper.root / name)
             place = output.move_aside(
                 keeper.root / name, "edited", {atomic.DONE, *done[1], *changed} if done else changed
             )
             files = ", ".join(sorted(taken_up | changed))
-            text = f"{name}/ is made anew, as what it stands on has changed; your edited {files} now lies in {place}."
+            text = f"{name}/ is written again, since its inputs have changed; your edited {files} now lies in {place}."
             self.progress.note(text)
 
     def record(self, name: str, after: Sequence[str], inputs: Any, make: Callable[[Report], Any]) -> Any:
         """Like `stage`, for a stage whose result is a record."""
-        made: list[Any] = []
+        results: list[Any] = []
 
         def write(folder: Path, report: Report) -> None:
-            made.append(make(report))
-            save_record(folder / "record", made[0])
+            results.append(make(report))
+            save_record(folder / "record", results[0])
 
         folder = self.stage(name, after, inputs, write)
-        # Within a budget of memory even what was just made is read back: then it lies in files.
-        return made[0] if made and not memory.tight() else load_record(folder / "record")
+        # Under a memory budget even a fresh result is read back: its arrays then lie in files.
+        return results[0] if results and not memory.tight() else load_record(folder / "record")

@@ -1,4 +1,4 @@
-"""What every kind of job begins with: engines and the mesh."""
+"""The first steps of every kind of job: Mitsuba variant, thread counts, and the mesh."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -14,9 +14,9 @@ from mistyle.process.cores import use_threads
 
 
 def start_engines(settings: Any) -> str:
-    """Choose the Mitsuba variant and set the thread counts of everything that computes; returns the variant.
+    """Choose the Mitsuba variant and set the thread counts of all libraries; returns the variant.
 
-    `settings` is the root record of any kind of job: its `threads` and `variant` count.
+    `settings` is the root record of any kind of job; only its `threads` and `variant` matter.
     """
     from mistyle.render.mitsuba import device
 
@@ -34,7 +34,7 @@ def read(path: Path, chosen: ReadSettings, size: int, report: Report) -> Asset:
 
 
 def mesh_stage(run: Any, files: Sequence[Path]) -> Asset:
-    """The stage "mesh" of a job; `files` are those that the mesh consists of."""
+    """The stage "mesh" of a job; `files` are the mesh file and all that it names."""
     s = run.job.settings
     return run.record(
         "mesh", [], [list(files), s.read, s.atlas.size], lambda r: read(run.job.mesh, s.read, s.atlas.size, r)

@@ -1,4 +1,4 @@
-"""What a result was made with, and how much memory it took: for `run.json`, `compare.json` and the reports."""
+"""Versions of mistyle and its packages, and peak memory: for `run.json`, `compare.json` and the reports."""
 
 import platform
 from importlib.metadata import PackageNotFoundError, version
@@ -26,11 +26,11 @@ def peak_gb() -> float:
 
 
 def versions() -> dict[str, str]:
-    """What the result was made with."""
-    found = {"mistyle": __version__, "python": platform.python_version(), "system": platform.platform()}
+    """Versions of mistyle, Python, the system and PACKAGES; "missing" for a package that is not installed."""
+    table = {"mistyle": __version__, "python": platform.python_version(), "system": platform.platform()}
     for name in PACKAGES:
         try:
-            found[name] = version(name)
+            table[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "missing"
-    return found
+            table[name] = "missing"
+    return table

@@ -67,7 +67,7 @@ def local(tmp_path_factory):
     assert killer.killed
     assert (summary["done"], summary["failed"]) == (2, 0), summary
     assert "crashed; once more" in engines.log_of(plan, 0).read_text()
-    assert "done before, taken over" in engines.log_of(plan, 0).read_text()
+    assert "reused from an earlier run" in engines.log_of(plan, 0).read_text()
     return hashes(plan)
 
 

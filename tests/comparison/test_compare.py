@@ -241,7 +241,7 @@ def test_limits_from_everywhere(tmp_path, capsys, rng):
     assert root.find("testsuite").get("failures") == "0"
     (tmp_path / "a" / "compare.toml").write_text('[images."shot_2*".min]\npsnr = 5\n')
     code, record, _ = run(capsys, *words)
-    assert code == 5 and "met nothing" in record["failures"][0]
+    assert code == 5 and "matched nothing" in record["failures"][0]
     for text in ("[limits]\npsnr = 3\n", "[limit]\n", "[limits.min]\npsnr = 'a'\n", "[limits.min\n"):
         (tmp_path / "a" / "compare.toml").write_text(text)
         code, _, said = run(capsys, *words)
@@ -264,7 +264,7 @@ def test_a_regression_suite(tmp_path, capsys, rng):
     save(golden / "old.exr", first)
     suite = ("--baseline", golden, new, "-o", tmp_path / "out", *FAST, "--min", "psnr=60")
     code, _, said = run(capsys, *suite)
-    assert code == 3 and "none called like" in said
+    assert code == 3 and "none named as" in said
     approving = ["compare", "--baseline", str(golden), str(new), "--approve"]
     assert main([*approving, "chair"]) == 0
     capsys.readouterr()

@@ -73,14 +73,14 @@ def test_good_files_pass_every_reader_that_is_there(run, monkeypatch):
     assert outcomes(told, "ball.glb", "glTF validator") == validator
     assert outcomes(told, "ball.usda", "Blender") == {"not checked"}
     assert json.loads((run / "verify" / "verify.json").read_text()) == told
-    assert "not checked" in table(told) and "no Blender here" in table(told)
+    assert "not checked" in table(told) and "Blender not found" in table(told)
     assert verify(run)["failed"] == 0  # its own folder is no part of what it checks
 
 
 def test_readers_that_are_not_there_are_plain_rows(run, monkeypatch):
     monkeypatch.setattr(verify_checks, "which", lambda name: None)
     told = verify(run / "asset" / "ball.glb", run / "checked")
-    assert outcomes(told, "glTF validator") == {"not checked"} and "no node here" in table(told)
+    assert outcomes(told, "glTF validator") == {"not checked"} and "node not found" in table(told)
     assert told["failed"] == 0 and told["not_checked"] == 2
 
 

@@ -20,7 +20,7 @@ from mistyle.core.view import View
 from mistyle.fitting.light import unknown_light
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
 from mistyle.fitting.pipeline.material import hold_out, lights_in_order, place, references_of
-from mistyle.fitting.pipeline.outlines import tell_placed
+from mistyle.fitting.pipeline.outlines import report_placement
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.cameras.views import read_views, write_views
 from mistyle.io.images.write import write_png
@@ -171,7 +171,7 @@ def test_cameras_that_do_not_fit_the_mesh_are_said(shots, tmp_path, capsys, monk
     else:
         captures = replace(captures, cameras=turned)
     wrong, progress = place(job, asset, captures, read, lambda done: None), Progress()
-    tell_placed(wrong, progress)
+    report_placement(wrong, progress)
     (note,) = progress.notes
     assert note.startswith("Warning: the cameras do not fit the mesh in ") and "less than 0.8" in note
     assert ("--align" in note) == (not align) and "--refine-poses" in note

@@ -91,7 +91,7 @@ def test_a_fit_to_pictures_keeps_less_of_their_samples_or_is_refused():
     kept = material_budget.check_material(settings.model_copy(update={"memory": free - 1}), pixels)
     assert 0 < kept.recover.memory < settings.recover.memory
     assert material_budget.material_gb(kept, pixels) <= free - 0.9
-    with pytest.raises(UsageError, match=r"--memory 0\.5G: the fit needs .* even if it keeps nothing"):
+    with pytest.raises(UsageError, match=r"--memory 0\.5G: the fit needs .* even without a cache"):
         material_budget.check_material(settings.model_copy(update={"memory": 0.5}), pixels)
 
 
@@ -111,11 +111,11 @@ def test_the_machines_memory_cuts_nothing_of_a_fit(monkeypatch):
     monkeypatch.setattr(memory, "limit", lambda: int((whole + 0.1) / budget.SHARE * 1e9))
     assert material_budget.check_material(settings, pixels) is settings
     monkeypatch.setattr(memory, "limit", lambda: int((whole - 1) / budget.SHARE * 1e9))
-    with pytest.raises(UsageError, match=r"the fit needs .* GB; give it --memory .* fewer of the pictures' samples"):
+    with pytest.raises(UsageError, match=r"the fit needs .* GB; give it --memory .* smaller cache of the pictures"):
         material_budget.check_material(settings, pixels)
     assert material_budget.check_material(settings.model_copy(update={"memory": whole - 1}), pixels).recover.memory < 4
     monkeypatch.setattr(memory, "limit", lambda: int(0.6e9))
-    with pytest.raises(UsageError, match="even if it keeps nothing"):
+    with pytest.raises(UsageError, match="even without a cache"):
         material_budget.check_material(settings, pixels)
 
 

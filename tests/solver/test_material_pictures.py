@@ -12,7 +12,7 @@ from mistyle.atlas.texels import rasterise
 from mistyle.core.camera import Camera, look_at
 from mistyle.core.capture import in_memory, shrunk
 from mistyle.core.errors import InputRefused
-from mistyle.fitting.pipeline.pictures import look_through, looked
+from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.io.read_mesh import read_mesh
 from mistyle.render.deferred import image_samples, renderer
 from mistyle.render.deferred.material_table import pack
@@ -52,8 +52,8 @@ def test_averages_are_kept_with_what_counts(bowls, tmp_path, rng):
     pictures = [rng.random((256, 256, 3)).astype(np.float32) for _ in range(2)]
     counts = [np.ones((256, 256), bool), rng.random((256, 256)) < 0.99]
     captures = in_memory([above(256)] * 2, [()] * 2, pictures, counts)
-    look_through(tmp_path, texels, captures, 0, lambda done: None)
-    found, notes = looked(tmp_path, captures)
+    write_averaged(tmp_path, texels, captures, 0, lambda done: None)
+    found, notes = read_averaged(tmp_path, captures)
     (by, _) = downsampling_factors(texels, captures.cameras)
     small = shrunk(captures, [by, by])
     assert by > 1 and found.cameras == small.cameras and found.cameras[0].size == (256 // by, 256 // by)
@@ -67,13 +67,13 @@ def test_averages_are_kept_with_what_counts(bowls, tmp_path, rng):
 def test_pictures_that_are_asked_for_as_they_are_are_not_copied(bowls, tmp_path):
     texels = [rasterise(read_mesh(bowls, size=64).mesh, 0, 8)]
     captures = in_memory([above(256)] * 3, [()] * 3, [np.ones((256, 256, 3), np.float32)] * 3)
-    look_through(tmp_path, texels, captures, 1, lambda done: None)
-    found, notes = looked(tmp_path, captures)
+    write_averaged(tmp_path, texels, captures, 1, lambda done: None)
+    found, notes = read_averaged(tmp_path, captures)
     assert found.cameras == captures.cameras and notes == () and not list(tmp_path.glob("*.npy"))
     assert found.load(1)[0] is captures.load(1)[0]
     black = in_memory([above(256)] * 3, [()] * 3, [np.zeros((256, 256, 3), np.float32)] * 3)
     with pytest.raises(InputRefused, match="3 pictures that are black"):
-        look_through(tmp_path / "black", texels, black, 1, lambda done: None)
+        write_averaged(tmp_path / "black", texels, black, 1, lambda done: None)
 
 
 def test_a_fit_to_fine_pictures(bowls, tmp_path):

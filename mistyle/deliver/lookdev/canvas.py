@@ -11,7 +11,7 @@ from mistyle.core.image import linear_from_srgb
 
 GROUND, PANEL = 0.0115, 0.0275  # linear greys of the sheet and of a panel
 FINE = 3
-INK, SOFT = 0.80, 0.33  # linear greys of what is read and of what is looked up
+INK, SOFT = 0.80, 0.33  # linear greys of captions and of details
 
 
 @dataclass(frozen=True)
@@ -42,13 +42,13 @@ class Sheet:
 
 
 def measures(scale: float) -> dict[str, int]:
-    """Distances and sizes of type in pixels."""
+    """Distances and type sizes in pixels."""
     usual = dict(margin=44, gutter=16, title=46, line=22, heading=22, caption=20, caption_room=42, row_gap=30)
     return {name: max(1, round(value * scale)) for name, value in usual.items()}
 
 
 def panel_widths(count: int, width: int, gutter: int) -> int:
-    """The width of each of `count` equal panels in a row of `width` pixels."""
+    """The width in pixels of each of `count` equal panels in a row of `width` pixels."""
     return (width - (count - 1) * gutter) // count
 
 
@@ -88,7 +88,7 @@ def compose(sheet: Sheet, width: int, scale: float) -> Float[np.ndarray, "h w 3"
         y += height + m["caption_room"] + m["row_gap"]
     whisper.text((left, y), fitted(sheet.foot, m["caption"], right - left), m["caption"])
     for layer, grey in ((ink, INK), (soft, SOFT)):
-        # Coverage of the glyphs, mixed as the eye expects light type on a dark ground.
+        # Gamma-decoded coverage of the glyphs: light type on a dark ground keeps its weight.
         layer = layer.reduce(FINE)
         share = linear_from_srgb(np.asarray(layer, np.float32) / 255)[..., None]
         canvas = canvas * (1 - share) + grey * share
@@ -96,7 +96,7 @@ def compose(sheet: Sheet, width: int, scale: float) -> Float[np.ndarray, "h w 3"
 
 
 class Pen:
-    """Writes on a layer that is FINE times as fine as the sheet: small type then keeps its spacing."""
+    """Writes text on a layer of FINE times the sheet's resolution: small type keeps its spacing."""
 
     def __init__(self, draw: Any) -> None:
         self.draw = draw
@@ -106,12 +106,12 @@ class Pen:
         self.draw.text((FINE * x, FINE * y), text, 255, font=font(FINE * size))
 
     def width(self, text: str, size: int) -> int:
-        """Pixels of the sheet that a text takes."""
+        """The width of a text in pixels of the sheet."""
         return round(font(FINE * size).getlength(text) / FINE)
 
 
 def font(size: int):
-    """The type that Pillow brings along (Aileron), the same everywhere."""
+    """Pillow's built-in font (Aileron), the same on every machine."""
     from PIL import ImageFont
 
     return ImageFont.load_default(size)

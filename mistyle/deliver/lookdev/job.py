@@ -3,7 +3,7 @@
 OUT/lookdev.png .exr       the sheet: sRGB without a tone curve, and the same linear
 OUT/turntable/000.png …    the asset turning under fixed light, with --turntable; OUT/turntable.webp (.mp4)
 OUT/light_turn/000.png …   the light turning about a fixed asset, with --hdri-turn; OUT/light_turn.webp (.mp4)
-OUT/lookdev.json           what the sheet was made of
+OUT/lookdev.json           asset, settings, exposures and versions of the sheet
 """
 
 import datetime
@@ -27,13 +27,13 @@ from mistyle.jobs.progress import Progress
 from mistyle.jobs.report.overlays import MAGENTA, viridis
 
 VIEW_TRANSFORM = "sRGB (Rec.709), no tone curve"
-USUAL = 560  # pixels of a hero picture for which the sheet's type is made
+USUAL = 560  # pixels of a hero picture at which the sheet's type has scale 1
 TURNS = {"turntable": "turn the asset", "light_turn": "turn the light"}
 LIGHT_STEPS = 8  # pictures of the HDRI's rotation on the sheet
 
 
 class LookSettings(BaseModel):
-    """How the sheet and the turntables are drawn."""
+    """Settings of the sheet and the turntables."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -50,7 +50,7 @@ class LookSettings(BaseModel):
 
 @dataclass(frozen=True)
 class SheetSubject:
-    """What the sheet shows: the asset, its file, and pictures per texture set of what is known of its texels."""
+    """The subject of a sheet: the asset, its file, and pictures of the run's texel data per texture set."""
 
     asset: Asset
     path: Path
@@ -67,10 +67,10 @@ def lookdev(
     date: str | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Draw the sheet of a mesh file or run folder into `out`; returns the paths of what was written.
+    """Draw the sheet of a mesh file or run folder into `out`; returns the written paths.
 
-    `hdri` is an .hdr or .exr environment map for the third light; `date` stands in the burn-in (else the day on which
-    the asset's file was last changed, UTC). The same asset, settings and thread count give the same pictures.
+    `hdri` is an .hdr or .exr environment map for the third light. `date` appears in the burn-in (default: the day of
+    the asset file's last change, UTC). The same asset, settings and thread count give the same pictures.
     """
     from mistyle.io.read import read_radiance
     from mistyle.jobs.report.turntable import encoder
@@ -122,7 +122,7 @@ def write_sheet(folder: Path, picture: np.ndarray) -> None:
 def write_turns(
     folder: Path, stage: Any, lights: Sequence[Any], settings: LookSettings, progress: Progress
 ) -> dict[str, str]:
-    """Draw and write the turntables that the settings ask for; returns the film of each, relative to the folder."""
+    """Draw and write the turntables of the settings; returns the film of each, relative to the folder."""
     from mistyle.jobs.report.turntable import write_turn
 
     turns = {
@@ -140,7 +140,7 @@ def write_turns(
 
 
 def files_of_sheet(settings: LookSettings) -> list[str]:
-    """What a sheet with these settings consists of."""
+    """The files of a sheet with these settings, relative to its folder."""
     names = ["lookdev.png", "lookdev.exr", "lookdev.json"]
     for name, frames in (("turntable", settings.turntable), ("light_turn", settings.hdri_turn)):
         if frames:
@@ -149,7 +149,7 @@ def files_of_sheet(settings: LookSettings) -> list[str]:
 
 
 def read_subject(place: Path) -> SheetSubject:
-    """A mesh file, or the asset of a run folder with what the run knows of its texels. Raises InputRefused."""
+    """A mesh file, or a run folder's asset with the run's knowledge of the texels. Raises InputRefused."""
     from mistyle.io.read_mesh import read_mesh
     from mistyle.render.external.renderers import finished_asset
 
@@ -168,28 +168,28 @@ def texel_knowledge(folder: Path, parts: int) -> dict[str, list[np.ndarray]]:
         try:
             return load_record(place) if place.is_dir() else None
         except MistyleError:
-            return None  # of another version: the sheet goes without
+            return None  # written by another version: the sheet omits it
 
     baked, repaired, recovered = (record(stage) for stage in ("bake", "repair", "recover"))
-    found: dict[str, list[np.ndarray]] = {}
+    pictures: dict[str, list[np.ndarray]] = {}
     source = recovered if recovered is not None else baked
     if source is not None:
         most = max(max(int(seen.max()) for seen in source.seen), 1)
-        found["coverage"] = [viridis(np.sqrt(seen / most).astype(np.float32)) / 255 for seen in source.seen]
+        pictures["coverage"] = [viridis(np.sqrt(seen / most).astype(np.float32)) / 255 for seen in source.seen]
     if recovered is not None:
-        found["confidence"] = [viridis(values.astype(np.float32)) / 255 for values in recovered.confidence]
+        pictures["confidence"] = [viridis(values.astype(np.float32)) / 255 for values in recovered.confidence]
     if repaired is not None:
-        found["struggle"] = [
+        pictures["struggle"] = [
             np.where(mask[..., None], np.array(MAGENTA), 0.25 + 0.5 * srgb_from_linear(maps.albedo).mean(-1)[..., None])
             for mask, maps in zip(repaired.mask, repaired.maps, strict=True)
         ]
-    return {name: [p.astype(np.float32) for p in each] for name, each in found.items() if len(each) == parts}
+    return {name: [p.astype(np.float32) for p in each] for name, each in pictures.items() if len(each) == parts}
 
 
 def sheet(
     subject: SheetSubject, stage: Any, lights: Sequence[Any], settings: LookSettings, day: str, report: Callable
 ) -> tuple[Sheet, int, float]:
-    """What `compose` wants: the sheet with all its pictures drawn, the width of its rows, and the scale of its type."""
+    """The arguments of `compose`: the sheet with its pictures, the width of its rows, and the scale of its type."""
     from mistyle.render.lookdev import sheet as drawing
     from mistyle.render.lookdev.aovs import aovs
 
@@ -227,7 +227,7 @@ def sheet(
         turned.append(Panel(shot(*drawing.CAMERAS["3/4"], light, step), f"{angle:.0f}°"))
     rows = (
         PanelRow("Three lights, each exposed so that the grey ball is 18 %", tuple(heroes)),
-        PanelRow("Soft studio from five sides: the asset turns, the light stands still", tuple(cameras)),
+        PanelRow("Soft studio from five sides: the asset turns, the light is fixed", tuple(cameras)),
         PanelRow("AOVs", tuple(strip)),
         PanelRow(f"{lights[2].name}, turned about the asset", tuple(turned)),
     )
@@ -235,7 +235,7 @@ def sheet(
 
 
 def on_panel(picture: np.ndarray) -> np.ndarray:
-    """Straight sRGB with alpha over a panel, still encoded."""
+    """Straight sRGB with alpha, composited over a panel in sRGB."""
     ground = float(srgb_from_linear(np.array(PANEL, np.float32)))
     return (picture[..., :3] * picture[..., 3:] + (1 - picture[..., 3:]) * ground).astype(np.float32)
 
@@ -248,7 +248,7 @@ def shown(picture: np.ndarray) -> np.ndarray:
 
 
 def facts(subject: SheetSubject) -> tuple[str, ...]:
-    """What the asset is, in a line, and what reading it had to change."""
+    """The asset in one line, and the first two notes of its reader."""
     mesh, sizes = subject.asset.mesh, []
     for material in subject.asset.materials:
         if material.albedo is not None:

@@ -1,4 +1,4 @@
-"""An unknown sky as cells of even radiance: their geometry, how they are refined where light is, their map."""
+"""An unknown environment light as spherical cells of constant radiance: geometry, refinement, environment map."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -12,9 +12,9 @@ from mistyle.core.light import Environment, environment_directions
 from mistyle.render.deferred.sky import even_directions
 
 CELLS = 128
-FINE = 64  # more of them go where the light is, once that is roughly known
-ROWS = 128  # of the map that is made of them
-GRID = 256  # rows of the directions by which cells are measured
+FINE = 64  # additional cells where the light is, after the first solve
+ROWS = 128  # rows of the environment map
+GRID = 256  # rows of the direction grid that measures the cells
 AROUND = 6  # neighbours of a cell
 
 
@@ -31,12 +31,12 @@ class EnvironmentCells:
     pairs: Int[np.ndarray, "p 2"]
 
     def mean(self, radiance: Float[np.ndarray, "k 3"]) -> Float[np.ndarray, "3"]:
-        """Of a radiance of every cell, over the sphere."""
+        """The mean over the sphere of a radiance per cell."""
         return (radiance * (self.angle / self.angle.sum())[:, None]).sum(axis=0)
 
     @property
     def width2(self) -> Float[np.ndarray, " k"]:
-        """Mean square of the angle from the middle, along one axis: a disc of that solid angle has radius²/4."""
+        """Mean squared angle from the cell's centre along one axis, for a disc of its solid angle: radius²/4."""
         return self.angle / (4 * np.pi)
 
 
@@ -44,7 +44,7 @@ Radiance = Float[np.ndarray, "k 3"]
 
 
 def cells_at(directions: Float[np.ndarray, "k 3"]) -> EnvironmentCells:
-    """The cells of these directions."""
+    """The Voronoi cells of these directions; their solid angles are measured on the direction grid."""
     towards, angle = _sphere()
     own = np.bincount(_owners(directions, towards), angle, minlength=len(directions))
     near = np.asarray(KDTree(directions).query(directions, AROUND + 1)[1])[:, 1:]
@@ -53,16 +53,16 @@ def cells_at(directions: Float[np.ndarray, "k 3"]) -> EnvironmentCells:
 
 
 def even_cells() -> EnvironmentCells:
-    """CELLS cells of nearly one size."""
+    """CELLS cells of nearly equal size."""
     return cells_at(even_directions(CELLS).astype(float))
 
 
 def refined(cells: EnvironmentCells, radiance: Radiance) -> tuple[EnvironmentCells, Float[np.ndarray, "n 3"]]:
-    """CELLS even cells and FINE more inside the old ones, as their light demands, and the same light in all of them."""
+    """CELLS even cells, FINE more in proportion to the old cells' energy, and the radiance resampled to them."""
     energy = luminance(radiance) * cells.angle
-    wish = FINE * energy / max(float(energy.sum()), 1e-20)
-    count = np.floor(wish).astype(int)
-    count[np.argsort(count - wish, kind="stable")[: FINE - count.sum()]] += 1
+    share = FINE * energy / max(float(energy.sum()), 1e-20)
+    count = np.floor(share).astype(int)
+    count[np.argsort(count - share, kind="stable")[: FINE - count.sum()]] += 1
     inside = [_within(cells, k, int(count[k])) for k in np.flatnonzero(count).tolist()]
     new = cells_at(np.concatenate([even_directions(CELLS), *inside]))
     towards, angle = _sphere()
@@ -72,19 +72,19 @@ def refined(cells: EnvironmentCells, radiance: Radiance) -> tuple[EnvironmentCel
 
 
 def environment_of(cells: EnvironmentCells, radiance: Radiance) -> Environment:
-    """The map of the cells' light."""
+    """The environment map of the cells' radiance, ROWS x 2 ROWS."""
     towards = environment_directions(ROWS, 2 * ROWS)
     own = _owners(cells.direction, towards.reshape(-1, 3))
     return Environment(radiance[own].reshape(towards.shape).astype(np.float32))
 
 
 def _owners(middles: Float[np.ndarray, "k 3"], towards: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
-    """To which cell each direction belongs."""
+    """The index of each direction's cell."""
     return np.asarray(KDTree(middles).query(towards)[1])
 
 
 def _within(cells: EnvironmentCells, k: int, count: int) -> Float[np.ndarray, "n 3"]:
-    """Directions spread evenly over a disc about the middle of cell k, as large as the cell (a Fibonacci spiral)."""
+    """Even directions (Fibonacci spiral) over a disc at the centre of cell k with the cell's solid angle."""
     middle = cells.direction[k]
     across = np.cross(middle, np.eye(3)[np.abs(middle).argmin()])
     across /= np.linalg.norm(across)
@@ -97,7 +97,7 @@ def _within(cells: EnvironmentCells, k: int, count: int) -> Float[np.ndarray, "n
 
 @cache
 def _sphere() -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Directions all over the sphere, and the solid angle that each stands for."""
+    """A direction grid of the whole sphere, and the solid angle of each direction."""
     towards = environment_directions(GRID, 2 * GRID).reshape(-1, 3)
     weight = np.repeat(np.sin(np.arange(GRID) / (GRID - 1) * np.pi), 2 * GRID)
     return towards, 4 * np.pi * weight / weight.sum()

@@ -1,10 +1,10 @@
-"""An environment map for pictures whose light nobody measured, found together with a first, coarse material.
+"""Estimation of an unknown environment map together with a first, coarse material.
 
-The sky is cut into cells, and their radiances and all texels of a coarse atlas are solved for together
-(`light/solve.py`), first with even cells, then with finer ones where the light is. Two things pictures may leave open,
-and are begun by convention: the albedo's scale (its brightest twentieth over what was seen has luminance BRIGHT) and
-the light's colour (its mean over the sphere is neutral). Highlights, which take no colour from the surface and whose
-strength the material model fixes, move both away from the convention as far as there are any.
+The sphere is divided into cells. Their radiances and all texels of a coarse atlas are solved jointly
+(`light/solve.py`), first with even cells, then with finer ones where the light is. Pictures may leave two quantities
+undetermined; both start from a convention. Initial scale: the 95th percentile of the observed albedo's luminance is
+BRIGHT. Initial colour: the light's mean over the sphere is neutral. Highlights resolve both, since they take no colour
+from the surface and the material model fixes their strength.
 """
 
 from collections.abc import Callable, Sequence
@@ -32,13 +32,13 @@ from mistyle.solver.table import atlas_of, scatter, scatter_to_atlas
 from mistyle.solver.texels.observations import ObservationOptions, TexelObservations, collect_observations
 
 SIDE = 192  # pixels along the longer side of the small pictures
-ATLAS, LEAST = 96, 16  # texels along the coarse atlas's side: of all sets together, and of each at least
-PICTURES = 48  # at most, spread evenly over those that there are
-OBSERVATIONS = 30_000  # of which about so many are enough, and time hangs on them
-STEPS = (10, 12)  # with even cells, and with finer ones
+ATLAS, LEAST = 96, 16  # texels a side of the coarse atlas: all sets together, and the least for each
+PICTURES = 48  # at most, evenly chosen
+OBSERVATIONS = 30_000  # target number of observations; the time is proportional to it
+STEPS = (10, 12)  # joint steps with even cells, and with finer ones
 NOISE, RELATIVE = 0.01, 0.03  # standard deviation of a small picture's pixels: the model is coarse
-FLOOR = 0.1  # least roughness, below which a highlight is narrower than the finest cells
-BRIGHT = 0.8
+FLOOR = 0.1  # least roughness; smaller values give highlights narrower than the finest cells
+BRIGHT = 0.8  # luminance of the 95th percentile of albedo
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ def find_light(
     settings: RecoverSettings,
     progress: Callable[[float], None] = lambda done: None,
 ) -> FoundLight:
-    """One environment, fixed to the world, for all pictures; `captures.lights` are not looked at.
+    """One environment, fixed to the world, for all pictures; `captures.lights` are ignored.
 
-    Needs views from around the object; one without highlights shows the light only blurred. Direct light and shadows
-    are modelled, light between surfaces is not. Raises InputRefused where no texel is seen.
+    Needs views from around the object. A surface without highlights determines the light only at low frequencies.
+    Direct light and shadows are modelled, interreflection is not. Raises InputRefused where no texel is seen.
     """
     from mistyle.render.mitsuba.draw import tracer
     from mistyle.solver.texels.levenberg_marquardt import Options
@@ -70,22 +70,22 @@ def find_light(
     options = Options(settings.model, settings.metallic, floor=max(FLOOR, settings.roughness_floor))
     residuals: list[float] = []
 
-    def heard(state: State) -> None:
+    def record(state: State) -> None:
         residuals.append(state.residual)
         progress(min(0.99, len(residuals) / (sum(STEPS) + 1)))
 
     cells = light_cells.even_cells()
     bundled = light_solve.bundle(traced, observed, normal, cells, options)
-    state = _begin(bundled)
-    heard(state)
-    state = light_solve.solve_light_and_texels(bundled, state, _conventional, STEPS[0], heard)
+    state = _start_state(bundled)
+    record(state)
+    state = light_solve.solve_light_and_texels(bundled, state, _conventional_mean, STEPS[0], record)
     cells, radiance = light_cells.refined(cells, state.radiance)
     bundled = light_solve.bundle(traced, observed, normal, cells, options)
     values = state.values
     for _ in range(3):
         radiance = light_solve.light_over(bundled, radiance, values)
     state = light_solve.texels_under(bundled, radiance, values, 8)
-    state = light_solve.solve_light_and_texels(bundled, state, _conventional, STEPS[1], heard)
+    state = light_solve.solve_light_and_texels(bundled, state, _conventional_mean, STEPS[1], record)
     progress(1.0)
     light = light_cells.environment_of(cells, state.radiance)
     return FoundLight(light, tuple(residuals), _maps(state, observed, texels))
@@ -94,11 +94,11 @@ def find_light(
 def _observations(
     traced: Tracer, captures: Captures, settings: RecoverSettings
 ) -> tuple[list[Texels], TexelObservations]:
-    """What small pictures say of a coarse atlas, as fine as OBSERVATIONS allows."""
+    """The texel observations of downsampled pictures on a coarse atlas, as fine as OBSERVATIONS allows."""
     from mistyle.render.deferred.image_samples import tangents_of
 
     chosen = np.unique(np.linspace(0, len(captures) - 1, PICTURES).round().astype(int))
-    cameras, pictures, masks = zip(*(_small(captures, int(k)) for k in chosen), strict=True)
+    cameras, pictures, masks = zip(*(_downsampled(captures, int(k)) for k in chosen), strict=True)
     lit = in_memory(cameras, [(Ambient((1.0, 1.0, 1.0)),)] * len(cameras), pictures, masks)
     mesh, tangents = traced.mesh, tangents_of(traced.mesh, settings.frame)
 
@@ -116,13 +116,13 @@ def _observations(
     if not (observed.seen >= recover_prior.LEAST_SEEN).any():
         raise InputRefused(
             f"found no place of the mesh that {recover_prior.LEAST_SEEN} of the pictures show, expected pictures from "
-            "around it. Check the cameras (--align where they are in other units than the mesh) and the masks."
+            "around it. Check the masks and the cameras (--align if their units differ from the mesh's)."
         )
     return texels, observed
 
 
-def _begin(bundled: Bundle) -> State:
-    """Light over grey texels, then texels under it, brought to the convention."""
+def _start_state(bundled: Bundle) -> State:
+    """The start state: light for grey texels, then texels under that light, scaled to the convention."""
     values = light_solve.first_values(bundled)
     middle = float(np.median(bundled.observed.observations.rgb))
     radiance = np.full((len(bundled.cells.angle), 3), max(middle, 1e-6))
@@ -136,7 +136,7 @@ def _begin(bundled: Bundle) -> State:
 
 
 def _factor(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
-    """What albedo would be multiplied by, and light divided, to be as the convention has them."""
+    """The factor that multiplies albedo and divides light to satisfy the convention."""
     mean = bundled.cells.mean(state.radiance)
     colour = mean / max(float(luminance(mean[None])[0]), 1e-9)
     seen = state.values[bundled.observed.seen > 0, ALBEDO]
@@ -144,8 +144,8 @@ def _factor(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
     return np.maximum(colour, 1e-3) * BRIGHT / max(bright, 1e-6)
 
 
-def _conventional(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
-    """The mean radiance that the light would then have."""
+def _conventional_mean(bundled: Bundle, state: State) -> Float[np.ndarray, "3"]:
+    """The mean radiance of a state's light under the convention."""
     return bundled.cells.mean(state.radiance) / _factor(bundled, state)
 
 
@@ -158,8 +158,8 @@ def _maps(state: State, observed: TexelObservations, texels: Sequence[Texels]) -
     return tuple(replace(m, known=known[p].reshape(m.known.shape)) for m, p in zip(maps, atlas.parts, strict=True))
 
 
-def _small(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Picture k shrunk to SIDE pixels by means over the pixels that count; a pixel counts where nearly all do."""
+def _downsampled(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
+    """Picture k downsampled to SIDE pixels by means of valid pixels; a result needs more than 90 % valid pixels."""
     rgb, mask = captures.load(k)
     height, width = mask.shape
     times = max(1, -(-max(height, width) // SIDE))
@@ -169,7 +169,7 @@ def _small(captures: Captures, k: int) -> tuple[Camera, Float[np.ndarray, "h w 3
     weight = inside.reshape(cells).sum(axis=(1, 3)).astype(np.float32)
     values = np.where(inside[..., None], rgb[: high * times, : wide * times], 0)
     total = values.reshape(*cells, 3).sum(axis=(1, 3))
-    # What does not fill a cell at the right and lower border is cut off; the camera's centre stays where it is.
+    # Incomplete blocks at the right and lower border are cropped; the principal point does not move.
     whole = replace(captures.cameras[k], size=(high * times, wide * times))
-    counts = weight > 0.9 * times * times
-    return resized(whole, (high, wide)), (total / np.maximum(weight, 1)[..., None]).astype(np.float32), counts
+    valid = weight > 0.9 * times * times
+    return resized(whole, (high, wide)), (total / np.maximum(weight, 1)[..., None]).astype(np.float32), valid

@@ -1,4 +1,4 @@
-"""How much memory a fit to pictures needs, stage by stage, and what of the pictures it keeps within its budget."""
+"""Memory model of a fit to pictures, stage by stage, and the cache of picture samples within the budget."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -7,9 +7,9 @@ from mistyle.core.errors import UsageError
 from mistyle.jobs.memory_budget import Counts, Need, allowed, peaks, rounded_up, shown, smaller_setting, with_setting
 from mistyle.solver.settings import joint_steps
 
-# A fit to pictures, without what is kept of the pictures' samples, up to `recover.memory`; the system does not get all
-# of that back after the stage. Read off `fit_512` and `fit_200`, the report off `fit_256`, what hangs on large pictures
-# off `large` of `python -m benchmarks.photographs`.
+# A fit to pictures without the cache of their samples. That takes up to `recover.memory`, which the system does not
+# regain completely after the stage. Measured by `fit_512` and `fit_200` of `python -m benchmarks.photographs`, the
+# report by `fit_256`, the terms of large pictures by `large`.
 MATERIAL = {
     "mesh": Need(0.38, face=5000),
     "texels": Need(0.39, texel=71),
@@ -22,63 +22,63 @@ MATERIAL = {
 }
 MATERIAL = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in MATERIAL.items()}
 KEEPING = ("recover", "measure", "asset", "scene", "report")
-# Shares of a picture that show the object, of the atlas that is covered, and of that what one picture sees.
+# The object's share of a picture, the covered share of the atlas, and the share of that which one picture sees.
 SHOWN, COVERED, SEEN = 0.3, 0.55, 0.35
-SAMPLE = 32  # bytes that are kept of a sample of a picture
-# The settings whose half saves memory.
+SAMPLE = 32  # cached bytes per sample of a picture
+# The settings that save memory when halved.
 FITTED = ("atlas.size", "recover.subsamples")
 
 
 def material_counts(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> Counts:
-    """The counts of a fit to pictures of so many pixels each."""
+    """The counts of a fit; `pixels` are those of each picture."""
     drawn, frame = shown(settings, sets)
     texel = solved = sets * settings.atlas.size**2
-    # Only covered texels are solved: half of them at least, as a rule.
+    # Only covered texels are solved, usually at least half of all.
     while solved > 2 * settings.recover.solver_texels:
         solved //= 4
     looks = 0 if settings.recover.solver == "pictures" else solved * len(pixels)
-    looked = looked_at(settings, pixels)
+    averaged = averaged_pixels(settings, pixels)
     return Counts(
-        texel, sum(looked), face=faces, drawn=drawn, frame=frame, look=looks,
-        picture=max(looked, default=0), photograph=max(pixels, default=0), own=own,
+        texel, sum(averaged), face=faces, drawn=drawn, frame=frame, look=looks,
+        picture=max(averaged, default=0), photograph=max(pixels, default=0), own=own,
     )  # fmt: skip
 
 
-def looked_at(settings: Any, pixels: Sequence[int]) -> list[int]:
-    """Pixels that are left of pictures of so many after blocks of them were averaged (solver/validate.py).
+def averaged_pixels(settings: Any, pixels: Sequence[int]) -> list[int]:
+    """Pixels of each picture after block averaging (solver/validate.py).
 
-    By the setting; else for an object that fills SHOWN of each picture, with COVERED of its atlas, SEEN by one, turned
-    away from the camera such that half of its area is left.
+    By the setting. Otherwise for an object that fills SHOWN of each picture and COVERED of its atlas, of which one
+    picture sees SEEN; slant halves its projected area.
     """
     texels, average = 0.5 * COVERED * SEEN * settings.atlas.size**2, settings.references.average
     return [n // max(1, average or int((SHOWN * n / texels) ** 0.5 / 2)) ** 2 for n in pixels]
 
 
 def material_gb(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> float:
-    """Peak memory of a fit to pictures of so many pixels each, GB."""
+    """Peak memory of a fit, GB; `pixels` are those of each picture."""
     count = material_counts(settings, pixels, faces, sets, own)
-    found = peaks(MATERIAL, count)
+    gb_of = peaks(MATERIAL, count)
     samples = max(settings.recover.subsamples, joint_steps(settings.recover) and settings.recover.joint_subsamples)
-    held = min(settings.recover.memory, SAMPLE * count.view * samples / 1e9)
-    held += between_gb(settings, pixels)
-    found |= {stage: found[stage] + held for stage in KEEPING}
-    return round(max(found.values()), 2)
+    cached = min(settings.recover.memory, SAMPLE * count.view * samples / 1e9)
+    cached += indirect_gb(settings, pixels)
+    gb_of |= {stage: gb_of[stage] + cached for stage in KEEPING}
+    return round(max(gb_of.values()), 2)
 
 
-def between_gb(settings: Any, pixels: Sequence[int]) -> float:
-    """GB of the light between surfaces that is kept of every picture: three floats a pixel of the estimate."""
+def indirect_gb(settings: Any, pixels: Sequence[int]) -> float:
+    """GB of the indirect light of all pictures: three floats per pixel of the estimate."""
     from mistyle.solver.indirect import MOST
 
     if settings.recover.solver == "pictures" or not settings.recover.bounces:
         return 0.0
-    return 12 * sum(min(n, MOST**2) for n in looked_at(settings, pixels)) / 1e9
+    return 12 * sum(min(n, MOST**2) for n in averaged_pixels(settings, pixels)) / 1e9
 
 
 def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: int = 1, own: int = 0) -> Any:
-    """The settings of a fit to pictures with `recover.memory` cut to what `--memory` leaves; UsageError for none.
+    """The settings of a fit with `recover.memory` reduced to the rest of `--memory`; UsageError if nothing remains.
 
-    A fit leaves out steps for which `recover.memory` is too small. So a budget that nobody gave cuts nothing: a fit
-    that is too large for the machine is refused.
+    A fit leaves out steps for which `recover.memory` is too small. Without `--memory` nothing is reduced: a fit that is
+    too large for the machine is refused.
     """
     budget = allowed(settings)
 
@@ -88,15 +88,15 @@ def check_material(settings: Any, pixels: Sequence[int], faces: int = 0, sets: i
     needed, left = least(settings), float(settings.recover.memory)
     if budget.given:
         left = budget.gb - max(peaks(MATERIAL, material_counts(settings, pixels, faces, sets, own)).values())
-        left -= between_gb(settings, pixels)
+        left -= indirect_gb(settings, pixels)
     elif (whole := material_gb(settings, pixels, faces, sets, own)) > budget.gb >= needed:
         raise UsageError(
-            f"{budget.who}: the fit needs {whole:.2f} GB; give it --memory {rounded_up(needed)}G or more, with which "
-            f"it keeps fewer of the pictures' samples, or {smaller_setting(settings, least, FITTED)}"
+            f"{budget.who}: the fit needs {whole:.2f} GB; give it --memory {rounded_up(needed)}G or more, with a "
+            f"smaller cache of the pictures' samples, or {smaller_setting(settings, least, FITTED)}"
         )
     if needed > budget.gb or left <= 0:
         raise UsageError(
-            f"{budget.who}: the fit needs {needed:.2f} GB even if it keeps nothing of the pictures' "
+            f"{budget.who}: the fit needs {needed:.2f} GB even without a cache of the pictures' "
             f"samples; give it --memory {rounded_up(needed)}G or more, or {smaller_setting(settings, least, FITTED)}"
         )
     return with_setting(settings, "recover.memory", min(settings.recover.memory, left)) if budget.given else settings

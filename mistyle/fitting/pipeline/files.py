@@ -1,4 +1,4 @@
-"""What `mistyle fit` writes for other programs: the asset, and a Mitsuba scene of it."""
+"""The outputs of `mistyle fit` for other programs: the asset, and a Mitsuba scene of it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from mistyle.deliver import asset_files
 from mistyle.jobs.edits import UNEDITED, Edited
 from mistyle.jobs.progress import Report
 
-BORDER = 1  # texels beside an island that interpolation brought into the pictures, so that they were fitted too
+BORDER = 1  # texels around an island that the fit determines, since bilinear lookups reach them
 
 
 def write(
@@ -24,21 +24,21 @@ def write(
     report: Report,
     edited: Edited = UNEDITED,
 ) -> None:
-    """The asset as `stylize` writes it; `edited` holds textures that a person painted over."""
+    """Write the asset; `edited` holds textures that a person painted over."""
     provenance = {"mesh": job.mesh.name, "references": job.references.name, "material": job.settings.recover.model}
     sets = zip(texels, recovered.maps, strict=True)
     asset_files.write(folder, job, asset, sets, provenance, report, edited, own=BORDER)
 
 
 def scene(folder: Path, job: Any, asset: Asset, texels: Sequence[Texels], recovered: Any, captures: Captures) -> None:
-    """A Mitsuba scene of the result that renders where mistyle is not installed."""
+    """Write a Mitsuba scene of the result that renders without mistyle."""
     from mistyle.atlas.frames import mitsuba_normals
     from mistyle.atlas.texels import pad, pad_maps
     from mistyle.render.mitsuba.scene_folder import write_scene
 
     padding, turned = job.settings.atlas.padding, list(recovered.maps)
     if job.settings.recover.frame == "mikkt":
-        # Texels beside the surface have no frame to turn from.
+        # Texels outside the islands have no tangent frame.
         normals = [pad(mitsuba_normals(asset.mesh, m, t), t, padding) for m, t in zip(turned, texels, strict=True)]
         turned = [replace(m, normal=normal) for m, normal in zip(turned, normals, strict=True)]
     padded = [pad_maps(m, t, padding, own=BORDER) for m, t in zip(turned, texels, strict=True)]

@@ -1,4 +1,4 @@
-"""A job of `fit`: what it is given, and its stages by name."""
+"""A job of `fit`: its inputs and settings, and the names of its stages."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,8 +22,8 @@ MATERIAL_STAGES = {
 
 @dataclass(frozen=True)
 class MaterialJob:
-    """What to fit and to what. `lights` and `masks` are files beside or instead of those in the references' folder;
-    lights "unknown" are solved for."""
+    """A mesh and its references. `lights` and `masks` replace or complete those of the references' folder; "unknown"
+    lights are estimated."""
 
     mesh: Path
     references: Path

@@ -1,7 +1,7 @@
-"""`mistyle fit`: a mesh and pictures of it under known light -> its material, measured against what was held out.
+"""`mistyle fit`: a mesh and pictures of it under known or unknown light -> its material, measured on held-out pictures.
 
-Stages are kept as those of `stylize` are (stylization/pipeline/stylize.py): a killed run goes on from the last finished
-stage, and the fit itself from its last checkpoint.
+Stages are cached as those of `stylize` (stylization/pipeline/stylize.py): rerun a killed job to resume it. The fit
+resumes from its last checkpoint.
 """
 
 from collections.abc import Sequence
@@ -21,8 +21,8 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.fitting.pipeline.budget import check_material
 from mistyle.fitting.pipeline.files import scene, write
 from mistyle.fitting.pipeline.job import MATERIAL_STAGES, MaterialJob
-from mistyle.fitting.pipeline.outlines import fix_of, tell_placed
-from mistyle.fitting.pipeline.pictures import look_through, looked
+from mistyle.fitting.pipeline.outlines import camera_advice, report_placement
+from mistyle.fitting.pipeline.pictures import read_averaged, write_averaged
 from mistyle.fitting.settings.material import MaterialSettings, ReferenceSettings
 from mistyle.io.images.textures import part_stems
 from mistyle.jobs import checkpoint
@@ -36,8 +36,8 @@ from mistyle.jobs.start import read, start_engines
 
 @dataclass(frozen=True)
 class Placed:
-    """The cameras in working space, the lights there, and what was done to bring them there. `overlap` is that of the
-    mesh's outline with each picture's alpha or mask (solver/cameras/outline_check.py), NaN where it has none."""
+    """Cameras and lights in working space, with notes and figures of the alignment. `overlap` is the IoU of the mesh's
+    outline with each picture's alpha or mask (solver/cameras/outline_check.py), NaN where it has none."""
 
     cameras: tuple[Camera, ...]
     lights: tuple[Lights, ...]
@@ -48,11 +48,11 @@ class Placed:
 
 @dataclass(frozen=True)
 class Measured:
-    """How well the fit explains each picture, those that it saw and those that it did not.
+    """The error of the fit in each picture, fitted or held out.
 
-    names, held   the picture's name; whether it was kept from the fit
-    psnr          of the picture in sRGB (peak 1, over the pixels that count), dB
-    worst         the pictures to look at: (index, reference, prediction), linear
+    names, held   the picture's name; whether it was held out
+    psnr          of the picture in sRGB (peak 1, over the valid pixels), dB
+    worst         the pictures of the report: (index, reference, prediction), linear
     conversion    mean relative difference of the same maps under the other material model
     """
 
@@ -65,7 +65,7 @@ class Measured:
 
 @dataclass(frozen=True)
 class MadeMaterial:
-    """Everything a job made, as the report wants it."""
+    """All results of a job, for the report."""
 
     job: MaterialJob
     asset: Asset
@@ -78,9 +78,9 @@ class MadeMaterial:
 
 
 def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
-    """Read, place, fit, measure and write; returns the paths of what was written and the figures of `run.json`.
+    """Read, place, fit, measure and write; returns the written paths and the figures of `run.json`.
 
-    Raises a MistyleError for everything that a user can mend; what was finished before stays.
+    Raises a MistyleError for every error that a user can fix; finished stages stay.
     """
     from mistyle.deliver.colour import in_working_space, key_of
     from mistyle.deliver.export import check, deliver
@@ -105,20 +105,22 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         check_material(s, pixels_of(captures), *size_of(asset))
         texels = run.record("texels", ["mesh"], [s.atlas], lambda r: lay_out(asset, s, r))
         read_as = [shot.pixels for shot in shots]
-        given = [pictures, read_as, [vars(c) for c in captures.cameras], captures.lights]
-        given += [s.references, s.seed, key_of(s.colour)]
-        placed = run.record("cameras", ["mesh"], given, lambda r: place(job, asset, captures, shots, r))
+        key_inputs = [pictures, read_as, [vars(c) for c in captures.cameras], captures.lights]
+        key_inputs += [s.references, s.seed, key_of(s.colour)]
+        placed = run.record("cameras", ["mesh"], key_inputs, lambda r: place(job, asset, captures, shots, r))
         placed = replace(placed, notes=(*reading_notes(job.references, shots), *placed.notes))
-        tell_placed(placed, progress)
+        report_placement(placed, progress)
         whole = replace(captures, cameras=placed.cameras, lights=placed.lights)
-        captures, said = no_finer(run, texels, whole)
-        placed = replace(placed, notes=(*placed.notes, *said))
+        captures, notes = average_pictures(run, texels, whole)
+        placed = replace(placed, notes=(*placed.notes, *notes))
         if job.lights == "unknown":
             captures = with_light(run, asset, captures)
-        kept, _ = hold_out(captures, s.references)
+        fitted, _ = hold_out(captures, s.references)
         inputs = [s.recover, s.references, s.start, s.seed]
         after = ["texels", "pictures", *(["light"] if job.lights == "unknown" else [])]
-        recovered = run.record("recover", after, inputs, lambda r: solve(run, asset, texels, subset(captures, kept), r))
+        recovered = run.record(
+            "recover", after, inputs, lambda r: solve(run, asset, texels, subset(captures, fitted), r)
+        )
         checkpoint.clear(job.out)
         measured = run.record("measure", ["recover"], [], lambda r: measure(asset, recovered.maps, captures, s, r))
         folder, edited = asset_stage(run, ["recover"], lambda f, e, r: write(f, job, asset, texels, recovered, r, e))
@@ -127,23 +129,23 @@ def fit_material(job: MaterialJob, progress: Progress) -> dict[str, Any]:
         recovered = replace(recovered, maps=tuple(maps))
         shown = replace(captures, cameras=whole.cameras)
         run.stage("scene", ["asset"], [job.name], lambda f, r: scene(f, job, asset, texels, recovered, shown))
-        made = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
+        results = MadeMaterial(job, asset, texels, captures, placed, recovered, measured, folder)
         progress.note(*asset.source.notes, *placed.notes, *recovered.notes, *old_report(job))
         if s.report.detail != "none":
             inputs = [s.report, job.name]
-            run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, made, progress, r))
-        return deliver(job, progress) | write_summary(made, run)
+            run.stage("report", ["asset", "measure"], inputs, lambda f, r: material_report(f, results, progress, r))
+        return deliver(job, progress) | write_summary(results, run)
 
 
 def inputs_of(job: MaterialJob) -> list[Path]:
-    """Every file and folder of the user's that the job reads."""
+    """Every input file and folder of the job."""
     lights = job.lights if isinstance(job.lights, Path) else None
-    given = (job.references, lights, job.masks, job.exposure, job.pictures)
-    return [*input_files(job.mesh), *(path for path in given if path is not None)]
+    paths = (job.references, lights, job.masks, job.exposure, job.pictures)
+    return [*input_files(job.mesh), *(path for path in paths if path is not None)]
 
 
 def references_of(job: MaterialJob) -> Captures:
-    """The job's pictures; cameras, lights and headers are read now, pixels one picture at a time."""
+    """The job's pictures; cameras, lights and headers are read now, pixels on demand, one picture at a time."""
     from mistyle.io.cameras.captures import read_captures
 
     captures = read_captures(
@@ -159,7 +161,7 @@ def references_of(job: MaterialJob) -> Captures:
 
 
 def refuse_scene_lights(captures: Captures, references: Path) -> None:
-    """A light that only a Mitsuba scene file describes cannot be summed."""
+    """InputRefused for a light that only a Mitsuba scene file describes: the solver has no model of it."""
     for camera, rig in zip(captures.cameras, captures.lights, strict=True):
         named = next((light for light in rig if isinstance(light, SceneLights)), None)
         if named is not None:
@@ -182,8 +184,8 @@ def lay_out(asset: Asset, settings: MaterialSettings, report: Report) -> tuple[T
 
 
 def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[Any], report: Report) -> Placed:
-    """The cameras in working space: as they are, through the mesh's own units, or aligned and refined on request; and
-    whether the mesh's outlines are where the pictures have them."""
+    """The cameras in working space: unchanged, converted from the mesh's units, or aligned and refined on request; and
+    the overlap of the mesh's outlines with the masks."""
     from mistyle.geometry.similarity import moved
     from mistyle.io.cameras.captures import camera_space, outline_of, silhouette, sparse_points
     from mistyle.solver.cameras.align import align_by_masks, align_by_points, refine_poses
@@ -203,12 +205,12 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
     if chosen.align:
         rng = np.random.default_rng(job.settings.seed)
         if sparse is not None:
-            found = align_by_points(asset.mesh, sparse.position, captures.cameras, masks, rng)
+            aligned = align_by_points(asset.mesh, sparse.position, captures.cameras, masks, rng)
         else:
-            found = align_by_masks(asset.mesh, captures.cameras, masks or (), rng)
-        captures = moved(captures, found.work_from_cams)
-        if len(found.after):
-            figures |= {"align_px": float(np.nanmean(found.after))}
+            aligned = align_by_masks(asset.mesh, captures.cameras, masks or (), rng)
+        captures = moved(captures, aligned.work_from_cams)
+        if len(aligned.after):
+            figures |= {"align_px": float(np.nanmean(aligned.after))}
     elif camera_space(job.references) == "own":
         captures = moved(captures, asset.source.work_from_user)
     report(0.3)
@@ -220,36 +222,36 @@ def place(job: MaterialJob, asset: Asset, captures: Captures, shots: Sequence[An
         captures = replace(captures, cameras=refined.cameras)
         before, after = (float(np.nanmean(each)) for each in (refined.before, refined.after))
         figures |= {"pose_px_before": before, "pose_px_after": after}
-    found = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done))
+    overlaps = check_outlines(asset.mesh, captures.cameras, outlines, lambda done: report(0.8 + 0.2 * done))
     ours = camera_space(job.references) == "working" and not chosen.align
     names = [camera.name for camera in captures.cameras]
-    said = overlap_notes(names, found, chosen.overlap, fix_of(chosen), trusted=ours)
-    if np.isfinite(found.overlap).any():
-        mean, least = float(np.nanmean(found.overlap)), float(np.nanmin(found.overlap))
+    warnings = overlap_notes(names, overlaps, chosen.overlap, camera_advice(chosen), trusted=ours)
+    if np.isfinite(overlaps.overlap).any():
+        mean, least = float(np.nanmean(overlaps.overlap)), float(np.nanmin(overlaps.overlap))
         figures |= {"outline_overlap": mean, "outline_overlap_least": least}
-    return Placed(captures.cameras, captures.lights, (*notes, *said), figures, found.overlap)
+    return Placed(captures.cameras, captures.lights, (*notes, *warnings), figures, overlaps.overlap)
 
 
-def no_finer(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:
-    """The captures with pixels not much finer than the texels, and what there is to say of them."""
+def average_pictures(run: Run, texels: Sequence[Texels], captures: Captures) -> tuple[Captures, tuple[str, ...]]:
+    """The captures at about the resolution of the texels, and notes about them."""
     average = run.job.settings.references.average
     folder = run.stage(
-        "pictures", ["texels", "cameras"], [], lambda f, r: look_through(f, texels, captures, average, r)
+        "pictures", ["texels", "cameras"], [], lambda f, r: write_averaged(f, texels, captures, average, r)
     )
-    return looked(folder, captures)
+    return read_averaged(folder, captures)
 
 
 def with_light(run: Run, asset: Asset, captures: Captures) -> Captures:
-    """The captures lit by an environment that is solved for together with a first material."""
+    """The captures with an environment that is estimated together with a first material."""
     from mistyle.fitting.light.unknown_light import find_light
 
     s: MaterialSettings = run.job.settings
-    found = run.record("light", ["pictures"], [s.recover], lambda r: find_light(asset.mesh, captures, s.recover, r))
-    return replace(captures, lights=tuple((found.light,) for _ in captures.cameras))
+    estimate = run.record("light", ["pictures"], [s.recover], lambda r: find_light(asset.mesh, captures, s.recover, r))
+    return replace(captures, lights=tuple((estimate.light,) for _ in captures.cameras))
 
 
 def lights_in_order(lights: Sequence[Lights]) -> list[int]:
-    """The number of each picture's light, by order of first appearance."""
+    """The index of each picture's light, by order of first appearance."""
     seen: list[Lights] = []
     result = []
     for rig in lights:
@@ -260,27 +262,27 @@ def lights_in_order(lights: Sequence[Lights]) -> list[int]:
 
 
 def hold_out(captures: Captures, settings: ReferenceSettings) -> tuple[list[int], list[int]]:
-    """(fitted to, kept for measuring): evenly chosen pictures, and those of the light that is kept away."""
+    """(fitted, held out): held out are evenly chosen pictures and those of `hold_out_light`. InputRefused for all."""
     count, number = len(captures), lights_in_order(captures.lights)
-    away = {k for k in range(count) if number[k] == settings.hold_out_light}
-    rest = [k for k in range(count) if k not in away]
-    wanted = (len(rest) // 12 if len(rest) >= 24 else 0) if settings.hold_out < 0 else settings.hold_out
-    # Multiples of the golden ratio: even steps would meet the same light of each view again and again.
+    held = {k for k in range(count) if number[k] == settings.hold_out_light}
+    rest = [k for k in range(count) if k not in held]
+    evenly = (len(rest) // 12 if len(rest) >= 24 else 0) if settings.hold_out < 0 else settings.hold_out
+    # Multiples of the golden ratio: even steps could select the same light of every view.
     order = np.argsort(np.arange(len(rest)) * 0.6180339887498949 % 1)
-    away |= {rest[int(k)] for k in order[:wanted]}
-    kept = [k for k in range(count) if k not in away]
-    if not kept:
-        raise InputRefused(f"all {count} references would be held out, none is left to fit to; hold out fewer")
-    return kept, sorted(away)
+    held |= {rest[int(k)] for k in order[:evenly]}
+    fitted = [k for k in range(count) if k not in held]
+    if not fitted:
+        raise InputRefused(f"all {count} references would be held out, none is left for the fit; hold out fewer")
+    return fitted, sorted(held)
 
 
 def pixels_of(captures: Captures) -> list[int]:
-    """Of each picture."""
+    """The number of pixels of each picture."""
     return [camera.size[0] * camera.size[1] for camera in captures.cameras]
 
 
 def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, report: Report) -> Any:
-    """The fit, with checkpoints in work/ under the stage's key: one of another job is not taken up."""
+    """The fit, with checkpoints in work/ under the stage's key, so that another job's checkpoint is never resumed."""
     from mistyle.atlas.texels import start_maps
     from mistyle.solver.recover import Checkpoints, recover
 
@@ -289,14 +291,14 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
     if s.start == "own":
         start = [start_maps(m, t, s.atlas.size) for m, t in zip(asset.materials, texels, strict=True)]
     folder = checkpoint.place(run.job.out, run.keys["recover"])
-    # What is kept of the pictures' samples changes how long the fit takes and nothing else.
-    looked_at = with_setting(s, "references.average", 1)  # they are averaged already
-    within = check_material(looked_at, pixels_of(captures), *size_of(asset))
+    # The cache of the pictures' samples changes only the time of the fit.
+    unaveraged = with_setting(s, "references.average", 1)  # the pictures are averaged already
+    bounded = check_material(unaveraged, pixels_of(captures), *size_of(asset))
     return recover(
         asset.mesh,
         texels,
         captures,
-        within.recover,
+        bounded.recover,
         s.seed,
         report,
         start=start,
@@ -309,7 +311,7 @@ def solve(run: Run, asset: Asset, texels: Sequence[Texels], captures: Captures, 
 def measure(
     asset: Asset, maps: Sequence[Maps], captures: Captures, settings: MaterialSettings, report: Report
 ) -> Measured:
-    """Every picture predicted by the fitted maps and compared with what it shows."""
+    """Predict every picture from the fitted maps and compare the two."""
     from mistyle.core.image import srgb_from_linear
     from mistyle.measure.metrics import psnr
     from mistyle.render.deferred.material_table import pack
@@ -317,29 +319,29 @@ def measure(
 
     chosen, sizes = settings.recover, [m.roughness.shape for m in maps]
     traced, table = tracer(asset.mesh), pack(maps)
-    other = "gltf" if chosen.model == "principled" else "principled"
+    second_model = "gltf" if chosen.model == "principled" else "principled"
     _, held = hold_out(captures, settings.references)
     errors: list[float] = []
     shown: dict[int, tuple[np.ndarray, np.ndarray]] = {}
     converted: list[float] = []
-    looked_at = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
+    shown_pictures = sorted({*held[:4], *(np.linspace(0, len(captures) - 1, 4).round().astype(int).tolist())})
     for k in range(len(captures)):
         one = subset(captures, [k])
         rendered = [
             picture_of(traced, one, sizes, table, model, chosen)
-            for model in ([chosen.model, other] if k in looked_at else [chosen.model])
+            for model in ([chosen.model, second_model] if k in shown_pictures else [chosen.model])
         ]
-        rgb, counts = captures.load(k)
-        counts = counts & (rendered[0][1] > 0.999)
-        if counts.any():
-            errors.append(psnr(srgb_from_linear(rgb)[counts], srgb_from_linear(rendered[0][0])[counts]))
+        rgb, valid = captures.load(k)
+        valid = valid & (rendered[0][1] > 0.999)
+        if valid.any():
+            errors.append(psnr(srgb_from_linear(rgb)[valid], srgb_from_linear(rendered[0][0])[valid]))
         else:
             errors.append(float("nan"))
-        if k in looked_at:
-            shown[k] = (np.where(counts[..., None], rgb, 0).astype(np.float32), rendered[0][0])
-            scale = float(rendered[0][0][counts].mean()) if counts.any() else 0.0
+        if k in shown_pictures:
+            shown[k] = (np.where(valid[..., None], rgb, 0).astype(np.float32), rendered[0][0])
+            scale = float(rendered[0][0][valid].mean()) if valid.any() else 0.0
             if scale > 0:
-                converted.append(float(np.abs(rendered[1][0] - rendered[0][0])[counts].mean()) / scale)
+                converted.append(float(np.abs(rendered[1][0] - rendered[0][0])[valid].mean()) / scale)
         report((k + 1) / len(captures))
     return Measured(
         names=tuple(camera.name for camera in captures.cameras),
@@ -351,7 +353,7 @@ def measure(
 
 
 def picture_of(traced: Any, captures: Captures, sizes, table, model: str, chosen: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The one picture of `captures` as the maps predict it, and its coverage."""
+    """The prediction of the one picture of `captures`, linear, and its coverage."""
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
     options = RenderOptions(model, chosen.frame, chosen.subsamples, memory=0)

@@ -1,4 +1,4 @@
-"""Whether the cameras of `mistyle fit` fit the mesh, as the user hears of it."""
+"""Messages of `mistyle fit` about cameras that do not fit the mesh."""
 
 from typing import Any
 
@@ -8,18 +8,18 @@ from mistyle.fitting.settings.material import ReferenceSettings
 from mistyle.jobs.progress import Progress
 
 
-def fix_of(chosen: ReferenceSettings) -> str:
-    """What helps cameras that do not fit, beyond what was asked for already."""
+def camera_advice(chosen: ReferenceSettings) -> str:
+    """The advice for cameras that do not fit, without the options already in use."""
     options = [f"--{name.replace('_', '-')}" for name in ("align", "refine_poses") if not getattr(chosen, name)]
     start = f"Try {' and '.join(options)}; check" if options else "Check"
     return (
-        f"{start} the cameras' axes and units, and that pictures and masks are those that the cameras were "
-        "made for. Masks that leave out parts of the object lower the overlap too."
+        f"{start} the cameras' axes and units, and that pictures and masks belong to these cameras. "
+        "Masks that omit parts of the object lower the overlap too."
     )
 
 
-def tell_placed(placed: Any, progress: Progress) -> None:
-    """Every picture's overlap of outlines, and a warning about the cameras at once, as the fit takes long."""
+def report_placement(placed: Any, progress: Progress) -> None:
+    """Print every picture's outline overlap, and warnings about cameras at once, since the fit takes long."""
     from mistyle.solver.cameras.outline_check import overlap_line
 
     if np.isfinite(placed.overlap).any():

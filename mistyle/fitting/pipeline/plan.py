@@ -1,4 +1,4 @@
-"""What a fit to pictures will do and cost, before it does it (`--dry-run`); see jobs/plan.py."""
+"""Estimates of `--dry-run` for a fit to pictures; see jobs/plan.py."""
 
 from typing import Any
 
@@ -7,8 +7,8 @@ from mistyle.fitting.pipeline.budget import (
     MATERIAL,
     SEEN,
     SHOWN,
+    averaged_pixels,
     check_material,
-    looked_at,
     material_counts,
     material_gb,
 )
@@ -33,9 +33,9 @@ from mistyle.solver.settings import all_rounds, descent_steps, estimates, joint_
 
 
 def plan_material(job: Any) -> dict[str, Any]:
-    """The same for a `MaterialJob`, whose cameras, lights and pictures' headers are read and refused as it does.
+    """The plan of a `MaterialJob`; cameras, lights and pictures' headers are read and refused as the job does.
 
-    How much of the pictures shows the object is not known yet: the shares of fitting/pipeline/budget.py are taken.
+    The object's share of the pictures is still unknown: fitting/pipeline/budget.py gives typical shares.
     """
     from mistyle.fitting.pipeline.material import inputs_of, pixels_of, references_of
     from mistyle.solver.indirect import MOST
@@ -47,8 +47,8 @@ def plan_material(job: Any) -> dict[str, Any]:
     sizes = pixels_of(references_of(job))
     texels = extent.sets * s.atlas.size**2
     chosen = check_material(s, sizes, *size)
-    averaged = looked_at(s, sizes)
-    looked, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
+    averaged = averaged_pixels(s, sizes)
+    sampled, observed = SHOWN * sum(averaged) * s.recover.subsamples, COVERED * SEEN * texels * len(sizes)
     solves = s.recover.solver != "pictures"
     rounds, estimated = solves * all_rounds(s.recover, len(sizes)), estimates(s.recover, len(sizes))
     begun = solves * (1 + len(estimated[0]))
@@ -57,23 +57,23 @@ def plan_material(job: Any) -> dict[str, Any]:
     again = joint_estimates(s.recover)
     samples += sum(again)
     paths = samples * sum(min(n, MOST**2) for n in averaged)
-    words = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
+    smoothings = solves * s.recover.smooth * (1 + (steps > 0) * len(passes(s.recover, len(sizes))))
     seconds = {
         "mesh": reading(extent),
         "texels": texels * PER_TEXEL,
         "cameras": 1,
         "pictures": sum(sizes) * PER_READ_PIXEL,
-        "recover": (rounds + 2 + steps / len(sizes)) * looked * PER_LOOK
+        "recover": (rounds + 2 + steps / len(sizes)) * sampled * PER_LOOK
         + (begun * len(STARTS) / 2 + rounds) * s.recover.solver_iterations * observed * PER_OBSERVATION
         + paths * PER_BOUNCED_PATH
         + joint * max(1, len(again)) * SHOWN * sum(averaged) * PER_JOINT
-        + words * COVERED * texels * PER_SMOOTHED,
-        "measure": 2 * looked * PER_LOOK,
+        + smoothings * COVERED * texels * PER_SMOOTHED,
+        "measure": 2 * sampled * PER_LOOK,
         "asset": 2 * texels * PER_TEXEL,
         "scene": 2 * texels * PER_TEXEL,
         "report": 5 + s.report.frames * s.report.resolution**2 * s.report.spp * PER_SAMPLE_RAY,
     }
-    kept = sum(12 * n for n, whole in zip(averaged, sizes, strict=True) if n < whole)
+    stored = sum(12 * n for n, whole in zip(averaged, sizes, strict=True) if n < whole)
     return {
         "mesh": str(job.mesh),
         "references": str(job.references),
@@ -83,5 +83,5 @@ def plan_material(job: Any) -> dict[str, Any]:
         "memory_gb": material_gb(chosen, sizes, *size),
         "in_files": False,
         "peaks_gb": peaks(MATERIAL, material_counts(s, sizes, *size)),
-        "disk_gb": round((texels * BYTES_PER_TEXEL + kept) / 1e9, 2),
+        "disk_gb": round((texels * BYTES_PER_TEXEL + stored) / 1e9, 2),
     }

@@ -1,4 +1,4 @@
-"""`mistyle fit --scene`: texture parameters of any Mitsuba scene, fitted to a picture per sensor.
+"""`mistyle fit --scene`: parameters of any Mitsuba scene, fitted to a picture per sensor.
 
 OUT/scene/<scene>.xml and its textures   the user's own file with the fitted elements replaced
 OUT/pictures/<sensor>.exr and .png        the fitted scene from every sensor
@@ -34,7 +34,7 @@ DRAWN_SPP = 64
 
 @dataclass(frozen=True)
 class SceneJob:
-    """One fit: a scene file with its parameters' values, the folder of its references, what is fitted, and how.
+    """One fit: a scene file with its defines, the folder of its references, the parameters to fit, and settings.
 
     sensor  index of the only sensor to fit to; None: all
     """
@@ -62,7 +62,7 @@ def loaded(scene: Path, defines: Mapping[str, str], settings: SceneSettings) -> 
 
 
 def listed(file: Any) -> list[Any]:
-    """Every parameter of a loaded scene, as the integrator that would be used sees it."""
+    """Every parameter of a loaded scene, under the integrator of the fit."""
     from mistyle.render.live.parameters import parameters
     from mistyle.solver.scene.gradients import ad_integrator
 
@@ -102,10 +102,10 @@ def _fit(
 
     read = [read_reference(path, job.settings.channels) for path in paths]
     progress.note(*file.notes, *(note for _, _, notes in read for note in notes))
-    how = job.settings.model_dump(mode="json")
-    inputs = [sorted(file.defines.items()), list(keys), list(numbers), list(paths), how]
+    settings = job.settings.model_dump(mode="json")
+    inputs = [sorted(file.defines.items()), list(keys), list(numbers), list(paths), settings]
     key = digest([program(), values(file.scene), *inputs])
-    fitted = _descended(job, file, keys, numbers, read, key, progress)
+    fitted = _run_fit(job, file, keys, numbers, read, key, progress)
     written: list[Any] = []
     with progress.stage("scene", "write the scene"):
         keeper.put(
@@ -134,21 +134,21 @@ def _fit(
         "settings": job.settings.model_dump(mode="json"),
     }
     shown = [
-        (every_name(file.scene, k), rgb, picture) for k, (rgb, _, _), picture in zip(numbers, read, drawn, strict=True)
+        (sensor_name(file.scene, k), rgb, picture) for k, (rgb, _, _), picture in zip(numbers, read, drawn, strict=True)
     ]
-    given = (job.scene.name, job.references.name, fitted, shown, summary)
-    keeper.put("report", key, lambda new: write_page(new / "index.html", *given))
+    arguments = (job.scene.name, job.references.name, fitted, shown, summary)
+    keeper.put("report", key, lambda new: write_page(new / "index.html", *arguments))
     record = summary | {"iterations": job.settings.iterations, "seed": job.settings.seed, "versions": versions()}
     write_record(job, record, progress)
     checkpoint.clear(job.out)
     return summary
 
 
-def _descended(job: SceneJob, file: Any, keys, numbers, read, key: str, progress: Progress) -> Any:
-    """The fit itself, with checkpoints in the run folder."""
+def _run_fit(job: SceneJob, file: Any, keys, numbers, read, key: str, progress: Progress) -> Any:
+    """Run the fit, with checkpoints in the run folder."""
     from mistyle.solver.scene.fit import fit_scene as run
 
-    how = job.settings
+    settings = job.settings
     folder = checkpoint.place(job.out, key)
     with progress.stage("fit", "fit the scene") as report, stopping.at_checkpoints():
         return run(
@@ -157,21 +157,21 @@ def _descended(job: SceneJob, file: Any, keys, numbers, read, key: str, progress
             list(numbers),
             [rgb for rgb, _, _ in read],
             masks=[mask for _, mask, _ in read],
-            iterations=how.iterations,
-            loss=None if how.loss == "auto" else how.loss,
-            spp=how.spp,
-            spp_grad=how.spp_grad or None,
-            seed=how.seed,
+            iterations=settings.iterations,
+            loss=None if settings.loss == "auto" else settings.loss,
+            spp=settings.spp,
+            spp_grad=settings.spp_grad or None,
+            seed=settings.seed,
             save=lambda arrays: checkpoint.save(folder, arrays),
             resume=checkpoint.load(folder, progress.note),
             progress=report,
         )
 
 
-def describe(found: Sequence[Any]) -> str:
-    """The parameters as a table for people: what can be fitted first, then why the rest cannot."""
-    free = [p for p in found if p.reason is None]
-    fixed = [p for p in found if p.reason is not None and p.kind not in ("geometry", "other")]
+def describe(listed_parameters: Sequence[Any]) -> str:
+    """The parameters as a text table: first those that can be fitted, then the others with the reason."""
+    free = [p for p in listed_parameters if p.reason is None]
+    fixed = [p for p in listed_parameters if p.reason is not None and p.kind not in ("geometry", "other")]
     wide = max((len(p.name) for p in free), default=0)
     lines = ["can be fitted:"] if free else ["nothing in this scene can be fitted"]
     for p in free:
@@ -189,7 +189,7 @@ def list_row(p: Any) -> dict[str, Any]:
 
 
 def draw(scene: Any, numbers: Sequence[int], seed: int, report: Any) -> list[Float[np.ndarray, "h w 3"]]:
-    """The scene as it is now from its sensors, linear, by the integrator of the fit."""
+    """The current scene from its sensors, linear, by the integrator of the fit."""
     from mistyle.render.live.draw import sensor_picture
     from mistyle.solver.scene.gradients import ad_integrator
 
@@ -200,8 +200,8 @@ def draw(scene: Any, numbers: Sequence[int], seed: int, report: Any) -> list[Flo
     return result
 
 
-def every_name(scene: Any, k: int) -> str:
-    """A sensor's id; Mitsuba's made-up ones become numbers."""
+def sensor_name(scene: Any, k: int) -> str:
+    """A sensor's id; a generated id becomes `sensor<k>`."""
     name = scene.sensors()[k].id()
     return f"sensor{k}" if not name or name.startswith(("__", "object_")) else name
 
@@ -211,6 +211,6 @@ def write_pictures(folder: Path, scene: Any, numbers: Sequence[int], drawn: Sequ
     from mistyle.io.images.write import write_exr, write_png
 
     for k, picture in zip(numbers, drawn, strict=True):
-        name = every_name(scene, k)
+        name = sensor_name(scene, k)
         write_exr(folder / f"{name}.exr", dict(zip("RGB", np.moveaxis(picture, -1, 0), strict=True)))
         write_png(folder / f"{name}.png", np.clip(srgb_from_linear(np.nan_to_num(picture)), 0, 1))

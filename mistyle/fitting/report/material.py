@@ -1,4 +1,4 @@
-"""What `mistyle fit` reports: the page, and `run.json`."""
+"""The report of `mistyle fit`: the page, and `run.json`."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -35,81 +35,84 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "seen_share": ("share of the covered texels that at least one reference sees", "higher"),
     "confident_share": ("share of the covered texels whose material the references determine well", "higher"),
     "psnr_fitted": ("mean PSNR (sRGB, peak 1) of the pictures that the material was fitted to, dB", "higher"),
-    "psnr_held_out": ("mean PSNR (sRGB, peak 1) of the pictures that were kept from the fit, dB", "higher"),
+    "psnr_held_out": ("mean PSNR (sRGB, peak 1) of the pictures that were held out of the fit, dB", "higher"),
     "conversion_error": (
         "mean relative difference of the same maps under the other material model",
         "lower",
     ),
     "outline_overlap": ("mean overlap of the mesh's outline with alpha or masks, intersection over union", "higher"),
-    "outline_overlap_least": ("the least such overlap of a picture", "higher"),
+    "outline_overlap_least": ("the least overlap of a picture", "higher"),
     "align_px": ("distance of the mesh's outline from the masks' after alignment, pixels", "lower"),
-    "pose_px_before": ("how far cameras were from the mesh's outline, pixels, before they were refined", "lower"),
-    "pose_px_after": ("how far cameras are from the mesh's outline, pixels, after they were refined", "lower"),
+    "pose_px_before": (
+        "distance of the mesh's outline from the masks' before the cameras were refined, pixels",
+        "lower",
+    ),
+    "pose_px_after": ("distance of the mesh's outline from the masks' after the cameras were refined, pixels", "lower"),
 }
 
 
-def material_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html` and `overview.png` into `folder`; for a full report `beauty.png` and the
-    turntable too."""
+def material_report(folder: Path, results: Any, progress: Progress, report: Callable[[float], None]) -> None:
+    """Draw the pictures and write `index.html` and `overview.png` into `folder`; a full report adds `beauty.png` and
+    the turntable."""
     from mistyle.io.images.write import write_png
 
-    settings, maps = made.job.settings, made.recovered.maps
+    settings, maps = results.job.settings, results.recovered.maps
     full = settings.report.detail == "full"
-    drawn = draw(made.asset, [maps], settings, lambda done: report(0.8 * done), path_traced=full)
+    drawn = draw(results.asset, [maps], settings, lambda done: report(0.8 * done), path_traced=full)
     beauty = drawn.close[0] if drawn.traced is None else drawn.traced
-    _, reference, predicted = made.measured.worst[0]
+    _, reference, predicted = results.measured.worst[0]
     if full:
         write_turn(folder / "turntable", drawn.turns[0])
         write_png(folder / "beauty.png", beauty)
     shots = [encoded(reference, reference), encoded(predicted, reference), beauty]
     write_png(folder / "overview.png", side_by_side(shots))
     report(0.9)
-    found = figures(made)
+    measured = figures(results)
     page = Report(
-        title=made.job.name,
-        mesh=made.job.mesh.name,
-        style=f"{len(made.captures)} pictures of {made.job.references.name}",
+        title=results.job.name,
+        mesh=results.job.mesh.name,
+        style=f"{len(results.captures)} pictures of {results.job.references.name}",
         relation="fitted to",
         painting=ReportPicture(
-            encoded(reference, reference), f"A reference: {made.measured.names[made.measured.worst[0][0]]}"
+            encoded(reference, reference), f"A reference: {results.measured.names[results.measured.worst[0][0]]}"
         ),
         turntable=tuple(drawn.turns[0]),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
-        facts=facts(made),
+        facts=facts(results),
         notes=tuple(Note(text) for text in progress.notes),
-        steps=steps(made),
-        maps=map_sets(made),
-        model=page_model(made.folder / f"{made.job.name}.glb"),
+        steps=steps(results),
+        maps=map_sets(results),
+        model=page_model(results.folder / f"{results.job.name}.glb"),
         timings=tuple(Timing(MATERIAL_STAGES[k], v, k in progress.reused) for k, v in progress.seconds.items()),
-        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k]) for k, v in found.items()),
+        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k]) for k, v in measured.items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),
-        files=file_list(made.folder, made.job.name),
+        files=file_list(results.folder, results.job.name),
     )
     write_report(folder / "index.html", page)
 
 
 def encoded(picture: np.ndarray, exposed_by: np.ndarray) -> np.ndarray:
-    """A linear picture for the eye: the brightest percent of `exposed_by` is white."""
+    """A linear picture in sRGB, exposed so that the 99th percentile of `exposed_by`'s luminance is white."""
     light = luminance(exposed_by)
     bright = float(np.percentile(light[light > 0], 99)) if (light > 0).any() else 1.0
     return srgb_from_linear(np.clip(picture / max(bright, 1e-6), 0, 1).astype(np.float32))
 
 
-def facts(made: Any) -> tuple[tuple[str, str], ...]:
-    mesh = made.asset.mesh
+def facts(results: Any) -> tuple[tuple[str, str], ...]:
+    mesh = results.asset.mesh
     return (
         ("faces", f"{len(mesh.faces):,}"),
         ("texture sets", str(len(mesh.parts))),
-        ("texture size", f"{made.job.settings.atlas.size}²"),
-        ("pictures", str(len(made.captures))),
-        ("held out", str(sum(made.measured.held))),
-        ("material", made.job.settings.recover.model),
+        ("texture size", f"{results.job.settings.atlas.size}²"),
+        ("pictures", str(len(results.captures))),
+        ("held out", str(sum(results.measured.held))),
+        ("material", results.job.settings.recover.model),
     )
 
 
-def steps(made: Any) -> tuple[Step, ...]:
-    measured = made.measured
+def steps(results: Any) -> tuple[Step, ...]:
+    measured = results.measured
     pairs = tuple(
         BeforeAfter(
             ReportPicture(encoded(reference, reference), "reference"),
@@ -131,7 +134,9 @@ def steps(made: Any) -> tuple[Step, ...]:
         shots=differences,
         columns=4,
     )
-    curves = Step("Convergence", "The loss of the fit, step by step.", charts=tuple(curve_charts(made.recovered.trace)))
+    curves = Step(
+        "Convergence", "The loss of the fit, step by step.", charts=tuple(curve_charts(results.recovered.trace))
+    )
     series = {
         label: [p if h == held else float("nan") for p, h in zip(measured.psnr, measured.held, strict=True)]
         for label, held in (("fitted", False), ("held out", True))
@@ -142,17 +147,17 @@ def steps(made: Any) -> tuple[Step, ...]:
         "PSNR of each prediction (sRGB, peak 1).",
         charts=(Chart("PSNR by picture", series, x_label="picture", y_label="dB", bars=True),),
     )
-    parts, longest = list(zip(made.asset.mesh.parts, made.texels, strict=True)), Sizes().of(kind_in_step(2))
+    parts, longest = list(zip(results.asset.mesh.parts, results.texels, strict=True)), Sizes().of(kind_in_step(2))
     trust = Step(
         "Confidence",
-        "How well the references determine each texel's material (dark blue: not at all, yellow: well), and how many "
-        "pictures see it.",
+        "Confidence of each texel's material (dark blue: undetermined, yellow: well determined), and the number of "
+        "pictures that see it.",
         shots=tuple(
             ReportPicture(picture, f"{name}: {what}", sharp=True)
             for k, (name, t) in enumerate(parts)
             for what, picture in (
-                ("confidence", heat(made.recovered.confidence[k], 1, t, longest)),
-                ("seen", heat(made.recovered.seen[k], len(made.captures), t, longest)),
+                ("confidence", heat(results.recovered.confidence[k], 1, t, longest)),
+                ("seen", heat(results.recovered.seen[k], len(results.captures), t, longest)),
             )
         ),
         columns=2,
@@ -165,52 +170,52 @@ def curve_charts(trace: dict[str, list[float]]) -> list[Chart]:
 
 
 def difference(reference: np.ndarray, predicted: np.ndarray) -> np.ndarray:
-    """|difference| in sRGB, ten times as bright."""
+    """|difference| in sRGB, times 10; zero where the reference is black."""
     apart = np.abs(encoded(predicted, reference) - encoded(reference, reference))
     return np.clip(10 * np.where((reference > 0).any(axis=-1, keepdims=True), apart, 0), 0, 1)
 
 
-def map_sets(made: Any) -> tuple[MapSet, ...]:
-    """The fitted maps of every texture set, and what there is to lay over them."""
-    sets, longest = [], Sizes().of(kind_of_maps(len(made.asset.mesh.parts)))
-    for k, (name, texels) in enumerate(zip(made.asset.mesh.parts, made.texels, strict=True)):
+def map_sets(results: Any) -> tuple[MapSet, ...]:
+    """The fitted maps of every texture set, with confidence and coverage as overlays."""
+    sets, longest = [], Sizes().of(kind_of_maps(len(results.asset.mesh.parts)))
+    for k, (name, texels) in enumerate(zip(results.asset.mesh.parts, results.texels, strict=True)):
         over = (
-            report_overlays.confidence(made.recovered.confidence[k], texels, longest),
-            report_overlays.coverage(made.recovered.seen[k], len(made.captures), texels, longest),
+            report_overlays.confidence(results.recovered.confidence[k], texels, longest),
+            report_overlays.coverage(results.recovered.seen[k], len(results.captures), texels, longest),
         )
-        sets.append(MapSet(name, map_shots(made.recovered.maps[k], longest), over))
+        sets.append(MapSet(name, map_shots(results.recovered.maps[k], longest), over))
     return tuple(sets)
 
 
-def figures(made: Any) -> dict[str, float]:
-    covered = [t.covered for t in made.texels]
+def figures(results: Any) -> dict[str, float]:
+    covered = [t.covered for t in results.texels]
     total = max(sum(int(c.sum()) for c in covered), 1)
 
     def share(masks: Sequence[np.ndarray]) -> float:
         return sum(int((m & c).sum()) for m, c in zip(masks, covered, strict=True)) / total
 
     def mean(held: bool) -> float:
-        values = [p for p, h in zip(made.measured.psnr, made.measured.held, strict=True) if h == held]
+        values = [p for p, h in zip(results.measured.psnr, results.measured.held, strict=True) if h == held]
         return float(np.nanmean(values)) if np.isfinite(values).any() else float("nan")
 
-    found = {
-        "seen_share": share([s > 0 for s in made.recovered.seen]),
-        "confident_share": share([c > 0.5 for c in made.recovered.confidence]),
+    table = {
+        "seen_share": share([s > 0 for s in results.recovered.seen]),
+        "confident_share": share([c > 0.5 for c in results.recovered.confidence]),
         "psnr_fitted": mean(False),
         "psnr_held_out": mean(True),
-        "conversion_error": made.measured.conversion,
-        **made.placed.figures,
+        "conversion_error": results.measured.conversion,
+        **results.placed.figures,
     }
-    return {name: value for name, value in found.items() if np.isfinite(value)}
+    return {name: value for name, value in table.items() if np.isfinite(value)}
 
 
 def _or_null(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-def write_summary(made: Any, run: Run) -> dict[str, Any]:
-    """Write `run.json`; returns what the caller wants to know."""
-    job = made.job
+def write_summary(results: Any, run: Run) -> dict[str, Any]:
+    """Write `run.json`; returns its summary: paths, times, memory, figures and notes."""
+    job = results.job
     path = job.out / "run.json"
     summary = {
         "name": job.name,
@@ -221,7 +226,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "seconds": merged_seconds(path, run),
         "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
         "peaks_gb": merged_peaks(path, run),
-        "figures": figures(made),
+        "figures": figures(results),
         "notes": list(run.progress.notes),
     }
     record = summary | {
@@ -229,7 +234,11 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "pictures": [
             {"name": n, "held_out": h, "psnr": _or_null(p), "outline_overlap": _or_null(o)}
             for n, h, p, o in zip(
-                made.measured.names, made.measured.held, made.measured.psnr, made.placed.overlap, strict=True
+                results.measured.names,
+                results.measured.held,
+                results.measured.psnr,
+                results.placed.overlap,
+                strict=True,
             )
         ],
         "seed": job.settings.seed,

@@ -1,4 +1,4 @@
-"""What a person learns from a fit of a scene: the table of values before and after, figures and the page."""
+"""The report of a scene fit: the table of values before and after, figures, and the page."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,7 +16,7 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "psnr_after": ("mean PSNR of the sensors' pictures after the fit (sRGB, peak 1), dB", "higher"),
     "render_noise": ("share of the remaining squared difference that is noise of one step's render, 0..1", ""),
     "unconverged": ("parameters that still moved at the end", "lower"),
-    "bad_gradients": ("gradients that were not numbers; their texels kept their values in that step", "lower"),
+    "bad_gradients": ("gradients that were not finite; their texels did not change in that step", "lower"),
 }
 
 
@@ -32,9 +32,9 @@ def figures(fitted: Any) -> dict[str, float]:
 
 
 def changes(fitted: Any) -> list[dict[str, Any]]:
-    """A row a parameter: its numbers before and after and their standard errors (null where unknown).
+    """One row per parameter: its values before and after and their standard errors (None where unknown).
 
-    A texture or an attribute stands for its channels' means.
+    Textures and attributes appear as the means of their channels.
     """
     from mistyle.solver.scene.result import brief
 
@@ -59,7 +59,7 @@ def row_text(row: dict[str, Any]) -> str:
 
 
 def noise_text(fitted: Any) -> str:
-    """How much of the residuals is the renders' own noise."""
+    """The share of render noise in the residuals, as a sentence."""
     shares = [r.noise[1] for r in fitted.residuals]
     between = f"{min(shares):.0%}" if len(shares) == 1 else f"{min(shares):.0%} to {max(shares):.0%}"
     return (
@@ -71,13 +71,13 @@ def noise_text(fitted: Any) -> str:
 def write_page(
     path: Path, scene: str, folder: str, fitted: Any, pictures: Sequence[tuple[str, Any, Any]], summary: dict[str, Any]
 ) -> None:
-    """The report: predictions beside references, the loss, what was fitted. `pictures`: name, reference, drawn."""
+    """Write the page: predictions beside references, the loss, fitted values. `pictures`: name, reference, render."""
     pairs, errors = [], []
     for (name, rgb, picture), residual in zip(pictures, fitted.residuals, strict=True):
-        said = f"{name}: {residual.psnr[0]:.1f} dB → {residual.psnr[1]:.1f} dB"
+        caption = f"{name}: {residual.psnr[0]:.1f} dB → {residual.psnr[1]:.1f} dB"
         pairs.append(
             BeforeAfter(
-                ReportPicture(encoded(rgb, rgb), "reference"), ReportPicture(encoded(picture, rgb), "fitted"), said
+                ReportPicture(encoded(rgb, rgb), "reference"), ReportPicture(encoded(picture, rgb), "fitted"), caption
             )
         )
         errors.append(ReportPicture(difference(rgb, picture), f"{name}: error", "ten times as bright"))

@@ -11,12 +11,12 @@ from mistyle.solver.settings import RecoverSettings
 
 
 class ReferenceSettings(BaseModel):
-    """How the pictures that a material is fitted to are read and placed."""
+    """Reading and alignment of the reference pictures."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     saturation: float = Field(
-        default=1.0, gt=0, le=1, description="encoded value from which a channel is blown out (JPEGs stop short of 1)"
+        default=1.0, gt=0, le=1, description="least encoded value of a saturated channel (below 1 for JPEGs)"
     )
     align: bool = Field(default=False, description="find the similarity that brings the mesh into the cameras' space")
     refine_poses: bool = Field(default=False, description="improve every camera against the mesh before fitting")
@@ -31,24 +31,24 @@ class ReferenceSettings(BaseModel):
         default=0,
         ge=0,
         le=64,
-        description="average blocks of so many pixels a side of each picture; 0: such that texels stay two blocks wide",
+        description="pixels a side of the averaged blocks of each picture; 0: so that texels stay two blocks wide",
     )
     hold_out: int = Field(
         default=-1,
         ge=-1,
         le=1000,
-        description="pictures kept from the fit to measure it by; -1: one in twelve, from 24 pictures on",
+        description="pictures held out of the fit and used to measure it; -1: one in twelve, from 24 pictures on",
     )
     hold_out_light: int = Field(
         default=-1,
         ge=-1,
         le=1000,
-        description="keep the pictures of this light (by order of appearance) from the fit, to measure it by; -1: none",
+        description="hold out the pictures of this light (by order of appearance) and measure on them; -1: none",
     )
 
 
 class MaterialSettings(BaseModel):
-    """One fit of a material: a mesh, pictures of it, and how."""
+    """The settings of one fit of a material to pictures."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -57,13 +57,13 @@ class MaterialSettings(BaseModel):
         default=0,
         ge=0,
         le=100_000,
-        description="GB of main memory that the job may take; a job that cannot keep it is refused; 0: nine tenths of "
-        "what there is, of that recover.memory for the pictures' samples",
+        description="GB of main memory that the job may take; a job that needs more is refused; 0: nine tenths of the "
+        "machine's memory, with recover.memory for the pictures' samples",
     )
     threads: int = Field(default=0, ge=0, le=1024, description="threads of the renderer; 0 takes all cores")
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     start: Literal["nothing", "own"] = Field(
-        default="nothing", description="begin from nothing, or from the material that the mesh brings along"
+        default="nothing", description="start of the fit: nothing, or the mesh's own material"
     )
     read: ReadSettings = ReadSettings()
     references: ReferenceSettings = ReferenceSettings()

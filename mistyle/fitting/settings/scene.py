@@ -6,7 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class SceneSettings(BaseModel):
-    """One fit of a Mitsuba scene's parameters: how, not to what."""
+    """The settings of one fit of a Mitsuba scene's parameters."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -16,12 +16,12 @@ class SceneSettings(BaseModel):
     iterations: int = Field(default=256, ge=1, le=1_000_000, description="steps; each renders one sensor")
     spp: int = Field(default=16, ge=1, le=65536, description="samples per pixel of the picture in a step")
     spp_grad: int = Field(
-        default=0, ge=0, le=65536, description="samples per pixel of its derivative; 0: 8 for numbers, 1 for textures"
+        default=0, ge=0, le=65536, description="samples per pixel of the derivative; 0: 8 for numbers, 1 for textures"
     )
     loss: Literal["auto", "relative", "log_srgb_l1", "l2"] = Field(
         default="auto",
-        description="auto: relative where renders have noise (its minimum does not depend on the samples), log_srgb_l1 "
-        "where they have none",
+        description="auto: relative for noisy renders (its minimum does not depend on the samples), log_srgb_l1 for "
+        "noise-free ones",
     )
     channels: str = Field(
         default="",

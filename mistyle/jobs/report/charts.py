@@ -7,14 +7,14 @@ from html import escape
 
 WIDTH, HEIGHT = 640, 300
 LEFT, RIGHT, TOP, BOTTOM = 64, 16, 28, 40
-# Told apart by people with any colour vision, and by their order (Okabe and Ito's palette without yellow).
+# Distinct for people with any colour vision (Okabe and Ito's palette without yellow).
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#56b4e9", "#e69f00")
 
 
 @dataclass(frozen=True)
 class Chart:
-    """Curves over the same axis, or bars where `bars`: `series` maps a name to its values, `x` is theirs (0, 1, …
-    where empty). `log` draws the values by their logarithm and leaves out what is not above zero."""
+    """Curves over one axis, or bars with `bars`: `series` maps a name to its values over `x` (0, 1, … where empty).
+    `log` plots log10 of the values and leaves out values that are not positive."""
 
     title: str
     series: Mapping[str, Sequence[float]]
@@ -107,9 +107,9 @@ def _axes(chart: Chart, low: float, high: float, left: float, right: float, px, 
     return parts
 
 
-def _ticks(low: float, high: float, wanted: int = 5) -> list[float]:
-    """Round numbers in the range, about as many as wanted."""
-    raw = (high - low) / wanted
+def _ticks(low: float, high: float, count: int = 5) -> list[float]:
+    """About `count` round numbers in the range."""
+    raw = (high - low) / count
     power = 10 ** math.floor(math.log10(raw))
     step = next(m * power for m in (1, 2, 5, 10) if m * power >= raw)
     first = math.ceil(low / step - 1e-9)

@@ -1,7 +1,7 @@
-"""The pictures of the asset that a report shows: all round it, close up, and one that is path-traced.
+"""Pictures of the asset for a report: the turntable, the close-up, and a path-traced close-up.
 
-All but the last come from `render/lookdev/studio.py`, which knows no noise and traces each frame once for all looks
-(the asset with one set of maps or another). The close-up stands before the path-traced picture's own backdrop.
+Turntable and close-up come from the noise-free renderer `render/lookdev/studio.py`. It traces each frame once for all
+looks (a look is the asset with one set of maps). The close-up uses the path-traced picture's backdrop.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,16 +21,16 @@ from mistyle.jobs.report.pictures import eight_bit
 ELEVATION = 15.0
 FIRST = 30.0  # azimuth of the first frame and of the close-up
 SKY_TEXELS, SKY_RAYS = 256, 64  # a side of a set, and rays for each
-# Of the path-traced picture: samples a pixel of a pass, the mean error of sRGB (0..1) that ends it, and how many times
-# the samples of `report.spp` it may take.
+# The path-traced picture: samples per pixel and pass, the mean sRGB error (0..1) that ends it, and its largest number
+# of samples as a multiple of `report.spp`.
 PASS, GOOD, MOST = 2, 0.6 / 255, 4
-PLAIN = 0.18  # radiance behind the close-up where nothing is path-traced
+PLAIN = 0.18  # radiance behind the close-up without a path-traced picture
 
 
 @dataclass(frozen=True)
 class Drawn:
-    """What was drawn, sRGB: per look the frames all round (h w 4, 8 bits, straight alpha) and the close-up (h w 3),
-    and the path-traced close-up of the first look, where there is one."""
+    """Pictures in sRGB: the turntable (h w 4, 8 bits, straight alpha) and the close-up (h w 3) of each look, and the
+    path-traced close-up of the first look, or None."""
 
     turns: tuple[list[np.ndarray], ...]
     close: tuple[Float[np.ndarray, "h w 3"], ...]
@@ -46,7 +46,7 @@ def draw(
     turning: int = 1,
     path_traced: bool = True,
 ) -> Drawn:
-    """Draw every look close up, the first `turning` of them all round, and the first one path-traced too."""
+    """Draw the close-up of every look, the turntable of the first `turning` looks, and the path-traced close-up."""
     from mistyle.render.lookdev.studio import Studio, prefiltered
     from mistyle.render.mitsuba.draw import as_fine_as, tracer
 
@@ -75,7 +75,7 @@ def draw(
 
 
 def cameras(settings: Any) -> list[Camera]:
-    """All round the asset."""
+    """The cameras of the turntable."""
     chosen = settings.report
     size = (chosen.resolution, chosen.resolution)
     return [
@@ -84,13 +84,13 @@ def cameras(settings: Any) -> list[Camera]:
 
 
 def close_up(settings: Any) -> Camera:
-    """The camera of the picture that stands for the asset."""
+    """The camera of the close-up."""
     size = (settings.report.resolution * 2, settings.report.resolution * 2)
     return orbit(FIRST, ELEVATION, distance=4, fov=30, size=size)
 
 
 def studio_light() -> Float[np.ndarray, "h w 3"]:
-    """The softboxes of scenes/studio.xml."""
+    """The softboxes of scenes/studio.xml as an environment map, linear Rec.709."""
     from mistyle.core.paths import scenes
     from mistyle.io.read import read_exr
 
@@ -99,7 +99,7 @@ def studio_light() -> Float[np.ndarray, "h w 3"]:
 
 
 def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
-    """Open sky over every texture set; it has no finer detail than the mesh."""
+    """Sky visibility of every texture set, SKY_TEXELS a side, since it has no finer detail than the mesh."""
     from mistyle.atlas.texels import rasterise
     from mistyle.render.lookdev.studio import StudioSky
     from mistyle.render.mitsuba.occlusion import open_sky
@@ -117,7 +117,7 @@ def sky(mesh: Mesh, traced: Any, seed: int) -> Any:
 def path_trace(
     asset: Asset, maps: Sequence[Maps], camera: Camera, settings: Any, guide: Float[np.ndarray, "h w 4"]
 ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 3"]]:
-    """The asset on its backdrop, linear, with as many samples as its noise needs, and the backdrop alone."""
+    """The asset on its backdrop and the backdrop alone, linear; sampling stops at the error GOOD."""
     from mistyle.render.mitsuba.device import give_back
     from mistyle.render.mitsuba.draw import passes
     from mistyle.render.mitsuba.scene import Staging
@@ -125,17 +125,17 @@ def path_trace(
 
     most = max(2, settings.report.spp * MOST // PASS)
     drawn = passes(asset.mesh, maps, camera, Staging("studio", PASS, settings.seed))
-    found, behind, _ = settled(drawn, guide, GOOD, most)
+    beauty, behind, _ = settled(drawn, guide, GOOD, most)
     give_back()
-    return found, behind
+    return beauty, behind
 
 
 def over(picture: Float[np.ndarray, "h w 4"], behind: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """A premultiplied picture before another one, sRGB."""
+    """A premultiplied picture composited over `behind`, sRGB."""
     return srgb_from_linear(np.clip(picture[..., :3] + (1 - picture[..., 3:]) * behind, 0, None))
 
 
 def shown(picture: np.ndarray) -> np.ndarray:
-    """A rendered picture as people see it: straight sRGB and alpha."""
+    """A rendered picture (premultiplied, linear) as straight sRGB and alpha."""
     alpha = np.clip(picture[..., 3:], 0, 1)
     return np.concatenate([srgb_from_linear(picture[..., :3] / np.maximum(alpha, 1e-4)), alpha], axis=-1)

@@ -1,4 +1,4 @@
-"""Numbers as colours: error maps, exposures, signed differences."""
+"""False colours for error maps, exposures and signed differences."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
@@ -25,7 +25,7 @@ def heat(error: Float[np.ndarray, "h w"], most: float = 1.0) -> UInt8[np.ndarray
 
 
 def mapped(values: np.ndarray, colours: tuple[tuple[int, int, int], ...]) -> UInt8[np.ndarray, "h w 3"]:
-    """Values of 0..1 as colours between those of a list."""
+    """Values of 0..1 as interpolated colours of a list."""
     table = np.array(colours, np.float64)
     steps = np.linspace(0, len(table) - 1, 256)
     lookup = np.stack([np.interp(steps, np.arange(len(table)), table[:, c]) for c in range(3)], axis=1)

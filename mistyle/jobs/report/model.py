@@ -1,7 +1,7 @@
-"""The asset inside the report: its GLB with smaller textures, packed into the page, and the viewer that shows it.
+"""The 3D model in the report: its GLB with smaller textures, packed into the page, and the viewer.
 
-The viewer is `vendor/model-viewer-umd.min.js` (vendor/NOTICE.txt says what it is and under which licences). It gets the
-asset from the page itself; the page's policy lets it fetch nothing else.
+The viewer is `vendor/model-viewer-umd.min.js` (vendor/NOTICE.txt names its source and licences). It reads the asset
+from the page itself; the page's policy forbids every other request.
 """
 
 import base64
@@ -14,7 +14,7 @@ from typing import Any
 VENDOR = Path(__file__).parent / "vendor"
 VIEWER = VENDOR / "model-viewer-umd.min.js"
 VIEWER_SHA256 = "d785423b1d046ea84a9f59ef6cf15f3077603e1bf938b01ced9b0240691884a2"
-# Of the asset's vertices and faces, as they stand in the page; larger ones are shown as pictures only.
+# Bytes of the packed vertices and faces; larger assets are shown as pictures only.
 MOST_GEOMETRY = 4_500_000
 
 
@@ -29,20 +29,20 @@ class PageModel:
 
 @dataclass(frozen=True)
 class TooLarge:
-    """An asset that a page has no room for, and the sentence that says so."""
+    """An asset that is too large for a page, and the sentence that the page shows instead."""
 
     sentence: str
 
 
 def page_model(glb: Path) -> PageModel | TooLarge:
-    """The asset for a page, unless its vertices and faces alone would take more than MOST_GEOMETRY bytes there."""
+    """The asset for a page, or TooLarge if its packed vertices and faces exceed MOST_GEOMETRY bytes."""
     from mistyle.io.read_mesh import load_gltf
 
     tree, buffers = load_gltf(glb)
     model = PageModel(glb.name, tree, buffers)
     pictures = {image.get("bufferView") for image in tree.get("images", [])}
     geometry = sum(v["byteLength"] for k, v in enumerate(tree.get("bufferViews", [])) if k not in pictures)
-    # Packing takes off a third to a half: what is four times too large need not be packed to know.
+    # Packing saves a third to a half, so geometry of four times the limit is too large in any case.
     size = geometry if geometry > 4 * MOST_GEOMETRY else len(packed(model, 16))
     if size <= MOST_GEOMETRY:
         return model
@@ -70,16 +70,16 @@ def packed(model: PageModel, longest: int) -> str:
             data, kind = shrink_picture(Path(model.name), builder.blobs[image["bufferView"]], longest, quality)
             builder.blobs[image["bufferView"]], image["mimeType"] = data, kind
     for texture in tree.get("textures", []):
-        # Its decoder would have to be fetched; every texture that has it as an extra has a plain image as well.
+        # Its decoder would need the network; a texture with this optional extension has a plain image as well.
         texture.get("extensions", {}).pop("KHR_texture_basisu", None)
     return base64.b64encode(gzip.compress(builder.pack(), 9, mtime=0)).decode()
 
 
-# The page's policy forbids WebAssembly, which the viewer would only decompress geometry with; it asks before use.
+# The page's policy forbids WebAssembly. The viewer needs it only for compressed geometry, and tests for it first.
 WITHOUT_WASM = "globalThis.WebAssembly = undefined;\n"
 
 
 def viewer_script() -> str:
-    """The viewer's program without the line that names its source map, which a browser would look for."""
+    """The viewer's script without the line that names its source map, which a browser would request."""
     text = VIEWER.read_text(encoding="utf-8")
     return WITHOUT_WASM + text.partition("\n//# sourceMappingURL=")[0]

@@ -1,6 +1,6 @@
-"""What the report can lay over the maps of a texture set: what was seen, where the fit struggled, what was repaired.
+"""Overlays on the maps of a texture set in the report: coverage, confidence, struggle and repair.
 
-Every overlay is at most `longest` pixels wide and high; the arrays that it is made of may be much larger.
+Every overlay is at most `longest` pixels wide and high; its source arrays may be much larger.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from mistyle.jobs.report.pictures import in_bands
 
 OPACITY = 0.8
 MAGENTA = (1.0, 0.0, 0.8)
-# Struggle is shown from the median to this share of the texels.
+# The struggle overlay shows the range from the median to this quantile of the texels.
 HIGHEST = 0.99
 
 
@@ -37,7 +37,7 @@ def layer(
 
 
 def coverage(seen: Int[np.ndarray, "h w"], views: int, texels: Texels, longest: int) -> Overlay:
-    """How many of the views see each texel."""
+    """The number of views that see each texel."""
 
     def rows(at: slice) -> np.ndarray:
         share = np.sqrt(seen[at] / max(views, 1)).astype(np.float32)
@@ -48,7 +48,7 @@ def coverage(seen: Int[np.ndarray, "h w"], views: int, texels: Texels, longest: 
 
 
 def confidence(values: Float[np.ndarray, "h w"], texels: Texels, longest: int) -> Overlay:
-    """How well the references determine each texel, 0..1."""
+    """The confidence of each texel, 0 undetermined to 1."""
 
     def rows(at: slice) -> np.ndarray:
         share = values[at]
@@ -61,12 +61,12 @@ def confidence(values: Float[np.ndarray, "h w"], texels: Texels, longest: int) -
 def struggle(
     total: Float[np.ndarray, "h w"], looks: Float[np.ndarray, "h w"], texels: Texels, longest: int
 ) -> Overlay | None:
-    """The mean |gradient| of a look in the last steps of the fit's albedo phase; None where that phase did not run."""
+    """The mean |gradient| per observation in the last steps of the fit's albedo phase; None without that phase."""
     total, looks, covered = _means(total, looks, texels.covered, longest)
     looked = covered & (looks > 0)
     if not looked.any():
         return None
-    # Single texels' gradients are noise: what lies around them is told, as for the repair
+    # Gradients of single texels are noise: the overlay shows their local mean, as the repair uses it
     # (stylization/inpaint/repair.py).
     total, looks = (gaussian(np.where(looked, a, 0).astype(np.float32), 0.002 * len(total)) for a in (total, looks))
     least = 0.25 * float(np.median(looks[looked]))
@@ -74,7 +74,7 @@ def struggle(
     low, high = np.quantile(mean[looked], [0.5, HIGHEST])
     share = np.clip((mean - low) / max(float(high - low), 1e-20), 0, 1).astype(np.float32)
     colours = np.stack([np.ones_like(share), 0.75 * (1 - share), np.zeros_like(share)], axis=-1)
-    legend = "clear: settled like most; yellow to red: the fit kept pulling at its colour"
+    legend = "clear: converged as most; yellow to red: large albedo gradients at the end of the fit"
     alpha = OPACITY * np.sqrt(share)
     picture = in_bands(share.shape, lambda at: layer(colours[at], alpha[at], covered[at]), longest, sharp=True)
     return Overlay("struggle", picture, legend)
@@ -83,7 +83,7 @@ def struggle(
 def _means(
     total: np.ndarray, looks: np.ndarray, covered: np.ndarray, longest: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All three on a grid of means over squares of texels, which is no coarser than `longest`."""
+    """All three arrays as means over squares of texels; the grid has at least `longest` cells a side."""
     side, by = min(covered.shape), 1
     while side // (2 * by) >= longest and all(length % (2 * by) == 0 for length in covered.shape):
         by *= 2
@@ -95,7 +95,7 @@ def _means(
 
 
 def repaired(mask: Bool[np.ndarray, "h w"], texels: Texels, longest: int) -> Overlay:
-    """Which texels were painted again after the fit."""
+    """The texels that were painted again after the fit."""
 
     def rows(at: slice) -> np.ndarray:
         share = mask[at].astype(np.float32)
@@ -103,4 +103,4 @@ def repaired(mask: Bool[np.ndarray, "h w"], texels: Texels, longest: int) -> Ove
         return layer(np.ascontiguousarray(colours), 0.65 * share, texels.covered[at])
 
     picture = in_bands(mask.shape, rows, longest, sharp=True)
-    return Overlay("repaired", picture, "magenta: painted again after the fit (masks/ has it as a picture to edit)")
+    return Overlay("repaired", picture, "magenta: painted again after the fit (edit it in masks/)")

@@ -1,10 +1,10 @@
-"""The report: one HTML file with everything a job made, that opens from disk with no network.
+"""The report: one HTML file with all results of a job, which opens from disk without a network.
 
-`Report` is pure data: pictures are arrays that are ready to look at (sRGB-encoded, 8 bit or float 0..1; grey, rgb or
-rgb with straight alpha), everything else is text and numbers. `write_report` inlines every picture as WebP, escapes
-every text (jinja2 autoescape) and forbids itself every connection by a content-security policy; its scripts are
-allowed by their hashes. The asset can be turned in three dimensions where it is small enough (jobs/report/model.py).
-The page works without scripts too: the turntable then stands still, and the asset is a picture.
+`Report` is pure data. Pictures are display-ready arrays: sRGB-encoded, 8 bit or float 0..1; grey, rgb or rgb with
+straight alpha. Everything else is text and numbers. `write_report` inlines every picture as WebP and escapes every text
+(jinja2 autoescape). A content-security policy forbids every connection and allows the page's scripts by their hashes.
+A small enough asset is shown in 3D (jobs/report/model.py). Without scripts the turntable stays on its first frame, and
+the asset is a picture.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,14 +30,14 @@ Pixels: TypeAlias = (
     | Bool[np.ndarray, "h w"]
 )
 
-# The whole file stays below this; where the pictures of a job are more, all of them are made smaller.
+# Limit of the whole file; if a job's pictures exceed it, all of them are scaled down.
 MOST_BYTES = 8_000_000
 SCALES = (1.0, 0.75, 0.55, 0.4, 0.25)
 
 
 @dataclass(frozen=True)
 class ReportPicture:
-    """One picture with what is said below it; `sharp` keeps its pixels as they are (masks, charts)."""
+    """One picture with its caption; `sharp` encodes it without loss (masks, charts)."""
 
     picture: Pixels
     caption: str
@@ -58,7 +58,7 @@ class BeforeAfter:
 class Step:
     """One stage of the job: a heading, a sentence or two, comparisons, charts and pictures, and a few facts.
 
-    `section` names the paper's section; `columns` is how many pictures stand in a row on a wide screen.
+    `section` names the paper's section; `columns` is the number of pictures in a row on a wide screen.
     """
 
     title: str
@@ -73,7 +73,7 @@ class Step:
 
 @dataclass(frozen=True)
 class Overlay:
-    """What can be laid over the maps of a texture set: a picture of their size with alpha, and what its colours say."""
+    """An overlay on the maps of a texture set: a picture of their size with alpha, and the legend of its colours."""
 
     name: str
     picture: Pixels
@@ -82,7 +82,7 @@ class Overlay:
 
 @dataclass(frozen=True)
 class MapSet:
-    """The maps of one texture set, and what can be laid over each of them."""
+    """The maps of one texture set, and their overlays."""
 
     name: str
     shots: tuple[ReportPicture, ...]
@@ -91,7 +91,7 @@ class MapSet:
 
 @dataclass(frozen=True)
 class Timing:
-    """How long a stage took; `reused` where its result was taken over from an earlier run."""
+    """The seconds of a stage; `reused` where its result came from an earlier run."""
 
     name: str
     seconds: float
@@ -100,7 +100,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Figure:
-    """A measured figure and what it means; `better` says which way is up."""
+    """A measured figure and its meaning; `better` is the direction of improvement."""
 
     name: str
     value: str
@@ -110,7 +110,7 @@ class Figure:
 
 @dataclass(frozen=True)
 class Setting:
-    """One setting of the job; `chosen` where it is not the default."""
+    """One setting of the job; `chosen` where it differs from the default."""
 
     name: str
     value: str
@@ -130,7 +130,7 @@ class File:
 
 @dataclass(frozen=True)
 class Note:
-    """A sentence that the reader should know; a warning is set apart."""
+    """A note to the reader; the page highlights a warning."""
 
     text: str
     warning: bool = False
@@ -138,11 +138,11 @@ class Note:
 
 @dataclass(frozen=True)
 class Report:
-    """Everything the page shows; empty tuples leave their part out.
+    """The content of the page; empty tuples leave their part out.
 
-    `turntable` and `plain` are frames of equal size and number all round the stylized and the original asset, evenly
-    spaced, transparent where nothing is; the first is what is seen first. `made` says when and with what in one line.
-    The title reads "mesh relation style". `model` is the asset itself, or says why it is not in the page.
+    `turntable` and `plain` are evenly spaced frames round the stylized and the original asset, equal in size and
+    number, with a transparent background. The page starts with the first frame. `made` names version and seed in one
+    line. The title reads "mesh relation style". `model` is the 3D model, or the reason why the page has none.
     """
 
     title: str
@@ -168,14 +168,14 @@ class Report:
 def write_report(path: Path, report: Report) -> None:
     """Write the report to `path` as one HTML file.
 
-    It stays below MOST_BYTES unless even pictures of a quarter of the usual size are more.
+    The file stays below MOST_BYTES unless even pictures of a quarter of the usual size exceed it.
     Raises ValueError where the turntable has no frames, or where `plain` has another number of frames.
     """
     if not report.turntable:
         raise ValueError("a report needs at least one turntable frame")
     if report.plain and len(report.plain) != len(report.turntable):
         raise ValueError(f"{len(report.plain)} frames of the original for {len(report.turntable)} of the turntable")
-    # All pictures at the smallest size take a tenth of the time of the usual one, and say which sizes can fit.
+    # Encoding at the smallest size takes a tenth of the usual time, and predicts the sizes that can fit.
     tried = Encoder(SCALES[-1])
     smallest = render(report, SCALES[-1], tried).encode()
     page = smallest
@@ -190,11 +190,11 @@ def write_report(path: Path, report: Report) -> None:
 
 
 def render(report: Report, scale: float = 1.0, encoder: Encoder | None = None) -> str:
-    """The page as text, with every picture at `scale` of its usual size; each one is encoded once."""
+    """The page as text, with every picture at `scale` of its usual size, encoded once."""
     from markupsafe import Markup
 
-    here = Path(__file__).parent
-    script = (here / "report.js").read_text(encoding="utf-8")
+    folder = Path(__file__).parent
+    script = (folder / "report.js").read_text(encoding="utf-8")
     viewer = viewer_script() if isinstance(report.model, PageModel) else ""
     swatches, sizes = palette(report.painting.picture), Sizes(scale)
     return _template().render(
@@ -207,8 +207,8 @@ def render(report: Report, scale: float = 1.0, encoder: Encoder | None = None) -
         kind_of_maps=kind_of_maps,
         palette=swatches,
         accent=accents(swatches),
-        # Both files are ours and hold no text of others.
-        style=Markup((here / "report.css").read_text(encoding="utf-8")),
+        # Both files belong to mistyle and hold no foreign text.
+        style=Markup((folder / "report.css").read_text(encoding="utf-8")),
         script=Markup(script),
         # base64 needs no escaping.
         asset=Markup(packed(report.model, sizes.of("texture"))) if isinstance(report.model, PageModel) else "",
@@ -230,7 +230,7 @@ def _template() -> Any:
 
 
 def policy(scripts: Sequence[str]) -> str:
-    """The content-security policy of a page with these scripts: nothing is fetched but what the page itself made.
+    """The content-security policy of a page with these scripts: the page may load only its own blobs and data URIs.
 
     The viewer, the second script, reads the asset and its textures from blobs of the page.
     """
@@ -249,7 +249,7 @@ def policy(scripts: Sequence[str]) -> str:
 
 
 def seconds(value: float) -> str:
-    """A duration as people say it: '0.4 s', '12 s', '3 min 05 s', '1 h 02 min'."""
+    """A duration as text: '0.4 s', '12 s', '3 min 05 s', '1 h 02 min'."""
     if value < 9.95:
         return f"{value:.1f} s"
     whole = round(value)
@@ -261,7 +261,7 @@ def seconds(value: float) -> str:
 
 
 def size(count: int) -> str:
-    """A number of bytes as people say it, in powers of 1000."""
+    """A number of bytes as text, in powers of 1000."""
     if count < 1000:
         return f"{count} B"
     power = 1
@@ -273,5 +273,5 @@ def size(count: int) -> str:
 
 def slug(text: str) -> str:
     """A text as an anchor: letters, digits and hyphens."""
-    kept = "".join(c if c.isascii() and c.isalnum() else " " for c in text.lower())
-    return "-".join(kept.split()) or "part"
+    words = "".join(c if c.isascii() and c.isalnum() else " " for c in text.lower())
+    return "-".join(words.split()) or "part"

@@ -1,4 +1,4 @@
-"""Pictures for the report: small WebP files as data URIs, and the colours that a painting is made of."""
+"""Pictures for the report: small WebP files as data URIs, and a painting's palette."""
 
 import base64
 import io
@@ -24,12 +24,12 @@ class Sizes:
 
 
 def kind_in_step(columns: int) -> str:
-    """The kind of a picture that stands in a row of so many."""
+    """The kind of a picture in a row of `columns`."""
     return "view" if columns > 2 else "picture"
 
 
 def kind_of_maps(sets: int) -> str:
-    """The kind of the maps of a mesh with so many texture sets."""
+    """The kind of the maps of a mesh with `sets` texture sets."""
     return "map" if sets < 3 else "picture"
 
 
@@ -67,12 +67,12 @@ def webp(picture: Shaped[np.ndarray, "h w *c"], longest: int, quality: int = 84,
     return Inline("data:image/webp;base64," + base64.b64encode(buffer.getvalue()).decode(), *image.size)
 
 
-# How the bytes of a picture grow with its pixels: less than these, for a finer picture is smoother.
+# Exponents of a picture's bytes over its pixels, below 1 because a finer picture is smoother.
 GROWTH, GROWTH_SHARP = 0.87, 0.8
 
 
 class Encoder:
-    """`webp` for a page: a picture that comes twice is encoded once. A class because it keeps what it made."""
+    """`webp` for a page: a repeated picture is encoded once. A class because it caches the results."""
 
     def __init__(self, scale: float) -> None:
         self._scale = scale
@@ -87,12 +87,12 @@ class Encoder:
         return self._made[key][1]
 
     def growth(self, scale: float) -> float:
-        """About how many bytes more the same pictures take at another scale."""
+        """The estimated growth of the pictures' bytes at another scale."""
         more = 0.0
-        for (_, longest, _, sharp), (picture, made) in self._made.items():
+        for (_, longest, _, sharp), (picture, inline) in self._made.items():
             side = min(max(picture.shape[:2]), longest * scale / self._scale)
-            pixels = (side / max(made.width, made.height)) ** 2
-            more += len(made.uri) * (pixels ** (GROWTH_SHARP if sharp else GROWTH) - 1)
+            pixels = (side / max(inline.width, inline.height)) ** 2
+            more += len(inline.uri) * (pixels ** (GROWTH_SHARP if sharp else GROWTH) - 1)
         return more
 
 
@@ -101,7 +101,7 @@ def in_bands(
 ) -> UInt8[np.ndarray, "h w n"]:
     """The picture of `shape` (height, width) whose rows `make` gives, as `webp` would show it at `longest` pixels.
 
-    Only BAND rows at a time are more than a byte a channel: maps may be much larger than what is shown of them.
+    At most BAND rows at a time take more than a byte per channel: maps may be much larger than their pictures.
     """
     from PIL import Image
 
@@ -140,7 +140,7 @@ def palette(picture: Shaped[np.ndarray, "h w *c"], count: int = 7) -> list[str]:
 
 
 def accents(colours: list[str]) -> dict[str, str]:
-    """One accent colour for light and one for dark pages: the most vivid after each was moved until it is readable.
+    """One accent colour for light and one for dark pages: the most vivid of the colours in their readable form.
 
     Readable means a contrast of 4.5 with the page (WCAG 2, level AA).
     """
@@ -153,7 +153,7 @@ def accents(colours: list[str]) -> dict[str, str]:
 
 
 def readable(colour: np.ndarray, page: tuple[int, int, int], towards: float) -> np.ndarray:
-    """`colour` mixed with black (towards = 0) or white (255) until it stands out from `page` 4.5 times."""
+    """`colour` mixed with black (towards = 0) or white (255) until its contrast with `page` is 4.5."""
     for share in np.linspace(0, 1, 41):
         mixed = colour * (1 - share) + towards * share
         high, low = sorted((relative_luminance(mixed), relative_luminance(np.array(page))), reverse=True)

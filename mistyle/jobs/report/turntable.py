@@ -21,9 +21,9 @@ def write_turn(place: Path, frames: Sequence[Frame], mp4: bool = False) -> list[
     """Write straight sRGB frames with alpha (0..1, or 8 bits) as `place`/000.png …, `place`.webp and, with `mp4`,
     `place`.mp4.
 
-    `place` is new: frames of an earlier turn are not removed here.
+    `place` is a new folder: frames of an earlier turn would remain.
 
-    The same frames give the same PNG and WebP bytes. EnvironmentMissing where mp4 is asked for and nothing encodes it.
+    The same frames give the same PNG and WebP bytes. EnvironmentMissing for `mp4` without an encoder.
     """
     if mp4:
         encoder()
@@ -41,7 +41,7 @@ def write_turn(place: Path, frames: Sequence[Frame], mp4: bool = False) -> list[
 
 
 def grounded(frame: Float[np.ndarray, "h w 4"]) -> np.ndarray:
-    """A frame over GROUND, uint8."""
+    """A frame composited over GROUND, uint8."""
     alpha = np.clip(frame[..., 3:], 0, 1)
     return np.round((np.clip(frame[..., :3], 0, 1) * alpha + (1 - alpha) * np.array(GROUND)) * 255).astype(np.uint8)
 
@@ -74,7 +74,7 @@ def write_mp4(path: Path, frames: Sequence[np.ndarray]) -> None:
 
 
 def encoder():
-    """The module that brings ffmpeg along."""
+    """The imageio_ffmpeg module, which includes an ffmpeg binary. EnvironmentMissing where it is not installed."""
     try:
         import imageio_ffmpeg  # pyright: ignore[reportMissingImports]
     except ImportError:

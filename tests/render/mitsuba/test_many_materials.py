@@ -231,5 +231,5 @@ def test_the_machines_memory_bounds_a_job_that_was_given_none(monkeypatch):
     with pytest.raises(UsageError) as caught:
         stylize_budget.tiles(asked)
     text = str(caught.value)
-    assert "there are 1.0 GB of memory here, 0.9 GB of them for a job: the job needs" in text
+    assert "this machine has 1.0 GB of memory, 0.9 GB of them for a job: the job needs" in text
     assert "give it --memory" in text and "--set atlas.size=2048" in text
