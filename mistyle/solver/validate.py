@@ -1,4 +1,4 @@
-"""Which reference pictures say something, and how far they may be downsampled."""
+"""Validation of reference pictures, and factors by which they can be downsampled."""
 
 from collections.abc import Sequence
 
@@ -12,14 +12,14 @@ from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 
 LEAST_VIEWS = 3
-FINE = 0.25  # share of the texels that may be narrower than ACROSS blocks of averaged pixels
+FINE = 0.25  # largest share of texels narrower than ACROSS blocks of averaged pixels
 ACROSS = 2
-LEAST_PIXELS = 32  # along the shorter side of a picture that is left
+LEAST_PIXELS = 32  # along the shorter side of a downsampled picture
 
 
 def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captures:
-    """The pictures that say something. A picture of another size than its camera is refused, as are captures of which
-    nothing is left."""
+    """The usable pictures; notes name the others. Raises InputRefused for a picture whose size differs from its
+    camera's, and if none is usable."""
     if len(captures) == 0:
         raise InputRefused("No reference pictures came; give at least three views of the object.")
     usable, silent = [], []
@@ -48,7 +48,7 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
 
 
 def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: np.ndarray) -> str:
-    """Why a picture cannot be used, or nothing."""
+    """The reason why a picture cannot be used, or an empty string."""
     px, depth = px_from_world(camera, mesh.positions.astype(np.float64))
     if not (in_frame(camera, px) & (depth > 0)).any():
         return "its camera cannot see the mesh"
@@ -62,10 +62,10 @@ def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: 
 
 
 def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
-    """How many pixels of each camera's picture, along a side, can be averaged and leave texels ACROSS blocks wide.
+    """Downsampling factor of each camera's picture at which texels are still ACROSS blocks wide.
 
-    Of the texels that face the camera, hidden ones too, three in four are at least that wide. With texels as wide as
-    one block the normals are nearly twice as wrong, with four a quarter less (`python -m benchmarks.photographs`).
+    At least three in four of the texels that face the camera, hidden ones included, are that wide. With texels one
+    block wide the normals' error nearly doubles; with four it falls by a quarter (`python -m benchmarks.photographs`).
     """
     from mistyle.solver.texels.observations import texel_sizes
 

@@ -1,9 +1,9 @@
-"""Bringing cameras and mesh together by what can be seen of the mesh: its silhouettes, and its shading where known.
+"""Registration of cameras and mesh by silhouettes and, where materials are known, by shading.
 
-A silhouette's residual is a distance in pixels. At every rim pixel of the mesh as drawn, the observed mask's signed
-distance d_seen less the drawn mask's own d_drawn is how far the rim must move along the gradient of d_seen; the rim's
-points on the mesh say how a motion moves it (to first order the rim stays the same points). Gauss-Newton on all rims
-gives the motion: seven parameters for a similarity of all cameras, six for a camera of its own.
+A silhouette's residual is a distance in pixels. At every rim pixel of the rendered mesh, d_seen is the observed mask's
+signed distance and d_drawn the rendered mask's. The rim must move by d_seen - d_drawn along the gradient of d_seen.
+A motion moves the rim through its surface points (to first order the rim keeps the same points). Gauss-Newton over all
+rims gives the motion: seven parameters for a similarity of all cameras, six for the pose of one camera.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,23 +23,23 @@ from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
 
 LEVELS = (96, 256)  # pixels along the longer side, coarse to fine
-WAYS = 3  # of laying the visual hull on the mesh that the silhouettes are asked about
+WAYS = 3  # registrations of the visual hull that are compared by silhouettes
 STEPS = 12  # at most, per level
-FAR = 0.05  # root mean square distance of an object's points from its mesh that no reconstruction reaches
-STILL = 0.01  # pixels that a step moves the rims when nothing more is to be gained
-# How far a camera may plausibly be off: it holds the motions that neither silhouette nor shading shows.
+FAR = 0.05  # RMS distance of points from the mesh, in its radii; errors of a correct reconstruction are smaller
+STILL = 0.01  # pixels of rim motion per step at which iteration stops
+# Prior standard deviations of a camera's error; they regularise motions that neither silhouette nor shading constrains.
 TURN, SHIFT = np.radians(3.0), 0.03
 
-_View = tuple[Camera, np.ndarray, int]  # shrunk camera, its mask, how many pixels of the picture one of its is wide
+_View = tuple[Camera, np.ndarray, int]  # shrunk camera, its mask, downsampling factor
 
-# Linear radiance that camera (of whatever size) number k should see of the mesh.
+# Linear radiance of the mesh as camera k (of any size) should see it.
 Predict = Callable[[Camera, int], Float[np.ndarray, "h w 3"]]
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """A similarity to the working space and how well each view's silhouette fits: mean distance of the contours in
-    pixels of the full picture, with the starting similarity and with the one found. NaN where a view shows nothing."""
+    """A similarity to the working space, and each view's contour error: mean distance in pixels of the full picture,
+    before and after refinement. NaN where a view shows nothing."""
 
     work_from_cams: Float[np.ndarray, "4 4"]
     before: tuple[float, ...]
@@ -48,7 +48,7 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Poses:
-    """Refined cameras and the mean distance of each one's contours, in pixels, before and after."""
+    """Refined cameras and each one's mean contour distance in pixels, before and after."""
 
     cameras: tuple[Camera, ...]
     before: tuple[float, ...]
@@ -62,10 +62,10 @@ def align_by_points(
     masks: Sequence[Bool[np.ndarray, "h w"]] | None,
     rng: np.random.Generator,
 ) -> Alignment:
-    """The similarity from COLMAP's points (those inside the masks, where there are masks), then from the silhouettes.
+    """The similarity from COLMAP's points (those inside the masks, if any), then from the silhouettes.
 
-    Without masks the points must be the object's own. InputRefused when they do not lie on the mesh, or when they lie
-    on it equally well another way round and no masks can tell.
+    Without masks all points must lie on the object. Raises InputRefused when they do not fit the mesh, or when two
+    registrations fit equally well and no masks can decide.
     """
     own = points if masks is None else points[in_masks(points, cameras, masks)]
     if len(own) < 20:
@@ -97,10 +97,10 @@ def align_by_masks(
     start: Float[np.ndarray, "4 4"] | None = None,
     levels: Sequence[int] = LEVELS,
 ) -> Alignment:
-    """The similarity from the cameras' space to the working space under which silhouettes fit the masks.
+    """The similarity from the cameras' space to the working space that best fits silhouettes to masks.
 
-    Without a `start`, the visual hull that the masks carve is laid on the mesh first; that needs views from around the
-    object. With one, it may be off by some 20 degrees and a third of the size.
+    Without a `start`, the visual hull of the masks is registered to the mesh first; that needs views from around the
+    object. A `start` may be off by some 20 degrees and a third of the size.
     """
     if not any(mask.any() for mask in masks):
         raise InputRefused("--align: found only empty masks; expected the object's. Check that white is the object.")
@@ -124,8 +124,8 @@ def _from_hull(
     coarse: Sequence[_View],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "4 4"]:
-    """Of the ways in which the visual hull lies on the mesh, the one whose silhouettes fit best: a hull from few views
-    has humps that the mesh has not, so that its own residual may favour another."""
+    """The registration of the visual hull whose silhouettes fit best. A hull from few views has humps that the mesh
+    lacks, so its own residual may favour another registration."""
     try:
         shell = visual_hull(cameras, masks)
     except ValueError as error:
@@ -140,7 +140,7 @@ def _from_hull(
 
 
 def _misfit(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> float:
-    """Mean distance of the contours over the views; infinite where a view shows nothing of the mesh."""
+    """Mean contour distance over the views; infinite where a view shows nothing of the mesh."""
     found = _distances(traced, views, matrix)
     return float(np.mean(np.nan_to_num(found, nan=np.inf)))
 
@@ -155,11 +155,11 @@ def refine_poses(
     levels: Sequence[int] = (*LEVELS, 768),
     progress: Callable[[float], None] = lambda done: None,
 ) -> Poses:
-    """Every camera (working space), turned and shifted so that the mesh's silhouette fits its mask.
+    """Rotate and translate every camera (working space) so that the mesh's silhouette fits its mask.
 
-    With `pictures` (`Captures.load`) and `predict`, the shading's luminance is brought together too (up to a factor per
-    view): it shows the motions that a silhouette does not. What neither shows stays as it was, as do focal lengths. A
-    view whose contours would fit worse keeps its camera, and so does one that shows nothing of the mesh.
+    With `pictures` (`Captures.load`) and `predict`, luminance is aligned too (up to a factor per view): it constrains
+    motions that silhouettes do not. Unconstrained motions and focal lengths stay unchanged. A view keeps its camera if
+    its contours would fit worse or if it shows nothing of the mesh.
     """
     if (pictures is None) != (predict is None):
         raise ValueError("shading needs both, the pictures and what they should show")
@@ -185,7 +185,7 @@ def refine_poses(
 
 @dataclass(frozen=True)
 class _Shading:
-    """A picture (linear, which pixels count) and what a camera should see."""
+    """A picture (linear, with its mask of valid pixels) and the predicted radiance."""
 
     picture: Float[np.ndarray, "h w 3"]
     counts: Bool[np.ndarray, "h w"]
@@ -193,8 +193,8 @@ class _Shading:
 
 
 def shrunk(camera: Camera, mask: np.ndarray, side: int) -> tuple[Camera, np.ndarray, int]:
-    """Camera and mask with about `side` pixels along the longer side, and how much smaller: by an odd number, so that
-    no pixel is half in and half out, which would move all contours outwards or all inwards."""
+    """Camera and mask downsampled to about `side` pixels along the longer side, and the factor. The factor is odd, so
+    that no pixel is half covered; that would shift all contours outwards or inwards."""
     if mask.shape != camera.size:
         raise ValueError(f"a mask of {mask.shape} for a camera of {camera.size}")
     times = 2 * round((max(camera.size) / side - 1) / 2) + 1 if max(camera.size) > side else 1
@@ -212,7 +212,7 @@ def _distances(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> tu
 
 
 def _rows(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Camera coordinates (n 3) of points, and how pixels move with them: (n 2 3)."""
+    """Camera coordinates (n 3) of points, and the derivative of their pixels (n 2 3)."""
     cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     z = np.maximum(cam[:, 2], 1e-6)
     moves = np.zeros((len(cam), 2, 3))
@@ -231,8 +231,8 @@ def _rotating(points: np.ndarray) -> np.ndarray:
 def _rim_rows(
     traced: Tracer, camera: Camera, seen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """The rim's points (n 3, working space), their camera coordinates, the residuals (n) and how these change with
-    the camera coordinates (n 3); None where the mesh or the mask shows no rim."""
+    """The rim's points (n 3, working space), their camera coordinates, the residuals (n) and the residuals' derivatives
+    by the camera coordinates (n 3). None where the mesh or the mask shows no rim."""
     hits = gbuffer(traced, camera)
     rim = rim_of(hits.mask)
     if not rim.any() or not seen.any():
@@ -246,13 +246,13 @@ def _rim_rows(
 
 
 def _weights(residual: np.ndarray) -> np.ndarray:
-    """Huber's, so that a hole in a mask or a cable beside the object pulls no more than a pixel's error does."""
+    """Huber's weights: a hole in a mask or a cable beside the object pulls no more than an error of one pixel."""
     limit = max(1.0, 1.5 * float(np.median(np.abs(residual))))
     return limit / np.maximum(np.abs(residual), limit)
 
 
 def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.ndarray:
-    """Gauss-Newton on the similarity: the mesh turns, shifts and grows in its own space, all cameras together."""
+    """Gauss-Newton on the similarity: the mesh rotates, translates and scales in its own space, with all cameras."""
     for _ in range(STEPS):
         lhs, rhs, rows = np.zeros((7, 7)), np.zeros(7), []
         for camera, seen, _ in views:
@@ -273,7 +273,7 @@ def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.n
         step = -np.linalg.solve(lhs + np.diag(1e-4 * lhs.diagonal() + 1e-9), rhs)
         step /= max(1.0, float(np.abs(step).max()) / 0.3)
         motion = similarity(float(np.exp(step[6])), Rotation.from_rotvec(step[:3]).as_matrix(), step[3:6])
-        # The mesh's motion, seen from the mesh, moves the cameras the other way.
+        # A motion of the mesh is the inverse motion of the cameras.
         matrix = np.linalg.inv(motion) @ matrix
         if np.sqrt(np.mean((np.concatenate(rows) @ step) ** 2)) < STILL:
             break
@@ -307,9 +307,10 @@ def _settle(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading
 
 
 def _shading_rows(traced: Tracer, camera: Camera, times: int, shading: _Shading) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of the luminance, as pixels (over the picture's mean slope), and how the camera's motion changes them.
+    """Luminance residuals in pixels (divided by the picture's mean slope), and their derivatives by the camera's
+    motion.
 
-    A point of the mesh keeps the luminance that the drawn view gives it; where the picture has it is asked.
+    A point of the mesh keeps its luminance from the rendered view; its position in the picture moves.
     """
     hits = gbuffer(traced, camera)
     drawn = luminance(shading.predict(camera))
