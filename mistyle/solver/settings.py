@@ -1,4 +1,4 @@
-"""What a user may choose about fitting materials to pictures under known light."""
+"""User settings of fitting materials to pictures under known light."""
 
 from math import isqrt
 from typing import Literal
@@ -6,15 +6,15 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 SETTLING = 3
-FEWER = 8  # times as few samples for estimates of light between surfaces that others soon replace
-PASSES = 8  # over the pictures at most, the last twice as long
-SWEEPS = 2  # how often a pass looks at every picture at least, or there are fewer passes
+FEWER = 8  # factor of fewer samples for provisional estimates of indirect light
+PASSES = 8  # most passes over the pictures, the last twice as long
+SWEEPS = 2  # least epochs of a pass; fewer steps give fewer passes
 
 
 class RecoverSettings(BaseModel):
-    """Choices of `solver/recover.py`; defaults are what measuring on synthetic maps of known truth suggested.
+    """Settings of `solver/recover.py`; defaults come from measurements on synthetic maps with ground truth.
 
-    Lengths of radiance are relative to the brightest that was observed, so no default depends on the exposure.
+    Radiance settings are relative to the brightest observed radiance, so no default depends on the exposure.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -141,35 +141,34 @@ class RecoverSettings(BaseModel):
 
 
 def descent_steps(settings: RecoverSettings) -> int:
-    """How many steps on whole pictures there are: none where texels are only solved one by one."""
+    """Number of steps on whole pictures; 0 with `solver` "texels"."""
     return 0 if settings.solver == "texels" else settings.iterations
 
 
 def joint_steps(settings: RecoverSettings) -> int:
-    """How many joint steps there are: none where texels are not solved one by one before and then whole pictures, or
-    where neighbours shall have no word."""
+    """Number of joint steps; 0 unless the per-texel solver and whole pictures come before and `smooth` is on."""
     return settings.joint if settings.solver == "both" and settings.smooth and descent_steps(settings) else 0
 
 
 def joint_estimates(settings: RecoverSettings) -> tuple[int, ...]:
-    """Samples a pixel of each estimate of light between surfaces that such steps follow: the last one, of maps that
-    hardly change any more, is worth more."""
+    """Samples a pixel of each estimate of indirect light before joint steps: the last has more, since its maps hardly
+    change any more."""
     several = joint_steps(settings) and settings.bounces
     return (settings.bounce_samples, 2 * settings.bounce_samples) if several else ()
 
 
 def all_rounds(settings: RecoverSettings, pictures: int) -> int:
-    """How many rounds the texels are solved in: `rounds` at first and after each estimate of light between surfaces,
-    SETTLING times as many after the last, whose changes take them to settle."""
+    """Rounds of the per-texel solver: `rounds` at first and after each estimate of indirect light, SETTLING times as
+    many after the last, so that they converge."""
     among = len(estimates(settings, pictures)[0])
     return settings.rounds * (among + (SETTLING if among else 1))
 
 
 def estimates(settings: RecoverSettings, pictures: int) -> tuple[list[int], list[int]]:
-    """Samples a pixel of each estimate of light between surfaces: those among the rounds, those before last passes.
+    """Samples a pixel of each estimate of indirect light: those among the rounds, those before last passes.
 
-    Few have the first, whose maps are still far off, and those that the last will replace; where there are joint steps,
-    that is theirs.
+    The first has few, since its maps are inaccurate, and so have provisional ones. With joint steps the last estimate
+    is theirs.
     """
     few, many = -(-settings.bounce_samples // FEWER), settings.bounce_samples
     late = min(_passes(settings, pictures) - 1, settings.bounces // 2) if settings.solver == "both" else 0
@@ -178,7 +177,7 @@ def estimates(settings: RecoverSettings, pictures: int) -> tuple[list[int], list
 
 
 def passes(settings: RecoverSettings, pictures: int) -> list[tuple[int, int]]:
-    """Of each pass on whole pictures the steps, and the samples of the estimate before it, 0 for none."""
+    """Steps of each pass on whole pictures, and samples of the estimate before it, 0 for none."""
     count, late = _passes(settings, pictures), estimates(settings, pictures)[1]
     ends = [settings.iterations * k // (count + 1) for k in range(count)] + [settings.iterations]
     steps = [end - begin for begin, end in zip(ends[:-1], ends[1:], strict=True)]

@@ -5,8 +5,8 @@ random numbers, and solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ
 the expected I is R, so that any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds
 with the J of others, so it has no bias from J's noise.
 
-The first rounds are short and walk to the neighbourhood of the solution. The rest share the remaining steps and do
-not replace one another: the result is the mean of their solutions, and their disagreement its standard error.
+The first rounds are short and approach the solution. The rest share the remaining steps and do not replace one another:
+the result is the mean of their solutions, and their disagreement its standard error.
 """
 
 import math
@@ -23,21 +23,21 @@ from mistyle.render.live.parameters import Parameter
 from mistyle.solver.scene import gradients as scene_grad
 
 MOST_NUMBERS = 32
-MOST_BYTES = 2.5e8  # of the derivatives that are kept, in checkpoints too
-SPP = (8, 64)  # fewest and most of the derivatives, unless given: as many as cost about what the pictures do
-OUTLIER, BESIDE = 8.0, 5  # a derivative counts at most so many times the mean size around it, in a square of pixels
-APPROACH = 0.6  # share of the steps at most that the short rounds take
-SHORT = 4  # steps of a short round, at least
-NEAR = 0.1  # relative change from which the long rounds begin
+MOST_BYTES = 2.5e8  # largest size of the stored derivatives, also in checkpoints
+SPP = (8, 64)  # range of the derivatives' default samples, which cost about as much as the pictures
+OUTLIER, BESIDE = 8.0, 5  # limit of a derivative relative to its local mean size, and the window's side in pixels
+APPROACH = 0.6  # largest share of the steps in short rounds
+SHORT = 4  # least steps of a short round
+NEAR = 0.1  # relative change below which the long rounds begin
 LONG = (4, 8)  # fewest and most long rounds
-LOST = 0.01  # share of a picture's values that are no numbers from which a round goes half the way back
-WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays as it is
+LOST = 0.01  # share of non-finite values above which a round returns half the way
+WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays unchanged
 DAMPING = 1e-3  # of the short rounds
 
 
 @dataclass(frozen=True)
 class Round:
-    """A long round: cameras, steps, where it stood, and g there."""
+    """A long round: cameras, steps, its values, and g at them."""
 
     views: tuple[int, ...]
     steps: int
@@ -47,7 +47,8 @@ class Round:
 
 @dataclass
 class Newton:
-    """What moves; `columns` are sums of derivatives by camera, of every other round, and `counts` their numbers."""
+    """The changing state; `columns` are sums of derivatives by camera, of alternating rounds, and `counts` their
+    numbers."""
 
     theta: Float[np.ndarray, " n"]
     round: int = 0
@@ -81,7 +82,7 @@ class _Seen:
 
 
 def refusal(chosen: Sequence[Parameter], free: Mapping[str, np.ndarray], views: Sequence[Any], loss: Any) -> str:
-    """Why Gauss–Newton does not suit a fit; nothing where it does."""
+    """The reason why Gauss–Newton does not suit a fit; empty if it does."""
     count = sum(int(free[p.key].sum()) for p in chosen)
     if any(p.kind != "value" for p in chosen):
         return "textures and attributes have too many numbers"
@@ -94,12 +95,12 @@ def refusal(chosen: Sequence[Parameter], free: Mapping[str, np.ndarray], views: 
 
 
 def gathered(job: Any, values: Mapping[str, np.ndarray]) -> Float[np.ndarray, " n"]:
-    """The numbers that move, in one vector."""
+    """The free numbers as one vector."""
     return np.concatenate([values[p.key][job.free[p.key]] for p in job.chosen]).astype(np.float64)
 
 
 def spread(job: Any, theta: Float[np.ndarray, " n"], fill: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The reverse of `gathered`; numbers that stand still come from `fill`."""
+    """The inverse of `gathered`; fixed numbers come from `fill`."""
     result, start = {}, 0
     for p in job.chosen:
         free = job.free[p.key]
@@ -110,12 +111,12 @@ def spread(job: Any, theta: Float[np.ndarray, " n"], fill: Mapping[str, np.ndarr
 
 
 def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
-    """One round; False, with nothing changed, where the run was asked to stop. `camera` of a step and a slot."""
+    """One round; False, without changes, on a request to stop. `camera` maps a step and a slot to a camera."""
     newton: Newton = state.newton
     size, long = _size(job, state)
     turns = [[camera(state.iteration + m, slot) for slot in range(job.plan.sensors_per_step)] for m in range(size)]
     views = tuple(sorted({k for turn in turns for k in turn}))
-    # A short round needs both halves where it stands: H then has no bias from J's noise there either.
+    # A short round needs both halves at its own values: H then has no bias from J's noise either.
     parts = [{k: _columns(job, state.values, newton, k, size, part) for k in views} for part in range(1 if long else 2)]
     scene_grad.put(job.table, job.chosen, state.values)
     seen = {k: _Seen(_weights(job, k)) for k in views}
@@ -167,7 +168,7 @@ def _size(job: Any, state: Any) -> tuple[int, bool]:
 
 
 def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) -> Float[np.ndarray, "n h w 3"]:
-    """The picture's derivatives of camera k where the round of `size` steps stands."""
+    """The derivatives of camera k's picture at the values of the round, which has `size` steps."""
     theta = newton.theta
     values, zero = spread(job, theta, fill), {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
     own = size * job.plan.spp * job.plan.sensors_per_step // (2 * len(theta) * len(job.views))
@@ -183,7 +184,7 @@ def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) 
 
 
 def _remember(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n h w 3"]]]) -> None:
-    """Add a long round's derivatives to one half; a short round's two take the place of all before: J was another."""
+    """Add a long round's derivatives to one half. A short round's two replace all earlier ones, since its J differs."""
     for part, columns in enumerate(parts):
         for k, new in columns.items():
             if k not in newton.columns:
@@ -196,14 +197,14 @@ def _remember(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n 
 
 
 def _halves(newton: Newton, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The mean derivatives (n, values) of either half of the rounds; twice the same where there is one half only."""
+    """The mean derivatives (n, values) of either half of the rounds; twice the same if only one half exists."""
     means = [s.reshape(len(s), -1) / max(c, 1) for s, c in zip(newton.columns[k], newton.counts[k], strict=True)]
     first, second = (means[h if newton.counts[k][h] else 1 - h].astype(np.float64) for h in (0, 1))
     return first, second
 
 
 def _tamed(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[np.ndarray, "n v"]:
-    """Derivatives without outliers: each at most OUTLIER times the mean size beside it, plus that of its picture."""
+    """Derivatives without outliers: each is limited to OUTLIER times its local mean size, plus its picture's mean."""
     result = []
     for column in columns:
         size = np.abs(column.reshape(shape))
@@ -215,7 +216,7 @@ def _tamed(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[n
 
 
 def _weights(job: Any, k: int) -> Float[np.ndarray, "h w 3"]:
-    """Of the squared differences, so that their sum is the loss: 0 where nothing counts."""
+    """Weights of the squared differences whose sum is the loss; 0 at invalid values."""
     view = job.views[k]
     counts = np.array(view.counts).astype(np.float64)
     weights = counts * np.array(view.weights) if job.loss == "relative" else counts
@@ -223,7 +224,7 @@ def _weights(job: Any, k: int) -> Float[np.ndarray, "h w 3"]:
 
 
 def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
-    """Render camera k, add the picture; its loss with its noise, and how many values are no numbers."""
+    """Render camera k and add the picture; returns its loss with noise and its number of non-finite values."""
     view = job.views[k]
     shown = np.array(scene_grad.picture(job.scene, job.engine, view.sensor, job.plan.spp, seed))[..., :3]
     finite = np.isfinite(shown)
@@ -234,7 +235,7 @@ def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
 
 
 def _gradient(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, " n"]:
-    """g of half the loss, mean over the cameras that were seen."""
+    """g of half the loss, mean over the rendered cameras."""
     total: Any = 0.0
     for k, sums in seen.items():
         test = _tamed(np.mean(_halves(newton, k), axis=0), sums.weights.shape)
@@ -254,7 +255,7 @@ def _matrices(job: Any, newton: Newton, views: Sequence[int]) -> dict[int, Float
 
 
 def _reference_noise(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, "n n"]:
-    """Covariance of g by what is left of I - R without render noise: Σ Φ W² r² Φᵀ."""
+    """Covariance of g by the residuals I - R without render noise: Σ Φ W² r² Φᵀ."""
     total: Any = 0.0
     for k, sums in seen.items():
         first, second = (_tamed(half, sums.weights.shape) for half in _halves(newton, k))
@@ -266,10 +267,10 @@ def _reference_noise(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndar
 def _short(
     job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _Seen], lost: float
 ) -> Float[np.ndarray, " n"]:
-    """Where a short round goes: a damped step, or half the way back to the best place so far.
+    """The values after a short round: a damped step, or half the way back to the best values so far.
 
-    It goes back where the pictures have become worse, or where `lost`, the share of their values that are no numbers,
-    says that the last step left the plugins' domain.
+    It returns if the loss has increased, or if `lost`, the share of non-finite values, shows that the last step left
+    the plugins' domain.
     """
     loss = float(np.mean([(s.weights * s.products()).sum() for s in seen.values()]))
     noise = float(np.mean([s.noise() for s in seen.values()]))
@@ -283,12 +284,12 @@ def _short(
 
 
 def _used(newton: Newton) -> list[Round]:
-    """The long rounds that count: all but the first, which began furthest away."""
+    """The long rounds that are averaged: all but the first, which began furthest away."""
     return newton.rounds[int(len(newton.rounds) >= LONG[0]) :]
 
 
 def _system(job: Any, newton: Newton, rounds: Sequence[Round]) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right side whose solution is the rounds' mean, each weighted by its steps."""
+    """Matrix and right-hand side whose solution is the rounds' mean, each weighted by its steps."""
     each = _matrices(job, newton, sorted({k for r in rounds for k in r.views}))
     matrix: Any = 0.0
     right: Any = 0.0
@@ -300,7 +301,7 @@ def _system(job: Any, newton: Newton, rounds: Sequence[Round]) -> tuple[np.ndarr
 
 
 def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Pseudo-inverse of the scaled matrix: directions of which the pictures say next to nothing stay."""
+    """Pseudo-inverse of the scaled matrix: directions that the pictures hardly constrain stay unchanged."""
     size = np.sqrt(np.maximum(np.diag(matrix), 0))
     scale = np.where(size > 0, 1 / np.where(size > 0, size, 1), 0)
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
@@ -342,9 +343,9 @@ def _bounds(job: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
-    """Standard error of every number (NaN where nothing tells), and whether its rounds still drift.
+    """Standard error of every number (NaN if unconstrained), and whether its rounds still drift.
 
-    Render noise comes from the long rounds' disagreement, the references' noise from what is left of the residuals.
+    Render noise is estimated from the long rounds' disagreement, the references' noise from the residuals.
     """
     count, used = len(newton.theta), _used(newton)
     if len(used) < 2 or newton.noise is None:
@@ -364,7 +365,7 @@ def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
 
 
 def saved(newton: Newton) -> dict[str, np.ndarray]:
-    """Everything, as arrays."""
+    """The whole state as arrays."""
     count = len(newton.theta)
     best = (np.nan, np.full(count, np.nan)) if newton.best is None else newton.best
     result = {
@@ -382,7 +383,7 @@ def saved(newton: Newton) -> dict[str, np.ndarray]:
 
 
 def brought_back(arrays: Mapping[str, np.ndarray]) -> Newton:
-    """The reverse of `saved`."""
+    """The inverse of `saved`."""
     held = {name: np.array(value) for name, value in arrays.items()}
     number, near, size, rounds = (int(n) for n in held["numbers"])
     count = len(held["theta"])

@@ -1,4 +1,4 @@
-"""A fit of a scene before it begins and when it is interrupted: what stands still, what moves, what is refused."""
+"""State of a scene fit: constants, changing values, checkpoints, and validation of its inputs."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -23,8 +23,8 @@ Regularizer = Callable[[Mapping[str, Any]], Any]
 
 @dataclass(frozen=True)
 class Bad:
-    """A number of a gradient that was NaN or infinite: `texel` is its index in the value of `key` (row, column, …).
-    `sensor` is None where a regularizer made it."""
+    """A NaN or infinite number of a gradient: `texel` is its index in the value of `key` (row, column, …). `sensor` is
+    None if a regularizer caused it."""
 
     key: str
     texel: tuple[int, ...]
@@ -34,7 +34,7 @@ class Bad:
 
 @dataclass(frozen=True)
 class FitPlan:
-    """The settings that decide the result; `spp_grad` None leaves it to the solver."""
+    """The settings that determine the result; with `spp_grad` None the solver chooses."""
 
     iterations: int
     spp: int
@@ -48,7 +48,7 @@ class FitPlan:
 
 @dataclass(frozen=True)
 class SceneProblem:
-    """What stands still during the fit."""
+    """Constants of the fit."""
 
     scene: Any
     table: Any
@@ -61,13 +61,13 @@ class SceneProblem:
     free: dict[str, np.ndarray]
     scales: dict[str, float]
     plan: FitPlan
-    fast: Any = None  # scene_fast.DeferredRenderer, where its pictures are the scene's
+    fast: Any = None  # scene_fast.DeferredRenderer, if it matches the scene
     newton: bool = False  # Gauss–Newton instead of Adam
 
 
 @dataclass
 class FitState:
-    """What moves, and in `held` which numbers do so no more; all but `bad`, `lost`, `broken` goes into a checkpoint.
+    """The changing values, and in `held` the frozen numbers. A checkpoint stores all but `bad`, `lost`, `broken`.
 
     start   the values before the first step
     tail    sums of the values over the last steps (Adam on noisy gradients: their mean is the result)
@@ -92,7 +92,7 @@ class FitState:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The parameters to fit, by name, and masks of the numbers that may change (`only`, by name)."""
+    """The parameters to fit, by name, and masks of their free numbers (`only`, by name)."""
 
     keys: str | Sequence[str]
     only: Mapping[str, np.ndarray] | None = None
@@ -100,7 +100,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The pictures to fit to, with their sensors and masks; None: the scene's sensors, every pixel."""
+    """The reference pictures with their sensors and masks; None: the scene's sensors, every pixel."""
 
     references: Any
     sensors: Any = None
@@ -109,7 +109,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Objective:
-    """The loss (None: chosen by the way of drawing) and the regularizers that are added to it."""
+    """The loss (None: depends on the renderer) and the added regularizers."""
 
     loss: str | scene_grad.Loss | None = None
     regularizers: Sequence[Regularizer] = ()
@@ -124,7 +124,7 @@ def prepare(
     integrator: Any = None,
     fast: bool = True,
 ) -> tuple[SceneProblem, list[str]]:
-    """Check everything and put it together; returns the problem and notes."""
+    """Validate the inputs and assemble the problem; returns it with notes."""
     import mitsuba as mi
 
     keys, loss, regularizers = unknowns.keys, objective.loss, objective.regularizers
@@ -178,7 +178,7 @@ def _way(quick: Any, engine: Any, why: str) -> str:
 
 
 def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Which numbers may change."""
+    """Masks of the free numbers."""
     free = {p.key: np.ones(p.shape, bool) for p in chosen}
     for name, mask in only.items():
         for p in scene_keys.choose(chosen, [name]):
@@ -192,7 +192,7 @@ def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[s
 
 
 def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
-    """The fast path, or why there is none."""
+    """The fast path, or the reason why it does not apply."""
     from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
 
     try:
@@ -227,7 +227,7 @@ def _called(camera: Any, k: int) -> str:
 
 
 def _scale(parameter: Parameter, values: np.ndarray) -> float:
-    """The rate's unit: 1 for what is limited to 0..1, else the size of the numbers."""
+    """The rate's unit: 1 for values limited to 0..1, else the magnitude of the numbers."""
     bounds = scene_keys.limits(parameter)
     if parameter.owner == "NormalMap" or (bounds is not None and np.isfinite(bounds[1])):
         return 1.0
@@ -250,7 +250,7 @@ def begun(job: SceneProblem) -> FitState:
 
 
 def _fingerprint(job: SceneProblem) -> str:
-    """What must be the same for a checkpoint to fit."""
+    """The identity of a fit that a checkpoint must match."""
     loss = job.loss if isinstance(job.loss, str) else getattr(job.loss, "__name__", type(job.loss).__name__)
     films = [list(view.reference.shape) for view in job.views]
     return json.dumps([[(p.name, p.shape) for p in job.chosen], films, loss, len(job.regularizers), asdict(job.plan)])

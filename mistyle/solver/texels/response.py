@@ -12,7 +12,7 @@ MIN_Z2 = 1e-4
 def terms(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tuple[Any, Any, list, list]:
     """Albedo-linear and constant term; light from a cell of `width2` (`sky.EnvironmentCells`) widens the lobe.
 
-    GGX's α² is twice the variance of the slopes that mirror, and these turn half as much as the light does.
+    GGX's α² is twice the variance of the microfacet slopes, and normals turn half as much as the light does.
     """
     import drjit as dr
 
