@@ -264,7 +264,7 @@ def _block(
     sampling: Sampling,
     soft: Sky | None,
 ) -> SampleBlock | None:
-    """Blocks of the rows of a picture, from `row` on, that `mask` covers."""
+    """The block of a picture's rows from `row` on; `mask` selects its pixels. None without any sample."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,8 +1,7 @@
-"""Runs inside Blender's Python (an environment of its own): opens files and counts what it finds.
+"""Runs inside Blender's Python (a separate environment): opens files and counts their contents.
 
 Takes one JSON file: files. Writes beside it a `.done` JSON with Blender's version and, for each file, its meshes,
-triangles and materials, the names of images that could not be loaded, and an error where the importer ended with one.
-Knows nothing of mistyle.
+triangles and materials, the names of missing images, and the importer's error, if any. Does not import mistyle.
 """
 
 import json

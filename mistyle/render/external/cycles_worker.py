@@ -1,9 +1,9 @@
-"""Runs inside Blender's Python (an environment of its own): imports a GLB and renders it in Cycles.
+"""Runs inside Blender's Python (a separate environment): imports a GLB and renders it in Cycles.
 
 Takes one JSON file: glb, size (width, height), fov_x (degrees), camera (4x4, OpenGL axes, the GLB's world), distance,
 depth, threads, suns (direction towards, irradiance), environment (EXR in Blender's layout), and shots (out, spp, seed).
 Writes each shot as EXR and beside the job file a `.done` JSON with Blender's version and the seconds of each shot.
-Knows nothing of mistyle.
+Does not import mistyle.
 """
 
 import json
@@ -14,7 +14,7 @@ import time
 import bpy  # pyright: ignore[reportMissingImports]
 from mathutils import Matrix, Vector  # pyright: ignore[reportMissingImports]
 
-# glTF is Y-up, Blender Z-up; its importer turns +90 degrees about X.
+# glTF is Y-up, Blender Z-up; its importer rotates by +90 degrees about X.
 BLENDER_FROM_GLTF = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 
 
@@ -46,7 +46,7 @@ def settings(scene, job):
     scene.cycles.device = "CPU"
     scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
     scene.cycles.pixel_filter_type = "BOX"
-    # Whatever trades correctness for less noise is off: two renderers shall converge to the same picture.
+    # Biased noise reduction is off, so that two renderers converge to the same picture.
     scene.cycles.sample_clamp_direct = scene.cycles.sample_clamp_indirect = 0.0
     scene.cycles.blur_glossy = 0.0
     scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = True

@@ -1,13 +1,13 @@
-"""Renderers by name, all behind one call: (shot, spp, seeds) -> linear pictures and their seconds.
+"""Renderers by name behind one call: (view, spp, seeds) -> linear pictures and their seconds.
 
     mitsuba:path  mitsuba:direct  mitsuba:scene   this Mitsuba with that integrator (a scene file: with its defaults);
                                                   "scene" is the scene file's own
     mitsuba@VENV:path                             the Mitsuba of another environment, by its Python
     blender:cycles                                Cycles in the Python that --blender or MISTYLE_BLENDER_PYTHON names
-    NAME=command {scene} {out} …                  anything else; also {spp} {seed} {sensor}; no shell is involved
+    NAME=command {scene} {out} …                  any other program; also {spp} {seed} {sensor}; no shell is involved
 
-A mesh is drawn with glTF's own reflectance model; where a mitsuba@… takes part, every Mitsuba reads the same exported
-scene file instead, whose material is Mitsuba's `principled`, so that versions are compared and not materials.
+A mesh is rendered with glTF's own reflectance model. If a mitsuba@… takes part, every Mitsuba reads the same exported
+scene file with Mitsuba's `principled` material instead, so that versions are compared and not materials.
 """
 
 import os
@@ -39,7 +39,7 @@ MITSUBA_VARIANTS = ("cuda_ad_rgb", "metal_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 
 @dataclass(frozen=True)
 class Rendered:
-    """Pictures (h w 3 or 4, linear, premultiplied), the seconds of each, and what drew them."""
+    """Pictures (h w 3 or 4, linear, premultiplied), the seconds of each, and the renderer's version."""
 
     pictures: tuple[np.ndarray, ...]
     seconds: tuple[float, ...]
@@ -51,7 +51,7 @@ Draw = Callable[[Subject, RenderView, int, Sequence[int]], Rendered]
 
 @dataclass(frozen=True)
 class Renderer:
-    """A renderer's name as it is shown, its kind, and the call."""
+    """A renderer's display name, its kind, and its call."""
 
     name: str
     kind: Literal["mitsuba", "other mitsuba", "blender", "command"]
@@ -59,7 +59,7 @@ class Renderer:
 
 
 def renderer(text: str, blender: str | None = None) -> Renderer:
-    """The renderer that a --with names. UsageError says what there is, EnvironmentMissing what is not installed."""
+    """The renderer of a --with. UsageError lists the available ones, EnvironmentMissing names a missing program."""
     name, equals, command = text.partition("=")
     if equals and name.replace("_", "").replace("-", "").isalnum():
         if "{scene}" not in command or "{out}" not in command:
@@ -86,7 +86,7 @@ def renderer(text: str, blender: str | None = None) -> Renderer:
 
 
 def _python(venv: Path) -> str:
-    """The Python of an environment; a path to the program itself will do too."""
+    """The Python of an environment, by the environment's folder or the program's path."""
     candidates = [venv] if venv.is_file() else [venv / "bin" / "python", venv / "Scripts" / "python.exe"]
     for path in candidates:
         if path.is_file():
@@ -123,7 +123,7 @@ def finished_asset(folder: Path) -> Path:
 
 
 def left_out(found: Subject) -> list[str]:
-    """What a glTF asks for that Mitsuba's side does not draw: emission, transparency, material extensions."""
+    """glTF features that Mitsuba's side does not render: emission, transparency, material extensions."""
     if found.path.suffix.lower() not in (".glb", ".gltf"):
         return []
     from mistyle.io.read_mesh import load_gltf
@@ -139,7 +139,7 @@ def left_out(found: Subject) -> list[str]:
 
 
 def shots(found: Subject, lights: Sequence[str], views: int, size: int) -> list[RenderView]:
-    """Cameras all round a mesh under every light, or the sensors of a scene file."""
+    """Cameras around a mesh under every light, or the sensors of a scene file."""
     if found.asset is None:
         from mistyle.render.lookdev.scenes import file_scene
 
@@ -181,7 +181,7 @@ def _mitsuba(integrator: str, found: Subject, shot: RenderView, spp: int, seeds:
 
 
 def _integrator(name: str, found: Subject) -> dict[str, Any] | None:
-    """A scene file gets the plugin with its defaults (None: its own); a mesh one that does not show its lights."""
+    """For a scene file the plugin with its defaults (None: its own); for a mesh one with hidden emitters."""
     if name == "scene":
         return None
     from mistyle.render.lookdev.scenes import integrator_dict
@@ -189,7 +189,7 @@ def _integrator(name: str, found: Subject) -> dict[str, Any] | None:
     return {"type": name} if found.asset is None else integrator_dict(name)
 
 
-# The asset in hand and its shapes: loading textures takes longer than many a render.
+# The current asset and its shapes: loading textures takes longer than many renders.
 _KEPT: list[tuple[Any, Any]] = []
 
 
@@ -273,7 +273,7 @@ def _command(name: str, template: str, found: Subject, shot: RenderView, spp: in
 
 
 def _filled(word: str, fields: Mapping[str, Any]) -> str:
-    """Plain replacement: braces that mean something else to the command stay."""
+    """Plain replacement: other braces in the command stay."""
     for key, value in fields.items():
         word = word.replace(f"{{{key}}}", str(value))
     return word

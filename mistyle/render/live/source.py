@@ -1,4 +1,4 @@
-"""The text of a Mitsuba scene file as XML: its elements by place, its parameters set, its own folder kept in reach."""
+"""The XML text of a Mitsuba scene file: element positions, parameter values, and paths to its own folder."""
 
 import os
 import re
@@ -11,7 +11,7 @@ from xml.sax.saxutils import quoteattr
 
 from mistyle.core.errors import InputRefused
 
-Edit = tuple[int, int, str]  # first byte, byte after the last, what comes in their place
+Edit = tuple[int, int, str]  # first byte, byte after the last, replacement
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Element:
 
 
 def elements_of(source: bytes) -> list[Element]:
-    """The elements of a scene file's text in the order of their start tags. InputRefused where it is not XML."""
+    """The elements of a scene file's text in the order of their start tags. Raises InputRefused if it is not XML."""
     parser = expat.ParserCreate()
     found: list[dict[str, Any]] = []
     above: list[int] = []
@@ -54,7 +54,7 @@ def elements_of(source: bytes) -> list[Element]:
 
 
 def include_edit(source: bytes, included: Path, defines: Mapping[str, str], new: str) -> list[Edit]:
-    """What makes `source` include the file `new` instead of `included`; nothing where it does not include that."""
+    """The edit by which `source` includes the file `new` instead of `included`; empty if it does not include it."""
     every = elements_of(source)
     given = {e.attributes.get("name", ""): e.attributes.get("value", "") for e in every if e.tag == "default"}
     given |= defines
@@ -68,7 +68,7 @@ def include_edit(source: bytes, included: Path, defines: Mapping[str, str], new:
 
 
 def surroundings(source: bytes, path: Path, defines: Mapping[str, str], out: Path) -> list[Edit]:
-    """Defaults as they were given, those that the file does not have too, and the way back to the original's folder."""
+    """Edits that set the given defaults, add missing ones, and keep paths to the original's folder valid."""
     edits: list[Edit] = []
     every = elements_of(source)
     there = {e.attributes.get("name", "") for e in every if e.tag == "default"}
@@ -90,7 +90,7 @@ def surroundings(source: bytes, path: Path, defines: Mapping[str, str], out: Pat
 
 
 def resolved(path: Path, defines: Mapping[str, str], out: Path) -> bytes:
-    """A scene file's text for another folder, with its parameters as given: it loads as `path` does with `defines`."""
+    """A scene file's text for another folder, with its parameters set: it loads as `path` does with `defines`."""
     source = path.read_bytes()
     return spliced(source, surroundings(source, path, defines, out))
 
@@ -103,7 +103,7 @@ def _from(out: Path, folder: Path) -> str:
 
 
 def spliced(source: bytes, edits: Sequence[Edit]) -> bytes:
-    """The text with pieces of it replaced."""
+    """The text with all edits applied."""
     result, at = [], 0
     for begin, end, text in sorted(edits):
         result += [source[at:begin], text.encode()]

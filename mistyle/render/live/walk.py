@@ -1,4 +1,4 @@
-"""The plugins of a live Mitsuba scene and every way that leads to them, where `mi.traverse` keeps only the first."""
+"""The plugins of a live Mitsuba scene and all paths to them; `mi.traverse` keeps only the first path."""
 
 import re
 from collections.abc import Iterable
@@ -8,7 +8,7 @@ MAX_NAMES = 64
 
 
 def children(scene: Any) -> dict[Any, list[tuple[str, Any]]]:
-    """What every plugin holds and under which name, each child once a plugin."""
+    """Every plugin's children with their names, each child once per plugin."""
     import mitsuba as mi
 
     class Listing(mi.TraversalCallback):
@@ -65,7 +65,7 @@ def ways(scene: Any, held: dict[Any, list[tuple[str, Any]]]) -> dict[Any, list[s
 
 
 def names(paths: Iterable[str]) -> tuple[str, ...]:
-    """The paths, those with an address last, each also without the wrappers around its material."""
+    """The paths, those with an address last, and each without the wrappers around its material."""
     ordered = sorted(dict.fromkeys(paths), key=lambda path: path.startswith("unnamed"))
     short = [re.sub(r"\.(brdf_0|nested_bsdf)(?=\.)", "", path) for path in ordered]
     return tuple(dict.fromkeys([*ordered, *short]))
