@@ -1,4 +1,4 @@
-"""Which Mitsuba variant draws, and on how many threads. Chosen at run time, never by an import."""
+"""Choice of the Mitsuba variant and its number of threads, at run time and never by an import."""
 
 import gc
 import os
@@ -11,10 +11,10 @@ from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.process import stopping
 from mistyle.setup.environment import known_llvm, use_llvm
 
-# The first that answers is taken; a GPU needs no LLVM.
+# The first that works is used; a GPU needs no LLVM.
 VARIANTS = {"cuda_ad_rgb": "CUDA", "metal_ad_rgb": "Metal", "llvm_ad_rgb": "LLVM"}
 
-# Dr.Jit 1.5 refuses LLVM 14 itself; 15 and 16 end the whole process when the first kernel is compiled.
+# Dr.Jit 1.5 rejects LLVM 14 itself; 15 and 16 abort the process when the first kernel is compiled.
 OLDEST_LLVM = 17
 
 LLVM_HELP = (
@@ -26,9 +26,9 @@ LLVM_HELP = (
 def use(variant: str | None = None, threads: int | None = None) -> str:
     """Make a differentiable RGB variant of Mitsuba current and return its name.
 
-    `variant` None keeps the variant that is current already, or else takes the first of VARIANTS that answers.
-    `threads` sets Dr.Jit's thread count (CPU only; None leaves it): results are bit-identical only at the same count.
-    Cheap to call again; every function of `render/` calls it. Raises EnvironmentMissing when nothing answers.
+    `variant` None keeps the current variant, or else selects the first of VARIANTS that works. `threads` sets Dr.Jit's
+    thread count (CPU only; None keeps it): results are bit-identical only at the same count. Repeated calls are cheap;
+    every function of `render/` calls it. Raises EnvironmentMissing if no variant works.
     """
     if "drjit" not in sys.modules:
         use_llvm()
@@ -53,7 +53,7 @@ def use(variant: str | None = None, threads: int | None = None) -> str:
 
 @contextmanager
 def file_threads() -> Iterator[None]:
-    """Two threads at least: with one, Mitsuba 3.9 waits for ever when it reads or writes an OpenEXR file."""
+    """At least two threads: with one, Mitsuba 3.9 deadlocks when it reads or writes an OpenEXR file."""
     import drjit as dr
 
     before = dr.thread_count()
@@ -68,9 +68,9 @@ def file_threads() -> Iterator[None]:
 
 @contextmanager
 def plain_errors(doing: str) -> Iterator[None]:
-    """What Mitsuba and Dr.Jit raise while `doing`, as one sentence (InputRefused); a request to stop stays one.
+    """Errors of Mitsuba and Dr.Jit while `doing`, as one sentence (InputRefused); a request to stop is passed on.
 
-    Dr.Jit wraps what is raised inside a loop, signals included, into a RuntimeError.
+    Dr.Jit wraps exceptions inside a loop, signals included, into a RuntimeError.
     """
     try:
         yield
@@ -88,18 +88,18 @@ def plain_errors(doing: str) -> Iterator[None]:
 
 
 def give_back() -> None:
-    """Memory that Dr.Jit keeps for arrays to come goes back to the system."""
+    """Release Dr.Jit's cached memory to the system."""
     import drjit as dr
 
     dr.flush_malloc_cache()
 
 
 class Frozen:
-    """`dr.freeze` of a function, with Python's garbage collector at rest while it runs.
+    """`dr.freeze` of a function, with Python's garbage collector disabled while it runs.
 
-    An array on NumPy's memory that is let go while Dr.Jit 1.5 records ends the whole process; the collector may do
-    that at any time, to arrays that have nothing to do with the function. With $MISTYLE_PLAIN set nothing is recorded,
-    each call is traced anew: slow, and the way to go on where a recording ends the process all the same.
+    If an array on NumPy's memory is freed while Dr.Jit 1.5 records, the process aborts. The collector may free
+    unrelated arrays at any time. With $MISTYLE_PLAIN set nothing is recorded and each call is traced anew: slow, but a
+    workaround if a recording still aborts the process.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -118,7 +118,7 @@ class Frozen:
 
     @property
     def n_recordings(self) -> int:
-        """How often the function has been recorded so far."""
+        """Number of recordings of the function."""
         return getattr(self._run, "n_recordings", 0)
 
 
