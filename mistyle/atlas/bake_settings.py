@@ -1,10 +1,10 @@
-"""What a user may choose about painting texels from views."""
+"""User settings of baking views into texels."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
 
 class BakeSettings(BaseModel):
-    """When a view may paint a texel (paper 4.1.4)."""
+    """Acceptance of a view for a texel (paper 4.1.4)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 

@@ -1,4 +1,4 @@
-"""Filling what is missing: the nearest texel of the same island, else the nearest on the surface."""
+"""Gap filling: the nearest texel of the same island, else the nearest on the surface."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -7,12 +7,12 @@ from mistyle.atlas.texels import threaded
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels
 
-NEIGHBOURS_3D = 1_000_000  # known texels that a search across islands looks through at most
+NEIGHBOURS_3D = 1_000_000  # most known texels in a search across islands
 
 
 def fill_in_place(albedo: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], texels: Texels) -> None:
-    """Give every covered texel that is not known the value of the nearest known one of its island, or, where the island
-    has none, of the nearest on the surface. Nothing is filled where nothing is known.
+    """Give every covered unknown texel the value of the nearest known one of its island, or, if the island has none, of
+    the nearest on the surface. Nothing is filled if no texel is known.
     """
     hole = texels.covered & ~known
     known = known & texels.covered
@@ -43,7 +43,7 @@ def fill_in_place(albedo: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h
 def nearest_in_space(
     known: Bool[np.ndarray, " t"], position: Float[np.ndarray, "t 3"], wanted: Int[np.ndarray, " n"]
 ) -> Int[np.ndarray, " n"]:
-    """The known texel nearest in space; with more than NEIGHBOURS_3D of them every k-th is looked at."""
+    """The known texel nearest in space; with more than NEIGHBOURS_3D of them, among every k-th."""
     from scipy.spatial import KDTree
 
     seeds = np.flatnonzero(known)
@@ -55,7 +55,7 @@ def nearest_in_space(
 def island_boxes(
     island: Int[np.ndarray, "h w"], wanted: Int[np.ndarray, " n"]
 ) -> list[tuple[int, tuple[slice, slice]]]:
-    """The wanted islands that have texels, each with the rectangle of the atlas that holds it."""
+    """The non-empty ones of the given islands, each with its bounding rectangle in the atlas."""
     from scipy.ndimage import find_objects
 
     found = find_objects(island + 1)

@@ -1,4 +1,4 @@
-"""What a user may choose about the texture sets."""
+"""User settings of the texture sets."""
 
 from pydantic import BaseModel, ConfigDict, Field
 

@@ -1,4 +1,4 @@
-"""Are two noisy renders of one scene renders of the same picture? And how fast does one converge?"""
+"""Welch's test whether two noisy renders have the same expectation, and convergence rates."""
 
 import math
 from collections.abc import Sequence
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-LEAST = 1e-6  # a difference that nobody need explain, in linear radiance
+LEAST = 1e-6  # negligible difference, in linear radiance
 
 
 @dataclass(frozen=True)
 class Tested:
-    """What a test of two means found.
+    """The result of a test of two means.
 
     passed    whether no block of any scale is rejected
-    share     share of the pixels in rejected blocks, the whole picture's aside
+    share     share of the pixels in rejected blocks, without the whole picture's
     worst     the largest |t|
     bias      mean of test minus reference over the reference's mean, all pixels together
     whole     whether the whole picture's mean is rejected
@@ -42,12 +42,12 @@ def same_picture(
 ) -> Tested:
     """Welch's test of the means of independent renders, per block and channel, at three scales.
 
-    The blocks are `block` pixels wide, four times as wide, and the whole picture: small ones find what is local, large
-    ones what is faint. Each seed's block mean is one observation; means and variances come from the seeds alone. The
+    The blocks are `block` pixels wide, four times as wide, and the whole picture: small ones detect local differences,
+    large ones faint ones. Each seed's block mean is one observation; means and variances come from the seeds alone. The
     hypothesis "both have the same expectation" is rejected for the picture at `level` with Šidák's correction over all
-    blocks, so that a pair without any difference fails at most once in 1 / level times. A standard error below `floor`
-    times the block's brightness counts as that (few seeds may agree by chance; differences below it are not looked
-    for). Fireflies make a block's mean less normal than the test supposes. ValueError for fewer than 2 seeds.
+    blocks, so that an equal pair fails at most once in 1 / level times. A standard error is at least `floor` times the
+    block's brightness (few seeds may agree by chance; smaller differences are ignored). Fireflies make block means less
+    normal than the test assumes. Raises ValueError for fewer than 2 seeds.
     """
     if len(reference) < 2 or len(test) < 2:
         raise ValueError(f"{len(reference)} and {len(test)} renders came; a variance needs two of each at least")
@@ -60,7 +60,7 @@ def same_picture(
     smallest = found[0][0]
     picked = np.take_along_axis(smallest, np.abs(smallest).argmax(axis=-1)[..., None], axis=-1)[..., 0]
     fine, coarse = (_spread(r, side, size) for r, side in zip(rejected[:2], sides[:2], strict=True))
-    # A large block shows only what no small one inside it does.
+    # A large block is rejected only without a rejected small one inside it.
     explained = np.asarray(_blocks(np.repeat(fine[None, ..., None], 3, axis=3), sides[1])[0, ..., 0] > 0)
     where = fine | (coarse & ~_spread(explained, sides[1], size))
     return Tested(
