@@ -60,7 +60,7 @@ def same_picture(
     smallest = found[0][0]
     picked = np.take_along_axis(smallest, np.abs(smallest).argmax(axis=-1)[..., None], axis=-1)[..., 0]
     fine, coarse = (_spread(r, side, size) for r, side in zip(rejected[:2], sides[:2], strict=True))
-    # A large block is rejected only without a rejected small one inside it.
+    # The map omits a large rejected block that a small rejected one inside explains.
     explained = np.asarray(_blocks(np.repeat(fine[None, ..., None], 3, axis=3), sides[1])[0, ..., 0] > 0)
     where = fine | (coarse & ~_spread(explained, sides[1], size))
     return Tested(

@@ -102,7 +102,7 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
 
 
 def intersect(traced: Tracer, ray: Any, tangents: Float[np.ndarray, "f 3 4"] | None) -> tuple[Any, Any]:
-    """Where rays first meet the mesh: Mitsuba's surface interaction, and the frame of the normal map (see `trace`)."""
+    """First hits of rays on the mesh: Mitsuba's surface interaction, and the frame of the normal map (see `trace`)."""
     import mitsuba as mi
 
     first = traced.scene.ray_intersect_preliminary(ray, coherent=True)

@@ -212,7 +212,7 @@ class MaterialRenderer:
 
     @property
     def recordings(self) -> int:
-        """How many times a frozen function has been recorded so far."""
+        """Number of recordings of frozen functions so far."""
         return sum(f.n_recordings for f in self._frozen.values())
 
     def _empty_gradient(self) -> Any:

@@ -61,7 +61,7 @@ class Split:
 
     @property
     def recordings(self) -> int:
-        """How many times a frozen function has been recorded so far."""
+        """Number of recordings of frozen functions so far."""
         return sum(f.n_recordings for f in self._frozen.values())
 
     def _function(self, name: Any, lit: deferred.Lit, function: Callable, *fixed: Any) -> device.Frozen:
