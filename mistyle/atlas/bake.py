@@ -87,7 +87,7 @@ def accepted(
     """`backproject` without the colours: per texel, row by row, the view that would paint it (-1: none), and the number
     of views that accept it."""
     if not views:
-        raise ValueError("there are no views to paint the atlas from; pass at least one")
+        raise ValueError("found no views to bake; expected at least one")
     towards = None if mesh is None else _faces_towards(mesh, [view.camera for view in views])
     tables = _depth_tables(views, settings)
     covered = texels.covered.reshape(-1)

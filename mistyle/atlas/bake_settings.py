@@ -12,5 +12,8 @@ class BakeSettings(BaseModel):
         default=0.05, gt=0, le=1, description="largest difference between a texel's and the view's depth"
     )
     window: int = Field(
-        default=5, ge=1, le=31, description="pixels across in which a silhouette pixel looks for its pure colour"
+        default=5,
+        ge=1,
+        le=31,
+        description="side in pixels of the window in which a silhouette pixel takes its pure colour",
     )

@@ -9,4 +9,4 @@ class AtlasSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     size: int = Field(default=2048, ge=16, le=16384, description="texels along each side of every texture set")
-    padding: int = Field(default=16, ge=0, le=1024, description="texels by which islands are continued outwards")
+    padding: int = Field(default=16, ge=0, le=1024, description="texels by which islands are extended outwards")

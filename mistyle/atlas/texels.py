@@ -62,8 +62,8 @@ def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
     uv = mesh.corner_uvs[chosen].astype(np.float64)
     if not np.isfinite(uv).all() or (uv.size and (uv.min() < -1 or uv.max() > 2)):
         raise InputRefused(
-            f"texture set '{mesh.parts[part]}': its UVs reach from {uv.min():.3g} to {uv.max():.3g}, they must"
-            " lie within one tile of the unit square; unwrap the mesh anew with --uv new"
+            f"texture set '{mesh.parts[part]}': its UVs reach from {uv.min():.3g} to {uv.max():.3g}, expected"
+            " values within one tile of the unit square; unwrap the mesh again with --uv new"
         )
     corners = np.stack([uv[..., 0] * size, (1 - uv[..., 1]) * size], axis=-1)
     local = np.full(size * size, -1, np.int32)

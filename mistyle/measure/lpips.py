@@ -40,7 +40,7 @@ def load_lpips(backbone: Path, heads: Path) -> Lpips:
         reference: Float[np.ndarray, "h w 3"], test: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
     ) -> float:
         if min(mask.shape) < SMALLEST:
-            raise ValueError(f"pictures of {mask.shape} pixels came; LPIPS needs {SMALLEST} along each side")
+            raise ValueError(f"found pictures of {mask.shape} pixels; LPIPS needs {SMALLEST} along each side")
         if not mask.any():
             return float("nan")
         same = np.where(mask[..., None], test, reference)

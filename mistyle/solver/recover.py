@@ -133,7 +133,9 @@ def polished(context: FitContext, table: MaterialTable, progress: Callable[[floa
     result = polish(context.traced.mesh, start, context.captures, chosen, context.seed, progress)
     context.trace["polish.loss"], context.trace["polish.whole"] = list(result.trace), list(result.loss)
     if not result.loss[1] < result.loss[0]:
-        context.notes.append(f"The polish was undone: the loss went from {result.loss[0]:.3g} to {result.loss[1]:.3g}.")
+        context.notes.append(
+            f"The polish was undone: the loss changed from {result.loss[0]:.3g} to {result.loss[1]:.3g}."
+        )
         return table
     return pack(result.maps)
 

@@ -21,7 +21,7 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
     """The usable pictures; notes name the others. Raises InputRefused for a picture whose size differs from its
     camera's, and if none is usable."""
     if len(captures) == 0:
-        raise InputRefused("No reference pictures came; give at least three views of the object.")
+        raise InputRefused("Found no reference pictures; expected at least three views of the object.")
     usable, silent = [], []
     for k, camera in enumerate(captures.cameras):
         rgb, mask = captures.load(k)
@@ -33,7 +33,7 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
         reason = _why_not(mesh, camera, captures.lights[k], rgb, mask)
         (silent if reason else usable).append((k, reason))
     for k, reason in silent:
-        notes.append(f"Picture '{captures.cameras[k].name}' is left out: {reason}.")
+        notes.append(f"Picture '{captures.cameras[k].name}' is skipped: {reason}.")
     if not usable:
         reasons = "; ".join(sorted({reason for _, reason in silent}))
         raise InputRefused(f"None of {len(captures)} reference pictures can be used ({reasons}). Check cameras, masks"
@@ -41,8 +41,8 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
     views = {captures.cameras[k].world_from_cam.tobytes() for k, _ in usable}
     if len(views) < LEAST_VIEWS:
         notes.append(
-            f"Only {len(views)} different view(s) can be used: the fit is singular, normals and roughness are guesses."
-            f" Give at least {LEAST_VIEWS} views, better 16 around the object."
+            f"Only {len(views)} different view(s) can be used: the fit is singular, normals and roughness are not"
+            f" reliable. Use at least {LEAST_VIEWS} views, better 16 around the object."
         )
     return subset(captures, [k for k, _ in usable])
 
@@ -53,9 +53,9 @@ def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: 
     if not (in_frame(camera, px) & (depth > 0)).any():
         return "its camera cannot see the mesh"
     if not lights:
-        return "no light is given for it"
+        return "it has no light"
     if not mask.any():
-        return "none of its pixels counts (all are saturated, masked or not numbers)"
+        return "none of its pixels is valid (all are saturated, masked or not finite)"
     if not (rgb[mask] > 0).any():
         return "it is all black"
     return ""

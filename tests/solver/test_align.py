@@ -205,7 +205,7 @@ def test_a_symmetric_mesh_is_not_aligned_by_luck(rng):
 
 
 def test_other_points_are_refused(mesh, rng):
-    with pytest.raises(InputRefused, match="mesh's radius away"):
+    with pytest.raises(InputRefused, match="mesh radii from the mesh"):
         align_by_points(mesh, rng.uniform(-3, 3, (150, 3)), [], None, rng)
 
 

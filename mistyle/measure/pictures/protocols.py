@@ -17,7 +17,7 @@ PROTOCOLS: Mapping[str, str] = {
     "frame, black surroundings included, and never below that of constant 0.5. ssim: Gaussian window of 3 px, standard "
     "deviation 1.5, mirrored, on psnr_l's pictures. Its LPIPS (VGG) is not measured. "
     "A reference four times as large is reduced by area averages",
-    "tensoir": "TensoIR's relighting figures, on sRGB-encoded pictures in 0..1 over white. psnr: peak 1, all pixels. "
+    "tensoir": "TensoIR's relighting metrics, on sRGB-encoded pictures in 0..1 over white. psnr: peak 1, all pixels. "
     "ssim: Gaussian window of 11 px, standard deviation 1.5, variances kept from below zero, only where the window "
     "lies inside the picture, mean over channels",
     "idiff": "OpenImageIO's idiff on the values as stored, all channels, missing ones and missing pixels 0, over the "

@@ -50,7 +50,7 @@ def same_picture(
     normal than the test assumes. Raises ValueError for fewer than 2 seeds.
     """
     if len(reference) < 2 or len(test) < 2:
-        raise ValueError(f"{len(reference)} and {len(test)} renders came; a variance needs two of each at least")
+        raise ValueError(f"{len(reference)} and {len(test)} renders; expected at least two of each for a variance")
     size = reference.shape[1:3]
     sides = [block, 4 * block, max(size)]
     found = [_welch(_blocks(reference, side), _blocks(test, side), floor) for side in sides]

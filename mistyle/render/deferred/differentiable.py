@@ -40,8 +40,8 @@ def lights_of_cameras(lights: Light | Sequence[Light] | Sequence[Sequence[Light]
         return (tuple(single),) * count
     rigs = tuple(tuple(rig) for rig in lights if not isinstance(rig, Light))
     if single or len(rigs) != count:
-        raise UsageError(f"found {len(rigs)} rigs and {len(single)} lights for {count} cameras; give one rig for all"
-                         " cameras, or a rig for each")  # fmt: skip
+        raise UsageError(f"found {len(rigs)} rigs and {len(single)} lights for {count} cameras; expected one rig for"
+                         " all cameras, or one for each")  # fmt: skip
     return rigs
 
 
@@ -83,7 +83,7 @@ class Renderer:
         if other:
             raise UsageError(
                 f"Renderer: found {', '.join(sorted(other))}; expected Directional, Point and Ambient lights. "
-                "render_views draws the others, without gradients."
+                "render_views supports the others, without gradients."
             )
         traced, tangents = tracer(self.mesh), tangents_of(self.mesh, frame)
         self._surfaces = [deferred.trace(traced, [camera], tangents) for camera in self.cameras]

@@ -211,10 +211,10 @@ def collect(
     """
     device.use()
     if mask.shape != camera.size:
-        raise ValueError(f"{camera.name}: a mask of {mask.shape} pixels came for a camera of {camera.size}")
+        raise ValueError(f"{camera.name}: found a mask of {mask.shape} pixels; expected the camera's {camera.size}")
     known = [light for light in lights if isinstance(light, Directional | Point)]
     if any(isinstance(light, SceneLights) for light in lights):
-        raise ValueError(f"{camera.name}: light that only a scene file describes cannot be collected")
+        raise ValueError(f"{camera.name}: lights that only a scene file describes are not supported")
     soft = soft or sky(lights)
     down, across = window(surface.traced.mesh, camera)
     near = np.zeros_like(mask)

@@ -77,7 +77,7 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
 
     device.use()
     if len({camera.size for camera in cameras}) != 1:
-        raise ValueError(f"cameras of one size are needed, not {sorted({camera.size for camera in cameras})}")
+        raise ValueError(f"found cameras of sizes {sorted({camera.size for camera in cameras})}; expected one size")
     point, frame = intersect(traced, ray := _rays(cameras), tangents)
     valid = point.is_valid()
     towards = -ray.d
@@ -127,7 +127,7 @@ def light(traced: Tracer, surface: Surface, lights: Lights, *, shadows: bool = T
             ambient += source.radiance
         else:
             raise ValueError(
-                f"{type(source).__name__} cannot be summed exactly; give directional, point or ambient light"
+                f"{type(source).__name__} cannot be summed exactly; expected directional, point or ambient light"
             )
     glow = (float(ambient[0]), float(ambient[1]), float(ambient[2])) if ambient.any() else None
     return _lit(traced, surface, beams, glow, shadows)
@@ -246,7 +246,7 @@ def _integrator_class() -> type:
                 raise RuntimeError(f"{INTEGRATOR}: set `lit` before rendering")
             rows, columns = lit.size
             if dr.width(ray.d) != rows * columns:
-                raise RuntimeError(f"{INTEGRATOR}: a film of {columns}x{rows} pixels at 1 spp is needed")
+                raise RuntimeError(f"{INTEGRATOR}: expected a film of {columns}x{rows} pixels at 1 spp")
             pixel = dr.arange(mi.UInt32, rows * columns)
             point = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
             point.wi = lit.wi

@@ -86,7 +86,7 @@ class MaterialRenderer:
         """`sizes` (rows, columns) of the texture sets; `weights` gives picture k's pixels a factor in the loss."""
         device.use()
         if len(sizes) != len(traced.mesh.parts):
-            raise ValueError(f"{len(sizes)} sizes came for {len(traced.mesh.parts)} texture sets")
+            raise ValueError(f"found {len(sizes)} sizes for {len(traced.mesh.parts)} texture sets")
         if options.model not in bsdf.MODELS:
             raise ValueError(f"model is {options.model!r}; expected one of {', '.join(bsdf.MODELS)}")
         self.traced, self.captures, self.weights = traced, captures, weights
@@ -116,7 +116,7 @@ class MaterialRenderer:
         elif not isinstance(table, mi.Float):
             array = np.ascontiguousarray(table, np.float32)
             if array.shape != (self.texels, COLUMNS):
-                raise ValueError(f"a table of {array.shape} came; expected {(self.texels, COLUMNS)}")
+                raise ValueError(f"found a table of {array.shape}; expected {(self.texels, COLUMNS)}")
             table = collecting.own(mi.Float, array.ravel())
         dr.eval(table)
         return table

@@ -136,7 +136,7 @@ def run_job(program: Sequence[str], path: Path, job: Mapping[str, Any], name: st
     finished([*program, str(path)], name)
     done = Path(f"{path}.done")
     if not done.is_file():
-        raise MistyleError(f"{name}: the renderer ended without a result")
+        raise MistyleError(f"{name}: the renderer exited without a result")
     return json.loads(done.read_text())
 
 

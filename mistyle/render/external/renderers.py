@@ -91,9 +91,7 @@ def _python(venv: Path) -> str:
     for path in candidates:
         if path.is_file():
             return str(path)
-    raise EnvironmentMissing(
-        f"mitsuba@{venv}: found no python there; expected a virtual environment with mitsuba in it"
-    )
+    raise EnvironmentMissing(f"mitsuba@{venv}: found no python; expected a virtual environment with mitsuba installed")
 
 
 def subject(path: Path, folder: Path, renderers: Sequence[Renderer], threads: int = 0) -> Subject:
@@ -106,7 +104,7 @@ def subject(path: Path, folder: Path, renderers: Sequence[Renderer], threads: in
         if not path.is_file():
             raise InputRefused(f"{path}: found nothing; expected a Mitsuba scene file. Check the path.")
         if any(r.kind == "blender" for r in renderers):
-            raise UsageError(f"{path}: Cycles reads no Mitsuba scenes; give a GLB, or leave out blender:cycles")
+            raise UsageError(f"{path}: Cycles reads no Mitsuba scenes; pass a GLB, or omit blender:cycles")
         return Subject(path, folder, threads=threads)
     from mistyle.io.read_mesh import read_mesh
 
@@ -229,7 +227,7 @@ def _cycles(python: str, found: Subject, shot: RenderView, spp: int, seeds: Sequ
     from mistyle.render.lookdev import scenes as lookdev
 
     if shot.camera is None or found.asset is None:
-        raise UsageError(f"{found.path}: Cycles reads no Mitsuba scenes; give a GLB")
+        raise UsageError(f"{found.path}: Cycles reads no Mitsuba scenes; pass a GLB")
     folder = found.folder / f"cycles_{shot.name}_{spp}"
     folder.mkdir(parents=True, exist_ok=True)
     sky = lookdev.blender_environment(shot.lights)
@@ -267,7 +265,7 @@ def _command(name: str, template: str, found: Subject, shot: RenderView, spp: in
         finished(words, name)
         seconds.append(time.perf_counter() - start)
         if not out.is_file():
-            raise MistyleError(f"{name}: the command ended well but wrote no {out.name}; expected an EXR at {{out}}")
+            raise MistyleError(f"{name}: the command succeeded but wrote no {out.name}; expected an EXR at {{out}}")
         pictures.append(_rgba(read_frame(out)))
     return Rendered(tuple(pictures), tuple(seconds), name)
 

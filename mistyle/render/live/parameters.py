@@ -95,7 +95,7 @@ def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
         kind = _kind(node, leaf, shape)
         reason = _reason(node, owner, role, kind, flags, value, storage)
         if reason is None and used is not None and node not in used:
-            reason = "no shape and no light uses it."
+            reason = "neither a shape nor a light uses it."
         if kind == "attribute":
             role, owner, unread = _reader(node, leaf, children)
             reason = reason or unread
@@ -155,7 +155,7 @@ def match(scene: Any, patterns: Sequence[str], engine: Any = None) -> tuple[Para
 def choose(listed: Sequence[Parameter], patterns: Sequence[str]) -> tuple[Parameter, ...]:
     """`match` in the list from `parameters`."""
     if not patterns:
-        raise UsageError("no parameter to optimise was named: give one or more keys or globs (`--list` shows them).")
+        raise UsageError("no parameter to optimise: name one or more keys or globs (`--list` shows them).")
     chosen: set[str] = set()
     for pattern in patterns:
         hits = [p for p in listed if any(fnmatchcase(name, pattern) for name in _spellings(p))]
@@ -165,7 +165,7 @@ def choose(listed: Sequence[Parameter], patterns: Sequence[str]) -> tuple[Parame
         if not usable:
             reasons = [f"{p.name}: {p.reason}" for p in hits[:5]]
             more = f" (and {len(hits) - 5} more)" if len(hits) > 5 else ""
-            raise UsageError(f"'{pattern}' names nothing that can be optimised. {' '.join(reasons)}{more}")
+            raise UsageError(f"'{pattern}' matches no parameter that can be optimised. {' '.join(reasons)}{more}")
         chosen.update(usable)
     return tuple(p for p in listed if p.key in chosen)
 
@@ -226,7 +226,7 @@ def fast_shapes(scene: Any, integrator: Any = None) -> dict[str, str | None]:
     wide = [e.class_name() for e in scene.emitters() if not int(e.flags()) & int(delta)]
     everywhere = f"{wide[0]} is neither a point nor a direction." if wide else None
     if everywhere is None and not 0 <= depth <= 2:
-        everywhere = "the integrator follows light from surface to surface (its max_depth is above 2)."
+        everywhere = "the integrator renders indirect light (its max_depth is above 2)."
     result = {}
     for shape in scene.shapes():
         bsdf: Any = shape.bsdf()
@@ -290,9 +290,9 @@ def _reason(node: Any, owner: Any, role: str, kind: str, flags: Any, value: Any,
     import mitsuba as mi
 
     if kind == "geometry":
-        return "it is geometry; the fit moves materials and lights, over surfaces that stand still."
+        return "it is geometry; only materials and lights can be fitted."
     if isinstance(node, (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.Scene)):
-        return "it belongs to a camera or to the rendering; the fit moves materials and lights."
+        return "it belongs to a camera or to the rendering; only materials and lights can be fitted."
     if storage in ("uint8", "int8"):
         return (
             "its texture is stored with 8 bits (uint8), which has no gradient; load it with "
@@ -321,14 +321,14 @@ def _notes(node: Any, owner: Any, role: str, value: Any, storage: str) -> tuple[
     if "BitmapTexture" in node.class_name() and re.search(r"\braw = 0\b", str(node)):
         notes.append(
             'raw is false: every step waits for a check of its range; <boolean name="raw" value="true"/> is '
-            "faster, where the file holds linear values."
+            "faster if the file holds linear values."
         )
     if storage == "float16":
-        notes.append('its texture is stored with 16 bits; format "variant" keeps the whole result.')
+        notes.append('its texture is stored with 16 bits; format "variant" stores the result in full precision.')
     if role in ROUGH:
         low = float(np.mean(np.asarray(value) < ROUGHNESS_FLOOR))
         if low:
-            notes.append(f"{low:.1%} of it lies below {ROUGHNESS_FLOOR} and is raised to that.")
+            notes.append(f"{low:.1%} of its values lie below {ROUGHNESS_FLOOR} and are raised to it.")
     return tuple(notes)
 
 

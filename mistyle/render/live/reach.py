@@ -55,7 +55,7 @@ def no_gradient(node: Any, owner: Any, role: str, engine: Any) -> str | None:
     called = "prb" if engine is None else str(engine).partition("[")[0].removesuffix("Integrator").lower()
     inside = isinstance(owner, (mi.Medium, mi.PhaseFunction)) or isinstance(node, mi.Volume)
     if inside and engine is not None and "vol" not in called:
-        return f"it belongs to a medium, and the integrator {called} follows no light through media."
+        return f"it belongs to a medium, and the integrator {called} does not support media."
     if not isinstance(owner, mi.BSDF) or not int(owner.flags()) & int(mi.BSDFFlags.Delta):
         return None
     if role == "diffuse_reflectance":
@@ -63,9 +63,9 @@ def no_gradient(node: Any, owner: Any, role: str, engine: Any) -> str | None:
     kind = re.sub(r"(BSDF|BRDF)$", "", owner.class_name())
     if detached:
         return (
-            f"{kind} has a lobe without an extent (a mirror's, smooth glass's or what a mask lets pass), of which the "
-            f"integrator {called} has no true gradient; a rough material in its place can be fitted."
+            f"{kind} has a delta lobe (of a mirror, smooth glass or a mask), for which the "
+            f"integrator {called} has no correct gradient; a rough material in its place can be fitted."
         )
     if role in SHARES and "Conductor" not in kind:
-        return f"it decides how often {kind} takes one lobe or another, of which {called} has no true gradient."
+        return f"it sets the probabilities of the lobes of {kind}, for which {called} has no correct gradient."
     return None

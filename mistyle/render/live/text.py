@@ -91,7 +91,7 @@ def _edits(
     if p.kind == "attribute":
         return _mesh_edits(elements, at, file)
     if p.kind != "value":
-        return f"a scene file cannot hold it; it was written as {file.name if file else 'nothing'}."
+        return f"a scene file cannot store it; it was written as {file.name if file else 'nothing'}."
     old = inner.get(literal)
     numbers = " ".join(f"{float(v):.9g}" for v in values)
     tag = "rgb" if len(values) == 3 else "float"

@@ -169,7 +169,7 @@ def write_scene(
     for p in fitted.parameters:
         found = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
         if isinstance(found, str):
-            notes.append(f"{p.name} is not in {out.name}: {found} Its value stands in run.json and in the report.")
+            notes.append(f"{p.name} is not in {out.name}: {found} run.json and the report have its value.")
         else:
             edits.setdefault(found[0], []).extend(found[1])
     if not any(edits.values()):
@@ -182,7 +182,7 @@ def write_scene(
         out.unlink()
         return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {wrong}"))
     if out.parent.resolve() != scene.path.parent.resolve():
-        notes.append(f"{out.name} takes its other files from {scene.path.parent}.")
+        notes.append(f"{out.name} reads its other files from {scene.path.parent}.")
     return WrittenScene(out, textures, tuple(notes))
 
 

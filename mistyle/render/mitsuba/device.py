@@ -18,7 +18,7 @@ VARIANTS = {"cuda_ad_rgb": "CUDA", "metal_ad_rgb": "Metal", "llvm_ad_rgb": "LLVM
 OLDEST_LLVM = 17
 
 LLVM_HELP = (
-    "Run `python3 -m mistyle doctor`: it fetches an LLVM that works or prints the command for this system "
+    "Run `python3 -m mistyle doctor`: it downloads a working LLVM or prints the command for this system "
     "(on Debian 12: apt-get install libllvm19 libatomic1; then DRJIT_LIBLLVM_PATH may name the libLLVM file)."
 )
 
@@ -81,7 +81,7 @@ def plain_errors(doing: str) -> Iterator[None]:
             cause = inner
         said = " ".join(str(cause).split())
         if "not attached to the AD graph" in said:
-            said = "no gradient reaches the chosen parameters: no camera sees them, or their plugin passes none on"
+            said = "no gradient reaches the chosen parameters: no camera sees them, or their plugin propagates none"
         raise InputRefused(
             f"Mitsuba failed while {doing}: {said[:400].rstrip('.')}. Check that the mitsuba command renders the scene."
         ) from error
@@ -142,13 +142,13 @@ def _missing(variant: str) -> str:
     import drjit as dr
 
     if VARIANTS[variant] != "LLVM":
-        return f"Mitsuba's {variant} does not answer on this machine (no device or no driver). Use llvm_ad_rgb instead."
+        return f"Mitsuba's {variant} does not work on this machine (no device or no driver). Use llvm_ad_rgb instead."
     if (ours := known_llvm()) and not os.environ.get("DRJIT_LIBLLVM_PATH"):
         return (
             f"Dr.Jit was imported before it could load the working LLVM ({ours}). Call"
             " `mistyle.setup.environment.use_llvm()` before the first import of mitsuba or drjit."
         )
     if not dr.has_backend(dr.JitBackend.LLVM):
-        return f"No LLVM library that Dr.Jit can load was found, and no GPU answers. {LLVM_HELP}"
+        return f"Found neither an LLVM library that Dr.Jit can load nor a working GPU. {LLVM_HELP}"
     found = ".".join(str(n) for n in dr.detail.llvm_version())
-    return f"LLVM {found} was found; {OLDEST_LLVM} or newer is needed (older ones abort while compiling). {LLVM_HELP}"
+    return f"Found LLVM {found}; expected {OLDEST_LLVM} or newer (older ones abort while compiling). {LLVM_HELP}"

@@ -46,7 +46,7 @@ def _delta(light: Light, camera: Camera) -> dict[str, Any]:
     if isinstance(light, Point):
         position = position_in_world(light, camera)
         return {"type": "point", "position": position.tolist(), "intensity": _colour(light.intensity)}
-    raise ValueError(f"{type(light).__name__} cannot be put into a scene")
+    raise ValueError(f"{type(light).__name__} cannot be an emitter of a scene")
 
 
 def _colour(values: Any) -> dict[str, Any]:

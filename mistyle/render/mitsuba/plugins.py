@@ -156,7 +156,7 @@ def _normalmap_class(mi: Any) -> type:
             super().__init__(props)
             nested = [child for _, child in props.objects() if isinstance(child, mi.BSDF)]
             if len(nested) != 1:
-                raise RuntimeError(f"{NORMALMAP}: exactly one nested BSDF is needed, {len(nested)} came")
+                raise RuntimeError(f"{NORMALMAP}: found {len(nested)} nested BSDFs; expected exactly one")
             self.nested = nested[0]
             self.normalmap = props.get_texture("normalmap")
             self.flip = bool(props.get("flip_invalid_normals", False))

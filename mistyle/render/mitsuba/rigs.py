@@ -35,7 +35,7 @@ class Planned:
         if self.covered < 1:
             text += f"; {100 * (1 - self.covered):.2f} % is left uncovered"
         if self.reachable < 1:
-            text += f" ({100 * (1 - self.reachable):.2f} % of the surface no camera about it sees well)"
+            text += f" ({100 * (1 - self.reachable):.2f} % of the surface is not seen well by any candidate camera)"
         return text
 
 

@@ -173,7 +173,9 @@ def object_shapes(
     device.use()
     chosen = list(maps) if maps is not None else [flat_maps(2, NEUTRAL_GREY)] * len(mesh.parts)
     if len(chosen) != len(mesh.parts):
-        raise ValueError(f"{len(chosen)} maps came for {len(mesh.parts)} texture sets ({', '.join(mesh.parts)})")
+        raise ValueError(
+            f"{len(chosen)} maps for {len(mesh.parts)} texture sets; expected one for each ({', '.join(mesh.parts)})"
+        )
     tangents = None
     if frame == "mikkt":
         tangents = corner_tangents(mesh)
@@ -273,7 +275,7 @@ def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | 
     declared = set(re.findall(r'<default\s+name="(\w+)"', path.read_text(encoding="utf-8", errors="replace")))
     given: dict[str, Any] = {name: repr(float(value)) for name, value in wanted.items() if name in declared}
     if hdri is not None and "hdri" not in declared:
-        raise InputRefused(f'{path}: takes no environment map; it needs <default name="hdri" value="..."/>.')
+        raise InputRefused(f'{path}: accepts no environment map; it needs <default name="hdri" value="..."/>.')
     with TemporaryDirectory() as folder:
         try:
             with device.file_threads():

@@ -114,7 +114,7 @@ def _emitter(light, camera: Camera, folder: Path, k: int) -> Element:
             turn = SubElement(emitter, "transform", name="to_world")
             SubElement(turn, "rotate", y="1", angle=repr(float(light.turn)))
     else:
-        raise ValueError(f"{type(light).__name__} cannot stand in a scene file")
+        raise ValueError(f"{type(light).__name__} cannot be written to a scene file")
     return emitter
 
 

@@ -28,7 +28,9 @@ def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -
 
     device.use()
     if len(maps) != len(mesh.parts):
-        raise ValueError(f"{len(maps)} maps came for {len(mesh.parts)} texture sets ({', '.join(mesh.parts)})")
+        raise ValueError(
+            f"{len(maps)} maps for {len(mesh.parts)} texture sets; expected one for each ({', '.join(mesh.parts)})"
+        )
     plugins.register()
     made = _pages_class(mi)
     textures = {name: _texture(made, [getattr(m, name) for m in maps]) for name in ("albedo", "roughness", "metallic")}

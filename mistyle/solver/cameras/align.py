@@ -76,14 +76,14 @@ def align_by_points(
     found, *_ = align_points(mesh, own, rng)
     if found.residual > FAR:
         raise InputRefused(
-            f"--align: the points stay {found.residual:.3f} of the mesh's radius away; expected less than {FAR}. "
-            "Hand in masks (the points show other things too), or check that this is the mesh of the pictures."
+            f"--align: found points {found.residual:.3f} mesh radii from the mesh; expected less than {FAR}. "
+            "Pass masks (some points lie on other objects), or check that the pictures show this mesh."
         )
     if masks is None:
         if found.rival < 1.1:
             raise InputRefused(
-                "--align: found two ways to lay the points on the mesh that fit equally well (it is symmetric); "
-                "expected one. Hand in masks, or align the cameras by hand."
+                "--align: found two registrations of the points that fit equally well (the mesh is symmetric); "
+                "expected one. Pass masks, or align the cameras by hand."
             )
         return Alignment(found.work_from_cams, (), ())
     return align_by_masks(mesh, cameras, masks, rng, start=found.work_from_cams)
@@ -103,7 +103,7 @@ def align_by_masks(
     object. A `start` may be off by some 20 degrees and a third of the size.
     """
     if not any(mask.any() for mask in masks):
-        raise InputRefused("--align: found only empty masks; expected the object's. Check that white is the object.")
+        raise InputRefused("--align: found only empty masks; expected the object's. Check that the object is white.")
     traced = tracer(mesh)
     coarse = [shrunk(camera, mask, levels[0]) for camera, mask in zip(cameras, masks, strict=True)]
     if start is None:
@@ -162,7 +162,7 @@ def refine_poses(
     its contours would fit worse or if it shows nothing of the mesh.
     """
     if (pictures is None) != (predict is None):
-        raise ValueError("shading needs both, the pictures and what they should show")
+        raise ValueError("shading needs both, the pictures and their prediction")
     traced = tracer(mesh)
     refined, before, after = [], [], []
     for k, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):

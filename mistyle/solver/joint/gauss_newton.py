@@ -118,8 +118,8 @@ def joint_gauss_newton(
     footprints = image_footprints(context, renderer)
     if footprints is None:
         context.notes.append(
-            f"The joint steps at the end were left out: they need more than the {settings.memory:g} GB of "
-            "recover.memory. Give more, or fewer or smaller pictures."
+            f"The joint steps were skipped: they need more than the {settings.memory:g} GB of "
+            "recover.memory. Raise it, or use fewer or smaller pictures."
         )
         return table, direct
     pictures, unknown, memory = footprints
@@ -174,7 +174,7 @@ def _steps(problem: JointProblem, table: MaterialTable, progress: Callable[[floa
     problem.context.trace.setdefault("joint.cost", []).extend(costs)
     if not costs[-1] < costs[0]:
         problem.context.notes.append(
-            f"The joint steps were undone: the cost went from {costs[0]:.3g} to {costs[-1]:.3g}."
+            f"The joint steps were undone: the cost changed from {costs[0]:.3g} to {costs[-1]:.3g}."
         )
         return None
     return x

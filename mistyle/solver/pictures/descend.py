@@ -107,7 +107,7 @@ def optimise_on_pictures(
     context.trace["pictures.whole"] = [before, after]
     if not after < before:
         context.notes.append(
-            f"The steps on whole pictures were undone: the loss went from {before:.3g} to {after:.3g}."
+            f"The steps on whole pictures were undone: the loss changed from {before:.3g} to {after:.3g}."
         )
         return estimate.table, direct
     return smoothed(table), direct
@@ -206,11 +206,11 @@ def _note_stopped(context: FitContext, stopped: list[tuple[int, str, int]]) -> N
         part, row, column = place_of(texel, context.atlas.sizes)
         label = context.traced.mesh.parts[part]
         context.notes.append(
-            f"The gradient of map '{name}' at texel (row {row}, column {column}) of set '{label}' is not a number in"
+            f"The gradient of map '{name}' at texel (row {row}, column {column}) of set '{label}' is not finite in"
             f" picture '{context.captures.cameras[picture].name}': the texel keeps its last good value."
         )
     if len(stopped) > 3:
-        context.notes.append(f"The same held for {len(stopped) - 3} more texels.")
+        context.notes.append(f"{len(stopped) - 3} more texels had such gradients.")
 
 
 def total_loss(renderer: "MaterialRenderer", table: MaterialTable, settings: RecoverSettings) -> float:

@@ -70,7 +70,7 @@ class DeferredRenderer:
     ) -> None:
         """Raises Unsupported, with a reason, if renders would differ from the scene's; `subsamples` a pixel."""
         if loss not in scene_grad.LOSSES:
-            raise Unsupported("the loss is a function of its own.")
+            raise Unsupported("the loss is a custom function.")
         self.loss, self.chosen, self.subsamples = loss, tuple(chosen), subsamples
         reasons = scene_keys.fast_shapes(scene, engine)
         self.materials = _materials(scene, reasons)
@@ -167,7 +167,7 @@ class DeferredRenderer:
         variants = [(f, s) for f in (False, True) for s in (False, True)] if bumped else [(False, False)]
         errors = [error(variant) for variant in variants]
         if min(errors) > AGREEMENT:
-            raise Unsupported(f"its pictures differ from the scene's own by {min(errors):.1%}.")
+            raise Unsupported(f"its pictures differ from the scene's by {min(errors):.1%}.")
         return renderer(*variants[int(np.argmin(errors))], self.subsamples)
 
 
@@ -264,7 +264,7 @@ def _stored(texture: Any, keys: Mapping[Any, str]) -> tuple[str, np.ndarray]:
 
     table: Any = mi.traverse(texture)
     if "to_uv" in table.keys() and not np.allclose(np.array(table["to_uv"].matrix).squeeze(), np.eye(3), atol=1e-6):
-        raise Unsupported("a texture is scaled or turned (to_uv).")
+        raise Unsupported("a texture is transformed (to_uv).")
     name = next((n for n in ("data", "value") if n in table.keys()), None)
     if name is None or texture not in keys:
         raise Unsupported(f"a texture is {texture.class_name()}.")

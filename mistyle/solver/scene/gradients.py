@@ -153,7 +153,7 @@ def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]
         return made, ()
     own = scene.integrator()
     if own is None:
-        return mi.load_dict({"type": "prb"}), ("The scene has no integrator; prb takes its place.",)
+        return mi.load_dict({"type": "prb"}), ("The scene has no integrator; prb replaces it.",)
     # `aov` and `moment` wrap other integrators; the first one's picture comes first.
     inner = own
     while held := [x for _, x in scene_walk.children(inner)[inner] if isinstance(x, mi.Integrator)]:
@@ -166,7 +166,7 @@ def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]
     if depth:
         # Unlimited depth is stored as 2^32 - 1.
         replacement["max_depth"] = int(depth[1]) if int(depth[1]) < 2**31 else -1
-    note = f"{own.class_name()} has no gradients; {plugin} takes its place"
+    note = f"{own.class_name()} has no gradients; {plugin} replaces it"
     return mi.load_dict(replacement), (f"{note} with max_depth {replacement.get('max_depth', 6)}.",)
 
 

@@ -181,27 +181,27 @@ def afterthoughts(job: SceneProblem, state: FitState, unconverged: Sequence[str]
     notes = []
     if undone:
         notes.append(
-            "The fitted values matched the references less well than the start: they were undone, the scene is as it "
-            "came. Other parameters, more views or another start may help."
+            "The fitted values matched the references less well than the start: they were undone, and the start is "
+            "restored. Other parameters, more views or another start may help."
         )
     for p in job.chosen:
         if not state.moments[p.key][0].steps.any():
-            notes.append(f"{p.name} never had a gradient: no camera sees it, or its plugin passes none on.")
+            notes.append(f"{p.name} never had a gradient: no camera sees it, or its plugin propagates none.")
             continue
         ends = [end for end in scene_keys.limits(p) or () if np.isfinite(end)]
         value = state.values[p.key][job.free[p.key]]
         if p.kind == "value" and any(np.isclose(value, end).any() for end in ends) and not undone:
-            notes.append(f"{p.name} stands at the end of its range, {' '.join(f'{v:.4g}' for v in value)}.")
+            notes.append(f"{p.name} is at the end of its range, {' '.join(f'{v:.4g}' for v in value)}.")
     if unconverged:
-        notes.append(f"{', '.join(unconverged)} still moved at the end: give more --iterations.")
+        notes.append(f"{', '.join(unconverged)} still moved at the end: raise --iterations.")
     if state.lost:
         first = state.bad[0]
         source = "a regularizer" if first.sensor is None else f"sensor {first.sensor}"
         notes.append(
-            f"{state.lost} gradients were no numbers, the first at {first.key}{list(first.texel)} from {source} in "
+            f"{state.lost} gradients were not finite, the first at {first.key}{list(first.texel)} from {source} in "
             f"step {first.iteration}; their texels kept their last good values from then on."
         )
     for k, count in sorted(state.broken.items()):
         if count:
-            notes.append(f"sensor {k}: {count} values of its pictures were NaN or infinite; they were left out.")
+            notes.append(f"sensor {k}: {count} values of its pictures were NaN or infinite; they were masked.")
     return notes

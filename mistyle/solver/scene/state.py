@@ -141,8 +141,8 @@ def prepare(
     notes = [*notes, *(f"{p.name}: {note}" for p in chosen for note in p.notes)]
     if len(views) < FEWEST_VIEWS:
         notes.append(
-            f"{len(views)} view{'s' * (len(views) > 1)} came: with fewer than {FEWEST_VIEWS} the fit is singular, "
-            "materials that differ look the same."
+            f"{len(views)} view{'s' * (len(views) > 1)} given: with fewer than {FEWEST_VIEWS} the fit is singular, "
+            "since different materials look alike."
         )
     table = mi.traverse(scene)
     table.properties = {p.key: table.properties[p.key] for p in chosen}
@@ -161,7 +161,7 @@ def prepare(
     notes.append(_way(quick, engine, why))
     if quick is None and loss == "log_srgb_l1":
         notes.append(
-            "The loss log_srgb_l1 is not linear in the picture: render noise shifts its minimum, by several percent at "
+            "The loss log_srgb_l1 is not linear in the picture: render noise shifts its minimum by several percent at "
             "16 samples a pixel. The loss 'relative' has no such bias."
         )
     losses = tuple(scene_grad.loss_of(loss, view) for view in views)
@@ -171,10 +171,8 @@ def prepare(
 
 def _way(quick: Any, engine: Any, why: str) -> str:
     if quick is not None:
-        return (
-            "Gradients came without Monte Carlo: direct light of points and directions on plain `principled` materials."
-        )
-    return f"Gradients came through {str(engine).partition('[')[0]}, not through the fast path: {why}"
+        return "Gradients were noise-free: direct light of points and directions on plain `principled` materials."
+    return f"Gradients came from {str(engine).partition('[')[0]}, not from the fast path: {why}"
 
 
 def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -211,10 +209,10 @@ def _views(scene: Any, sensors: Sequence[Any] | None, references: Sequence[np.nd
             chosen = own[chosen]
         cameras.append(chosen)
     if not cameras:
-        raise UsageError("the scene has no sensor; give one as `sensors`, or put it into the scene file.")
+        raise UsageError("the scene has no sensor; pass one as `sensors`, or add it to the scene file.")
     if len(references) != len(cameras) or (masks is not None and len(masks) != len(cameras)):
         counted = f"{len(references)} references" + (f" and {len(masks)} masks" if masks is not None else "")
-        raise UsageError(f"{counted} came for {len(cameras)} sensors; one of each is expected for every sensor.")
+        raise UsageError(f"found {counted} for {len(cameras)} sensors; expected one of each for every sensor.")
     return tuple(
         scene_grad.sight(camera, np.asarray(references[k]), masks[k] if masks is not None else None, _called(camera, k))
         for k, camera in enumerate(cameras)
@@ -278,8 +276,8 @@ def checkpoint(state: FitState, job: SceneProblem) -> dict[str, np.ndarray]:
 def restored(saved: Mapping[str, np.ndarray], job: SceneProblem) -> FitState:
     if "job" not in saved or str(saved["job"]) != _fingerprint(job):
         raise UsageError(
-            "the checkpoint belongs to another fit: its keys, cameras or settings differ. Start without it, or give "
-            "the settings it was made with."
+            "the checkpoint belongs to another fit: its keys, cameras or settings differ. Start without it, or use "
+            "the settings of its fit."
         )
     moments = {}
     for p in job.chosen:

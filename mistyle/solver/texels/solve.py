@@ -76,7 +76,7 @@ def solve_level(
     if start is not None:
         start = [_shrunk(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
     estimate, direct = solve_texels(coarse, coarse.renderer(), start, progress)
-    context.notes.append(f"Texels were solved one by one on a level {by} times coarser than the atlas.")
+    context.notes.append(f"The per-texel solver ran on a level {by} times coarser than the atlas.")
     return _upsampled(estimate, coarse.atlas, by), direct
 
 
@@ -133,7 +133,7 @@ def solve_texels(
     )
     if settings.solver == "pictures" or not len(observed.observations.rgb):
         if settings.solver != "pictures":
-            context.notes.append("No texel was observed in the light: texels were not solved one by one.")
+            context.notes.append("No texel was observed in the light: the per-texel solver was skipped.")
         nothing = np.full(mean.shape, recover_prior.NOTHING, np.float32)
         return _on_atlas(observed, atlas, (first, std, np.ones(len(mean), np.float32), nothing), False), direct
     problem = Problem(
@@ -147,7 +147,7 @@ def solve_texels(
     solution, observed, direct = _rounds(context, renderer, problem, solved_anew, observed, progress)
     bad = ~np.isfinite(solution.values).all(axis=1, keepdims=True)
     if bad.any():
-        context.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
+        context.notes.append(f"{int(bad.sum())} texels were not finite after the per-texel solver and were reset.")
     values = np.where(bad, mean, solution.values)
     std = np.where(bad, std, solution.spread * recover_prior.inflation(solution, observed))
     weight = recover_prior.data_weight(solution, observed)
