@@ -309,8 +309,8 @@ def pure_colours(view: View, settings: BakeSettings) -> Float[np.ndarray, "h w 3
         r, c = rows[left] + dy, columns[left] + dx
         inside = (r >= 0) & (c >= 0) & (r < depth.shape[0]) & (c < depth.shape[1])
         r, c = np.where(inside, r, 0), np.where(inside, c, 0)
-        here = depth[rows[left], columns[left]]
-        good = inside & pure[r, c] & (np.abs(depth[r, c] - here) <= settings.depth_tolerance)
+        centre = depth[rows[left], columns[left]]
+        good = inside & pure[r, c] & (np.abs(depth[r, c] - centre) <= settings.depth_tolerance)
         rgb[rows[left[good]], columns[left[good]]] = view.rgb[r[good], c[good]]
         left = left[~good]
     rgb[rows[left], columns[left]] /= np.clip(view.coverage[rows[left], columns[left]], 0.1, 1)[:, None]

@@ -24,24 +24,24 @@ def fill_in_place(albedo: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h
     def work(k: int) -> None:
         island, box = boxes[k]
         own = texels.island[box] == island
-        wanted, offered = own & hole[box], own & known[box]
+        missing, offered = own & hole[box], own & known[box]
         if offered.any():
-            index, part = nearest(offered)[0][wanted], albedo[box]
-            part[wanted] = part[np.unravel_index(index, own.shape)]
+            index, part = nearest(offered)[0][missing], albedo[box]
+            part[missing] = part[np.unravel_index(index, own.shape)]
         else:
-            rows, columns = np.nonzero(wanted)
+            rows, columns = np.nonzero(missing)
             lost.append((rows + box[0].start) * hole.shape[1] + columns + box[1].start)
 
     threaded(work, len(boxes))
     if lost:
-        wanted = np.concatenate(lost)
-        source = nearest_in_space(known.reshape(-1), texels.position.reshape(-1, 3), wanted)
+        missing = np.concatenate(lost)
+        source = nearest_in_space(known.reshape(-1), texels.position.reshape(-1, 3), missing)
         flat = albedo.reshape(-1, 3)
-        flat[wanted] = flat[source]
+        flat[missing] = flat[source]
 
 
 def nearest_in_space(
-    known: Bool[np.ndarray, " t"], position: Float[np.ndarray, "t 3"], wanted: Int[np.ndarray, " n"]
+    known: Bool[np.ndarray, " t"], position: Float[np.ndarray, "t 3"], targets: Int[np.ndarray, " n"]
 ) -> Int[np.ndarray, " n"]:
     """The known texel nearest in space; with more than NEIGHBOURS_3D of them, among every k-th."""
     from scipy.spatial import KDTree
@@ -49,14 +49,14 @@ def nearest_in_space(
     seeds = np.flatnonzero(known)
     seeds = seeds[:: -(-len(seeds) // NEIGHBOURS_3D)]
     tree = KDTree(position[seeds], balanced_tree=False, compact_nodes=False)
-    return seeds[tree.query(position[wanted])[1]]
+    return seeds[tree.query(position[targets])[1]]
 
 
 def island_boxes(
-    island: Int[np.ndarray, "h w"], wanted: Int[np.ndarray, " n"]
+    island: Int[np.ndarray, "h w"], numbers: Int[np.ndarray, " n"]
 ) -> list[tuple[int, tuple[slice, slice]]]:
     """The non-empty ones of the given islands, each with its bounding rectangle in the atlas."""
     from scipy.ndimage import find_objects
 
-    found = find_objects(island + 1)
-    return [(int(k), found[k]) for k in wanted if k < len(found) and found[k] is not None]
+    slices = find_objects(island + 1)
+    return [(int(k), slices[k]) for k in numbers if k < len(slices) and slices[k] is not None]

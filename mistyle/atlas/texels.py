@@ -264,14 +264,14 @@ def sharpen_in_place(values: Float[np.ndarray, "h w *c"], texels: Texels) -> Non
             was[0] = above
         above = was[rows.stop - 1 - wide.start].copy()
         island, sharp = texels.island[wide], was.copy()
-        for one, other in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-            joined = (island[one] == island[other])[..., None]
-            step = np.where(joined, was[other] - was[one], 0) / 12
+        for one, following in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+            joined = (island[one] == island[following])[..., None]
+            step = np.where(joined, was[following] - was[one], 0) / 12
             sharp[one] -= step
-            sharp[other] += step
-        here = texels.covered[rows]
+            sharp[following] += step
+        covered = texels.covered[rows]
         inner = sharp[rows.start - wide.start : rows.stop - wide.start]
-        values[rows][here] = np.clip(inner[here], 0, 1).reshape(-1, *values.shape[2:])
+        values[rows][covered] = np.clip(inner[covered], 0, 1).reshape(-1, *values.shape[2:])
 
 
 def pad_maps(maps: Maps, texels: Texels, padding: int, own: int = 0) -> Maps:

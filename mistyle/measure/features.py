@@ -218,8 +218,8 @@ def _plan(weights: dict[str, torch.Tensor], convolutions, taps, pools_before, pa
             break
         weight, bias = weights.get(f"{n}.weight"), weights.get(f"{n}.bias")
         if weight is None or bias is None or weight.shape[2:] != (3, 3) or (channels and weight.shape[1] != channels):
-            found = "nothing" if weight is None else tuple(weight.shape)
-            raise InputRefused(f"{path}: layer {n} is {found}; expected a 3x3 convolution of {channels or 3} channels.")
+            shape = "nothing" if weight is None else tuple(weight.shape)
+            raise InputRefused(f"{path}: layer {n} is {shape}; expected a 3x3 convolution of {channels or 3} channels.")
         channels = weight.shape[0]
         plan.append((weight.contiguous(memory_format=torch.channels_last), bias, n in pools_before, n in taps))
     return plan

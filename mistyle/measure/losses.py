@@ -86,26 +86,26 @@ def crop_picture(picture: Float[torch.Tensor, "c h w"], crop: Crop, size: int) -
 
 
 def style_aligned(
-    maps: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor], mask: torch.Tensor, weights: Sequence[float] = ()
+    maps: Sequence[torch.Tensor], targets: Sequence[torch.Tensor], mask: torch.Tensor, weights: Sequence[float] = ()
 ) -> torch.Tensor:
     """sum_l w_l mean |Phi_l(R * M_R) - Phi_l(T * M_T)|² (paper 4.2); w_l is 1 for every level without `weights`.
 
-    `maps` are the features of the masked render, `wanted` of the masked target. The loss is meaningful only if both
+    `maps` are the features of the masked render, `targets` of the masked target. The loss is meaningful only if both
     show the same place: crops of the stylized view of the same camera. The pictures are masked before feature
     extraction (`masked_features`), so pixels outside have no influence at all. The sum is divided by the mask's share,
     so that a half-empty crop weighs as much per pixel as a full one.
     """
     total = maps[0].new_zeros(())
-    for level, (a, b) in enumerate(zip(maps, wanted, strict=True)):
+    for level, (a, b) in enumerate(zip(maps, targets, strict=True)):
         total = total + _weight(weights, level) * functional.mse_loss(a, b)
     return total / mask.to(total.dtype).mean().clamp_min(1e-3)
 
 
 def style_statistics(
     maps: Sequence[torch.Tensor],
-    wanted: Sequence[torch.Tensor],
+    targets: Sequence[torch.Tensor],
     mask: torch.Tensor,
-    mask_wanted: torch.Tensor,
+    target_mask: torch.Tensor,
     weights: Sequence[float] = (),
     kind: Statistic = "gram",
     rng: np.random.Generator | None = None,
@@ -119,19 +119,19 @@ def style_statistics(
     mask and larger than DENSE are subsampled to every second row and column.
     """
     total = maps[0].new_zeros(())
-    whole = mask, mask_wanted
-    for level, (a, b) in enumerate(zip(maps, wanted, strict=True)):
-        (a, mask), (b, mask_wanted) = (_thinned(*each) for each in zip((a, b), whole, strict=True))
+    whole = mask, target_mask
+    for level, (a, b) in enumerate(zip(maps, targets, strict=True)):
+        (a, mask), (b, target_mask) = (_thinned(*each) for each in zip((a, b), whole, strict=True))
         if kind == "gram":
-            mine, theirs = gram(a, mask), gram(b, mask_wanted)
+            mine, theirs = gram(a, mask), gram(b, target_mask)
             energy = theirs.diagonal(dim1=1, dim2=2).mean(dim=1).clamp_min(1e-8)
             distance = ((mine - theirs) / energy[:, None, None]).square().mean()
         elif kind == "mean-std":
-            mine, theirs = _moments(a, mask), _moments(b, mask_wanted)
+            mine, theirs = _moments(a, mask), _moments(b, target_mask)
             energy = theirs.square().sum(dim=1).mean(dim=1).clamp_min(1e-8)
             distance = ((mine - theirs).square().mean(dim=(1, 2)) / energy).mean()
         else:
-            distance = _feature_swd(a, b, mask, mask_wanted, rng or np.random.default_rng(0))
+            distance = _feature_swd(a, b, mask, target_mask, rng or np.random.default_rng(0))
         total = total + _weight(weights, level) * distance
     return total
 
@@ -156,16 +156,16 @@ def _moments(maps: torch.Tensor, mask: torch.Tensor) -> Float[torch.Tensor, "n 2
     return torch.stack([mean, variance.clamp_min(1e-12).sqrt()], dim=1)
 
 
-def _feature_swd(a, b, mask, mask_wanted, rng: np.random.Generator) -> torch.Tensor:
+def _feature_swd(a, b, mask, target_mask, rng: np.random.Generator) -> torch.Tensor:
     """Mean over the crops with pixels in both masks."""
-    inside = [_shares(maps, m)[:, 0] > 0.5 for maps, m in ((a, mask), (b, mask_wanted))]
-    found = []
+    inside = [_shares(maps, m)[:, 0] > 0.5 for maps, m in ((a, mask), (b, target_mask))]
+    distances = []
     for k in range(len(a)):
         mine, theirs = (maps[k].flatten(1).T[chosen[k]] for maps, chosen in zip((a, b), inside, strict=True))
         if len(mine) and len(theirs):
             distance = sliced_wasserstein(mine, theirs, rng, SWD_PROJECTIONS, SWD_SAMPLES)
-            found.append(distance / theirs.square().mean().clamp_min(1e-8))
-    return torch.stack(found).mean() if found else a.new_zeros(())
+            distances.append(distance / theirs.square().mean().clamp_min(1e-8))
+    return torch.stack(distances).mean() if distances else a.new_zeros(())
 
 
 def masked_features(
@@ -173,8 +173,8 @@ def masked_features(
 ) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """Phi(R * M_R), with its gradient, and Phi(T * M_T), without."""
     with torch.no_grad():
-        wanted = features(target * mask_target)
-    return features(render * mask), wanted
+        targets = features(target * mask_target)
+    return features(render * mask), targets
 
 
 def gram(maps: Float[torch.Tensor, "n k h w"], mask: torch.Tensor) -> Float[torch.Tensor, "n k k"]:

@@ -57,12 +57,12 @@ def taps(net: Mapping[str, torch.Tensor], pictures: Float[torch.Tensor, "n 3 h w
     shift, scale = (pictures.new_tensor(v).view(1, 3, 1, 1) for v in (SHIFT, SCALE))
     x = (2 * pictures - 1 - shift) / scale
     x = functional.relu(functional.conv2d(x, net["0.weight"], net["0.bias"], stride=2))
-    found = [x]
+    maps = [x]
     for layer in range(2, max(TAPS) + 1):
         x = functional.max_pool2d(x, 3, 2, ceil_mode=True) if layer in POOLS else _fire(net, layer, x)
         if layer in TAPS:
-            found.append(x)
-    return found
+            maps.append(x)
+    return maps
 
 
 def _fire(net: Mapping[str, torch.Tensor], layer: int, x: torch.Tensor) -> torch.Tensor:
@@ -95,11 +95,11 @@ def _squeezenet(weights: Mapping[str, torch.Tensor], path: Path) -> dict[str, to
         expected[f"{layer}.expand3x3"] = (4 * few, few, 3, 3)
         channels = 8 * few
     for name, shape in expected.items():
-        found = weights.get(f"{name}.weight")
-        if found is None or tuple(found.shape) != shape or f"{name}.bias" not in weights:
-            said = "nothing" if found is None else tuple(found.shape)
+        weight = weights.get(f"{name}.weight")
+        if weight is None or tuple(weight.shape) != shape or f"{name}.bias" not in weights:
+            actual = "nothing" if weight is None else tuple(weight.shape)
             raise InputRefused(
-                f"{path}: layer 'features.{name}' is {said}; expected {shape}: SqueezeNet 1.1's weights."
+                f"{path}: layer 'features.{name}' is {actual}; expected {shape}: SqueezeNet 1.1's weights."
             )
     return {f"{name}.{kind}": weights[f"{name}.{kind}"] for name in expected for kind in ("weight", "bias")}
 
@@ -108,11 +108,11 @@ def _heads(weights: Mapping[str, torch.Tensor], path: Path) -> list[torch.Tensor
     """One weight per channel and tap; LPIPS keeps them non-negative."""
     heads = []
     for k, channels in enumerate(TAPS.values()):
-        found = weights.get(f"lin{k}.model.1.weight")
-        if found is None or tuple(found.shape) != (1, channels, 1, 1):
-            said = "nothing" if found is None else tuple(found.shape)
+        weight = weights.get(f"lin{k}.model.1.weight")
+        if weight is None or tuple(weight.shape) != (1, channels, 1, 1):
+            actual = "nothing" if weight is None else tuple(weight.shape)
             raise InputRefused(
-                f"{path}: 'lin{k}.model.1.weight' is {said}; expected (1, {channels}, 1, 1) of LPIPS-squeeze's heads."
+                f"{path}: 'lin{k}.model.1.weight' is {actual}; expected (1, {channels}, 1, 1) of LPIPS-squeeze's heads."
             )
-        heads.append(found.reshape(-1))
+        heads.append(weight.reshape(-1))
     return heads

@@ -57,8 +57,8 @@ class PatchReference:
             axes /= np.linalg.norm(axes, axis=0)
             mine, theirs = (_places(m, scale, samples, rng) for m in (masks, style_masks))
             if any(len(chosen) for chosen in mine) and any(len(chosen) for chosen in theirs):
-                found = _quantiles(_patches(style, theirs, scale) @ axes)
-                self._scales.append((scale, axes, mine, found))
+                quantiles = _quantiles(_patches(style, theirs, scale) @ axes)
+                self._scales.append((scale, axes, mine, quantiles))
 
     def distance(self, pictures: Sequence[Float[np.ndarray, "h w 3"]]) -> float:
         total = [
@@ -80,11 +80,11 @@ def _quantiles(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "k q"]:
 
 def _places(masks, scale: int, samples: int, rng: np.random.Generator) -> list[np.ndarray]:
     """Positions of about `samples` patches at one scale, drawn evenly from the pictures: flat pixel numbers of each."""
-    found = []
+    places_by_picture = []
     for mask in masks:
         size = (mask.shape[0] // scale, mask.shape[1] // scale)
         if min(size) < PATCH:
-            found.append(np.zeros(0, np.int64))
+            places_by_picture.append(np.zeros(0, np.int64))
             continue
         whole = erode(resize(mask.astype(np.float32), size) > 0.999, PATCH // 2)
         edge = PATCH // 2
@@ -92,13 +92,13 @@ def _places(masks, scale: int, samples: int, rng: np.random.Generator) -> list[n
         places = np.flatnonzero(whole)
         if len(places):
             places = rng.choice(places, min(len(places), samples // len(masks)), replace=False)
-        found.append(places)
-    return found
+        places_by_picture.append(places)
+    return places_by_picture
 
 
 def _patches(pictures, places: Sequence[np.ndarray], scale: int) -> Float[np.ndarray, "n k"]:
     """The patches about chosen pixels of pictures at one scale, rows of Lab / 100."""
-    found = []
+    patches = []
     for picture, chosen in zip(pictures, places, strict=True):
         if len(chosen) == 0:
             continue
@@ -107,8 +107,8 @@ def _patches(pictures, places: Sequence[np.ndarray], scale: int) -> Float[np.nda
         row, column = chosen // size[1], chosen % size[1]
         offsets = np.arange(-(PATCH // 2), PATCH // 2 + 1)
         window = small[row[:, None, None] + offsets[:, None], column[:, None, None] + offsets]
-        found.append(window.reshape(len(chosen), -1))
-    return np.concatenate(found)
+        patches.append(window.reshape(len(chosen), -1))
+    return np.concatenate(patches)
 
 
 def gram_distance(

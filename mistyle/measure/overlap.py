@@ -118,8 +118,8 @@ def _means(picture: np.ndarray, px: np.ndarray, axes: np.ndarray) -> Float[np.nd
     for step in np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2):
         places.reshape(-1, 2)[:count] = px - 0.5 + axes @ step
         x, y = places[..., 0].copy(), places[..., 1].copy()
-        found = cv2.remap(flat, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        total += found.reshape(-1, picture.shape[2])[:count]
+        values = cv2.remap(flat, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        total += values.reshape(-1, picture.shape[2])[:count]
     return total / LOOKS**2
 
 

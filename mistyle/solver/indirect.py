@@ -254,13 +254,13 @@ def _arriving(scene: Any, emitter: Any, segment: PathSegment, sampler: Any) -> A
     towards, power = emitter.sample_direction(si, place, hit)
     free = hit & (towards.pdf > 0)
     free &= ~scene.ray_test(si.spawn_ray_to(towards.p), free)
-    reflected, other = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(towards.d), free)
+    reflected, bsdf_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(towards.d), free)
     if not soft:
         return dr.select(free, reflected * power, 0)
     along = dr.zeros(mi.DirectionSample3f)
     along.d = ray.d
     past = emitter.eval(si, escaped) * _heuristic(density, emitter.pdf_direction(last, along, escaped))
-    return dr.select(free, reflected * power * _heuristic(towards.pdf, other), 0) + dr.select(escaped, past, 0)
+    return dr.select(free, reflected * power * _heuristic(towards.pdf, bsdf_pdf), 0) + dr.select(escaped, past, 0)
 
 
 def _heuristic(own: Any, other: Any) -> Any:
@@ -284,9 +284,9 @@ def in_proportion(
     """
     size = light.shape[0], light.shape[1]
     shown = resize(direct, size)
-    made = gaussian(shown + np.where(shown > 0, light, 0), LIKE)
-    there = gaussian(np.where(shown > 0, resize(picture, size), 0), LIKE)
-    return light * np.where(made > 1e-9, np.clip(there / np.maximum(made, 1e-9), 0, BRIGHTER), 1)
+    rendered = gaussian(shown + np.where(shown > 0, light, 0), LIKE)
+    observed = gaussian(np.where(shown > 0, resize(picture, size), 0), LIKE)
+    return light * np.where(rendered > 1e-9, np.clip(observed / np.maximum(rendered, 1e-9), 0, BRIGHTER), 1)
 
 
 def averaged(
@@ -321,13 +321,13 @@ def _around(
             if not (dy or dx):
                 continue
             rows, columns = _overlap(inside.shape[0], dy), _overlap(inside.shape[1], dx)
-            here, there = (rows[0], columns[0]), (rows[1], columns[1])
-            lift = ((position[there] - position[here]) * normal[here]).sum(axis=-1) / (LEVEL * unit[here])
-            turn2 = ((normal[there] - normal[here]) ** 2).sum(axis=-1)
+            centre, neighbour = (rows[0], columns[0]), (rows[1], columns[1])
+            lift = ((position[neighbour] - position[centre]) * normal[centre]).sum(axis=-1) / (LEVEL * unit[centre])
+            turn2 = ((normal[neighbour] - normal[centre]) ** 2).sum(axis=-1)
             likeness = np.exp(-(lift**2) - turn2 / ALIKE**2) * (0.25 if dy and dx else 0.5)
-            weight = np.where(inside[here] & inside[there], likeness, 0)
-            total[here] += weight[..., None] * light[there]
-            weights[here] += weight
+            weight = np.where(inside[centre] & inside[neighbour], likeness, 0)
+            total[centre] += weight[..., None] * light[neighbour]
+            weights[centre] += weight
     return total, weights
 
 

@@ -181,9 +181,9 @@ def metal_f0_prior(mean: Values, prior: Values, metal: Float[np.ndarray, " t"]) 
 
 
 def _product(
-    mean: Float[np.ndarray, "t c"], prior: Float[np.ndarray, "t c"], other: Any, weight: Any
+    mean: Float[np.ndarray, "t c"], prior: Float[np.ndarray, "t c"], centre: Any, weight: Any
 ) -> tuple[Float[np.ndarray, "t c"], Float[np.ndarray, "t c"], Float[np.ndarray, " t"]]:
-    """Mean, weight and constant of prior (x - mean)² + weight (x - other)²."""
+    """Mean, weight and constant of prior (x - mean)² + weight (x - centre)²."""
     both = prior + np.float32(weight)
-    constant = ((mean - other) ** 2 * prior * weight / both).sum(axis=1)
-    return ((mean * prior + np.float32(other) * weight) / both).astype(np.float32), both, constant.astype(np.float32)
+    constant = ((mean - centre) ** 2 * prior * weight / both).sum(axis=1)
+    return ((mean * prior + np.float32(centre) * weight) / both).astype(np.float32), both, constant.astype(np.float32)

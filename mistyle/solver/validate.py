@@ -79,8 +79,8 @@ def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) ->
     for camera in cameras:
         px, depth = px_from_world(camera, position)
         facing = ((camera.position - position) * normal).sum(axis=1) > 0
-        there = facing & (depth > 0) & (size > 0) & in_frame(camera, px)
-        wide = size[there] * camera.focal / depth[there] / ACROSS
+        visible = facing & (depth > 0) & (size > 0) & in_frame(camera, px)
+        wide = size[visible] * camera.focal / depth[visible] / ACROSS
         most = max(1, min(camera.size) // LEAST_PIXELS)
         result.append(int(np.clip(np.quantile(wide, FINE), 1, most)) if len(wide) else 1)
     return result

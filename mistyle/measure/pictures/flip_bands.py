@@ -61,13 +61,13 @@ def flip_maps(
             if meanwhile is not None:
                 meanwhile()
             tops = {k: rows_of(p.reference, p.test, ppd, p.exposures, 0, cut) for k, p in pairs.items()}
-            said = helper.communicate()[1]
+            output = helper.communicate()[1]
         finally:
             if helper.poll() is None:
                 helper.kill()
                 helper.wait()
         if helper.returncode != 0:
-            raise RuntimeError(f"FLIP's second process ended with {helper.returncode}: {said.decode()[-500:]}")
+            raise RuntimeError(f"FLIP's second process ended with {helper.returncode}: {output.decode()[-500:]}")
         return {
             k: np.concatenate([top, np.load(Path(folder, f"map{n}.npy"), allow_pickle=False)])
             for n, (k, top) in enumerate(tops.items())
@@ -127,8 +127,8 @@ def _band(reference, test, ppd: float, exposures: Exposures) -> Float[np.ndarray
         first, last, count = exposures
         chosen = {"ppd": ppd, "startExposure": first, "stopExposure": last, "numExposures": count}
     kind = "LDR" if exposures is None else "HDR"
-    found = flip_evaluator.evaluate(a, b, kind, applyMagma=False, computeMeanError=False, parameters=chosen)
-    return np.asarray(found[0], np.float32)[..., 0]
+    results = flip_evaluator.evaluate(a, b, kind, applyMagma=False, computeMeanError=False, parameters=chosen)
+    return np.asarray(results[0], np.float32)[..., 0]
 
 
 def main(folder: Path) -> None:

@@ -177,7 +177,7 @@ def measure_colour(
     if "flip" in names and looks is not None:
         jobs["flip"] = FlipPair(*looks)
 
-    def others() -> None:
+    def other_metrics() -> None:
         values.update(_linear(a, b, mask, names, viewing))
         progress(0.1)
         if looks is not None:
@@ -185,10 +185,10 @@ def measure_colour(
         progress(0.4)
 
     if jobs:
-        maps |= flip_maps(jobs, viewing.ppd, others)
+        maps |= flip_maps(jobs, viewing.ppd, other_metrics)
         values |= {k: float(maps[k][mask].mean(dtype=np.float64)) for k in jobs}
     else:
-        others()
+        other_metrics()
     progress(1.0)
     return MetricValues(values, maps, exposures)
 
@@ -213,8 +213,8 @@ def _encoded(a, b, mask, names: Sequence[str], viewing: Viewing, maps: dict[str,
     if "de2000" in names or "de2000_p95" in names:
         maps["de2000"] = ciede_map(a, b)
         inside = maps["de2000"][mask]
-        found = {"de2000": float(inside.mean(dtype=np.float64)), "de2000_p95": float(np.percentile(inside, 95))}
-        values |= {k: v for k, v in found.items() if k in names}
+        figures = {"de2000": float(inside.mean(dtype=np.float64)), "de2000_p95": float(np.percentile(inside, 95))}
+        values |= {k: v for k, v in figures.items() if k in names}
     if "lpips" in names and viewing.lpips is not None and min(mask.shape) >= LPIPS_SMALLEST:
         values["lpips"] = float(viewing.lpips(a, b, mask))
     return values
@@ -232,10 +232,10 @@ def measure_data(
         return MetricValues(values)
     a, b = reference[mask].astype(np.float64), test[mask].astype(np.float64)
     gap = np.abs(a - b)
-    found = {"rmse": np.sqrt((gap**2).mean()), "mae": gap.mean(), "max_error": gap.max()}
+    figures = {"rmse": np.sqrt((gap**2).mean()), "mae": gap.mean(), "max_error": gap.max()}
     if "angle" in values:
-        found["angle"] = _angle(a, b)
-    return MetricValues({n: float(found[n]) for n in values})
+        figures["angle"] = _angle(a, b)
+    return MetricValues({n: float(figures[n]) for n in values})
 
 
 def _angle(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> float:
@@ -275,8 +275,8 @@ def flip_exposures(
     middle = light[np.argpartition(bright, len(bright) // 2)[len(bright) // 2]]
     strip = np.tile(middle, (8, 8, 1)).astype(np.float32)
     strip[0, 0] = light[bright.argmax()]
-    found: Any = flip_evaluator.evaluate(strip, strip, "HDR", applyMagma=False, computeMeanError=False)[2]
-    first, last, count = float(found["startExposure"]), float(found["stopExposure"]), int(found["numExposures"])
+    rule: Any = flip_evaluator.evaluate(strip, strip, "HDR", applyMagma=False, computeMeanError=False)[2]
+    first, last, count = float(rule["startExposure"]), float(rule["stopExposure"]), int(rule["numExposures"])
     # With one exposure the package answers 0 whatever the pictures are.
     return (first, last, max(count, 2)) if math.isfinite(first) and math.isfinite(last) else (0.0, 0.0, 2)
 
@@ -338,7 +338,7 @@ def ssim(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"], mask: Boo
         low, high = max(0, start - reach), min(len(a), start + band + reach)
         if high - low < 11:
             low = max(0, high - 11)
-        found: Any = structural_similarity(
+        result: Any = structural_similarity(
             a[low:high],
             b[low:high],
             data_range=1.0,
@@ -347,6 +347,6 @@ def ssim(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"], mask: Boo
             use_sample_covariance=False,
             full=True,
         )
-        own = found[1][start - low : min(start + band, len(a)) - low]
+        own = result[1][start - low : min(start + band, len(a)) - low]
         total += float(own[mask[start : start + band]].sum(dtype=np.float64))
     return total / (3 * int(mask.sum()))

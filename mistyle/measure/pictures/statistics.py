@@ -53,11 +53,11 @@ def same_picture(
         raise ValueError(f"{len(reference)} and {len(test)} renders; expected at least two of each for a variance")
     size = reference.shape[1:3]
     sides = [block, 4 * block, max(size)]
-    found = [_welch(_blocks(reference, side), _blocks(test, side), floor) for side in sides]
-    limit = -math.expm1(math.log1p(-level) / sum(p.size for _, p in found))
-    rejected = [np.asarray((p < limit).any(axis=-1)) for _, p in found]
+    tests = [_welch(_blocks(reference, side), _blocks(test, side), floor) for side in sides]
+    limit = -math.expm1(math.log1p(-level) / sum(p.size for _, p in tests))
+    rejected = [np.asarray((p < limit).any(axis=-1)) for _, p in tests]
     bias = float((test.mean() - reference.mean()) / max(float(reference.mean()), 1e-12))
-    smallest = found[0][0]
+    smallest = tests[0][0]
     picked = np.take_along_axis(smallest, np.abs(smallest).argmax(axis=-1)[..., None], axis=-1)[..., 0]
     fine, coarse = (_spread(r, side, size) for r, side in zip(rejected[:2], sides[:2], strict=True))
     # The map omits a large rejected block that a small rejected one inside explains.
@@ -66,7 +66,7 @@ def same_picture(
     return Tested(
         passed=not any(r.any() for r in rejected),
         share=float(where.mean()),
-        worst=max(float(np.abs(t).max()) for t, _ in found),
+        worst=max(float(np.abs(t).max()) for t, _ in tests),
         bias=bias,
         whole=bool(rejected[2].any()),
         t=_spread(picked, block, size).astype(np.float32),
@@ -104,11 +104,11 @@ def interval(values: Sequence[float], level: float = 0.95) -> tuple[float, float
     """Mean and half the width of its confidence interval, by Student's t; NaN half-width for a single value."""
     from scipy.stats import t as student
 
-    found = np.asarray(values, np.float64)
-    if len(found) < 2:
-        return float(found.mean()), math.nan
-    half = student.ppf(0.5 + level / 2, len(found) - 1) * found.std(ddof=1) / math.sqrt(len(found))
-    return float(found.mean()), float(half)
+    numbers = np.asarray(values, np.float64)
+    if len(numbers) < 2:
+        return float(numbers.mean()), math.nan
+    half = student.ppf(0.5 + level / 2, len(numbers) - 1) * numbers.std(ddof=1) / math.sqrt(len(numbers))
+    return float(numbers.mean()), float(half)
 
 
 def slope(x: Sequence[float], y: Sequence[float]) -> float:

@@ -77,12 +77,12 @@ class Renderer:
         self.mesh = mesh.mesh if isinstance(mesh, Asset) else mesh
         self.cameras = (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
         self.lights = lights_of_cameras(lights, len(self.cameras))
-        other = {
+        unsupported = {
             type(x).__name__ for rig in self.lights for x in rig if not isinstance(x, Directional | Point | Ambient)
         }
-        if other:
+        if unsupported:
             raise UsageError(
-                f"Renderer: found {', '.join(sorted(other))}; expected Directional, Point and Ambient lights. "
+                f"Renderer: found {', '.join(sorted(unsupported))}; expected Directional, Point and Ambient lights. "
                 "render_views supports the others, without gradients."
             )
         traced, tangents = tracer(self.mesh), tangents_of(self.mesh, frame)
@@ -197,9 +197,9 @@ class Renderer:
 
 def _maps_of(one: MapSet) -> dict[str, Any]:
     """The maps by name, at least one, with consistent shapes."""
-    given = vars(one) if isinstance(one, Maps) else dict(one)
-    unknown = sorted(set(given) - {*NEUTRAL, "known"})
-    maps = {name: given[name] for name in NEUTRAL if name in given}
+    named = vars(one) if isinstance(one, Maps) else dict(one)
+    unknown = sorted(set(named) - {*NEUTRAL, "known"})
+    maps = {name: named[name] for name in NEUTRAL if name in named}
     if unknown or not maps:
         raise ValueError(f"maps are called {', '.join(map(repr, unknown)) or 'nothing'}; expected {', '.join(NEUTRAL)}")
     size = _size(maps)

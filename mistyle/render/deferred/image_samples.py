@@ -279,21 +279,21 @@ def _block(
     point = rays.point
     face = mi.UInt32(point.prim_index)
     dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv)
-    on, kept = np.array(rays.valid), np.flatnonzero(np.array(rays.lit)).astype(np.uint32)
+    on, lit_rays = np.array(rays.valid), np.flatnonzero(np.array(rays.lit)).astype(np.uint32)
     hit = np.bincount(pixel[on] - row * width, minlength=mask.size).reshape(mask.shape)
     if not on.any():
         return None
-    part = surface.traced.mesh.part[np.array(face)[kept]]
-    uv = np.array(point.uv).T[kept]
+    part = surface.traced.mesh.part[np.array(face)[lit_rays]]
+    uv = np.array(point.uv).T[lit_rays]
     uv = np.stack([uv[:, 0], 1 - uv[:, 1].astype(np.float64)], axis=1)
     texel, step, place = bilinear_footprint(uv, part, surface.sizes)
-    size = padded(len(kept))
+    size = padded(len(lit_rays))
     # Samples are ordered by pixel.
-    begins = np.concatenate([[True], np.diff(pixel[kept]) > 0])[: len(kept)]
+    begins = np.concatenate([[True], np.diff(pixel[lit_rays]) > 0])[: len(lit_rays)]
     first, slot = np.flatnonzero(begins), np.cumsum(begins) - 1
-    lit_pixels, count = pixel[kept][first], np.diff(first, append=len(kept))
-    variant = _variants(pixel[kept], kept % subsamples, subsamples, width)
-    samples = _samples(surface, rays, kept, (slot, texel, step, place), variant, soft, sampling.shadows)
+    lit_pixels, count = pixel[lit_rays][first], np.diff(first, append=len(lit_rays))
+    variant = _variants(pixel[lit_rays], lit_rays % subsamples, subsamples, width)
+    samples = _samples(surface, rays, lit_rays, (slot, texel, step, place), variant, soft, sampling.shadows)
     p = padded(len(lit_pixels))
     pixels = Pixels(*(own(mi.UInt32, _pad(a.astype(np.uint32), p)) for a in (lit_pixels, first, count)))
     transpose, touched = _transpose(texel, step, place, surface.sizes, size) if sampling.gradients else (None, 0)
@@ -310,7 +310,7 @@ def _block(
         row=row,
         covered=hit.astype(np.uint16),
         dark=np.flatnonzero(dark) + row * width,
-        counts=(len(kept), len(lit_pixels), touched),
+        counts=(len(lit_rays), len(lit_pixels), touched),
         bytes=size * (29 + 16 * len(lights) + soft_bytes)
         + 12 * p
         + (0 if transpose is None else 32 * size + 12 * padded(touched)),
@@ -348,20 +348,20 @@ def _trace(
 def _samples(
     surface: TexturedMesh,
     rays: _Traced,
-    kept: Integer[np.ndarray, " n"],
+    lit_rays: Integer[np.ndarray, " n"],
     columns: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     variants: Integer[np.ndarray, " n"],
     soft: Sky | None,
     shadows: bool,
 ) -> Samples:
-    """The `kept` rays, padded; `columns` are their slots, texels, steps and positions, see `Samples`."""
+    """The rays `lit_rays`, padded; `columns` are their slots, texels, steps and positions, see `Samples`."""
     import drjit as dr
     import mitsuba as mi
 
     slot, texel, step, place = columns
-    size = padded(len(kept))
-    where = own(mi.UInt32, _pad(kept, size))
-    real = dr.arange(mi.UInt32, size) < len(kept)
+    size = padded(len(lit_rays))
+    where = own(mi.UInt32, _pad(lit_rays, size))
+    real = dr.arange(mi.UInt32, size) < len(lit_rays)
     axes: Any = None
     variant, visible = None, None
     if soft is not None:

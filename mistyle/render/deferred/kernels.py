@@ -127,8 +127,8 @@ def step(terms, subsamples, loss, textures, block: BlockArrays, goal) -> Any:
 
     samples, pixels, lights = block.samples, block.pixels, block.lights
     values, (target, scale) = _fetch(textures, samples), goal
-    wanted = dr.gather(mi.Vector4f, target, dr.arange(mi.UInt32, dr.width(pixels.index)))
-    reference, weight = mi.Color3f(wanted.x, wanted.y, wanted.z), wanted.w * scale
+    packet = dr.gather(mi.Vector4f, target, dr.arange(mi.UInt32, dr.width(pixels.index)))
+    reference, weight = mi.Color3f(packet.x, packet.y, packet.z), packet.w * scale
     if subsamples == 1 and lights[1] is None:
         dr.enable_grad(values)
         lost = LOSSES[loss](_colour(terms, values, samples, lights), reference) * weight
@@ -340,8 +340,8 @@ class _Lobe:
         cosine = dr.clip(dr.dot(wi, self.normal), 1e-3, 1)
         side = wi - self.normal * dr.dot(wi, self.normal)
         # At normal incidence any azimuth will do.
-        other = mi.Vector3f(1, 0, 0) - self.normal * self.normal.x
-        self.x = dr.normalize(dr.select(dr.squared_norm(side) > 1e-8, side, other))
+        tangent = mi.Vector3f(1, 0, 0) - self.normal * self.normal.x
+        self.x = dr.normalize(dr.select(dr.squared_norm(side) > 1e-8, side, tangent))
         self.y = dr.cross(self.normal, self.x)
         self.cosine, self.sine = cosine, dr.sqrt(dr.maximum(1 - cosine * cosine, 0))
 

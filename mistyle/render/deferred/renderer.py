@@ -96,7 +96,7 @@ class MaterialRenderer:
         reflectance = bsdf.Reflectance(options.model, options.flip_invalid, options.shadowing, options.specular)
         self._terms = partial(bsdf.terms, reflectance)
         self._steps = _steps(self.sizes)
-        self._kept: dict[int, list[Block]] = {}
+        self._cache: dict[int, list[Block]] = {}
         self._too_large: set[int] = set()
         self._skies: dict[Any, tuple[Sky | None, Any]] = {}
         self._frozen: dict[Any, Any] = {}
@@ -130,11 +130,11 @@ class MaterialRenderer:
 
         mi: Any = mitsuba
         self.captures, self.weights = captures, weights
-        for k in self._kept if pictures is None else pictures:
-            if k not in self._kept:
+        for k in self._cache if pictures is None else pictures:
+            if k not in self._cache:
                 continue
             rgb, weight = captures.load(k)[0].reshape(-1, 3), self._weight(k).ravel()
-            for block in self._kept[k]:
+            for block in self._cache[k]:
                 target = np.array(block.target).reshape(-1, 4)
                 target[: len(block.pixel), :3] = rgb[block.pixel]
                 target[: len(block.pixel), 3] = weight[block.pixel]
@@ -143,7 +143,7 @@ class MaterialRenderer:
     def with_memory(self, memory: float) -> "MaterialRenderer":
         """The same renderer with an empty cache of `memory` bytes."""
         twin = copy(self)
-        twin.options, twin._kept, twin._too_large = replace(self.options, memory=memory), {}, set()
+        twin.options, twin._cache, twin._too_large = replace(self.options, memory=memory), {}, set()
         return twin
 
     def image(self, table: Any, picture: int) -> Float[np.ndarray, "h w 3"]:
@@ -242,28 +242,28 @@ class MaterialRenderer:
 
     def blocks(self, picture: int, gradients: bool = True) -> Iterator["Block"]:
         """The cached blocks of a picture, top to bottom, collected now if missing; then possibly for pictures only."""
-        if picture in self._kept:
-            yield from self._kept[picture]
+        if picture in self._cache:
+            yield from self._cache[picture]
             return
         camera, lights = self.captures.cameras[picture], self.captures.lights[picture]
         rgb, mask = self.captures.load(picture)
         weights = self._weight(picture)
         soft, soft_light = self._sky(lights)
-        kept: list[Block] | None = [] if self.options.memory and picture not in self._too_large else None
+        cached: list[Block] | None = [] if self.options.memory and picture not in self._too_large else None
         sampling = collecting.Sampling(
-            self.subsamples, self.options.shadows, self.options.gradients and (gradients or kept is not None)
+            self.subsamples, self.options.shadows, self.options.gradients and (gradients or cached is not None)
         )
         surface = collecting.TexturedMesh(self.traced, self.sizes, self._tangents)
         for hits in collecting.collect(surface, camera, lights, mask, sampling, soft):
             block = Block(hits, soft_light, rgb, weights)
-            if kept is not None:
-                kept.append(block)
-                if self.held() + sum(b.bytes for b in kept) > self.options.memory:
-                    kept = None
+            if cached is not None:
+                cached.append(block)
+                if self.held() + sum(b.bytes for b in cached) > self.options.memory:
+                    cached = None
                     self._too_large.add(picture)
             yield block
-        if kept is not None:
-            self._kept[picture] = kept
+        if cached is not None:
+            self._cache[picture] = cached
 
     def _weight(self, picture: int) -> Float[np.ndarray, "h w"]:
         if self.weights is not None:
@@ -281,7 +281,7 @@ class MaterialRenderer:
 
     def held(self) -> int:
         """Bytes of the cached samples."""
-        return sum(block.bytes for blocks in self._kept.values() for block in blocks)
+        return sum(block.bytes for blocks in self._cache.values() for block in blocks)
 
 
 class Block:

@@ -129,13 +129,13 @@ def _pull(terms: Callable, moving: tuple[str, ...], film: tuple, packed, adjoint
     at = dr.select(mask, dr.gather(mi.Color3f, adjoint, lane), 0)
     by_albedo, by_rest = mi.Color3f(0), [mi.Float(0)] * 5
     for wo, light in _lights(wi, directional, ambient):
-        rest, here = [mi.Float(x) for x in v[3:]], at * light
+        rest, weighted = [mi.Float(x) for x in v[3:]], at * light
         for name in moving:
             if name != "albedo":
                 dr.enable_grad(rest[COLUMNS[name].start - 3 : COLUMNS[name].stop - 3])
         p, g = terms(wi, wo, mi.Vector3f(*rest[:3]), rest[3], rest[4])
-        by_albedo += here * dr.detach(p)
-        value = p * dr.sum(here * albedo) + g * dr.sum(here)
+        by_albedo += weighted * dr.detach(p)
+        value = p * dr.sum(weighted * albedo) + g * dr.sum(weighted)
         if dr.grad_enabled(value):
             dr.backward(value)
             by_rest = [total + dr.grad(x) for total, x in zip(by_rest, rest, strict=True)]

@@ -141,7 +141,7 @@ class _Wrapped:
         import torch
 
         self.integrator.lit = lit
-        wanted = {}
+        optimised = {}
         for name, values in zip(CHANNELS, pixels.split(list(CHANNELS.values()), dim=1), strict=True):
             image = values.reshape(*self.size, -1)
             if name == "normal":
@@ -149,13 +149,13 @@ class _Wrapped:
             if name in moving:
                 # A new tensor: Dr.Jit reads and writes torch's memory, also beyond its end (core/drjit_arrays.py), and
                 # does not recognise nn.Parameter.
-                wanted[name] = torch.nn.functional.pad(image.reshape(-1), (0, LANES))[: image.numel()].view_as(image)
+                optimised[name] = torch.nn.functional.pad(image.reshape(-1), (0, LANES))[: image.numel()].view_as(image)
             else:
                 self.parameters[self.names[name]] = mi.TensorXf(aligned(image.detach().numpy()))
-        if not wanted:
+        if not optimised:
             return self._still()
         # Dr.Jit's wrapper enables gradients of every float argument, so only optimised maps are arguments.
-        return self._render(wanted).clone()
+        return self._render(optimised).clone()
 
     def _draw(self, moving: dict[str, Any]) -> Any:
         import mitsuba as mi
@@ -190,7 +190,7 @@ def _each(description: Any, plugin: str, changes: Mapping[str, Any]) -> None:
 def _functions() -> dict[str, Any]:
     """torch's Functions for `matrix @ values` and for the frozen split; built at the first use, because importing torch
     takes seconds."""
-    if not _made:
+    if not _cached:
         import torch
 
         class SparseProduct(torch.autograd.Function):
@@ -215,8 +215,8 @@ def _functions() -> dict[str, Any]:
                 gradient = split.pull(lit, packed, grads[0].contiguous().numpy(), moving)
                 return torch.from_numpy(gradient), None, None, None
 
-        _made.update(sparse=SparseProduct, shaded=Shaded)
-    return _made
+        _cached.update(sparse=SparseProduct, shaded=Shaded)
+    return _cached
 
 
-_made: dict[str, Any] = {}
+_cached: dict[str, Any] = {}

@@ -9,9 +9,9 @@ BLENDER = "MISTYLE_BLENDER_PYTHON"
 OPEN_WORKER = str(Path(__file__).with_name("blender_worker.py"))
 
 
-def find_blender(said: str | None, environment: Mapping[str, str] = os.environ) -> str | None:
+def find_blender(program: str | None, environment: Mapping[str, str] = os.environ) -> str | None:
     """A Python with bpy or the program itself: from the option, the environment, or `blender` on the PATH."""
-    return said or environment.get(BLENDER) or which("blender")
+    return program or environment.get(BLENDER) or which("blender")
 
 
 def blender_command(program: str, script: str) -> list[str]:

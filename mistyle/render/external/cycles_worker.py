@@ -24,9 +24,9 @@ def main(path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.import_scene.gltf(filepath=job["glb"])
     scene = bpy.context.scene
-    for thing in list(scene.objects):
-        if thing.type in ("LIGHT", "CAMERA"):
-            bpy.data.objects.remove(thing)
+    for obj in list(scene.objects):
+        if obj.type in ("LIGHT", "CAMERA"):
+            bpy.data.objects.remove(obj)
     camera(scene, job)
     lights(scene, job)
     settings(scene, job)
@@ -67,10 +67,10 @@ def camera(scene, job):
     data.sensor_fit = "HORIZONTAL"
     data.angle = math.radians(job["fov_x"])
     data.clip_start, data.clip_end = job["distance"] * 0.01, job["distance"] * 100
-    thing = bpy.data.objects.new("camera", data)
-    thing.matrix_world = BLENDER_FROM_GLTF @ Matrix(job["camera"])
-    scene.collection.objects.link(thing)
-    scene.camera = thing
+    obj = bpy.data.objects.new("camera", data)
+    obj.matrix_world = BLENDER_FROM_GLTF @ Matrix(job["camera"])
+    scene.collection.objects.link(obj)
+    scene.camera = obj
 
 
 def lights(scene, job):
@@ -79,10 +79,10 @@ def lights(scene, job):
         strength = max(sun["irradiance"])
         data.energy, data.angle = strength, 0.0
         data.color = [c / strength if strength else 0.0 for c in sun["irradiance"]]
-        thing = bpy.data.objects.new("sun", data)
+        obj = bpy.data.objects.new("sun", data)
         towards = BLENDER_FROM_GLTF.to_3x3() @ Vector(sun["direction"])
-        thing.rotation_euler = towards.to_track_quat("Z", "Y").to_euler()
-        scene.collection.objects.link(thing)
+        obj.rotation_euler = towards.to_track_quat("Z", "Y").to_euler()
+        scene.collection.objects.link(obj)
     world = bpy.data.worlds.new("world")
     scene.world = world
     world.use_nodes = True

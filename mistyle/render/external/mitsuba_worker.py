@@ -16,8 +16,8 @@ import numpy as np
 def main(path):
     with open(path, encoding="utf-8") as file:
         job = json.load(file)
-    there = mi.variants()
-    mi.set_variant(*[name for name in job["variants"] if name in there])
+    available = mi.variants()
+    mi.set_variant(*[name for name in job["variants"] if name in available])
     scene = mi.load_file(job["scene"])
     chosen = {} if job["integrator"] is None else {"integrator": mi.load_dict(job["integrator"])}
     seconds = []

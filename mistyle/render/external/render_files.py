@@ -40,18 +40,18 @@ class Subject:
     threads: int = 0
 
 
-def exported(found: Subject, shot: RenderView) -> Path:
+def exported(subject: Subject, shot: RenderView) -> Path:
     """The shot as a Mitsuba scene file that any Mitsuba renders, with Mitsuba's own material."""
     from mistyle.render.lookdev.scenes import material_maps
     from mistyle.render.mitsuba.scene_folder import write_scene
 
-    folder = found.folder / f"scene_{shot.name}"
+    folder = subject.folder / f"scene_{shot.name}"
     if not (folder / "scene.xml").is_file():
         folder.mkdir(parents=True, exist_ok=True)
         if shot.camera is None:
             raise ValueError("a mesh needs a camera")
-        maps = [material_maps(m) for m in found.asset.materials]
-        path = write_scene(folder, "scene", found.asset.mesh, maps, [shot.camera], shot.lights)
+        maps = [material_maps(m) for m in subject.asset.materials]
+        path = write_scene(folder, "scene", subject.asset.mesh, maps, [shot.camera], shot.lights)
         # The environment lights the asset but stays invisible, as everywhere in a comparison.
         text = path.read_text(encoding="utf-8")
         mark = '<integer name="max_depth" value="6" />'
@@ -59,13 +59,13 @@ def exported(found: Subject, shot: RenderView) -> Path:
     return folder / "scene.xml"
 
 
-def as_glb(found: Subject) -> Path:
+def as_glb(subject: Subject) -> Path:
     """The file itself if it is glTF; any other mesh is written as GLB."""
-    if found.path.suffix.lower() in (".glb", ".gltf"):
-        return found.path
-    path = found.folder / "asset.glb"
+    if subject.path.suffix.lower() in (".glb", ".gltf"):
+        return subject.path
+    path = subject.folder / "asset.glb"
     if not path.is_file():
-        write_asset_glb(path, found.asset)
+        write_asset_glb(path, subject.asset)
     return path
 
 
@@ -98,22 +98,22 @@ def user_camera(asset: Any, camera: Camera) -> tuple[np.ndarray, float]:
     return matrix, scale
 
 
-def scene_for(found: Subject, shot: RenderView, spp: int, seed: int) -> Path:
+def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
     """The file for {scene} in a command: the scene file, or for a mesh a JSON that names mesh, camera, lights and an
     equal Mitsuba scene file."""
-    if found.asset is None or shot.camera is None:
-        return found.path.resolve()
+    if subject.asset is None or shot.camera is None:
+        return subject.path.resolve()
     from mistyle.io.images.write import write_exr
     from mistyle.render.lookdev import scenes as lookdev
 
-    xml = exported(found, shot)
+    xml = exported(subject, shot)
     sky = xml.with_name("blender_environment.exr")
     if not sky.is_file():
         radiance = lookdev.blender_environment(shot.lights)
         write_exr(sky, dict(zip("RGB", np.moveaxis(radiance, -1, 0), strict=True)))
-    matrix, _ = user_camera(found.asset, shot.camera)
+    matrix, _ = user_camera(subject.asset, shot.camera)
     text = {
-        "mesh": str(found.path.resolve()),
+        "mesh": str(subject.path.resolve()),
         "mitsuba": str(xml.resolve()),
         "size": list(shot.camera.size[::-1]),
         "fov_x": shot.camera.fov,
@@ -150,5 +150,5 @@ def finished(words: Sequence[str], name: str) -> None:
     except subprocess.TimeoutExpired as error:
         raise MistyleError(f"{name}: no result within {TIMEOUT / 3600:.0f} hours") from error
     if done.returncode != 0:
-        said = (done.stderr.strip() or done.stdout.strip())[-1500:]
-        raise MistyleError(f"{name}: {Path(words[0]).name} ended with {done.returncode}:\n{said}")
+        output = (done.stderr.strip() or done.stdout.strip())[-1500:]
+        raise MistyleError(f"{name}: {Path(words[0]).name} ended with {done.returncode}:\n{output}")

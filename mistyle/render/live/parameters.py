@@ -72,7 +72,7 @@ def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
     """
     import mitsuba as mi
 
-    found = mi.traverse(scene)
+    table = mi.traverse(scene)
     children = scene_walk.children(scene)
     ways = scene_walk.ways(scene, children)
     used = scene_reach.drawn(scene, children) if isinstance(scene, mi.Scene) else None
@@ -83,9 +83,9 @@ def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
             if child not in holders or isinstance(holders[child][1], mi.Scene):
                 holders[child] = (name, holder)
     result = []
-    for key, (_, _, node, flags) in found.properties.items():
+    for key, (_, _, node, flags) in table.properties.items():
         leaf = key.rpartition(".")[2]
-        value: Any = found[key]
+        value: Any = table[key]
         held_as = isinstance(node, (mi.Texture, mi.Volume)) and node in holders
         role, owner = holders[node] if held_as else (leaf, node)
         names = scene_walk.names([f"{way}.{leaf}" if way else leaf for way in ways.get(node, ())] or [key])
@@ -130,10 +130,10 @@ def merged(chosen: Sequence[Parameter]) -> tuple[str, ...]:
 
 def _reader(shape: Any, attribute: str, children: scene_reach.Children) -> tuple[str, Any, str | None]:
     """Role and owner of a mesh's attribute by the texture that reads it, and the reason if none does."""
-    found = scene_reach.readers(shape, attribute, children)
-    if found:
-        return *found[0], None
-    return attribute, shape, None if found is None else f"no material of its shape reads {attribute}."
+    readers = scene_reach.readers(shape, attribute, children)
+    if readers:
+        return *readers[0], None
+    return attribute, shape, None if readers is None else f"no material of its shape reads {attribute}."
 
 
 def _channels(node: Any, leaf: str, kind: str, shape: tuple[int, ...]) -> int:
@@ -220,8 +220,8 @@ def fast_shapes(scene: Any, integrator: Any = None) -> dict[str, str | None]:
     engine = scene.integrator() if integrator is None else integrator
     depth = getattr(engine, "max_depth", None)
     if depth is None:
-        told = re.search(r"max_depth = (\d+)", str(engine))
-        depth = int(told[1]) if told else (2 if engine.class_name() == "DirectIntegrator" else -1)
+        printed = re.search(r"max_depth = (\d+)", str(engine))
+        depth = int(printed[1]) if printed else (2 if engine.class_name() == "DirectIntegrator" else -1)
     delta = mi.EmitterFlags.DeltaDirection | mi.EmitterFlags.DeltaPosition
     wide = [e.class_name() for e in scene.emitters() if not int(e.flags()) & int(delta)]
     everywhere = f"{wide[0]} is neither a point nor a direction." if wide else None
@@ -255,12 +255,12 @@ def _unknown(listed: Sequence[Parameter], pattern: str) -> str:
     usable = list(dict.fromkeys(name for p in listed if p.reason is None for name in p.names))
     everything = list(dict.fromkeys(name for p in listed for name in p.names))
     near = get_close_matches(pattern, usable, 5, 0.4) or get_close_matches(pattern, everything, 5, 0.4) or usable[:5]
-    told = f"The nearest keys: {', '.join(near)}." if near else "Nothing in this scene can be optimised."
+    message = f"The nearest keys: {', '.join(near)}." if near else "Nothing in this scene can be optimised."
     if any(name.startswith("unnamed") for name in everything):
-        told += (
+        message += (
             " Shapes without a name may have been merged by mi.load_file or mi.load_dict; `optimize=False` keeps them."
         )
-    return f"'{pattern}' matches no parameter of the scene. {told}"
+    return f"'{pattern}' matches no parameter of the scene. {message}"
 
 
 def _kind(node: Any, leaf: str, shape: tuple[int, ...]) -> str:

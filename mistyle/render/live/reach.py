@@ -39,12 +39,12 @@ def drawn(scene: Any, held: Children) -> set[Any]:
 
 def readers(shape: Any, attribute: str, held: Children) -> list[tuple[str, Any]] | None:
     """(role, owner) of the textures that read a mesh's attribute; None if a user's plugin may read it itself."""
-    found, own = [], False
+    textures, own = [], False
     for name, holder, child in below(shape, held):
         if child.class_name() == "MeshAttribute" and re.search(rf'name = "{re.escape(attribute)}"', str(child)):
-            found.append((name, holder))
+            textures.append((name, holder))
         own |= type(child).__module__.partition(".")[0] not in ("mitsuba", "drjit")
-    return found if found or not own else None
+    return textures if textures or not own else None
 
 
 def no_gradient(node: Any, owner: Any, role: str, engine: Any) -> str | None:

@@ -69,8 +69,8 @@ def edits_of(
     if place is None:
         return "its element could not be distinguished from the others."
     node, literal = place
-    found = _edits(node, literal, sources[node.file_index], p, values, file)
-    return found if isinstance(found, str) else (node.file_index, found)
+    edits = _edits(node, literal, sources[node.file_index], p, values, file)
+    return edits if isinstance(edits, str) else (node.file_index, edits)
 
 
 def _edits(

@@ -62,25 +62,25 @@ def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = Non
     file = Path(path)
     if not file.is_file():
         raise InputRefused(f"{file}: no such scene file.")
-    given = {name: str(value) for name, value in (defines or {}).items()}
+    parameters = {name: str(value) for name, value in (defines or {}).items()}
     config: Any = mi.parser.ParserConfig(device.use())
     config.merge_equivalent = config.merge_meshes = False
     try:
-        with _found_beside(file), device.file_threads():
-            state, converted = _parsed(config, file, given)
+        with _relative_to(file), device.file_threads():
+            state, converted = _parsed(config, file, parameters)
             # Loading empties the parsed state, and `write_scene` needs it.
-            made = mi.parser.instantiate(config, _parsed(config, file, given)[0])
+            instances = mi.parser.instantiate(config, _parsed(config, file, parameters)[0])
     except RuntimeError as error:
         stopping.check()
         raise InputRefused(f"{file}: Mitsuba cannot load this scene. {error}") from error
-    scene: Any = made[0] if isinstance(made, list) else made
+    scene: Any = instances[0] if isinstance(instances, list) else instances
     if not isinstance(scene, mi.Scene):
         raise InputRefused(f"{file}: holds a {type(scene).__name__}, not a scene.")
     notes = []
     if converted:
         shown = ", ".join(sorted(set(converted))[:5]) + (", …" if len(set(converted)) > 5 else "")
         notes.append(f"{len(converted)} bitmaps were loaded as 32-bit floats, which have gradients ({shown}).")
-    return SceneFile(scene, state, file, given, tuple(notes))
+    return SceneFile(scene, state, file, parameters, tuple(notes))
 
 
 def _parsed(config: Any, file: Path, defines: dict[str, str]) -> tuple[Any, list[str]]:
@@ -95,7 +95,7 @@ def _parsed(config: Any, file: Path, defines: dict[str, str]) -> tuple[Any, list
 
 
 @contextmanager
-def _found_beside(file: Path) -> Iterator[None]:
+def _relative_to(file: Path) -> Iterator[None]:
     """Resolve relative paths beside the file, as `mi.load_file` does."""
     import mitsuba as mi
 
@@ -167,20 +167,20 @@ def write_scene(
     edits: dict[int, list[scene_source.Edit]] = {0: []}
     notes = []
     for p in fitted.parameters:
-        found = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
-        if isinstance(found, str):
-            notes.append(f"{p.name} is not in {out.name}: {found} run.json and the report have its value.")
+        replaced = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
+        if isinstance(replaced, str):
+            notes.append(f"{p.name} is not in {out.name}: {replaced} run.json and the report have its value.")
         else:
-            edits.setdefault(found[0], []).extend(found[1])
+            edits.setdefault(replaced[0], []).extend(replaced[1])
     if not any(edits.values()):
         return WrittenScene(None, textures, tuple(notes))
     notes += _rewrite_includes(scene, sources, edits, out, write_file)
     edits[0] += scene_source.surroundings(sources[0], scene.path, scene.defines, out)
     write_file(out, scene_source.spliced(sources[0], edits[0]))
-    wrong = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
-    if wrong:
+    difference = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
+    if difference:
         out.unlink()
-        return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {wrong}"))
+        return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {difference}"))
     if out.parent.resolve() != scene.path.parent.resolve():
         notes.append(f"{out.name} reads its other files from {scene.path.parent}.")
     return WrittenScene(out, textures, tuple(notes))
@@ -255,8 +255,8 @@ def _differences(out: Path, fitted: Any, left_out: set[str]) -> str:
             continue
         if p.key not in table:
             return f"it has no {p.key}."
-        value, wanted = np.array(table[p.key], dtype=np.float32).ravel(), fitted.values[p.key].ravel()
+        value, expected = np.array(table[p.key], dtype=np.float32).ravel(), fitted.values[p.key].ravel()
         # A light's single number comes back as a grey colour.
-        if len(wanted) not in (1, len(value)) or not np.allclose(value, wanted, rtol=1e-6, atol=1e-7):
+        if len(expected) not in (1, len(value)) or not np.allclose(value, expected, rtol=1e-6, atol=1e-7):
             return f"it holds another {p.key}."
     return ""

@@ -37,7 +37,7 @@ def aovs(
         np.repeat(per_texel(hits, [getattr(m, n)[..., None] for m in maps]), 3, axis=-1)
         for n in ("roughness", "metallic")
     )
-    found = {
+    layers = {
         "albedo": srgb_from_linear(per_texel(hits, [m.albedo for m in maps])),
         "normal": normals(asset.mesh, hits, maps, camera) * 0.5 + 0.5,
         "roughness": roughness,
@@ -47,7 +47,7 @@ def aovs(
         "texel density": density(asset.mesh, hits, maps)[0],
         **{name: per_texel(hits, pictures) for name, pictures in (extra or {}).items()},
     }
-    return {name: _small(rgb, hits) for name, rgb in found.items()}
+    return {name: _small(rgb, hits) for name, rgb in layers.items()}
 
 
 def per_texel(hits: Hits, maps: Sequence[Float[np.ndarray, "_ _ c"]]) -> Float[np.ndarray, "h w c"]:

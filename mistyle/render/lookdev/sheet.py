@@ -195,22 +195,22 @@ class Stage:
         self, frames: int, light: Environment, size: int, spp: int, seed: int, progress: Callable[[float], None]
     ) -> list[Float[np.ndarray, "h w 4"]]:
         """The asset turned by a full circle; camera and light are fixed."""
-        made = []
+        pictures = []
         for k in range(frames):
-            made.append(self.picture(CAMERAS["3/4"][0] + 360 * k / frames, 12.0, light, size, spp, seed))
+            pictures.append(self.picture(CAMERAS["3/4"][0] + 360 * k / frames, 12.0, light, size, spp, seed))
             progress((k + 1) / frames)
-        return made
+        return pictures
 
     def light_turn(
         self, frames: int, light: Environment, size: int, spp: int, seed: int, progress: Callable[[float], None]
     ) -> list[Float[np.ndarray, "h w 4"]]:
         """The light turned by a full circle; camera and asset are fixed."""
-        made = []
+        pictures = []
         for k in range(frames):
             turned = replace(light, turn=light.turn + 360 * k / frames)
-            made.append(self.picture(*CAMERAS["3/4"], turned, size, spp, seed))
+            pictures.append(self.picture(*CAMERAS["3/4"], turned, size, spp, seed))
             progress((k + 1) / frames)
-        return made
+        return pictures
 
 
 def asset_camera(azimuth: float, elevation: float, size: int) -> Camera:

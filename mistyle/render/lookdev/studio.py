@@ -67,9 +67,9 @@ def _resized(radiance: Float[np.ndarray, "h w 3"], rows: int) -> Float[np.ndarra
     # Rows lie at both poles, so with an odd refinement the coarse rows' centres are rows of the fine grid.
     fine += 1 - fine % 2
     grid = environment_directions((rows - 1) * fine + 1, 2 * rows * fine)
-    found = environment_radiance(light, grid)
-    found = np.concatenate([found[: fine // 2][::-1], found, found[len(found) - fine // 2 :][::-1]])
-    return found.reshape(rows, fine, 2 * rows, fine, 3).mean(axis=(1, 3)).astype(np.float32)
+    samples = environment_radiance(light, grid)
+    samples = np.concatenate([samples[: fine // 2][::-1], samples, samples[len(samples) - fine // 2 :][::-1]])
+    return samples.reshape(rows, fine, 2 * rows, fine, 3).mean(axis=(1, 3)).astype(np.float32)
 
 
 def _filtered(radiance: Float[np.ndarray, "h w 3"], alpha: float) -> Float[np.ndarray, "h w 3"]:
@@ -195,8 +195,8 @@ class Studio:
             x = (px + across - value[21]) / value[23]
             y = (py + down - dr.floor(down) - value[22]) / value[23]
             away = dr.normalize(_turned(value[3:12], mi.Vector3f(x, y, 1)))
-            found = self._shaded(mi.Ray3f(mi.Point3f(*value[:3]), away), value[12:21], looks)
-            return k + 1, *(total + colour for total, colour in zip(totals, found, strict=True))
+            colours = self._shaded(mi.Ray3f(mi.Point3f(*value[:3]), away), value[12:21], looks)
+            return k + 1, *(total + colour for total, colour in zip(totals, colours, strict=True))
 
         state = (mi.UInt32(0), *(dr.zeros(mi.Vector4f, n) for _ in looks))
         _, *totals = dr.while_loop(state, lambda k, *_: k < rays, body)
@@ -274,8 +274,8 @@ class Studio:
                 [dr.gather(mi.Vector4f, self._light, first + below * 2 * ROWS + c) for c in columns] for below in (0, 1)
             ]
             upper, lower = (dr.lerp(pair[0], pair[1], x) for pair in pixels)
-            found = dr.lerp(upper, lower, y)
-            return mi.Color3f(found.x, found.y, found.z)
+            colour = dr.lerp(upper, lower, y)
+            return mi.Color3f(colour.x, colour.y, colour.z)
 
         return [at(one) for one in levels]
 

@@ -43,7 +43,7 @@ def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray,
     device.use()
     plugins.register()
     material = asset.materials[part]
-    shading, made = material.shading, classes(mi.variant())
+    shading, plugin_types = material.shading, classes(mi.variant())
     if shading.stated == "nothing":
         maps = replace(maps, albedo=np.full((2, 2, 3), BARE, np.float32))
     elif shading.stated == "colour":
@@ -51,13 +51,13 @@ def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray,
     glow = _radiance(material, maps)
     if shading.unlit or shading.black:
         maps = replace(maps, albedo=np.zeros((2, 2, 3), np.float32))
-    described: dict[str, Any] = {"type": "twosided", "bsdf": _relief(material, maps, made)}
+    described: dict[str, Any] = {"type": "twosided", "bsdf": _relief(material, maps, plugin_types)}
     if shading.transmission > 0:
         described = _glass(shading, maps)
-    opacity = _opacity(material, made)
+    opacity = _opacity(material, plugin_types)
     if opacity is not None:
         described = {"type": "mask", "opacity": opacity, "nested": described}
-    emitter = None if glow is None else made["Glow"](_loaded(glow), opacity)
+    emitter = None if glow is None else plugin_types["Glow"](_loaded(glow), opacity)
     return scenery.mitsuba_mesh(
         asset.mesh, part, mi.load_dict(described), f"part{part}", tangents=tangents, emitter=emitter
     )
@@ -67,11 +67,11 @@ def shapes(asset: Asset, maps: list[OwnMaps]) -> dict[str, Any]:
     """Every texture set as one loaded shape, by name."""
     device.use()
     tangents = corner_tangents(asset.mesh)
-    there = [p for p in range(len(asset.mesh.parts)) if (asset.mesh.part == p).any()]
-    plain = [p for p in there if is_plain(asset.materials[p])]
+    present = [p for p in range(len(asset.mesh.parts)) if (asset.mesh.part == p).any()]
+    plain = [p for p in present if is_plain(asset.materials[p])]
     result = {f"part{p}": scenery.object_shape(asset.mesh, p, maps[p], tangents) for p in plain}
-    result |= {f"part{p}": shape_of(asset, p, maps[p], tangents) for p in there if p not in plain}
-    return {f"part{p}": result[f"part{p}"] for p in there}
+    result |= {f"part{p}": shape_of(asset, p, maps[p], tangents) for p in present if p not in plain}
+    return {f"part{p}": result[f"part{p}"] for p in present}
 
 
 def needs_path(shapes: dict[str, Any]) -> bool:
@@ -89,13 +89,13 @@ def integrator(depth: int) -> Any:
     return classes(mi.variant())["Path"](depth)
 
 
-def _relief(material: Material, maps: OwnMaps, made: dict[str, type]) -> dict[str, Any]:
+def _relief(material: Material, maps: OwnMaps, plugin_types: dict[str, type]) -> dict[str, Any]:
     """The normal map over the surface."""
     shading = material.shading
     bare = shading.unlit or shading.stated == "nothing"
     f0 = np.zeros(3, np.float32) if bare else np.array(shading.specular, np.float32)
     specular = np.broadcast_to(f0, (2, 2, 3)) if material.specular is None else material.specular * f0
-    surface = made["Surface"](
+    surface = plugin_types["Surface"](
         {
             "base_color": _loaded(maps.albedo),
             "roughness": _loaded(maps.roughness[..., None]),
@@ -112,17 +112,17 @@ def _relief(material: Material, maps: OwnMaps, made: dict[str, type]) -> dict[st
 
 def _glass(shading: Shading, maps: OwnMaps) -> dict[str, Any]:
     """Transmission by Mitsuba's own material: with a volume a refracting solid, else a thin sheet."""
-    told: dict[str, Any] = {
+    parameters: dict[str, Any] = {
         "base_color": scenery.texture_dict(maps.albedo),
         "roughness": scenery.texture_dict(maps.roughness[..., None]),
         "spec_trans": shading.transmission,
         "eta": max(shading.ior, LEAST_INDEX),
     }
     if shading.thin:
-        return {"type": "principledthin", **told}
+        return {"type": "principledthin", **parameters}
     metallic = scenery.texture_dict(maps.metallic[..., None])
     normal = scenery.texture_dict(scenery.encoded(maps.normal))
-    inner = {"type": "principled", "metallic": metallic, **told}
+    inner = {"type": "principled", "metallic": metallic, **parameters}
     return {"type": plugins.NORMALMAP, "normalmap": normal, "bsdf": inner}
 
 
@@ -138,7 +138,7 @@ def _radiance(material: Material, maps: OwnMaps) -> Float[np.ndarray, "h w 3"] |
     return np.broadcast_to(factor, (2, 2, 3)) if texture is None else texture * factor
 
 
-def _opacity(material: Material, made: dict[str, type]) -> Any:
+def _opacity(material: Material, plugin_types: dict[str, type]) -> Any:
     """The opacity as a texture; None if all is opaque."""
     shading = material.shading
     if shading.opacity == 1 and material.opacity is None and (shading.cutoff or 0) <= 1:
@@ -147,7 +147,7 @@ def _opacity(material: Material, made: dict[str, type]) -> Any:
     if material.opacity is not None:
         values = np.clip(material.opacity * np.float32(shading.opacity), 0, 1)
     texture = _loaded(values[..., None])
-    return texture if shading.cutoff is None else made["Cut"](texture, shading.cutoff)
+    return texture if shading.cutoff is None else plugin_types["Cut"](texture, shading.cutoff)
 
 
 def _loaded(values: Float[np.ndarray, "h w c"]) -> Any:
@@ -276,11 +276,11 @@ def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tup
     # The environment lights the asset but is invisible.
     lit = active & (si.is_valid() | (depth > 0))
     ds = mi.DirectionSample3f(scene, si, before)
-    found = scene.pdf_emitter_direction(before, ds, lit & ~delta)
-    share = dr.select(delta, 1, _balanced(pdf, found))
+    density = scene.pdf_emitter_direction(before, ds, lit & ~delta)
+    share = dr.select(delta, 1, _balanced(pdf, density))
     result = result + dr.select(lit, throughput * share * ds.emitter.eval(si, lit), 0)
-    here = active & si.is_valid()
-    goes = here & (depth + 1 < most) & (passed < PASSED)
+    hit = active & si.is_valid()
+    goes = hit & (depth + 1 < most) & (passed < PASSED)
     surface = si.bsdf(ray)
     direct = goes & mi.has_flag(surface.flags(), mi.BSDFFlags.Smooth)
     ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(goes), True, direct)
@@ -290,7 +290,7 @@ def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tup
     result = result + dr.select(direct, throughput * value * weight * share, 0)
     sampled, weight = surface.sample(ctx, si, sampler.next_1d(goes), sampler.next_2d(goes), goes)
     null = goes & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)
-    valid = valid | (here & ~null)
+    valid = valid | (hit & ~null)
     throughput = dr.select(goes, throughput * weight, throughput)
     return (
         sampler,

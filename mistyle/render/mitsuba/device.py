@@ -79,11 +79,11 @@ def plain_errors(doing: str) -> Iterator[None]:
         cause: BaseException = error
         while (inner := cause.__cause__ or cause.__context__) is not None:
             cause = inner
-        said = " ".join(str(cause).split())
-        if "not attached to the AD graph" in said:
-            said = "no gradient reaches the chosen parameters: no camera sees them, or their plugin propagates none"
+        text = " ".join(str(cause).split())
+        if "not attached to the AD graph" in text:
+            text = "no gradient reaches the chosen parameters: no camera sees them, or their plugin propagates none"
         raise InputRefused(
-            f"Mitsuba failed while {doing}: {said[:400].rstrip('.')}. Check that the mitsuba command renders the scene."
+            f"Mitsuba failed while {doing}: {text[:400].rstrip('.')}. Check that the mitsuba command renders the scene."
         ) from error
 
 
@@ -150,5 +150,5 @@ def _missing(variant: str) -> str:
         )
     if not dr.has_backend(dr.JitBackend.LLVM):
         return f"Found neither an LLVM library that Dr.Jit can load nor a working GPU. {LLVM_HELP}"
-    found = ".".join(str(n) for n in dr.detail.llvm_version())
-    return f"Found LLVM {found}; expected {OLDEST_LLVM} or newer (older ones abort while compiling). {LLVM_HELP}"
+    version = ".".join(str(n) for n in dr.detail.llvm_version())
+    return f"Found LLVM {version}; expected {OLDEST_LLVM} or newer (older ones abort while compiling). {LLVM_HELP}"

@@ -44,7 +44,7 @@ def with_tangents(welded: Welded, tangents: Float[np.ndarray, "f 3 4"]) -> tuple
     """Split the indices whose corners differ in tangent; returns the attributes of the new indices too."""
     index, corners = welded.faces.reshape(-1), tangents.reshape(-1, 4).astype(np.float32)
     first, inverse = distinct(corner_rows(index, corners))
-    old, found = index[first], corners[first]
+    old, attributes = index[first], corners[first]
     split = Welded(
         positions=welded.positions[old],
         normals=welded.normals[old],
@@ -52,7 +52,7 @@ def with_tangents(welded: Welded, tangents: Float[np.ndarray, "f 3 4"]) -> tuple
         faces=inverse.reshape(-1, 3).astype(np.int32),
         vertex=welded.vertex[old],
     )
-    return split, {TANGENT: found[:, :3], HANDEDNESS: np.sign(found[:, 3:])}
+    return split, {TANGENT: attributes[:, :3], HANDEDNESS: np.sign(attributes[:, 3:])}
 
 
 def _gltf_class(mi: Any) -> type:
@@ -235,16 +235,16 @@ def _tangents(mi: Any, si: Any, active: Any) -> tuple[Any, Any]:
     import drjit as dr
 
     # No `&=` here: Dr.Jit would change the caller's mask.
-    here = active
+    valid = active
     if dr.is_jit_v(mi.Float):
-        here = here & (si.shape != None)  # noqa: E711
-        here = here & si.shape.has_attribute(TANGENT, here)
+        valid = valid & (si.shape != None)  # noqa: E711
+        valid = valid & si.shape.has_attribute(TANGENT, valid)
     elif not (active and si.shape is not None and si.shape.has_attribute(TANGENT)):
         return mi.Vector2f(1, 0), mi.Vector2f(0, 1)
-    world = si.shape.eval_attribute_3(TANGENT, si, here)
-    hand = dr.mulsign(mi.Float(1), si.shape.eval_attribute_1(HANDEDNESS, si, here))
+    world = si.shape.eval_attribute_3(TANGENT, si, valid)
+    hand = dr.mulsign(mi.Float(1), si.shape.eval_attribute_1(HANDEDNESS, si, valid))
     local = si.to_local(mi.Vector3f(world.x, world.y, world.z))
     s = mi.Vector2f(local.x, local.y)
-    here = here & (dr.squared_norm(s) > 1e-12)
-    s = dr.select(here, dr.normalize(dr.select(here, s, 1)), mi.Vector2f(1, 0))
-    return s, mi.Vector2f(-s.y, s.x) * dr.select(here, hand, 1)
+    valid = valid & (dr.squared_norm(s) > 1e-12)
+    s = dr.select(valid, dr.normalize(dr.select(valid, s, 1)), mi.Vector2f(1, 0))
+    return s, mi.Vector2f(-s.y, s.x) * dr.select(valid, hand, 1)

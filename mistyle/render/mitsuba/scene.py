@@ -262,8 +262,8 @@ def follows_camera(template: str | Path) -> bool:
     return bool(re.search(r'<default\s+name="turn"|id="(camera_|floor)|<include', text))
 
 
-def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | None = None, **wanted: float) -> Any:
-    """Load a template; `hdri` and `wanted` (turn, floor) are passed on only if the file declares them as `<default>`.
+def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | None = None, **values: float) -> Any:
+    """Load a template; `hdri` and `values` (turn, floor) are passed on only if the file declares them as `<default>`.
 
     The file itself is trusted: Mitsuba opens all files that it names. `hdri` is linear radiance, latitude-longitude, +Y
     up. Raises InputRefused if the file is not a readable scene, has no shape "object", or does not accept an `hdri`.
@@ -273,17 +273,17 @@ def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | 
     device.use()
     path = template_path(template)
     declared = set(re.findall(r'<default\s+name="(\w+)"', path.read_text(encoding="utf-8", errors="replace")))
-    given: dict[str, Any] = {name: repr(float(value)) for name, value in wanted.items() if name in declared}
+    defines: dict[str, Any] = {name: repr(float(value)) for name, value in values.items() if name in declared}
     if hdri is not None and "hdri" not in declared:
         raise InputRefused(f'{path}: accepts no environment map; it needs <default name="hdri" value="..."/>.')
     with TemporaryDirectory() as folder:
         try:
             with device.file_threads():
                 if hdri is not None:
-                    given["hdri"] = str(Path(folder, "hdri.exr"))
-                    mi.Bitmap(np.ascontiguousarray(hdri, np.float32)).write(given["hdri"])
+                    defines["hdri"] = str(Path(folder, "hdri.exr"))
+                    mi.Bitmap(np.ascontiguousarray(hdri, np.float32)).write(defines["hdri"])
                 # Merging meshes, an optimisation of the loader, would lose their ids.
-                scene = mi.load_file(str(path), optimize=False, **given)
+                scene = mi.load_file(str(path), optimize=False, **defines)
         except RuntimeError as error:
             raise InputRefused(f"{path}: Mitsuba cannot load this scene. {error}") from error
     if not isinstance(scene, mi.Scene) or all(shape.id() != "object" for shape in scene.shapes()):

@@ -32,8 +32,8 @@ def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -
             f"{len(maps)} maps for {len(mesh.parts)} texture sets; expected one for each ({', '.join(mesh.parts)})"
         )
     plugins.register()
-    made = _pages_class(mi)
-    textures = {name: _texture(made, [getattr(m, name) for m in maps]) for name in ("albedo", "roughness", "metallic")}
+    pages = _pages_class(mi)
+    textures = {name: _texture(pages, [getattr(m, name) for m in maps]) for name in ("albedo", "roughness", "metallic")}
     bsdf = {
         "type": "principled",
         "base_color": textures["albedo"],
@@ -43,7 +43,7 @@ def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -
     }
     relief = {
         "type": plugins.NORMALMAP,
-        "normalmap": _texture(made, [m.normal for m in maps], scenery.encoded_into),
+        "normalmap": _texture(pages, [m.normal for m in maps], scenery.encoded_into),
         "flip_invalid_normals": flip_invalid,
         "bsdf": bsdf,
     }
@@ -60,7 +60,7 @@ def table(values: Sequence[Float[np.ndarray, "_h _w *c"]]) -> tuple[Int[np.ndarr
 
 
 def _texture(
-    made: type,
+    pages: type,
     values: Sequence[np.ndarray],
     fill: Callable[[np.ndarray, np.ndarray], object] = lambda to, values: np.copyto(to, values),
 ) -> Any:
@@ -75,7 +75,7 @@ def _texture(
     for first, (height, width), one in zip(start, sizes, values, strict=True):
         page = texels[channels * first : channels * (first + height * width)]
         fill(page.reshape(one.shape), one)
-    return made(mi.Float(texels), *(mi.UInt32(aligned(n, np.uint32)) for n in (start, *sizes.T)), channels)
+    return pages(mi.Float(texels), *(mi.UInt32(aligned(n, np.uint32)) for n in (start, *sizes.T)), channels)
 
 
 def _pages_class(mi: Any) -> type:

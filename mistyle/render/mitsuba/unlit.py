@@ -64,12 +64,12 @@ def unlit(
         lower = dr.lerp(texel(0, 1), texel(1, 1), x - left)
         return dr.lerp(upper, lower, y - top), dr.select(valid, mi.Float(1), 0)
 
-    found = []
+    pictures = []
     for camera in cameras:
         rgb, share = _picture(mi, dr, traced, camera, fine, fetch)
-        found.append((memory.copied(rgb), memory.copied(share)) if memory.tight() else (rgb, share))
-        progress(len(found) / len(cameras))
-    return found
+        pictures.append((memory.copied(rgb), memory.copied(share)) if memory.tight() else (rgb, share))
+        progress(len(pictures) / len(cameras))
+    return pictures
 
 
 def _picture(mi: Any, dr: Any, traced: Tracer, camera: Camera, fine: int, fetch: Callable[[Any], Any]) -> Picture:
@@ -92,8 +92,8 @@ def _picture(mi: Any, dr: Any, traced: Tracer, camera: Camera, fine: int, fetch:
         y = (py + (mi.Float(k // fine) + 0.5) / fine - centre[1]) / focal
         away = mi.Vector3f(*(turn[3 * r] * x + turn[3 * r + 1] * y + turn[3 * r + 2] for r in range(3)))
         ray = mi.Ray3f(origin, dr.normalize(away))
-        found, share = fetch(traced.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True))
-        return k + 1, colour + found, coverage + share
+        rgb, share = fetch(traced.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True))
+        return k + 1, colour + rgb, coverage + share
 
     state = (mi.UInt32(0), dr.zeros(mi.Color3f, height * width), dr.zeros(mi.Float, height * width))
     _, colour, coverage = dr.while_loop(state, lambda k, *rest: k < fine * fine, body)

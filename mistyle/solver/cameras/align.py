@@ -73,20 +73,20 @@ def align_by_points(
             f"--align: found {len(own)} of {len(points)} points on the object; expected at least 20. "
             "Check the masks, or reconstruct with more pictures."
         )
-    found, *_ = align_points(mesh, own, rng)
-    if found.residual > FAR:
+    registration, *_ = align_points(mesh, own, rng)
+    if registration.residual > FAR:
         raise InputRefused(
-            f"--align: found points {found.residual:.3f} mesh radii from the mesh; expected less than {FAR}. "
+            f"--align: found points {registration.residual:.3f} mesh radii from the mesh; expected less than {FAR}. "
             "Pass masks (some points lie on other objects), or check that the pictures show this mesh."
         )
     if masks is None:
-        if found.rival < 1.1:
+        if registration.rival < 1.1:
             raise InputRefused(
                 "--align: found two registrations of the points that fit equally well (the mesh is symmetric); "
                 "expected one. Pass masks, or align the cameras by hand."
             )
-        return Alignment(found.work_from_cams, (), ())
-    return align_by_masks(mesh, cameras, masks, rng, start=found.work_from_cams)
+        return Alignment(registration.work_from_cams, (), ())
+    return align_by_masks(mesh, cameras, masks, rng, start=registration.work_from_cams)
 
 
 def align_by_masks(
@@ -130,7 +130,7 @@ def _from_hull(
         shell = visual_hull(cameras, masks)
     except ValueError as error:
         raise InputRefused(f"--align: found that {error}; expected one object in all. Check the masks.") from error
-    ways = [found.work_from_cams for found in align_points(mesh, shell, rng, trim=0.8)]
+    ways = [registration.work_from_cams for registration in align_points(mesh, shell, rng, trim=0.8)]
     misfits = [_misfit(traced, coarse, way) for way in ways]
     order = np.argsort(misfits)[:WAYS]
     close = [ways[k] for k in order if misfits[k] <= 2 * misfits[order[0]]]
@@ -141,8 +141,8 @@ def _from_hull(
 
 def _misfit(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> float:
     """Mean contour distance over the views; infinite where a view shows nothing of the mesh."""
-    found = _distances(traced, views, matrix)
-    return float(np.mean(np.nan_to_num(found, nan=np.inf)))
+    distances = _distances(traced, views, matrix)
+    return float(np.mean(np.nan_to_num(distances, nan=np.inf)))
 
 
 def refine_poses(
@@ -175,10 +175,10 @@ def refine_poses(
         finest = levels[-1]
         old, new = (_distance(traced, *shrunk(which, mask, finest)[:2]) for which in (camera, pose))
         times = shrunk(camera, mask, finest)[2]
-        kept = not np.isfinite(new) or (shading is None and new > old)
-        refined.append(camera if kept else pose)
+        worse = not np.isfinite(new) or (shading is None and new > old)
+        refined.append(camera if worse else pose)
         before.append(old * times)
-        after.append((old if kept else new) * times)
+        after.append((old if worse else new) * times)
         progress((k + 1) / len(cameras))
     return Poses(tuple(refined), tuple(before), tuple(after))
 
@@ -257,10 +257,10 @@ def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.n
         lhs, rhs, rows = np.zeros((7, 7)), np.zeros(7), []
         for camera, seen, _ in views:
             placed = moved_camera(camera, matrix)
-            found = _rim_rows(traced, placed, seen)
-            if found is None:
+            rim = _rim_rows(traced, placed, seen)
+            if rim is None:
                 continue
-            points, _, residual, by_cam = found
+            points, _, residual, by_cam = rim
             by_world = by_cam @ placed.cam_from_world[:3, :3]
             turning = np.einsum("nj,njk->nk", by_world, _rotating(points))
             jacobian = np.concatenate([turning, by_world, (by_world * points).sum(axis=1, keepdims=True)], axis=1)
@@ -287,10 +287,10 @@ def _settle(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading
     prior = np.diag(1 / np.array([TURN] * 3 + [SHIFT * depth] * 3) ** 2)
     total = np.zeros(6)
     for _ in range(STEPS):
-        found = _rim_rows(traced, small, seen)
-        if found is None:
+        rim = _rim_rows(traced, small, seen)
+        if rim is None:
             break
-        _, cam, residual, by_cam = found
+        _, cam, residual, by_cam = rim
         jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotating(cam)), by_cam], axis=1)
         if shading is not None:
             more = _shading_rows(traced, small, times, shading)

@@ -79,11 +79,11 @@ def overlap_line(names: Sequence[str], overlaps: Sequence[float]) -> str:
 
 
 def overlap_notes(
-    names: Sequence[str], found: Outlines, least: float, fix: str, *, trusted: bool = False
+    names: Sequence[str], outlines: Outlines, least: float, fix: str, *, trusted: bool = False
 ) -> tuple[str, ...]:
     """Notes on overlaps below `least`, on unchecked cameras, and on rotations that the check cannot detect (these only
     unless the cameras' frame is `trusted`, such as that of our own files)."""
-    known = [(o, n) for n, o in zip(names, found.overlap, strict=True) if np.isfinite(o)]
+    known = [(o, n) for n, o in zip(names, outlines.overlap, strict=True) if np.isfinite(o)]
     if not known:
         return (
             "The pictures have neither alpha nor masks with an outline: it was not checked whether the cameras fit the "
@@ -93,14 +93,14 @@ def overlap_notes(
     if bad:
         mean = float(np.mean([o for o, _ in known]))
         worst = ", ".join(f"{n} {o:.2f}" for o, n in bad[:3])
-        best = max(found.turned, key=lambda name: found.turned[name])
-        better = f"With the cameras turned {best} it would be {found.turned[best]:.2f} on average. "
-        hint = better if found.turned[best] >= max(least, found.base + ALIKE) else ""
+        best = max(outlines.turned, key=lambda name: outlines.turned[name])
+        better = f"With the cameras turned {best} it would be {outlines.turned[best]:.2f} on average. "
+        hint = better if outlines.turned[best] >= max(least, outlines.base + ALIKE) else ""
         return (
             f"Warning: the cameras do not fit the mesh in {len(bad)} of {len(known)} pictures: its outline overlaps "
             f"alpha or masks by less than {least:g} there (worst: {worst}; mean of all {mean:.2f}). {hint}{fix}",
         )
-    alike = [name for name, value in found.turned.items() if value >= found.base - ALIKE]
+    alike = [name for name, value in outlines.turned.items() if value >= outlines.base - ALIKE]
     if trusted or not alike:
         return ()
     return (

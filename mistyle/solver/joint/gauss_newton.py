@@ -255,8 +255,8 @@ def _derivatives(
             down[:, ROUGHNESS] = np.maximum(down[:, ROUGHNESS], floor)
         high, low = problem.images(up), problem.images(down)
         moved = (up - down)[problem.unknown.rows, columns[0]]
-        for each, p, here, a, b in zip(result, pictures, images, high, low, strict=True):
-            change = _without_jumps(a - here, here - b) if columns in ((TILT_X,), (TILT_Y,)) else a - b
+        for each, p, image, a, b in zip(result, pictures, images, high, low, strict=True):
+            change = _without_jumps(a - image, image - b) if columns in ((TILT_X,), (TILT_Y,)) else a - b
             each[:, :, j] = change / np.maximum(p.fetch @ moved, far / 10)[:, None]
     return result
 

@@ -118,14 +118,14 @@ class _Job:
         self._environments: dict[tuple[int, ...], list[Any]] = {}
         moving = [n for n in RATES if n != "metallic" or settings.metallic]
         parts = [p for p in range(len(maps)) if f"part{p}" in self.shapes]
-        wanted = {scenery.parameters(p)[name]: (p, name) for p in parts for name in moving}
-        found = scene_keys.match(self.scene(0), list(wanted))
+        places = {scenery.parameters(p)[name]: (p, name) for p in parts for name in moving}
+        moved = scene_keys.match(self.scene(0), list(places))
         gc.collect()  # frees that scene: with two scenes alive, Dr.Jit compiles other kernels
-        self.places = [wanted[p.key] for p in found]
+        self.places = [places[p.key] for p in moved]
         self.names = [name for _, name in self.places]
         # The parameter is a normal map even if its plugin is one of ours.
         self.chosen = [
-            replace(p, owner="NormalMap") if name == "normal" else p for p, name in zip(found, self.names, strict=True)
+            replace(p, owner="NormalMap") if name == "normal" else p for p, name in zip(moved, self.names, strict=True)
         ]
 
     def scene(self, k: int) -> Any:
@@ -141,10 +141,10 @@ class _Job:
         key = tuple(map(id, lights))
         if key in self._environments:
             return self._environments[key]
-        made = emitters(lights, camera)
-        if all(light["type"] == "envmap" for light in made):
-            made = self._environments[key] = [self.mi.load_dict(light) for light in made]
-        return made
+        emitter_dicts = emitters(lights, camera)
+        if all(light["type"] == "envmap" for light in emitter_dicts):
+            emitter_dicts = self._environments[key] = [self.mi.load_dict(light) for light in emitter_dicts]
+        return emitter_dicts
 
     def values(self) -> dict[str, np.ndarray]:
         """The start values by key."""

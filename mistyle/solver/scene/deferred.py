@@ -158,11 +158,11 @@ class DeferredRenderer:
             exact = renderer(*variant, min(fine), memory=0)
             table = exact.upload(self._table({}))
 
-            def wrong(k: int) -> float:
+            def deviation(k: int) -> float:
                 image, coverage = exact.image_and_coverage(table, k)
                 return _beyond_noise(image, pairs[k], captures.load(k)[1], coverage)
 
-            return max(wrong(k) for k in looked)
+            return max(deviation(k) for k in looked)
 
         variants = [(f, s) for f in (False, True) for s in (False, True)] if bumped else [(False, False)]
         errors = [error(variant) for variant in variants]
@@ -181,9 +181,9 @@ def _beyond_noise(ours: np.ndarray, pair: Sequence[np.ndarray], counts: np.ndarr
     if not at.any():
         return 0.0
     mean, noise = (pair[0] + pair[1])[at] / 2, np.square(pair[0] - pair[1], dtype=np.float64)[at].mean() / 4
-    wrong = np.square(mean - ours[at], dtype=np.float64).mean()
+    squared_error = np.square(mean - ours[at], dtype=np.float64).mean()
     # Both also contain noise of sample positions within the pixel; twice the noise covers that.
-    return float(np.sqrt(max(wrong - 2 * noise, 0) / max(np.square(mean, dtype=np.float64).mean(), 1e-30)))
+    return float(np.sqrt(max(squared_error - 2 * noise, 0) / max(np.square(mean, dtype=np.float64).mean(), 1e-30)))
 
 
 def _unit(stored: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -207,8 +207,8 @@ def _by_value(role: str, gradient: Float[np.ndarray, "n c"], value: np.ndarray) 
 
 
 def _missing(scene: Any, parameter: Parameter, reasons: Mapping[str, str | None]) -> str:
-    told = next((f"{name}: {reason}" for name, reason in reasons.items() if reason is not None), None)
-    return told or f"{parameter.name} is not a map of a plain `principled` on a mesh."
+    first_reason = next((f"{name}: {reason}" for name, reason in reasons.items() if reason is not None), None)
+    return first_reason or f"{parameter.name} is not a map of a plain `principled` on a mesh."
 
 
 def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[MaterialTexels | None]:

@@ -157,14 +157,14 @@ def _step(job: scene_job.SceneProblem, state: scene_job.FitState) -> None:
     total = 0.0
     for slot in range(plan.sensors_per_step):
         k = _camera(job, step, slot)
-        value, found, broken = _gradients(job, state, k, scene_grad.seeds(plan.seed, step, slot))
+        value, added, broken = _gradients(job, state, k, scene_grad.seeds(plan.seed, step, slot))
         total += value / plan.sensors_per_step
         state.broken[k] = state.broken.get(k, 0) + broken
-        _add(gradient, found, state, 1 / plan.sensors_per_step, k)
+        _add(gradient, added, state, 1 / plan.sensors_per_step, k)
     if job.regularizers:
-        value, found = scene_grad.regularized(job.table, job.chosen, state.values, job.regularizers)
+        value, added = scene_grad.regularized(job.table, job.chosen, state.values, job.regularizers)
         total += value
-        _add(gradient, found, state, 1.0, None)
+        _add(gradient, added, state, 1.0, None)
     noisy, paces = job.fast is None, []
     for p in job.chosen:
         usable = job.free[p.key] & ~state.held[p.key]
@@ -205,17 +205,17 @@ def _gradients(job: scene_job.SceneProblem, state: scene_job.FitState, k: int, s
     return scene_grad.gradients(live, state.values, job.views[k], job.losses[k], samples, seeds)
 
 
-def _add(total: dict, found: dict, state: scene_job.FitState, weight: float, sensor: int | None) -> None:
+def _add(total: dict, gradients: dict, state: scene_job.FitState, weight: float, sensor: int | None) -> None:
     """Add gradients; texels with non-finite gradients are recorded and frozen."""
-    for key, gradient in found.items():
-        wrong = ~np.isfinite(gradient)
-        if wrong.any():
-            where = np.argwhere(wrong & ~state.held[key])
+    for key, gradient in gradients.items():
+        invalid = ~np.isfinite(gradient)
+        if invalid.any():
+            where = np.argwhere(invalid & ~state.held[key])
             state.lost += len(where)
             room = max(MOST_BAD - len(state.bad), 0)
             state.bad += [Bad(key, tuple(int(n) for n in row), sensor, state.iteration) for row in where[:room]]
-            state.held[key] |= wrong.any(axis=-1, keepdims=True) if wrong.ndim == 3 else wrong
-            gradient = np.where(wrong, 0, gradient)
+            state.held[key] |= invalid.any(axis=-1, keepdims=True) if invalid.ndim == 3 else invalid
+            gradient = np.where(invalid, 0, gradient)
         total[key] += np.float32(weight) * gradient
 
 

@@ -125,10 +125,10 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
         if stopping.asked():
             return False
         numbers = [scene_grad.seeds(job.plan.seed, state.iteration + m, slot)[0] for slot in range(len(turn))]
-        found = [_look(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
-        losses.append(float(np.mean([value for value, _ in found])))
-        for k, (_, wrong) in zip(turn, found, strict=True):
-            broken[k] += wrong
+        renders = [_look(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
+        losses.append(float(np.mean([value for value, _ in renders])))
+        for k, (_, invalid) in zip(turn, renders, strict=True):
+            broken[k] += invalid
     _remember(newton, parts)
     old, gradient = newton.theta, _gradient(newton, seen)
     if long:
@@ -228,9 +228,9 @@ def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
     view = job.views[k]
     shown = np.array(scene_grad.picture(job.scene, job.engine, view.sensor, job.plan.spp, seed))[..., :3]
     finite = np.isfinite(shown)
-    wrong = np.where(finite, shown - np.array(view.reference), 0).astype(np.float64)
-    square = wrong**2
-    seen.count, seen.total, seen.square = seen.count + 1, seen.total + wrong, seen.square + square
+    residual = np.where(finite, shown - np.array(view.reference), 0).astype(np.float64)
+    square = residual**2
+    seen.count, seen.total, seen.square = seen.count + 1, seen.total + residual, seen.square + square
     return float((seen.weights * square).sum()), int((~finite).sum())
 
 
@@ -318,9 +318,9 @@ def _bounded(job: Any, theta: np.ndarray, matrix: np.ndarray, right: np.ndarray)
     high = np.minimum(high, theta + reach)
     held = np.zeros(len(theta), bool)
     step = np.zeros(len(theta))
-    wanted = right - matrix @ theta
+    residual = right - matrix @ theta
     for _ in range(len(theta)):
-        step[~held] = _inverse(matrix[np.ix_(~held, ~held)]) @ (wanted - matrix[:, held] @ step[held])[~held]
+        step[~held] = _inverse(matrix[np.ix_(~held, ~held)]) @ (residual - matrix[:, held] @ step[held])[~held]
         new = theta + step
         outside = ~held & ((new < low) | (new > high))
         if not outside.any():

@@ -133,24 +133,24 @@ def total_variation(weight: float, keys: Sequence[str] | None = None) -> Callabl
     return penalty
 
 
-def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]:
-    """An integrator with gradients, and notes: `wanted` (a plugin's name, a dictionary or an integrator), else the
+def ad_integrator(scene: Any, requested: Any = None) -> tuple[Any, tuple[str, ...]]:
+    """An integrator with gradients, and notes: `requested` (a plugin's name, a dictionary or an integrator), else the
     scene's own if it has gradients, else `prb` (`prbvolpath` in a scene with media) with the depth of the scene's own.
     """
     import mitsuba as mi
 
-    if isinstance(wanted, mi.Integrator):
-        return wanted, ()
-    if wanted is not None:
+    if isinstance(requested, mi.Integrator):
+        return requested, ()
+    if requested is not None:
         try:
-            made: Any = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
+            integrator: Any = mi.load_dict({"type": requested} if isinstance(requested, str) else dict(requested))
         except RuntimeError as error:
             raise UsageError(
-                f"the integrator '{wanted}' cannot be made; expected for example 'prb'. {error}"
+                f"the integrator '{requested}' cannot be made; expected for example 'prb'. {error}"
             ) from error
-        if not isinstance(made, mi.Integrator):
-            raise UsageError(f"'{wanted}' is not an integrator; expected for example 'prb'.")
-        return made, ()
+        if not isinstance(integrator, mi.Integrator):
+            raise UsageError(f"'{requested}' is not an integrator; expected for example 'prb'.")
+        return integrator, ()
     own = scene.integrator()
     if own is None:
         return mi.load_dict({"type": "prb"}), ("The scene has no integrator; prb replaces it.",)

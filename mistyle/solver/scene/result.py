@@ -105,14 +105,14 @@ def looks(job: SceneProblem, values: Mapping[str, np.ndarray], progress: Callabl
 def _look(job: SceneProblem, k: int, pair: Sequence[Any]) -> ViewLook:
     view = job.views[k]
     counts, reference = np.array(view.counts), np.array(view.reference, np.float64)
-    wrong = []
+    residuals = []
     for shown in pair:
         plain = np.array(shown, dtype=np.float64)[..., :3]
-        wrong.append(np.where(counts & np.isfinite(plain), plain - reference, 0))
+        residuals.append(np.where(counts & np.isfinite(plain), plain - reference, 0))
     weights = np.array(view.weights, np.float64)
-    squares = (weights if job.loss != "l2" else 1) * wrong[0] * wrong[1]
-    noise = (weights * (wrong[0] - wrong[1]) ** 2).sum() / 2
-    whole = (weights * (wrong[0] ** 2 + wrong[1] ** 2)).sum() / 2
+    squares = (weights if job.loss != "l2" else 1) * residuals[0] * residuals[1]
+    noise = (weights * (residuals[0] - residuals[1]) ** 2).sum() / 2
+    whole = (weights * (residuals[0] ** 2 + residuals[1] ** 2)).sum() / 2
     mean = (pair[0] + pair[1]) / 2
     loss = float(squares.sum() / counts.sum())
     if job.loss not in scene_grad.SQUARED:
@@ -141,15 +141,15 @@ def errors(job: SceneProblem, state: FitState) -> tuple[dict[str, np.ndarray], t
     widths = [len(brief(p, state.values[p.key])) for p in job.chosen]
     course = np.array(state.course).reshape(-1, sum(widths))
     paces = np.array(state.paces).reshape(-1, sum(widths))
-    found, names, start = {}, [], 0
+    stds, names, start = {}, [], 0
     for p, width in zip(job.chosen, widths, strict=True):
         part = course[:, start : start + width]
-        found[p.key], drifts = _spread(part, job.scales[p.key])
+        stds[p.key], drifts = _spread(part, job.scales[p.key])
         drifts |= _one_way(paces[:, start : start + width])
         start += width
         if drifts:
             names.append(p.name)
-    return found, tuple(names)
+    return stds, tuple(names)
 
 
 def _one_way(paces: np.ndarray) -> bool:

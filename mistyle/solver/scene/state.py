@@ -165,8 +165,8 @@ def prepare(
             "16 samples a pixel. The loss 'relative' has no such bias."
         )
     losses = tuple(scene_grad.loss_of(loss, view) for view in views)
-    given = (scene, table, chosen, views, engine, loss, losses, tuple(regularizers), free, scales, plan)
-    return SceneProblem(*given, fast=quick, newton=newton), notes
+    constants = (scene, table, chosen, views, engine, loss, losses, tuple(regularizers), free, scales, plan)
+    return SceneProblem(*constants, fast=quick, newton=newton), notes
 
 
 def _way(quick: Any, engine: Any, why: str) -> str:

@@ -143,7 +143,7 @@ class Problem:
         free = 7 if self.options.metallic else 6
 
         def body(k, *state):
-            tried, kept, sums, best, damping = state[:7], state[7:14], unflat(state[14:47]), state[47], state[48]
+            tried, accepted, sums, best, damping = state[:7], state[7:14], unflat(state[14:47]), state[47], state[48]
             new = self._accumulate(chunk, list(tried))
             total = new.cost
             for v, m, p in zip(tried, mean, prior, strict=True):
@@ -151,11 +151,11 @@ class Problem:
             better = total < best
             damping = dr.clip(damping * dr.select(better, LIGHTER, HEAVIER), 1e-7, 1e6)
             best = dr.select(better, total, best)
-            kept = [dr.select(better, a, b) for a, b in zip(tried, kept, strict=True)]
+            accepted = [dr.select(better, a, b) for a, b in zip(tried, accepted, strict=True)]
             flat = [dr.select(better, a, b) for a, b in zip(flat_of(new), flat_of(sums), strict=True)]
-            change = step(unflat(flat), kept, mean, prior, damping)
-            tried = [v - s if j < free else v for j, (v, s) in enumerate(zip(kept, change, strict=True))]
-            return k + 1, *_project(tried, self.options), *kept, *flat, best, damping
+            change = step(unflat(flat), accepted, mean, prior, damping)
+            tried = [v - s if j < free else v for j, (v, s) in enumerate(zip(accepted, change, strict=True))]
+            return k + 1, *_project(tried, self.options), *accepted, *flat, best, damping
 
         state = [*first, *[kind(v) for v in first], *flat_of(nothing(kind, width))]
         state += [dr.full(kind, 1e30, width), dr.full(kind, 1e-2 / LIGHTER, width)]
@@ -163,10 +163,10 @@ class Problem:
         last = dr.opaque(type(chunk["count"]), iterations + 1)
         start_state = (dr.zeros(type(chunk["count"]), width), *state)
         done = dr.while_loop(start_state, lambda k, *rest: k < last, body, label="levenberg_marquardt")[1:]
-        kept, sums = list(done[7:14]), unflat(done[14:47])
+        accepted, sums = list(done[7:14]), unflat(done[14:47])
         spread, diagonal = spread_of(sums, prior)
-        dr.eval(kept, sums.cost, spread, diagonal)
-        return _rows(kept), np.array(sums.cost), _rows(spread), _rows(diagonal)
+        dr.eval(accepted, sums.cost, spread, diagonal)
+        return _rows(accepted), np.array(sums.cost), _rows(spread), _rows(diagonal)
 
     def _accumulate(self, chunk: dict, x: list) -> Sums:
         """Normal matrix, gradient and cost of every lane at x."""

@@ -234,8 +234,8 @@ def _visible(camera: Camera, seen: GBuffer, pure, points: tuple[np.ndarray, ...]
     own = np.zeros((4, len(near)), bool)
     hit, front = seen.position.reshape(-1, 3), seen.normal.reshape(-1, 3)
     for k, step in enumerate((0, 1, width, width + 1)):
-        there = hit.take(pixel + step, axis=0), front.take(pixel + step, axis=0)
-        own[k] = pure.ravel().take(pixel + step) & _one_surface(p, n, unit / cosine[near], *there)
+        surface = hit.take(pixel + step, axis=0), front.take(pixel + step, axis=0)
+        own[k] = pure.ravel().take(pixel + step) & _one_surface(p, n, unit / cosine[near], *surface)
     good = own.any(axis=0)
     chosen = near[good]
     worth = np.sqrt(cosine[chosen]) * np.minimum(size[chosen] / unit[good], 1)
@@ -256,9 +256,9 @@ def _observe(rgb, usable, lit, soft: bool, visible: VisibleTexels, move: float) 
     for j, corner in enumerate(corners):
         good[j] &= usable.ravel().take(corner)
         for k, state in enumerate(lit):
-            here = state.ravel().take(corner)
-            good[j] &= here >= 0
-            code[j] |= np.where(here == 1, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
+            lit_state = state.ravel().take(corner)
+            good[j] &= lit_state >= 0
+            code[j] |= np.where(lit_state == 1, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
     bits, u, v = _moved(good, code, x, y)
     moved = (u - x) ** 2 + (v - y) ** 2
     share = 1 / (1 + np.float32(MOVED) * moved)

@@ -52,12 +52,12 @@ def first_solve(
     tries = [(start, mean, prior)]
     for metal in (0.0, 1.0) if settings.metallic else (None,):
         for roughness in STARTS:
-            other, around, weight = mean.copy(), mean.copy(), prior
-            other[:, ROUGHNESS] = roughness
+            guess, around, weight = mean.copy(), mean.copy(), prior
+            guess[:, ROUGHNESS] = roughness
             if metal is not None:
-                other[:, METALLIC], around[:, METALLIC] = abs(metal - 0.1), metal
+                guess[:, METALLIC], around[:, METALLIC] = abs(metal - 0.1), metal
                 around, weight, _ = metal_f0_prior(around, prior, np.full(len(mean), metal, np.float32))
-            tries.append((other, around, weight))
+            tries.append((guess, around, weight))
     tries = tries if not np.array_equal(start, mean) else tries[1:]
     solved = []
     for k, (each, around, weight) in enumerate(tries):
@@ -111,22 +111,22 @@ def another_round(
     solved = [tried(solution.values, 5, _nearest(solution.values))]
     if number < RESTARTS:
         for roughness in (None, 0.15, 0.4, 0.8):
-            other = mean.copy()
+            guess = mean.copy()
             if roughness is not None:
-                other[:, ROUGHNESS] = roughness
-            solved.append(tried(other, 8, _nearest(mean)))
+                guess[:, ROUGHNESS] = roughness
+            solved.append(tried(guess, 8, _nearest(mean)))
     return best(solved)
 
 
 def best(solutions: Sequence[tuple[Solution, Float[np.ndarray, " t"]]]) -> Solution:
     """Per texel the solution of least cost plus penalty; the first of equals."""
     result, least = solutions[0][0], solutions[0][0].cost + solutions[0][1]
-    for other, extra in solutions[1:]:
-        cost = other.cost + extra
+    for candidate, extra in solutions[1:]:
+        cost = candidate.cost + extra
         better = cost < least
         least = np.where(better, cost, least)
         names = [f.name for f in fields(Solution)]
-        result = Solution(**{n: _pick(better, getattr(other, n), getattr(result, n)) for n in names})
+        result = Solution(**{n: _pick(better, getattr(candidate, n), getattr(result, n)) for n in names})
     return result
 
 

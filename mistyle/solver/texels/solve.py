@@ -172,21 +172,21 @@ def _rounds(
     direct = DirectCaptures(context.captures)
     total, solution = all_rounds(settings, pictures), solved_anew(progress.part(0.3, 0.5))
     for number in range(total):
-        here = progress.part(0.5 + 0.5 * number / total, 0.5 + 0.5 * (number + 1) / total)
+        part = progress.part(0.5 + 0.5 * number / total, 0.5 + 0.5 * (number + 1) / total)
         table = scatter_to_atlas(solution.values, observed, atlas)
         if 0 < number <= settings.rounds * len(samples) and number % settings.rounds == 0:
             sampling = samples[number // settings.rounds - 1], context.seed + number
-            for k, light, _ in estimate_indirect(context, renderer, table, sampling, here.part(0, 0.4)):
+            for k, light, _ in estimate_indirect(context, renderer, table, sampling, part.part(0, 0.4)):
                 direct = direct.with_indirect(k, light)
             observed = _observed_direct(observed, weight, direct)
             problem.reweight(observed.observations.weight)
             problem.retarget(observed.observations.rgb)
-            solution = solved_anew(here.part(0.4, 0.8))
+            solution = solved_anew(part.part(0.4, 0.8))
             table = scatter_to_atlas(solution.values, observed, atlas)
         residuals = RoundResiduals(direct, renderer, renderer.upload(table), [])
         solution = recover_solve.another_round(problem, observed, atlas, solution, residuals, settings, number)
         context.trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(residuals.squares))))
-        here(1.0)
+        part(1.0)
     return solution, observed, direct
 
 
@@ -241,9 +241,11 @@ def estimate_indirect(
     scene = Indirect(context.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for group in by_camera(captures.cameras):
         many = [captures.lights[k] for k in group]
-        asked = captures.cameras[group[0]], many, samples, seed + len(captures) * group[0]
+        request = captures.cameras[group[0]], many, samples, seed + len(captures) * group[0]
         lights: list[tuple[np.ndarray, Any]]
-        lights = scene.pictures_and_vectors(*asked) if vectors else [(light, None) for light in scene.pictures(*asked)]
+        lights = (
+            scene.pictures_and_vectors(*request) if vectors else [(light, None) for light in scene.pictures(*request)]
+        )
         for k, (light, vector) in zip(group, lights, strict=True):
             rgb, mask = captures.load(k)
             counts = (mask & np.isfinite(rgb).all(axis=-1))[..., None]
