@@ -311,7 +311,7 @@ def _weight(weights: Sequence[float], level: int) -> float:
 
 
 def blur(x: Float[torch.Tensor, "n c h w"], radius: float) -> Float[torch.Tensor, "n c h w"]:
-    """Gaussian of standard deviation `radius` (pixels), zero beyond the border, at half resolution where it is wide."""
+    """Gaussian of standard deviation `radius` (pixels), zero beyond the border, at half resolution for large radii."""
     shrink = max(int(radius // 4), 1)
     size = x.shape[2:]
     if shrink > 1:

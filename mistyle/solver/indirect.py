@@ -28,7 +28,7 @@ TOGETHER = 6  # pictures of one camera that share their paths; larger batches ma
 ROUGH = 0.25  # least roughness past the first point: mirror paths are few bright samples
 DEPTH = 5  # path segments: up to four surface points
 ALIKE = 0.15  # bilateral scale of the difference of two unit normals
-LEVEL = 0.7  # bilateral scale of the distance from the tangent plane, relative to the distance in pixels
+LEVEL = 0.7  # bilateral scale of the distance from the tangent plane, in pixel widths on the surface
 PALE = 0.04  # added to the albedo before division: specular reflectance, which has no colour
 LIKE = 8  # pixels: Gaussian window of the comparison between estimate and picture
 BRIGHTER = 2.0  # largest scale factor of that comparison
@@ -55,7 +55,7 @@ class Indirect:
     def pictures(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
     ) -> list[Float[np.ndarray, "h w 3"]]:
-        """Indirect radiance, linear Rec.709, of at most MOST pixels per side (see `enlarged`), under each of `many`
+        """Indirect radiance, linear Rec.709, in pictures of at most MOST pixels a side, under each of `many`
         lights.
 
         Pixels beside the object have the value of the nearest pixel on it. `samples` are per pixel of the estimate.

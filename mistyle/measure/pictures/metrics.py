@@ -277,7 +277,7 @@ def flip_exposures(
     strip[0, 0] = light[bright.argmax()]
     rule: Any = flip_evaluator.evaluate(strip, strip, "HDR", applyMagma=False, computeMeanError=False)[2]
     first, last, count = float(rule["startExposure"]), float(rule["stopExposure"]), int(rule["numExposures"])
-    # With one exposure the package answers 0 whatever the pictures are.
+    # With one exposure the package always returns 0.
     return (first, last, max(count, 2)) if math.isfinite(first) and math.isfinite(last) else (0.0, 0.0, 2)
 
 

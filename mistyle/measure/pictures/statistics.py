@@ -89,7 +89,7 @@ def _welch(a: np.ndarray, b: np.ndarray, floor: float) -> tuple[np.ndarray, np.n
 
 
 def _blocks(stack: np.ndarray, block: int) -> Float[np.ndarray, "n r c 3"]:
-    """Block means; blocks that the border cuts are means of what is there."""
+    """Block means; blocks at the border average the pixels inside the picture."""
     rows, columns = (np.arange(0, s, block) for s in stack.shape[1:3])
     total = np.add.reduceat(np.add.reduceat(stack.astype(np.float64), rows, axis=1), columns, axis=2)
     heights, widths = (np.diff([*starts, s]) for starts, s in ((rows, stack.shape[1]), (columns, stack.shape[2])))

@@ -97,7 +97,7 @@ def _python(venv: Path) -> str:
 def subject(path: Path, folder: Path, renderers: Sequence[Renderer], threads: int = 0) -> Subject:
     """Read FILE: a scene file, a mesh, or a run folder of ours with one GLB in `asset/`.
 
-    A scene file (.xml) is trusted like code, as Mitsuba opens whatever it names.
+    A scene file (.xml) is trusted like code, since Mitsuba opens all files that it names.
     """
     path = finished_asset(path) if path.is_dir() else path
     if path.suffix.lower() == ".xml":
