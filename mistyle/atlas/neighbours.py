@@ -97,7 +97,7 @@ def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
     position, normal = texels.position.reshape(-1, 3)[at], texels.normal.reshape(-1, 3)[at]
     own, island = texels.island.ravel()[at], np.pad(texels.island, 1, constant_values=-1)
     row, column = np.divmod(at, texels.covered.shape[1])
-    sides, tree = _sides(mesh, texels.covered.shape)[texels.face.ravel()[at]], KDTree(position)
+    sides, tree = _texel_steps(mesh, texels.covered.shape)[texels.face.ravel()[at]], KDTree(position)
     most = min(CANDIDATES, len(at))
 
     def across(down: int, right: int) -> Seam:
@@ -115,6 +115,6 @@ def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
     return right, left, below, above
 
 
-def _sides(mesh: Mesh, size: tuple[int, ...]) -> Float[np.ndarray, "f 2 3"]:
+def _texel_steps(mesh: Mesh, size: tuple[int, ...]) -> Float[np.ndarray, "f 2 3"]:
     """The step on the surface of one texel to the right, and one down, on every face."""
     return (uv_derivatives(mesh) / np.array([[size[1]], [-size[0]]])).astype(np.float32)

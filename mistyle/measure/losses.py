@@ -121,7 +121,7 @@ def style_statistics(
     total = maps[0].new_zeros(())
     whole = mask, target_mask
     for level, (a, b) in enumerate(zip(maps, targets, strict=True)):
-        (a, mask), (b, target_mask) = (_thinned(*each) for each in zip((a, b), whole, strict=True))
+        (a, mask), (b, target_mask) = (_subsampled(*each) for each in zip((a, b), whole, strict=True))
         if kind == "gram":
             mine, theirs = gram(a, mask), gram(b, target_mask)
             energy = theirs.diagonal(dim1=1, dim2=2).mean(dim=1).clamp_min(1e-8)
@@ -136,7 +136,7 @@ def style_statistics(
     return total
 
 
-def _thinned(maps: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _subsampled(maps: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     if maps.shape[2:] != mask.shape[2:] or maps[0, 0].numel() <= DENSE:
         return maps, mask
     return maps[:, :, ::2, ::2], mask[:, :, ::2, ::2]

@@ -46,7 +46,7 @@ def overlap(view: View, other: View) -> Overlap:
     chosen = erode(view.mask, INSIDE)
     here, depth = pixel_centres(view.camera.size)[chosen], view.depth[chosen].astype(np.float64)
     there, z = px_from_world(other.camera, world_from_px(view.camera, here, depth))
-    seen, both = _sees(other, there, z), np.zeros(chosen.shape, bool)
+    seen, both = _visible_in(other, there, z), np.zeros(chosen.shape, bool)
     both[chosen] = seen
     here, there, depth = here[seen], there[seen], depth[seen]
     steps = pixel_steps(view.camera, other.camera, here, depth, view.normal[both])
@@ -123,7 +123,7 @@ def _means(picture: np.ndarray, px: np.ndarray, axes: np.ndarray) -> Float[np.nd
     return total / LOOKS**2
 
 
-def _sees(view: View, px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def _visible_in(view: View, px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     height, width = view.camera.size
     inside = (z > 0) & (px >= 0).all(axis=1) & (px[:, 0] < width) & (px[:, 1] < height)
     column, row = np.where(inside[:, None], px, 0).astype(np.int64).T

@@ -61,7 +61,7 @@ class Indirect:
         Pixels beside the object have the value of the nearest pixel on it. `samples` are per pixel of the estimate.
         Raises ValueError for lights of a scene file.
         """
-        return [light for light, _ in self._all(camera, many, samples, seed, False)]
+        return [light for light, _ in self._in_batches(camera, many, samples, seed, False)]
 
     def pictures_and_vectors(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
@@ -72,9 +72,9 @@ class Indirect:
         A diffuse surface of normal n and reflectance a has the radiance a / π E · n while n stays near the mapped
         normal. E excludes light from below the mapped normal's horizon and attenuates grazing light (GRAZING).
         """
-        return self._all(camera, many, samples, seed, True)
+        return self._in_batches(camera, many, samples, seed, True)
 
-    def _all(
+    def _in_batches(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, vectors: bool
     ) -> list[tuple[Any, Any]]:
         """Pairs of radiance and vector irradiance; the latter is None without `vectors`."""
@@ -98,7 +98,7 @@ class Indirect:
         times, each = scenery.passes(samples)
         sensor = mi.load_dict(scenery.sensor_dict(small, each))
         options = (self.scene, self.sharp, sensor, lit, each)
-        passes = [_traced(*options, seed + k * 7919, vectors) for k in range(times)]
+        passes = [_trace_paths(*options, seed + k * 7919, vectors) for k in range(times)]
         whole = np.mean(passes, axis=0)
         share = whole[..., 0]
         inside = np.isfinite(whole).all(axis=-1) & (share > 0)
@@ -124,7 +124,7 @@ class Indirect:
         return list(zip(map(smooth, light[:count]), arriving, strict=True))
 
 
-def _traced(
+def _trace_paths(
     scene: Any,
     sharp: Sequence[tuple[Any, Any]],
     sensor: Any,
@@ -161,7 +161,7 @@ def _traced(
         # A ray that escapes from the first point carries direct light. The last segment only tests for escape.
         escaped, hit = active & ~si.is_valid() & (k > 0), active & si.is_valid() & (k < points)
         segment = PathSegment(ray, si, last, density, escaped, hit)
-        arriving = (sum((_arriving(scene, e, segment, sampler) for e in own), mi.Color3f(0)) for own in lit)
+        arriving = (sum((_emitter_radiance(scene, e, segment, sampler) for e in own), mi.Color3f(0)) for own in lit)
         more = (total + through * light for total, light in zip(sums, arriving, strict=True))
         return k + 1, *onward(si, si.bsdf(), through, hit, sampler), sampler, *more
 
@@ -239,7 +239,7 @@ class PathSegment(NamedTuple):
     hit: Any
 
 
-def _arriving(scene: Any, emitter: Any, segment: PathSegment, sampler: Any) -> Any:
+def _emitter_radiance(scene: Any, emitter: Any, segment: PathSegment, sampler: Any) -> Any:
     """Radiance of one emitter along the ray: reflected at the surface point `si`, or directly where the ray escaped.
 
     Environment light uses both sampling strategies, weighted by the power heuristic (Veach and Guibas 1995).
@@ -304,14 +304,14 @@ def averaged(
     """
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     position, normal = (np.where(inside[..., None], field, 0).astype(np.float32) for field in (position, normal))
-    total, weights = _around(light, position, normal, unit, inside)
+    total, weights = _neighbour_sums(light, position, normal, unit, inside)
     if np.isfinite(most):
         brightest = most * (total / np.maximum(weights, 1e-6)[..., None])
         light = np.where(weights[..., None] > 1e-6, np.minimum(light, brightest), light)
     return (light + total) / (1 + weights)[..., None]
 
 
-def _around(
+def _neighbour_sums(
     light: np.ndarray, position: np.ndarray, normal: np.ndarray, unit: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weighted sum and weights of each pixel's eight neighbours."""
@@ -320,7 +320,7 @@ def _around(
         for dx in (-1, 0, 1):
             if not (dy or dx):
                 continue
-            rows, columns = _overlap(inside.shape[0], dy), _overlap(inside.shape[1], dx)
+            rows, columns = _shifted_slices(inside.shape[0], dy), _shifted_slices(inside.shape[1], dx)
             centre, neighbour = (rows[0], columns[0]), (rows[1], columns[1])
             lift = ((position[neighbour] - position[centre]) * normal[centre]).sum(axis=-1) / (LEVEL * unit[centre])
             turn2 = ((normal[neighbour] - normal[centre]) ** 2).sum(axis=-1)
@@ -331,6 +331,6 @@ def _around(
     return total, weights
 
 
-def _overlap(size: int, step: int) -> tuple[slice, slice]:
+def _shifted_slices(size: int, step: int) -> tuple[slice, slice]:
     """Slices of the rows with a neighbour `step` further on, and of those neighbours."""
     return slice(max(0, -step), size - max(0, step)), slice(max(0, step), size + min(0, step))

@@ -73,7 +73,7 @@ def map_smoothing(
     moved, atlas = np.zeros_like(table), with_seam_weights(atlas, table[:, SOLVED], noise)
     for c in LEAST:
         for one in _fields(table, noise, atlas, c):
-            moved[one.part, c] = (_likely(one) - one.estimate).ravel()
+            moved[one.part, c] = (_map_estimate(one) - one.estimate).ravel()
     result = table + fill(moved, atlas)
     if metallic:
         result = binarise_metallic(result, noise)
@@ -89,7 +89,7 @@ def prior_precision_matrix(
     P x. Variances are those of `map_smoothing` on `table`. `atlas` comes from `with_seam_weights`."""
     from scipy.sparse import block_diag
 
-    return block_diag([_prior(one) for one in _fields(table, noise, atlas, channel)], format="csr")
+    return block_diag([_field_prior(one) for one in _fields(table, noise, atlas, channel)], format="csr")
 
 
 def _fields(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: int) -> Iterator[Field]:
@@ -99,7 +99,7 @@ def _fields(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: int) ->
         estimate = table[part, channel].reshape(size)
         error = np.minimum(noise[part, channel].reshape(size), OPEN)
         among = links if OVER_SEAMS[channel] else within(links)
-        error, variance = _measured(estimate, error, among, LEAST[channel])
+        error, variance = _estimate_variance(estimate, error, among, LEAST[channel])
         yield Field(part, estimate, error, variance, ridge[part].reshape(size), among)
 
 
@@ -133,29 +133,29 @@ def binarise_metallic(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, 
     return result
 
 
-def _lines(among: Links) -> Both:
+def _inner_texels(among: Links) -> Both:
     """Texels with a neighbour in the grid on either side, along rows and along columns (transposed)."""
     return among.right[:, :-1] & among.right[:, 1:], (among.below[:-1] & among.below[1:]).T
 
 
-def _second(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
+def _second_differences(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
     """Second differences along rows, the mean of two neighbours less the texel; 0 without both neighbours."""
     return np.where(links, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
 
 
-def _measured(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
+def _estimate_variance(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
     """Errors of the estimate, and the surface's own variance of second differences, both from a local window.
 
     Where values vary less than their errors predict, the errors are correlated (by the solver's prior). Errors then
     shrink to the observed variation, since smoothing cannot remove the correlated part.
     """
     total = np.zeros((3, *estimate.shape, 1), np.float32)
-    for turned, link in enumerate(_lines(among)):
+    for turned, link in enumerate(_inner_texels(among)):
         x, e = (estimate.T, error.T) if turned else (estimate, error)
         noise = 0.25 * (e[:, :-2] ** 2 + e[:, 2:] ** 2) + e[:, 1:-1] ** 2
         weight = np.where(link, 1 / (noise + SURE**2) ** 2, 0)
         sums = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
-        for own, value in zip(sums, (_second(x, link) ** 2, noise, 1), strict=True):
+        for own, value in zip(sums, (_second_differences(x, link) ** 2, noise, 1), strict=True):
             own[:, 1:-1] += weight * value
     varies, noise, weights = diffused(total, among, AROUND)[..., 0]
     own = np.clip((varies - noise) / np.maximum(weights, 1e-12), least**2, MOST**2)
@@ -163,19 +163,19 @@ def _measured(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[
     return error * np.sqrt(share), own
 
 
-def _within(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
+def _grid_differences(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
     """Flat indices (both neighbours, the texel) of every texel with two neighbours in the grid, along rows and columns,
     and the precisions of their second differences."""
     number, own = np.arange(variance.size, dtype=np.int32).reshape(variance.shape), variance.ravel()
-    lines, texels = _lines(among), []
+    lines, texels = _inner_texels(among), []
     for grid, link in zip((number, number.T), lines, strict=True):
         texels.append(np.stack([grid[:, :-2][link], grid[:, 2:][link], grid[:, 1:-1][link]], axis=1))
     every = np.concatenate(texels)
     return every, 1 / own[every[:, 2]]
 
 
-def _over_seams(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
-    """Indices and precisions, as of `_within`, of texels with a seam on one or both sides."""
+def _seam_differences(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
+    """Indices and precisions, as of `_grid_differences`, of texels with a seam on one or both sides."""
     width, rows, firm = variance.shape[1], [], []
     grids = np.pad(among.right, ((0, 0), (0, 1))).ravel(), np.pad(among.below, ((0, 1), (0, 0))).ravel()
     for grid, step, sides in zip(grids, (1, width), (among.seams[:2], among.seams[2:]), strict=True):
@@ -192,30 +192,32 @@ def _over_seams(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows).astype(np.int32), np.concatenate(firm)
 
 
-def _differences(variance: Grid, among: Links) -> Any:
+def _difference_matrix(variance: Grid, among: Links) -> Any:
     """Sparse matrix of second differences, each row divided by its standard deviation."""
     from scipy.sparse import csr_array
 
-    texels, firm = map(np.concatenate, zip(_within(variance, among), _over_seams(variance, among), strict=True))
+    texels, firm = map(
+        np.concatenate, zip(_grid_differences(variance, among), _seam_differences(variance, among), strict=True)
+    )
     root = np.sqrt(firm).astype(np.float32)[:, None]
     values = (root * np.array([0.5, 0.5, -1], np.float32)).ravel()
     starts = np.arange(0, values.size + 1, 3, dtype=np.int32)
     return csr_array((values, texels.ravel(), starts), shape=(len(texels), variance.size))
 
 
-def _prior(one: Field) -> Any:
+def _field_prior(one: Field) -> Any:
     """The second and third sum of one set as a sparse matrix."""
     from scipy.sparse import dia_array
 
-    differences, size = _differences(one.variance, one.among), one.ridge.size
+    differences, size = _difference_matrix(one.variance, one.among), one.ridge.size
     return (differences.T @ differences + dia_array((one.ridge.ravel()[None], 0), shape=(size, size))).tocsr()
 
 
-def _likely(one: Field) -> Float[np.ndarray, "h w"]:
+def _map_estimate(one: Field) -> Float[np.ndarray, "h w"]:
     from scipy.sparse import dia_array
     from scipy.sparse.linalg import cg
 
-    prior = _prior(one)
+    prior = _field_prior(one)
     sure = (1 / np.maximum(one.error, 1e-4) ** 2).astype(np.float32).ravel()
     matrix = prior + dia_array((sure[None], 0), shape=prior.shape)
     inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=prior.shape)

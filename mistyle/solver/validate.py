@@ -30,7 +30,7 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
             raise InputRefused(
                 f"Picture '{camera.name}' has {size} pixels, its camera {expected}. Resize one to the other's size."
             )
-        reason = _why_not(mesh, camera, captures.lights[k], rgb, mask)
+        reason = _rejection(mesh, camera, captures.lights[k], rgb, mask)
         (silent if reason else usable).append((k, reason))
     for k, reason in silent:
         notes.append(f"Picture '{captures.cameras[k].name}' is skipped: {reason}.")
@@ -47,7 +47,7 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
     return subset(captures, [k for k, _ in usable])
 
 
-def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: np.ndarray) -> str:
+def _rejection(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: np.ndarray) -> str:
     """The reason why a picture cannot be used, or an empty string."""
     px, depth = px_from_world(camera, mesh.positions.astype(np.float64))
     if not (in_frame(camera, px) & (depth > 0)).any():

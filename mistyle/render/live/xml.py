@@ -90,7 +90,7 @@ def _parsed(config: Any, file: Path, defines: dict[str, str]) -> tuple[Any, list
     state = mi.parser.parse_file(config, str(file), **defines)
     mi.parser.transform_all(config, state)
     converted = _as_floats(state)
-    _named(state)
+    _assign_ids(state)
     return state, converted
 
 
@@ -120,7 +120,7 @@ def _as_floats(state: Any) -> list[str]:
     return changed
 
 
-def _named(state: Any) -> None:
+def _assign_ids(state: Any) -> None:
     """Give the scene's children ids, and remove textures that are reachable through their users."""
     import mitsuba as mi
 

@@ -51,7 +51,7 @@ def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray,
     glow = _radiance(material, maps)
     if shading.unlit or shading.black:
         maps = replace(maps, albedo=np.zeros((2, 2, 3), np.float32))
-    described: dict[str, Any] = {"type": "twosided", "bsdf": _relief(material, maps, plugin_types)}
+    described: dict[str, Any] = {"type": "twosided", "bsdf": _surface_bsdf(material, maps, plugin_types)}
     if shading.transmission > 0:
         described = _glass(shading, maps)
     opacity = _opacity(material, plugin_types)
@@ -89,7 +89,7 @@ def integrator(depth: int) -> Any:
     return classes(mi.variant())["Path"](depth)
 
 
-def _relief(material: Material, maps: OwnMaps, plugin_types: dict[str, type]) -> dict[str, Any]:
+def _surface_bsdf(material: Material, maps: OwnMaps, plugin_types: dict[str, type]) -> dict[str, Any]:
     """The normal map over the surface."""
     shading = material.shading
     bare = shading.unlit or shading.stated == "nothing"
@@ -258,7 +258,7 @@ def _path_class(mi: Any) -> type:
     return Path
 
 
-def _balanced(a: Any, b: Any) -> Any:
+def _power_heuristic(a: Any, b: Any) -> Any:
     """Veach's power heuristic for a sample of density a that a strategy of density b could have generated."""
     import drjit as dr
 
@@ -277,7 +277,7 @@ def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tup
     lit = active & (si.is_valid() | (depth > 0))
     ds = mi.DirectionSample3f(scene, si, before)
     density = scene.pdf_emitter_direction(before, ds, lit & ~delta)
-    share = dr.select(delta, 1, _balanced(pdf, density))
+    share = dr.select(delta, 1, _power_heuristic(pdf, density))
     result = result + dr.select(lit, throughput * share * ds.emitter.eval(si, lit), 0)
     hit = active & si.is_valid()
     goes = hit & (depth + 1 < most) & (passed < PASSED)
@@ -286,7 +286,7 @@ def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tup
     ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(goes), True, direct)
     direct = direct & (ds.pdf != 0)
     value, at = surface.eval_pdf(ctx, si, si.to_local(ds.d), direct)
-    share = dr.select(ds.delta, 1, _balanced(ds.pdf, at))
+    share = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, at))
     result = result + dr.select(direct, throughput * value * weight * share, 0)
     sampled, weight = surface.sample(ctx, si, sampler.next_1d(goes), sampler.next_2d(goes), goes)
     null = goes & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)

@@ -37,11 +37,11 @@ def use(variant: str | None = None, threads: int | None = None) -> str:
 
     current = mi.variant()
     if variant is None:
-        variant = current if current in VARIANTS else _first_that_answers(mi.variants())
+        variant = current if current in VARIANTS else _first_working(mi.variants())
     elif variant not in VARIANTS:
         raise EnvironmentMissing(f"Mitsuba variant '{variant}' cannot be used; expected one of {', '.join(VARIANTS)}.")
     if variant != current:
-        if not _answers(variant, mi.variants()):
+        if not _works(variant, mi.variants()):
             raise EnvironmentMissing(_missing(variant))
         mi.set_variant(variant)
     if threads is not None and threads != dr.thread_count():
@@ -122,14 +122,14 @@ class Frozen:
         return getattr(self._run, "n_recordings", 0)
 
 
-def _first_that_answers(built: list[str]) -> str:
+def _first_working(built: list[str]) -> str:
     for variant in VARIANTS:
-        if _answers(variant, built):
+        if _works(variant, built):
             return variant
     raise EnvironmentMissing(_missing("llvm_ad_rgb"))
 
 
-def _answers(variant: str, built: list[str]) -> bool:
+def _works(variant: str, built: list[str]) -> bool:
     import drjit as dr
 
     backend = getattr(dr.JitBackend, VARIANTS[variant], None)

@@ -44,13 +44,13 @@ def filtered(picture: Rgb, guide: Float[np.ndarray, "h w 4"]) -> tuple[Rgb, Rgb]
     share = guide[..., 3:]
     away = (share == 0).astype(np.float32)
     whole = (share > 0.999).astype(np.float32)
-    behind = _behind(picture, away, sigma)
+    behind = _background(picture, away, sigma)
     least = 1e-4 * gaussian(whole, sigma) + 1e-8
     ratio = (gaussian(picture * whole, sigma) + least) / (gaussian(guide[..., :3] * whole, sigma) + least)
     return np.maximum(guide[..., :3] * ratio + (1 - share) * behind, 0), behind
 
 
-def _behind(picture: Rgb, away: Float[np.ndarray, "h w 1"], sigma: float) -> Rgb:
+def _background(picture: Rgb, away: Float[np.ndarray, "h w 1"], sigma: float) -> Rgb:
     """The local mean of the background: with `sigma` close to the asset, with WIDE times that farther away."""
     height, width = picture.shape[:2]
     small = max(1, height // WIDE), max(1, width // WIDE)

@@ -107,7 +107,7 @@ def align_by_masks(
     traced = tracer(mesh)
     coarse = [shrunk(camera, mask, levels[0]) for camera, mask in zip(cameras, masks, strict=True)]
     if start is None:
-        start = _from_hull(mesh, traced, cameras, masks, coarse, rng)
+        start = _register_hull(mesh, traced, cameras, masks, coarse, rng)
     matrix = _descend(traced, coarse, start)
     for side in levels[1:]:
         small = [shrunk(camera, mask, side) for camera, mask in zip(cameras, masks, strict=True)]
@@ -116,7 +116,7 @@ def align_by_masks(
     return Alignment(matrix, _distances(traced, finest, start), _distances(traced, finest, matrix))
 
 
-def _from_hull(
+def _register_hull(
     mesh: Mesh,
     traced: Tracer,
     cameras: Sequence[Camera],
@@ -171,7 +171,7 @@ def refine_poses(
             shading = _Shading(*pictures(k), lambda seen, k=k: predict(seen, k))
         pose = camera
         for side in levels:
-            pose = _settle(traced, pose, mask, side, shading)
+            pose = _refine_pose(traced, pose, mask, side, shading)
         finest = levels[-1]
         old, new = (_distance(traced, *shrunk(which, mask, finest)[:2]) for which in (camera, pose))
         times = shrunk(camera, mask, finest)[2]
@@ -221,7 +221,7 @@ def _rows(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return cam, moves * (camera.focal / z)[:, None, None]
 
 
-def _rotating(points: np.ndarray) -> np.ndarray:
+def _rotation_jacobian(points: np.ndarray) -> np.ndarray:
     """d (w x p) / d w = -[p]x, (n 3 3)."""
     x, y, z = points.T
     zero = np.zeros_like(x)
@@ -262,7 +262,7 @@ def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.n
                 continue
             points, _, residual, by_cam = rim
             by_world = by_cam @ placed.cam_from_world[:3, :3]
-            turning = np.einsum("nj,njk->nk", by_world, _rotating(points))
+            turning = np.einsum("nj,njk->nk", by_world, _rotation_jacobian(points))
             jacobian = np.concatenate([turning, by_world, (by_world * points).sum(axis=1, keepdims=True)], axis=1)
             weight = _weights(residual)
             lhs += (jacobian * weight[:, None]).T @ jacobian
@@ -280,7 +280,7 @@ def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.n
     return matrix
 
 
-def _settle(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading: _Shading | None) -> Camera:
+def _refine_pose(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading: _Shading | None) -> Camera:
     """Gauss-Newton on one camera's pose at one size."""
     small, seen, times = shrunk(camera, mask, side)
     depth = max(float(np.linalg.norm(camera.position)), 1e-6)
@@ -291,7 +291,7 @@ def _settle(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading
         if rim is None:
             break
         _, cam, residual, by_cam = rim
-        jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotating(cam)), by_cam], axis=1)
+        jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotation_jacobian(cam)), by_cam], axis=1)
         if shading is not None:
             more = _shading_rows(traced, small, times, shading)
             jacobian, residual = np.concatenate([jacobian, more[0]]), np.concatenate([residual, more[1]])
@@ -326,5 +326,5 @@ def _shading_rows(traced: Tracer, camera: Camera, times: int, shading: _Shading)
         return np.zeros((0, 6)), np.zeros(0)
     cam, moves = _rows(camera, hits.position[inner].astype(float))
     by_cam = np.einsum("nk,nkj->nj", slope, moves) / scale
-    jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotating(cam)), by_cam], axis=1)
+    jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotation_jacobian(cam)), by_cam], axis=1)
     return jacobian, (seen - gain * drawn)[inner] / scale

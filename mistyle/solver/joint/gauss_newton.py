@@ -163,7 +163,7 @@ def _steps(problem: JointProblem, table: MaterialTable, progress: Callable[[floa
             for p, d, r, e in zip(pictures, derivatives, residuals, errors, strict=True)
         ]
         progress((k + 0.5) / settings.joint)
-        x = _moved(x, unknown, _step(x, linearised, unknown, problem.context.atlas), settings.roughness_floor)
+        x = _updated(x, unknown, _step(x, linearised, unknown, problem.context.atlas), settings.roughness_floor)
         images = problem.images(x)
         # The indirect light was subtracted for the maps of its estimate.
         moved = (x - table)[unknown.rows]
@@ -278,7 +278,7 @@ def _step(table: MaterialTable, images: Sequence[LinearisedImage], unknown: Unkn
     own = np.einsum("tii->ti", np.linalg.inv(blocks)).copy()
     std = np.full((len(table), 7), NOTHING, np.float32)
     std[rows, JOINT] = np.where(unknown.seen[:, None], np.sqrt(MARGIN * np.maximum(own, 1e-12)), NOTHING)
-    priors, x = _priors(table, std, rows, atlas), table[rows, JOINT]
+    priors, x = _prior_matrices(table, std, rows, atlas), table[rows, JOINT]
     right = rhs(images, len(rows)) - _product(priors, x)
     diagonal = np.stack([prior.diagonal() for prior in priors], axis=1)
     blocks[:, of, of] += np.maximum(diagonal, 1e-6) - 1 / FREE**2
@@ -291,7 +291,7 @@ def _step(table: MaterialTable, images: Sequence[LinearisedImage], unknown: Unkn
     return pcg(applied, right, inverse)
 
 
-def _priors(
+def _prior_matrices(
     table: MaterialTable, std: Float[np.ndarray, "a 7"], rows: Int[np.ndarray, " t"], atlas: Atlas
 ) -> list[Any]:
     """P of each unknown: the priors of covered texels; uncovered texels are tied to the nearest covered one."""
@@ -318,7 +318,7 @@ def _product(priors: Sequence[Any], v: Unknowns) -> Unknowns:
     return np.stack([prior @ v[:, c] for c, prior in enumerate(priors)], axis=1)
 
 
-def _moved(table: MaterialTable, unknown: UnknownTexels, change: Unknowns, floor: float) -> MaterialTable:
+def _updated(table: MaterialTable, unknown: UnknownTexels, change: Unknowns, floor: float) -> MaterialTable:
     """The table after a step, clipped to LONGEST and to the channels' bounds; no step where it is not finite."""
     result, change = table.copy(), np.where(np.isfinite(change).all(axis=1, keepdims=True), change, 0)
     values = result[unknown.rows, JOINT] + np.clip(change, -LONGEST, LONGEST)

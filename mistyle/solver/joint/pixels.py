@@ -63,7 +63,7 @@ def image_footprints(
         every = _covered_pixels(context, renderer, cameras[group[0]]) if settings.bounces else None
         for k in group:
             lit = _lit_pixels(renderer, k)
-            images[k] = lit if every is None else _and_dark(lit, every)
+            images[k] = lit if every is None else _with_unlit(lit, every)
             fetch = images[k].fetch
             seen[fetch.indices] = True
             left -= PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
@@ -112,7 +112,7 @@ def _footprint(blocks: Iterable[SampleBlock], sizes: Sequence[tuple[int, int]], 
     return ImageFootprint(np.concatenate(index), np.concatenate(lit), vstack(fetches, format="csr"))
 
 
-def _and_dark(pixels: ImageFootprint, every: ImageFootprint) -> ImageFootprint:
+def _with_unlit(pixels: ImageFootprint, every: ImageFootprint) -> ImageFootprint:
     """`pixels`, then the pixels of `every` that they lack."""
     from scipy.sparse import vstack
 

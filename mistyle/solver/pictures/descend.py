@@ -175,7 +175,7 @@ def _state(
 def _unconstrained_std(estimate: TexelEstimate) -> Float[np.ndarray, "a 7"]:
     """Standard deviations after a pass: those of `estimate`, which approach LEFT times the median."""
     std = estimate.unconstrained
-    return (std / np.sqrt(1 + (std / (LEFT * _usual(estimate))) ** 2)).astype(np.float32)
+    return (std / np.sqrt(1 + (std / (LEFT * _median_std(estimate))) ** 2)).astype(np.float32)
 
 
 def _rate_factors(estimate: TexelEstimate, atlas: Atlas) -> MaterialTable:
@@ -183,19 +183,19 @@ def _rate_factors(estimate: TexelEstimate, atlas: Atlas) -> MaterialTable:
     steps, and a tilt that its neighbours decided would drift. Uncovered texels, seen by pixels at island borders, take
     the rate of the nearest covered one, so that these pixels still have an effect."""
     factors = np.ones((len(estimate.data_weight), COLUMNS), np.float32)
-    if _known(estimate).any():
-        factors[:, SOLVED] = np.clip(estimate.unconstrained / _usual(estimate), SHORTEST, LONGEST)
+    if _observed(estimate).any():
+        factors[:, SOLVED] = np.clip(estimate.unconstrained / _median_std(estimate), SHORTEST, LONGEST)
     factors[:, TILT] *= np.sqrt(estimate.data_weight)[:, None]
     return fill(factors, atlas)
 
 
-def _known(estimate: TexelEstimate) -> Bool[np.ndarray, " a"]:
+def _observed(estimate: TexelEstimate) -> Bool[np.ndarray, " a"]:
     return np.asarray((estimate.seen > 0) & (estimate.unconstrained < NOTHING).all(axis=1))
 
 
-def _usual(estimate: TexelEstimate) -> Float[np.ndarray, "7"]:
+def _median_std(estimate: TexelEstimate) -> Float[np.ndarray, "7"]:
     """The median standard deviation of observed texels."""
-    known = _known(estimate)
+    known = _observed(estimate)
     usual = np.median(estimate.unconstrained[known], axis=0) if known.any() else np.full(7, NOTHING, np.float32)
     return np.maximum(usual, 1e-9)
 

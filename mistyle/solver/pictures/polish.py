@@ -167,7 +167,7 @@ class _Job:
             result[part] = replace(result[part], **{name: np.ascontiguousarray(grid, np.float32)})
         return result
 
-    def _look(self, scene: Any, k: int, spp: int, seed: int) -> tuple[Any, Any]:
+    def _render_pair(self, scene: Any, k: int, spp: int, seed: int) -> tuple[Any, Any]:
         """The picture and its reference."""
         sensor = scene.sensors()[0]
         shown = scene_grad.picture(scene, self.engine, sensor, spp, seed)
@@ -186,7 +186,7 @@ class _Job:
         scene = self.scene(k)
         table = self._table(scene)
         moving = scene_grad.put(table, self.chosen, values, grad=True)
-        shown, view = self._look(scene, k, spp[0], seeds[0])
+        shown, view = self._render_pair(scene, k, spp[0], seeds[0])
         value, pixels, _ = scene_grad.compare(shown, view, self.loss)
         self.engine.render_backward(
             scene, table, pixels, view.sensor, seed=dr.opaque(self.mi.UInt32, seeds[1]), spp=spp[1]
@@ -200,7 +200,7 @@ class _Job:
             # A function, so that each scene is freed before the next is built.
             scene = self.scene(k)
             scene_grad.put(self._table(scene), self.chosen, values)
-            shown, view = self._look(scene, k, 4 * spp, scene_grad.seeds(seed, 2**31 + k)[0])
+            shown, view = self._render_pair(scene, k, 4 * spp, scene_grad.seeds(seed, 2**31 + k)[0])
             return scene_grad.compare(shown, view, self.loss)[0]
 
         return float(np.mean([one(k) for k in pictures]))

@@ -84,11 +84,11 @@ class DeferredRenderer:
             raise Unsupported("its materials differ in `specular`.")
         traced = tracer(_mesh(scene))
         cameras = [_camera(view.sensor, k) for k, view in enumerate(views)]
-        masks = [self._counts(traced, camera, view) for camera, view in zip(cameras, views, strict=True)]
+        masks = [self._valid_pixels(traced, camera, view) for camera, view in zip(cameras, views, strict=True)]
         references = [np.array(view.reference) for view in views]
         captures = in_memory(cameras, [lights] * len(cameras), references, masks)
         self.shares = [max(view.share, 1e-9) for view in views]
-        self.renderer = self._agreeing(scene, traced, captures, views, engine, kinds.pop())
+        self.renderer = self._best_variant(scene, traced, captures, views, engine, kinds.pop())
 
     def gradients(self, values: Mapping[str, np.ndarray], k: int) -> tuple[float, dict[str, np.ndarray]]:
         """Noise-free loss of camera k and its gradient by key, like `scene_grad.gradients`.
@@ -105,7 +105,7 @@ class DeferredRenderer:
             start += count
             for role, (key, _) in material.roles.items() if material is not None else ():
                 if key in result:
-                    result[key] += _by_value(role, part[:, ROLES[role]], values[key])
+                    result[key] += _stored_gradient(role, part[:, ROLES[role]], values[key])
         return float(np.array(value)[0]) / self.shares[k], result
 
     def _table(self, values: Mapping[str, np.ndarray]) -> Float[np.ndarray, "t 8"]:
@@ -122,7 +122,7 @@ class DeferredRenderer:
             parts.append(rows)
         return np.concatenate(parts)
 
-    def _counts(self, traced: Tracer, camera: Camera, view: scene_grad.ReferenceView) -> np.ndarray:
+    def _valid_pixels(self, traced: Tracer, camera: Camera, view: scene_grad.ReferenceView) -> np.ndarray:
         """Valid pixels: those of the mask that neither see nor touch another material."""
         counts = np.array(view.counts)[..., 0].astype(bool)
         foreign = [k for k, material in enumerate(self.materials) if material is None]
@@ -132,7 +132,7 @@ class DeferredRenderer:
             counts &= ~dilate(np.isin(gbuffer(traced, camera).part, foreign), 1)
         return counts
 
-    def _agreeing(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
+    def _best_variant(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
         """The renderer that matches the scene best, over Mitsuba's variants of a normal map."""
         from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
@@ -160,7 +160,7 @@ class DeferredRenderer:
 
             def deviation(k: int) -> float:
                 image, coverage = exact.image_and_coverage(table, k)
-                return _beyond_noise(image, pairs[k], captures.load(k)[1], coverage)
+                return _excess_rms(image, pairs[k], captures.load(k)[1], coverage)
 
             return max(deviation(k) for k in looked)
 
@@ -175,7 +175,7 @@ def _picture(scene: Any, engine: Any, sensor: Any, seed: int) -> np.ndarray:
     return np.array(scene_grad.picture(scene, engine, sensor, CHECK_SPP, seed))[..., :3]
 
 
-def _beyond_noise(ours: np.ndarray, pair: Sequence[np.ndarray], counts: np.ndarray, coverage: np.ndarray) -> float:
+def _excess_rms(ours: np.ndarray, pair: Sequence[np.ndarray], counts: np.ndarray, coverage: np.ndarray) -> float:
     """RMS difference of two renderers beyond the noise of one, relative to the picture's RMS."""
     at = counts & (coverage > 0.999)
     if not at.any():
@@ -191,7 +191,7 @@ def _unit(stored: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
 
 
-def _by_value(role: str, gradient: Float[np.ndarray, "n c"], value: np.ndarray) -> np.ndarray:
+def _stored_gradient(role: str, gradient: Float[np.ndarray, "n c"], value: np.ndarray) -> np.ndarray:
     """The gradient by stored values: literals sum over all texels, encoded normals go through n = unit(2 t - 1)."""
     if role == "normalmap":
         flat = value.reshape(-1, 3)

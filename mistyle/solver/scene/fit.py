@@ -121,7 +121,7 @@ def _finished(
     progress: Any,
 ) -> FittedScene:
     """The result, compared with the start and undone where it is worse."""
-    if (count := state.iteration - _first(job, TAIL)) > 0 and not (job.newton or job.fast):
+    if (count := state.iteration - _first_of_last(job, TAIL)) > 0 and not (job.newton or job.fast):
         mean = {p.key: (state.tail[p.key] / count).astype(np.float32) for p in job.chosen}
         # Unchanged values keep their bytes.
         state.values = {k: np.where(state.values[k] == state.start[k], state.start[k], v) for k, v in mean.items()}
@@ -160,15 +160,15 @@ def _step(job: scene_job.SceneProblem, state: scene_job.FitState) -> None:
         value, added, broken = _gradients(job, state, k, scene_grad.seeds(plan.seed, step, slot))
         total += value / plan.sensors_per_step
         state.broken[k] = state.broken.get(k, 0) + broken
-        _add(gradient, added, state, 1 / plan.sensors_per_step, k)
+        _add_gradients(gradient, added, state, 1 / plan.sensors_per_step, k)
     if job.regularizers:
         value, added = scene_grad.regularized(job.table, job.chosen, state.values, job.regularizers)
         total += value
-        _add(gradient, added, state, 1.0, None)
+        _add_gradients(gradient, added, state, 1.0, None)
     noisy, paces = job.fast is None, []
     for p in job.chosen:
         usable = job.free[p.key] & ~state.held[p.key]
-        rate = plan.rate * _falling(step, plan.iterations, noisy) * job.scales[p.key]
+        rate = plan.rate * _rate_factor(step, plan.iterations, noisy) * job.scales[p.key]
         own = np.where(usable, gradient[p.key], 0)
         change = laplacian.change(state.moments[p.key], own, rate, SHARE, fair=noisy)
         moved = scene_keys.project(p, state.values[p.key] + change)
@@ -177,20 +177,20 @@ def _step(job: scene_job.SceneProblem, state: scene_job.FitState) -> None:
         paces.append(scene_result.pace(p, state.values[p.key] - old, rate))
     state.trace.append(total)
     state.iteration += 1
-    if step >= _first(job, TAIL):
+    if step >= _first_of_last(job, TAIL):
         for p in job.chosen:
             state.tail[p.key] += state.values[p.key]
-    if step >= _first(job, COURSE):
+    if step >= _first_of_last(job, COURSE):
         state.paces.append(np.concatenate(paces))
         state.course.append(np.concatenate([scene_result.brief(p, state.values[p.key]) for p in job.chosen]))
 
 
-def _first(job: scene_job.SceneProblem, share: float) -> int:
+def _first_of_last(job: scene_job.SceneProblem, share: float) -> int:
     """The first of the last steps that form this share of all."""
     return int(np.ceil((1 - share) * job.plan.iterations))
 
 
-def _falling(step: int, steps: int, noisy: bool) -> float:
+def _rate_factor(step: int, steps: int, noisy: bool) -> float:
     """Factor of the rate, along a cosine; with noisy gradients it ends before the averaged steps."""
     end = (1 - TAIL) * steps if noisy else steps
     return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * min(step / end, 1.0)))
@@ -205,7 +205,7 @@ def _gradients(job: scene_job.SceneProblem, state: scene_job.FitState, k: int, s
     return scene_grad.gradients(live, state.values, job.views[k], job.losses[k], samples, seeds)
 
 
-def _add(total: dict, gradients: dict, state: scene_job.FitState, weight: float, sensor: int | None) -> None:
+def _add_gradients(total: dict, gradients: dict, state: scene_job.FitState, weight: float, sensor: int | None) -> None:
     """Add gradients; texels with non-finite gradients are recorded and frozen."""
     for key, gradient in gradients.items():
         invalid = ~np.isfinite(gradient)

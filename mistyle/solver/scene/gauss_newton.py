@@ -62,7 +62,7 @@ class Newton:
 
 
 @dataclass
-class _Seen:
+class _PictureSums:
     """Sums of I - R and of its square over one camera's pictures of a round, and the weights of the loss."""
 
     weights: Float[np.ndarray, "h w 3"]
@@ -119,26 +119,26 @@ def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
     # A short round needs both halves at its own values: H then has no bias from J's noise either.
     parts = [{k: _columns(job, state.values, newton, k, size, part) for k in views} for part in range(1 if long else 2)]
     scene_grad.put(job.table, job.chosen, state.values)
-    seen = {k: _Seen(_weights(job, k)) for k in views}
+    seen = {k: _PictureSums(_weights(job, k)) for k in views}
     losses, broken = [], dict.fromkeys(views, 0)
     for m, turn in enumerate(turns):
         if stopping.asked():
             return False
         numbers = [scene_grad.seeds(job.plan.seed, state.iteration + m, slot)[0] for slot in range(len(turn))]
-        renders = [_look(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
+        renders = [_render_view(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
         losses.append(float(np.mean([value for value, _ in renders])))
         for k, (_, invalid) in zip(turn, renders, strict=True):
             broken[k] += invalid
-    _remember(newton, parts)
+    _store_derivatives(newton, parts)
     old, gradient = newton.theta, _gradient(newton, seen)
     if long:
         newton.size = newton.size or size
         newton.rounds.append(Round(views, size, old, gradient))
         newton.noise = _reference_noise(newton, seen)
-        new = _bounded(job, old, *_system(job, newton, _used(newton)))
+        new = _bounded(job, old, *_system(job, newton, _averaged_rounds(newton)))
     else:
         lost = sum(broken.values()) / (size * job.plan.sensors_per_step * np.size(next(iter(seen.values())).weights))
-        new = _short(job, newton, gradient, seen, lost)
+        new = _short_step(job, newton, gradient, seen, lost)
         newton.near = newton.round >= 2 and bool((np.abs(new - old) < NEAR * (np.abs(new) + 0.02 * _scales(job))).all())
     newton.theta, newton.round = new, newton.round + 1
     state.values = spread(job, new, state.values)
@@ -183,7 +183,7 @@ def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) 
     return np.stack(result)
 
 
-def _remember(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n h w 3"]]]) -> None:
+def _store_derivatives(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n h w 3"]]]) -> None:
     """Add a long round's derivatives to one half. A short round's two replace all earlier ones, since its J differs."""
     for part, columns in enumerate(parts):
         for k, new in columns.items():
@@ -203,7 +203,7 @@ def _halves(newton: Newton, k: int) -> tuple[np.ndarray, np.ndarray]:
     return first, second
 
 
-def _tamed(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[np.ndarray, "n v"]:
+def _without_outliers(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[np.ndarray, "n v"]:
     """Derivatives without outliers: each is limited to OUTLIER times its local mean size, plus its picture's mean."""
     result = []
     for column in columns:
@@ -223,7 +223,7 @@ def _weights(job: Any, k: int) -> Float[np.ndarray, "h w 3"]:
     return weights / counts.sum()
 
 
-def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
+def _render_view(job: Any, k: int, seed: int, seen: _PictureSums) -> tuple[float, int]:
     """Render camera k and add the picture; returns its loss with noise and its number of non-finite values."""
     view = job.views[k]
     shown = np.array(scene_grad.picture(job.scene, job.engine, view.sensor, job.plan.spp, seed))[..., :3]
@@ -234,11 +234,11 @@ def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
     return float((seen.weights * square).sum()), int((~finite).sum())
 
 
-def _gradient(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, " n"]:
+def _gradient(newton: Newton, seen: Mapping[int, _PictureSums]) -> Float[np.ndarray, " n"]:
     """g of half the loss, mean over the rendered cameras."""
     total: Any = 0.0
     for k, sums in seen.items():
-        test = _tamed(np.mean(_halves(newton, k), axis=0), sums.weights.shape)
+        test = _without_outliers(np.mean(_halves(newton, k), axis=0), sums.weights.shape)
         total = total + test @ (sums.weights * sums.total / sums.count).ravel()
     return total / len(seen)
 
@@ -249,23 +249,24 @@ def _matrices(job: Any, newton: Newton, views: Sequence[int]) -> dict[int, Float
     for k in views:
         weights, shape = _weights(job, k).ravel(), _weights(job, k).shape
         first, second = _halves(newton, k)
-        product = (_tamed(first, shape) * weights) @ second.T + (_tamed(second, shape) * weights) @ first.T
+        robust = [_without_outliers(half, shape) * weights for half in (first, second)]
+        product = robust[0] @ second.T + robust[1] @ first.T
         result[k] = (product + product.T) / 4
     return result
 
 
-def _reference_noise(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, "n n"]:
+def _reference_noise(newton: Newton, seen: Mapping[int, _PictureSums]) -> Float[np.ndarray, "n n"]:
     """Covariance of g by the residuals I - R without render noise: Σ Φ W² r² Φᵀ."""
     total: Any = 0.0
     for k, sums in seen.items():
-        first, second = (_tamed(half, sums.weights.shape) for half in _halves(newton, k))
+        first, second = (_without_outliers(half, sums.weights.shape) for half in _halves(newton, k))
         product = (first * (sums.weights**2 * sums.products()).ravel()) @ second.T
         total = total + (product + product.T) / 2
     return total / len(seen) ** 2
 
 
-def _short(
-    job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _Seen], lost: float
+def _short_step(
+    job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _PictureSums], lost: float
 ) -> Float[np.ndarray, " n"]:
     """The values after a short round: a damped step, or half the way back to the best values so far.
 
@@ -283,7 +284,7 @@ def _short(
     return _bounded(job, newton.theta, matrix, matrix @ newton.theta - gradient)
 
 
-def _used(newton: Newton) -> list[Round]:
+def _averaged_rounds(newton: Newton) -> list[Round]:
     """The long rounds that are averaged: all but the first, which began furthest away."""
     return newton.rounds[int(len(newton.rounds) >= LONG[0]) :]
 
@@ -347,7 +348,7 @@ def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
 
     Render noise is estimated from the long rounds' disagreement, the references' noise from the residuals.
     """
-    count, used = len(newton.theta), _used(newton)
+    count, used = len(newton.theta), _averaged_rounds(newton)
     if len(used) < 2 or newton.noise is None:
         return np.full(count, np.nan), np.zeros(count, bool)
     inverse = _inverse(_system(job, newton, used)[0])

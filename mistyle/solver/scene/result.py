@@ -97,12 +97,12 @@ def looks(job: SceneProblem, values: Mapping[str, np.ndarray], progress: Callabl
     for k, view in enumerate(job.views):
         seeds = scene_grad.seeds(job.plan.seed, k, 2**31)
         pair = [scene_grad.picture(job.scene, job.engine, view.sensor, job.plan.spp, s) for s in seeds]
-        result.append(_look(job, k, pair))
+        result.append(_evaluate_view(job, k, pair))
         progress((k + 1) / len(job.views))
     return result
 
 
-def _look(job: SceneProblem, k: int, pair: Sequence[Any]) -> ViewLook:
+def _evaluate_view(job: SceneProblem, k: int, pair: Sequence[Any]) -> ViewLook:
     view = job.views[k]
     counts, reference = np.array(view.counts), np.array(view.reference, np.float64)
     residuals = []
@@ -144,15 +144,15 @@ def errors(job: SceneProblem, state: FitState) -> tuple[dict[str, np.ndarray], t
     stds, names, start = {}, [], 0
     for p, width in zip(job.chosen, widths, strict=True):
         part = course[:, start : start + width]
-        stds[p.key], drifts = _spread(part, job.scales[p.key])
-        drifts |= _one_way(paces[:, start : start + width])
+        stds[p.key], drifts = _batch_error(part, job.scales[p.key])
+        drifts |= _share_direction(paces[:, start : start + width])
         start += width
         if drifts:
             names.append(p.name)
     return stds, tuple(names)
 
 
-def _one_way(paces: np.ndarray) -> bool:
+def _share_direction(paces: np.ndarray) -> bool:
     """Whether the steps share a direction, beyond momentum-filtered noise."""
     if len(paces) < 2:
         return False
@@ -161,7 +161,7 @@ def _one_way(paces: np.ndarray) -> bool:
     return bool((np.abs(paces.mean(axis=0)) > np.maximum(PACE, 4 * error)).any())
 
 
-def _spread(course: np.ndarray, scale: float) -> tuple[np.ndarray, bool]:
+def _batch_error(course: np.ndarray, scale: float) -> tuple[np.ndarray, bool]:
     """Standard error of the mean over correlated steps, by batch means; and whether they drift."""
     if len(course) < 2 * BATCHES:
         return np.full(course.shape[1], np.nan), False

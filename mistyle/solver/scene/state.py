@@ -146,7 +146,7 @@ def prepare(
         )
     table = mi.traverse(scene)
     table.properties = {p.key: table.properties[p.key] for p in chosen}
-    free = _free(chosen, unknowns.only or {})
+    free = _free_masks(chosen, unknowns.only or {})
     scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
     quick, why = _fast(scene, chosen, views, loss or "log_srgb_l1", engine) if fast else (None, "it was not requested.")
     if loss is None:
@@ -175,7 +175,7 @@ def _way(quick: Any, engine: Any, why: str) -> str:
     return f"Gradients came from {str(engine).partition('[')[0]}, not from the fast path: {why}"
 
 
-def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+def _free_masks(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     """Masks of the free numbers."""
     free = {p.key: np.ones(p.shape, bool) for p in chosen}
     for name, mask in only.items():

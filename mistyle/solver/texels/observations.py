@@ -107,12 +107,12 @@ def collect_observations(
         camera = captures.cameras[group[0]]
         beams = [light for k in group for light in captures.lights[k] if isinstance(light, DELTA)]
         seen, corners = trace_gbuffer(traced, camera, beams), trace_gbuffer(traced, of_corners(camera), beams)
-        pure = _pure(camera, seen, corners)
+        pure = _unmixed_pixels(camera, seen, corners)
         visible = _visible(camera, seen, pure, (position, normal, size), options.facing)
         any_light, first = np.zeros(len(visible.texel), bool), 0
         for k in group:
             count = sum(isinstance(light, DELTA) for light in captures.lights[k])
-            lit = [_steady(seen.lit[j], corners.lit[j]) for j in range(first, first + count)]
+            lit = [_uniform_light(seen.lit[j], corners.lit[j]) for j in range(first, first + count)]
             first += count
             rgb, usable = captures.load(k)
             ids, values, bits, chosen, *place, share = _observe(rgb, usable, lit, soft[k], visible, options.move)
@@ -167,7 +167,7 @@ def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
 
 
-def _pure(camera: Camera, seen: GBuffer, corners: GBuffer) -> Bool[np.ndarray, "h w"]:
+def _unmixed_pixels(camera: Camera, seen: GBuffer, corners: GBuffer) -> Bool[np.ndarray, "h w"]:
     """Pixels whose corners show the same surface as their centre: no silhouette or crease crosses them."""
     p, n = seen.position, seen.normal
     away = camera.position.astype(np.float32) - p
@@ -193,7 +193,7 @@ def _corners(size: tuple[int, int]) -> list[tuple[slice, slice]]:
     return [np.s_[r : r + height, c : c + width] for r in (0, 1) for c in (0, 1)]
 
 
-def _steady(lit: Bool[np.ndarray, "h w"], corners: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, "h w"]:
+def _uniform_light(lit: Bool[np.ndarray, "h w"], corners: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, "h w"]:
     """1 where a pixel's centre and corners are all lit, 0 where none is, -1 where a shadow's edge crosses it."""
     count = lit.astype(np.int8)
     for corner in _corners(lit.shape):
@@ -259,7 +259,7 @@ def _observe(rgb, usable, lit, soft: bool, visible: VisibleTexels, move: float) 
             lit_state = state.ravel().take(corner)
             good[j] &= lit_state >= 0
             code[j] |= np.where(lit_state == 1, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
-    bits, u, v = _moved(good, code, x, y)
+    bits, u, v = _nearest_valid(good, code, x, y)
     moved = (u - x) ** 2 + (v - y) ** 2
     share = 1 / (1 + np.float32(MOVED) * moved)
     chosen = np.flatnonzero(good.any(axis=0) & (moved <= move**2) & ((bits != 0) | soft))
@@ -268,7 +268,7 @@ def _observe(rgb, usable, lit, soft: bool, visible: VisibleTexels, move: float) 
     return near[chosen], values, bits[chosen], chosen, u, v, share[chosen]
 
 
-def _moved(good: Bool[np.ndarray, "4 n"], code: UInt[np.ndarray, "4 n"], x, y) -> tuple[np.ndarray, ...]:
+def _nearest_valid(good: Bool[np.ndarray, "4 n"], code: UInt[np.ndarray, "4 n"], x, y) -> tuple[np.ndarray, ...]:
     """The light bits of the nearest `good` pixel of the four, and the position (u, v) nearest to (x, y) that needs only
     good pixels in the same light: all four, two side by side or stacked, or the nearest alone."""
     across, down = np.stack([x, 1 - x, x, 1 - x]), np.stack([y, y, 1 - y, 1 - y])

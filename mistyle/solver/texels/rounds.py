@@ -108,13 +108,13 @@ def another_round(
             solved.values, observed.seen
         )
 
-    solved = [tried(solution.values, 5, _nearest(solution.values))]
+    solved = [tried(solution.values, 5, _is_metal(solution.values))]
     if number < RESTARTS:
         for roughness in (None, 0.15, 0.4, 0.8):
             guess = mean.copy()
             if roughness is not None:
                 guess[:, ROUGHNESS] = roughness
-            solved.append(tried(guess, 8, _nearest(mean)))
+            solved.append(tried(guess, 8, _is_metal(mean)))
     return best(solved)
 
 
@@ -126,14 +126,14 @@ def best(solutions: Sequence[tuple[Solution, Float[np.ndarray, " t"]]]) -> Solut
         better = cost < least
         least = np.where(better, cost, least)
         names = [f.name for f in fields(Solution)]
-        result = Solution(**{n: _pick(better, getattr(candidate, n), getattr(result, n)) for n in names})
+        result = Solution(**{n: _select(better, getattr(candidate, n), getattr(result, n)) for n in names})
     return result
 
 
-def _pick(choice: Bool[np.ndarray, " t"], a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _select(choice: Bool[np.ndarray, " t"], a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(choice.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
 
-def _nearest(values: Values) -> Float[np.ndarray, " t"]:
+def _is_metal(values: Values) -> Float[np.ndarray, " t"]:
     """1 for metal, 0 for dielectric."""
     return (values[:, METALLIC] > 0.5).astype(np.float32)
