@@ -116,7 +116,7 @@ def bake(
     *,
     mesh: Mesh | None = None,
 ) -> Backprojection:
-    """`backproject`, `fill` and `stages.texels.pad` in one array: all of section 4.1.4 after the rasterisation.
+    """`backproject`, `fill` and `texels.pad` in one array: all of section 4.1.4 after the rasterisation.
 
     albedo is complete inside the islands and `padding` texels around them; known, view and seen are those of
     `backproject`.
@@ -328,7 +328,7 @@ def fill(baked: Backprojection, texels: Texels) -> Float[np.ndarray, "h w 3"]:
     and inside their own island; if an island has none, the nearest on the surface (3-D distance).
 
     The paper's distance transform leaks colours between islands that lie side by side in the atlas. Texels outside the
-    islands stay unchanged (`stages.texels.pad`). Nothing is filled if no view painted any texel.
+    islands stay unchanged (`texels.pad`). Nothing is filled if no view painted any texel.
     """
     albedo = memory.copied(baked.albedo)
     fill_in_place(albedo, baked.known, texels)

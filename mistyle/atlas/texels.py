@@ -252,7 +252,7 @@ def pad(values: Float[np.ndarray, "h w *c"], texels: Texels, padding: int) -> Fl
 def sharpen_in_place(values: Float[np.ndarray, "h w *c"], texels: Texels) -> None:
     """Sharpen values 0..1 so that bilinear lookups of covered texels best match their sampled function.
 
-    As `surface.style.for_bilinear`, along both axes: minus a twelfth of the second difference, within an island. For
+    As `exemplar.for_bilinear`, along both axes: minus a twelfth of the second difference, within an island. For
     point-sampled values only; area averages need no sharpening.
     """
     height, width = texels.covered.shape

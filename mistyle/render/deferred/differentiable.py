@@ -1,7 +1,7 @@
 """Public differentiable renderer: texture maps in, a noise-free picture out, gradients in torch and Dr.Jit.
 
-It shades the result of `deferred.trace`, traced once per camera: one ray through each pixel's centre, direct light with
-exact shadows. The reflectance is Mitsuba's `principled` in closed form (`render/deferred/bsdf.py`), so the picture
+It shades the result of `integrator.trace`, traced once per camera: one ray through each pixel's centre, direct light
+with exact shadows. The reflectance is Mitsuba's `principled` in closed form (`render/deferred/bsdf.py`), so the picture
 equals that of `mi.render` with the `direct` integrator. Without noise, finite differences validate its gradients.
 """
 

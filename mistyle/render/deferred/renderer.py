@@ -1,6 +1,6 @@
 """The differentiable renderer of the fits: known surface samples, known lights, one texture fetch, no noise.
 
-Nothing is traced while materials change: `hits.collect` stores each sample's geometry, and a picture is
+Nothing is traced while materials change: `image_samples.collect` stores each sample's geometry, and a picture is
 
     I_p = 1/S Σ_s Σ_l f(wi, wo_l; material at s) cos θ_l · strength_l · colour_l      (box filter over S samples)
 

@@ -3,7 +3,7 @@
 The sphere is divided into D cells of about equal importance, half by luminance and half by solid angle, and each cell
 into VARIANTS parts. A sample sees one part of every cell, and its neighbours see others. Their mean has the accuracy of
 D · VARIANTS directions, and the parts together preserve the light's energy exactly. Where a glossy lobe is narrower
-than the cells, the map is sampled instead (`shading.soft_light`). Everything is in world axes, NumPy only.
+than the cells, the map is sampled instead (`kernels.soft_light`). Everything is in world axes, NumPy only.
 """
 
 import heapq

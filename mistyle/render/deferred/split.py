@@ -3,7 +3,7 @@
 Dr.Jit replays a recorded function several times faster than it traces it, but no gradient flows through a replay. The
 computation is therefore split at the picture. A frozen forward renders it, torch gives the loss and dL/dI, and a frozen
 backward turns dL/dI into gradients of each pixel's own material. The reflectance is the closed form of
-`render/deferred/bsdf.py`, as in `render/deferred/renderer.py`; the sum over lights is that of `deferred.Deferred`, its
+`render/deferred/bsdf.py`, as in `render/deferred/renderer.py`; the sum over lights is that of `integrator.py`, its
 reference implementation.
 
 Materials are packed, 8 floats a pixel: albedo 3 (linear), normal 3 (tangent space, any length), roughness, metallic.
@@ -104,7 +104,7 @@ def _lights(wi: Any, directional: list[Any], ambient: Any) -> Iterator[tuple[Any
 
 
 def _image(terms: Callable, film: tuple, packed) -> Any:
-    """`film` is (wi, mask, directional lights, ambient light), as in `deferred.Lit`."""
+    """`film` is (wi, mask, directional lights, ambient light), as in `integrator.Lit`."""
     import drjit as dr
     import mitsuba as mi
 

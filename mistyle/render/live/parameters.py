@@ -68,7 +68,7 @@ class Parameter:
 def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
     """Every parameter of a live `mi.Scene` (or of any other Mitsuba object), in the order of `mi.traverse`.
 
-    `engine` is the integrator for the gradients (`scene_grad.ad_integrator`); None means `prb`.
+    `engine` is the integrator for the gradients (`gradients.ad_integrator`); None means `prb`.
     """
     import mitsuba as mi
 

@@ -53,9 +53,9 @@ def next_best_views(mesh: Mesh, settings: RigSettings, traced: Any = None) -> Pl
 
     Some view sees every point at a face-on weight of `settings.facing` or more, if any of the `settings.candidates`
     cameras about the mesh does. Neighbouring views overlap by `settings.overlap`. There are at most
-    `settings.most_views`. `traced` is a `render.draw.Tracer` of the mesh, built here by default. The surface is sampled
-    at SAMPLES points of equal area, so features smaller than a few of them may be missed. Raises InputRefused if no
-    candidate sees the mesh.
+    `settings.most_views`. `traced` is a `render.mitsuba.draw.Tracer` of the mesh, built here by default. The surface is
+    sampled at SAMPLES points of equal area, so features smaller than a few of them may be missed. Raises InputRefused
+    if no candidate sees the mesh.
     """
     from mistyle.render.mitsuba.draw import tracer
     from mistyle.render.mitsuba.visible import face_on

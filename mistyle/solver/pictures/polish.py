@@ -47,7 +47,7 @@ class Polished:
 class PolishSettings:
     """Settings of the refinement.
 
-    loss      a name of `scene_grad.LOSSES`
+    loss      a name of `gradients.LOSSES`
     rate      of Adam, on the albedo (see RATES)
     metallic  whether it moves too
     depth     path segments at most
@@ -78,7 +78,7 @@ def polish(
 
     Pixels are valid inside the picture's mask where the object covers them fully. Bytes are reproducible with one
     thread only: Mitsuba sums texture gradients in varying order. Roughness stays at or above
-    `scene_keys.ROUGHNESS_FLOOR`.
+    `parameters.ROUGHNESS_FLOOR`.
     """
     device.use()
     job = _Job(mesh, maps, captures, settings)

@@ -91,7 +91,7 @@ class DeferredRenderer:
         self.renderer = self._best_variant(scene, traced, captures, views, engine, kinds.pop())
 
     def gradients(self, values: Mapping[str, np.ndarray], k: int) -> tuple[float, dict[str, np.ndarray]]:
-        """Noise-free loss of camera k and its gradient by key, like `scene_grad.gradients`.
+        """Noise-free loss of camera k and its gradient by key, like `gradients.gradients`.
 
         Pixels beside the fitted materials do not contribute to the loss.
         """

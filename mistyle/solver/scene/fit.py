@@ -1,9 +1,9 @@
 """Fitting texture parameters of any Mitsuba scene to pictures of known cameras, through `prb` or another integrator.
 
 Nothing is assumed about the materials: any parameter whose plugin has gradients can be fitted, several at once. The
-few numbers of literals and colours use Gauss–Newton (`scene_newton`). Textures and attributes use Adam on the Laplacian
-pyramid (`pyramid.py`) with a falling rate; with noisy gradients the result is the mean of the last steps. Values stay
-in their ranges (`scene_keys.limits`). A result worse than its start is undone.
+few numbers of literals and colours use Gauss–Newton (`gauss_newton.py`). Textures and attributes use Adam on the
+Laplacian pyramid (`pyramid.py`) with a falling rate; with noisy gradients the result is the mean of the last steps.
+Values stay in their ranges (`parameters.limits`). A result worse than its start is undone.
 """
 
 import time

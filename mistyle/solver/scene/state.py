@@ -61,7 +61,7 @@ class SceneProblem:
     free: dict[str, np.ndarray]
     scales: dict[str, float]
     plan: FitPlan
-    fast: Any = None  # scene_fast.DeferredRenderer, if it matches the scene
+    fast: Any = None  # deferred.DeferredRenderer, if it matches the scene
     newton: bool = False  # Gauss–Newton instead of Adam
 
 
@@ -71,8 +71,8 @@ class FitState:
 
     start   the values before the first step
     tail    sums of the values over the last steps (Adam on noisy gradients: their mean is the result)
-    course  means of every parameter (`scene_result.brief`) after each of the last steps
-    paces   mean changes in the same steps (`scene_result.pace`)
+    course  means of every parameter (`result.brief`) after each of the last steps
+    paces   mean changes in the same steps (`result.pace`)
     """
 
     iteration: int

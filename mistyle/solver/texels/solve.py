@@ -41,7 +41,7 @@ class TexelEstimate:
 
     std            standard deviations under observations and priors
     data_weight    the data's share in a texel's tilt against its neighbours', 0..1
-    unconstrained  standard deviations under the observations alone, `recover_prior.NOTHING` without any
+    unconstrained  standard deviations under the observations alone, `prior.NOTHING` without any
     seen, views    number of pictures and of cameras that observed each texel in the light
     """
 
