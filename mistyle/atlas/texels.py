@@ -54,7 +54,7 @@ def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
     an edge belongs to exactly one of the two triangles. Where several faces cover a centre, the first one in order is
     used. UVs outside the unit square wrap (see core/asset.py). An island is a set of faces joined by points with equal
     position and UV; islands are numbered in face order. An island too thin to cover any centre takes the free texels at
-    its corners and face centres, each with the surface point there, so that it never shows the colours of a neighbour.
+    its corners and face centres, each with the surface point there. It therefore never shows a neighbour's colours.
 
     Raises InputRefused for UVs that are not finite or farther than one tile outside the square.
     """

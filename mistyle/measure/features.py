@@ -105,7 +105,7 @@ def _functions() -> tuple[Any, Any, Any]:
 
     class Rectified(torch.autograd.Function):
         """x (n, 8, h, w) over sqrt(2) -> rounded magnitude s = sqrt(x² + SOFTNESS² / 2), and the energy of the odd and
-        the even filter of each orientation, e = sqrt(2 (s_odd² + s_even²)), with half the rounding (n, 4, h, w)."""
+        the even filter of each orientation, e = sqrt(2 (s_odd² + s_even²)), (n, 4, h, w)."""
 
         @staticmethod
         def forward(ctx: Any, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

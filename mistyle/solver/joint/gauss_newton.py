@@ -7,8 +7,8 @@ that valley slowly. Gauss-Newton steps follow it at once. Around the current map
 
 Here b are the bilinear weights, averaged over the pixel's lit samples. D is the pixel's derivative by a change that all
 its texels share, from central differences of whole pictures. (D treats the samples of a pixel as equal. The pictures
-are exact, so the fixed point is exact up to that approximation.) With R the references and P the priors of
-`solver/smoothing.py`, whose variances are estimated in the same way, each step solves
+are exact, so the fixed point is exact up to that approximation.) R are the references. P are the priors of
+`solver/smoothing.py`, with variances estimated in the same way. Each step solves
 
     (B' D' W D B + P) d = B' D' W (R - I(x)) - P x
 

@@ -1,7 +1,7 @@
 """Noise-free gradients of a live Mitsuba scene by the deferred renderer (`render/deferred/renderer.py`).
 
-It applies where only points and directions light the scene, the integrator renders direct light only, films have a box
-filter, and the fitted parameters are maps (or literals) of plain `principled` materials on meshes. Other shapes cast
+All lights must be points or directions, the integrator must render direct light only, and films need a box filter.
+The fitted parameters must be maps (or literals) of plain `principled` materials on meshes. Other shapes cast
 shadows; pixels that see their materials are masked. Mitsuba does not expose some plugin settings (wrapping, shadowing
 of normal maps), so renders of both are compared. If they disagree, `prb` is used and a note gives the reason.
 """

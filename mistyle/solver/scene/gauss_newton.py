@@ -1,9 +1,9 @@
 """Gauss–Newton on the few numbers of a scene: literals and colours under a squared loss, from noisy renders.
 
-A round renders the picture's derivative J by every number (forward mode) at the values θ, then pictures I by other
-random numbers, and solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ W J. Φ is J without outliers: at the solution
-the expected I is R, so that any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds
-with the J of others, so it has no bias from J's noise.
+A round renders the picture's derivative J by every number (forward mode) at the values θ, then pictures I with other
+random numbers. It solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ W J. Φ is J without outliers. At the solution
+the expected I is R, so any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds with
+the J of others, so it has no bias from J's noise.
 
 The first rounds are short and approach the solution. The rest share the remaining steps and do not replace one another:
 the result is the mean of their solutions, and their disagreement its standard error.
