@@ -3,8 +3,8 @@
 With known geometry, cameras and delta lights, a texel's own observations determine its own unknowns
 x = (albedo r, g, b, tilt x, tilt y, roughness, metallic). No picture has to be rendered. Soft light is approximated by
 one directional light per cell of the sky; each cell widens the lobe by its own width. The reflectance is
-albedo · linear + constant of `render/deferred/bsdf.py`. With irradiance E and q = (tilt, roughness, metallic), the model
-of an observation is, per channel c,
+albedo · linear + constant of `render/deferred/bsdf.py`. With irradiance E and q = (tilt, roughness, metallic), the
+model of an observation is, per channel c,
 
     f_c(x) = sum over its lights of E_c (albedo_c linear(q) + constant(q))
 
