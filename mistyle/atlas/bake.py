@@ -1,4 +1,4 @@
-"""From views to the atlas (paper 4.1.4): which view sees a texel best, and which colour it shows there."""
+"""Baking views into the atlas (paper 4.1.4): view selection and colour per texel."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -16,20 +16,20 @@ from mistyle.core.view import View
 from mistyle.geometry.normals import area_vectors
 from mistyle.process import memory
 
-DEPTH_NOISE = 0.0005  # what depth maps may be off by: float32 through a file and another projection
-STEEP = 4.0  # depth per width of a surface seen at 76 degrees
-BAND = 64  # rows of a view handled at a time
-ROWS = 2**16  # texels handled at a time; their intermediate arrays then stay in the cache
+DEPTH_NOISE = 0.0005  # error of depth maps: float32 through a file and another projection
+STEEP = 4.0  # tan of the steepest view angle, 76 degrees
+BAND = 64  # rows of a view per task
+ROWS = 2**16  # texels per task; their intermediate arrays then fit the cache
 
 
 @dataclass(frozen=True)
 class Backprojection:
-    """What the views say about the atlas; zero, False, -1 and 0 where they say nothing.
+    """Baked atlas; zero, False, -1 and 0 where no view sees a texel.
 
-    albedo  linear Rec.709, as the views have it
+    albedo  linear Rec.709, from the views
     known   whether a view painted the texel
     view    the index of that view
-    seen    how many views could have painted it
+    seen    number of views that accept the texel
     """
 
     albedo: Float[np.ndarray, "h w 3"]
@@ -49,18 +49,18 @@ def backproject(
     """Paint every texel from the accepted view that faces it most: w = max(0, n . (c - P) / |c - P|), first of equals.
 
     The paper accepts a view when the projection is in bounds with z > 0, when the depth map max-pooled over 5x5 "to
-    handle silhouette boundaries" matches z within 0.05, and when the mask holds. Taken literally the pooled test lets a
-    texel hidden up to two pixels behind a silhouette take the colour of what hides it, and refuses a texel in front
-    when something farther begins beside it. Our reading keeps the number and the purpose apart:
+    handle silhouette boundaries" matches z within 0.05, and when the mask holds. Taken literally, the pooled test
+    paints a texel hidden up to two pixels behind a silhouette with the occluder's colour. It also rejects a texel in
+    front when something farther begins beside it. Our reading separates the threshold from its purpose:
 
-    - visibility: z agrees with the depth of the very pixel within 0.05, and more closely with the plane that continues
-      what the pixel sees (so that one of two sheets 0.01 apart does not paint the other), and the mask holds;
-    - silhouettes: pixels whose colour is a mixture (coverage below 1, or a depth step beside them) take the colour of
-      the nearest pure pixel of their own surface in the 5x5 window before anything is sampled;
-    - colour: bilinear over those of the four pixels that the mask holds and whose depth matches, weights renormalised.
+    - visibility: the mask holds, and z agrees with that pixel's own depth within 0.05. It agrees more closely with the
+      plane that continues the pixel's surface, so that one of two sheets 0.01 apart does not paint the other;
+    - silhouettes: pixels with mixed colours (coverage below 1, or a depth step beside them) take the colour of the
+      nearest pure pixel of their own surface in the 5x5 window before sampling;
+    - colour: bilinear over those of the four pixels inside the mask with matching depth, weights renormalised.
 
-    A texel whose normal, or (with `mesh`) whose face, turns away from a camera is never painted by it; the face counts
-    as turned where its corner normals point. Views may differ in size. The result does not depend on the thread count.
+    A view never paints a texel whose normal, or (with `mesh`) whose face, turns away from its camera; the face's front
+    is the side of its corner normals. Views may differ in size. The result does not depend on the thread count.
     """
     chosen, seen = accepted(views, texels, settings, lambda done: progress(0.7 * done), mesh=mesh)
     position = texels.position.reshape(-1, 3)
@@ -84,10 +84,10 @@ def accepted(
     *,
     mesh: Mesh | None = None,
 ) -> tuple[Int[np.ndarray, " t"], Int[np.ndarray, " t"]]:
-    """`backproject` without the colours: per texel, row by row, the view that would paint it (-1: none), and how many
-    views see it."""
+    """`backproject` without the colours: per texel, row by row, the view that would paint it (-1: none), and the number
+    of views that accept it."""
     if not views:
-        raise ValueError("there are no views to paint the atlas from; pass at least one")
+        raise ValueError("found no views to bake; expected at least one")
     towards = None if mesh is None else _faces_towards(mesh, [view.camera for view in views])
     tables = _depth_tables(views, settings)
     covered = texels.covered.reshape(-1)
@@ -116,7 +116,7 @@ def bake(
     *,
     mesh: Mesh | None = None,
 ) -> Backprojection:
-    """`backproject`, `fill` and `stages.texels.pad` in one array: the whole of section 4.1.4 after the rasterisation.
+    """`backproject`, `fill` and `texels.pad` in one array: all of section 4.1.4 after the rasterisation.
 
     albedo is complete inside the islands and `padding` texels around them; known, view and seen are those of
     `backproject`.
@@ -129,7 +129,7 @@ def bake(
 
 
 def _faces_towards(mesh: Mesh, cameras: Sequence[Camera]) -> Bool[np.ndarray, "c f"]:
-    """Which faces show each camera their front; the front is the side of the corner normals."""
+    """Faces that show each camera their front, the side of the corner normals."""
     n = area_vectors(mesh.positions, mesh.faces)
     side = np.sign(np.einsum("fi,fki->f", n, mesh.corner_normals, optimize=True))
     n *= side[:, None]
@@ -138,10 +138,10 @@ def _faces_towards(mesh: Mesh, cameras: Sequence[Camera]) -> Bool[np.ndarray, "c
 
 
 def _depth_tables(views: Sequence[View], settings: BakeSettings) -> list[Float[np.ndarray, "_ 4"]]:
-    """`_depth_band` over every view, with a frame of one pixel around it in which nothing is seen, row after row."""
+    """`_depth_band` over every view, row after row, with an empty frame of one pixel around it."""
     sizes = [(view.camera.size[0] + 2, view.camera.size[1] + 2) for view in views]
     starts = np.cumsum([0] + [h * w for h, w in sizes])
-    # One array for all: freed memory of this size goes back to the system, small pieces may not.
+    # One array for all: freed memory of this size returns to the system, small pieces may not.
     together = memory.empty((int(starts[-1]), 4))
     together.fill(-1)
     tables = [together[a:b] for a, b in zip(starts[:-1], starts[1:], strict=True)]
@@ -158,14 +158,15 @@ def _depth_tables(views: Sequence[View], settings: BakeSettings) -> list[Float[n
 
 
 def _depth_band(view: View, top: int, bottom: int, tolerance: float) -> Float[np.ndarray, "h w 4"]:
-    """The plane z = a + b x + c y (x, y in pixels) that continues what each pixel sees, and how far a texel's depth may
-    be from it: a, b, c, allowance; for the rows from top to bottom. Where the mask does not hold the allowance is -1.
+    """The plane z = a + b x + c y (x, y in pixels) that continues each pixel's surface, and the largest accepted
+    distance of a texel's depth from it: a, b, c, allowance; for the rows from top to bottom. The allowance is -1
+    outside the mask.
 
-    Of the steps to the two neighbours the smaller one is the surface's own, unless it is large too: then something else
-    lies on both sides. The plane leaves out curvature, hence a quarter of its steps is allowed, and a tenth of a
-    pixel's width. Steps and allowance together stay within the depth tolerance, or within what a surface seen at 76°
-    does across a pixel where pixels are so coarse (below about 256²) that this is more; half the depth bounds the
-    allowance, so that nothing behind the camera agrees.
+    The smaller one of the steps to the two neighbours belongs to the surface, unless it is large too: then other
+    surfaces lie on both sides. The plane ignores curvature, so the allowance is a quarter of its steps plus a tenth of
+    a pixel's width. Steps and allowance together stay within the depth tolerance. With coarse pixels (below about 256²)
+    the depth step of a surface seen at 76° across a pixel is larger and takes its place. Half the depth bounds the
+    allowance, so that no point behind the camera agrees.
     """
     first, last = max(top - 1, 0), min(bottom + 1, len(view.depth))
     depth, mask = view.depth[first:last], view.mask[first:last]
@@ -190,7 +191,7 @@ def _depth_band(view: View, top: int, bottom: int, tolerance: float) -> Float[np
 
 
 def _smaller(a: np.ndarray, b: np.ndarray, limit: np.ndarray) -> np.ndarray:
-    """Of two steps the one of smaller size; 0 where it reaches the limit or is not a number."""
+    """The smaller one of two steps; 0 if it reaches the limit or is not finite."""
     step = np.where(np.abs(a) < np.abs(b), a, b)
     step = np.where(np.isfinite(step), step, a)
     return np.where(np.abs(step) < limit, step, 0)
@@ -248,7 +249,7 @@ def _paint(
     position: Float[np.ndarray, "t 3"],
     settings: BakeSettings,
 ) -> None:
-    """Write the view's colours into the texels that chose it."""
+    """Write the view's colours into the texels that selected it."""
     if len(texel) == 0:
         return
     height, width = view.camera.size
@@ -259,7 +260,7 @@ def _paint(
     for start in range(0, len(texel), ROWS):
         part = texel[start : start + ROWS]
         x, y, z = _project(view.camera, np.ascontiguousarray(position.take(part, axis=0).T))
-        # What `_depth_band` may bridge between a pixel's centre and a texel in it.
+        # Most that `_depth_band` may bridge between a pixel's centre and a texel in it.
         tolerance = np.maximum(1.001 * settings.depth_tolerance, 1.5 * STEEP / view.camera.focal * z)
         albedo[part] = _fetch(pixels, width + 2, x + 1, y + 1, z, tolerance)
 
@@ -267,7 +268,7 @@ def _paint(
 def _fetch(pixels: Float[np.ndarray, "p 4"], width: int, x, y, z, tolerance) -> Float[np.ndarray, "n 3"]:
     """Bilinear colour over the pixels (rgb and depth, rows of `width`) whose depth matches.
 
-    The pixel that holds the projection weighs at least 1/4 and matches, since its view was accepted.
+    The pixel at the projection weighs at least 1/4 and matches, since its view was accepted.
     """
     low_x, low_y = np.floor(x - 0.5), np.floor(y - 0.5)
     tx, ty = x - 0.5 - low_x, y - 0.5 - low_y
@@ -291,9 +292,9 @@ def _fetch(pixels: Float[np.ndarray, "p 4"], width: int, x, y, z, tolerance) -> 
 def pure_colours(view: View, settings: BakeSettings) -> Float[np.ndarray, "h w 3"]:
     """The view's rgb with mixed pixels replaced by the nearest pure one of their own surface within the window.
 
-    Mixed is a masked pixel that the mesh covers in part, or whose depth lies off the line between its neighbours' by
-    more than the tolerance: one of them is another surface's. Where the window has no pure pixel of matching depth
-    (thin things) the colour stays, divided by coverage.
+    A masked pixel is mixed if the mesh covers it in part, or if its depth deviates from the line between its
+    neighbours' by more than the tolerance: one neighbour then belongs to another surface. If the window has no pure
+    pixel of matching depth (thin parts), the colour is divided by coverage instead.
     """
     depth = np.where(view.mask, view.depth, np.nan).astype(np.float32)
     bend = np.zeros(depth.shape, bool)
@@ -308,8 +309,8 @@ def pure_colours(view: View, settings: BakeSettings) -> Float[np.ndarray, "h w 3
         r, c = rows[left] + dy, columns[left] + dx
         inside = (r >= 0) & (c >= 0) & (r < depth.shape[0]) & (c < depth.shape[1])
         r, c = np.where(inside, r, 0), np.where(inside, c, 0)
-        here = depth[rows[left], columns[left]]
-        good = inside & pure[r, c] & (np.abs(depth[r, c] - here) <= settings.depth_tolerance)
+        centre = depth[rows[left], columns[left]]
+        good = inside & pure[r, c] & (np.abs(depth[r, c] - centre) <= settings.depth_tolerance)
         rgb[rows[left[good]], columns[left[good]]] = view.rgb[r[good], c[good]]
         left = left[~good]
     rgb[rows[left], columns[left]] /= np.clip(view.coverage[rows[left], columns[left]], 0.1, 1)[:, None]
@@ -317,17 +318,17 @@ def pure_colours(view: View, settings: BakeSettings) -> Float[np.ndarray, "h w 3
 
 
 def _offsets(window: int) -> list[tuple[int, int]]:
-    """The offsets of a window around its middle, nearest first, the middle left out."""
+    """The offsets of a window around its centre, nearest first, without the centre."""
     reach = range(-(window // 2), window // 2 + 1)
     return sorted(((y, x) for y in reach for x in reach if (y, x) != (0, 0)), key=lambda o: (o[0] ** 2 + o[1] ** 2, o))
 
 
 def fill(baked: Backprojection, texels: Texels) -> Float[np.ndarray, "h w 3"]:
     """Albedo with every covered texel coloured: unpainted ones take the nearest painted texel's colour, in the atlas
-    and inside their own island; where an island has none, the nearest on the surface (3-D distance).
+    and inside their own island; if an island has none, the nearest on the surface (3-D distance).
 
     The paper's distance transform leaks colours between islands that lie side by side in the atlas. Texels outside the
-    islands are not touched (`stages.texels.pad`). Nothing is filled where no view painted anything at all.
+    islands stay unchanged (`texels.pad`). Nothing is filled if no view painted any texel.
     """
     albedo = memory.copied(baked.albedo)
     fill_in_place(albedo, baked.known, texels)

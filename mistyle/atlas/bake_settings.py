@@ -1,10 +1,10 @@
-"""What a user may choose about painting texels from views."""
+"""User settings of baking views into texels."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
 
 class BakeSettings(BaseModel):
-    """When a view may paint a texel (paper 4.1.4)."""
+    """Acceptance of a view for a texel (paper 4.1.4)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -12,5 +12,8 @@ class BakeSettings(BaseModel):
         default=0.05, gt=0, le=1, description="largest difference between a texel's and the view's depth"
     )
     window: int = Field(
-        default=5, ge=1, le=31, description="pixels across in which a silhouette pixel looks for its pure colour"
+        default=5,
+        ge=1,
+        le=31,
+        description="side in pixels of the window in which a silhouette pixel takes its pure colour",
     )

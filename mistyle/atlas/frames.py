@@ -1,8 +1,8 @@
-"""Tangent frames of texels, and normal maps turned from one kind of frame into another.
+"""Tangent frames of texels, and conversion of normal maps between frames.
 
-A job keeps its normals in the MikkTSpace frame, as glTF and every engine do. Mitsuba 3.9's own `normalmap` shades in
-a frame of its own: s = dp/du of the face, made perpendicular to the interpolated normal, t = n x s, whatever the
-chart's handedness. A map for Mitsuba alone is therefore turned, texel by texel, from one into the other.
+A job stores its normals in the MikkTSpace frame, as glTF and every engine do. Mitsuba 3.9's own `normalmap` shades in
+another frame: s = dp/du of the face, made perpendicular to the interpolated normal, t = n x s, whatever the chart's
+handedness. A map for Mitsuba alone is therefore converted texel by texel.
 """
 
 import numpy as np
@@ -14,9 +14,9 @@ from mistyle.geometry.tangents import corner_tangents
 
 
 def mitsuba_normals(mesh: Mesh, maps: Maps, texels: Texels) -> Float[np.ndarray, "h w 3"]:
-    """The MikkTSpace normal map of a texture set for Mitsuba 3.9's `normalmap`; uncovered texels stay as they are.
+    """The MikkTSpace normal map of a texture set for Mitsuba 3.9's `normalmap`; uncovered texels stay unchanged.
 
-    Exact at texel centres; between them Mitsuba interpolates vectors of what may be two faces' frames.
+    Exact at texel centres; between them Mitsuba interpolates vectors that may belong to two faces' frames.
     """
     at = texels.covered
     place = texels.face[at], texels.position[at], texels.normal[at]
@@ -38,7 +38,7 @@ def texel_frames(
 ) -> Float[np.ndarray, "t 3 3"]:
     """Tangent, bitangent and normal at surface points, as `render/deferred/integrator.py` builds them at samples.
 
-    With `tangents` (MikkTSpace, per corner) the interpolated tangent made perpendicular to the normal; without them
+    With `tangents` (MikkTSpace, per corner), the interpolated tangent made perpendicular to the normal; without them
     Mitsuba's own frame, the face's dp/du made perpendicular.
     """
     if tangents is None:
@@ -58,7 +58,7 @@ def texel_frames(
 
 
 def uv_derivatives(mesh: Mesh) -> Float[np.ndarray, "f 2 3"]:
-    """dp/du and dp/dv of every face, in the mesh's unit; those of a face without area in UV only have a direction."""
+    """dp/du and dp/dv of every face, in the mesh's unit; faces without UV area have only a direction."""
     p, uv = mesh.positions[mesh.faces].astype(np.float64), mesh.corner_uvs.astype(np.float64)
     e1, e2, d1, d2 = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0], uv[:, 1] - uv[:, 0], uv[:, 2] - uv[:, 0]
     area = d1[:, :1] * d2[:, 1:] - d1[:, 1:] * d2[:, :1]

@@ -1,4 +1,4 @@
-"""Filling what is missing: the nearest texel of the same island, else the nearest on the surface."""
+"""Gap filling: the nearest texel of the same island, else the nearest on the surface."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -7,12 +7,12 @@ from mistyle.atlas.texels import threaded
 from mistyle.core.image import nearest
 from mistyle.core.maps import Texels
 
-NEIGHBOURS_3D = 1_000_000  # known texels that a search across islands looks through at most
+NEIGHBOURS_3D = 1_000_000  # most known texels in a search across islands
 
 
 def fill_in_place(albedo: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], texels: Texels) -> None:
-    """Give every covered texel that is not known the value of the nearest known one of its island, or, where the island
-    has none, of the nearest on the surface. Nothing is filled where nothing is known.
+    """Give every covered unknown texel the value of the nearest known one of its island, or, if the island has none, of
+    the nearest on the surface. Nothing is filled if no texel is known.
     """
     hole = texels.covered & ~known
     known = known & texels.covered
@@ -24,39 +24,39 @@ def fill_in_place(albedo: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h
     def work(k: int) -> None:
         island, box = boxes[k]
         own = texels.island[box] == island
-        wanted, offered = own & hole[box], own & known[box]
+        missing, offered = own & hole[box], own & known[box]
         if offered.any():
-            index, part = nearest(offered)[0][wanted], albedo[box]
-            part[wanted] = part[np.unravel_index(index, own.shape)]
+            index, part = nearest(offered)[0][missing], albedo[box]
+            part[missing] = part[np.unravel_index(index, own.shape)]
         else:
-            rows, columns = np.nonzero(wanted)
+            rows, columns = np.nonzero(missing)
             lost.append((rows + box[0].start) * hole.shape[1] + columns + box[1].start)
 
     threaded(work, len(boxes))
     if lost:
-        wanted = np.concatenate(lost)
-        source = nearest_in_space(known.reshape(-1), texels.position.reshape(-1, 3), wanted)
+        missing = np.concatenate(lost)
+        source = nearest_in_space(known.reshape(-1), texels.position.reshape(-1, 3), missing)
         flat = albedo.reshape(-1, 3)
-        flat[wanted] = flat[source]
+        flat[missing] = flat[source]
 
 
 def nearest_in_space(
-    known: Bool[np.ndarray, " t"], position: Float[np.ndarray, "t 3"], wanted: Int[np.ndarray, " n"]
+    known: Bool[np.ndarray, " t"], position: Float[np.ndarray, "t 3"], targets: Int[np.ndarray, " n"]
 ) -> Int[np.ndarray, " n"]:
-    """The known texel nearest in space; with more than NEIGHBOURS_3D of them every k-th is looked at."""
+    """The known texel nearest in space; with more than NEIGHBOURS_3D of them, among every k-th."""
     from scipy.spatial import KDTree
 
     seeds = np.flatnonzero(known)
     seeds = seeds[:: -(-len(seeds) // NEIGHBOURS_3D)]
     tree = KDTree(position[seeds], balanced_tree=False, compact_nodes=False)
-    return seeds[tree.query(position[wanted])[1]]
+    return seeds[tree.query(position[targets])[1]]
 
 
 def island_boxes(
-    island: Int[np.ndarray, "h w"], wanted: Int[np.ndarray, " n"]
+    island: Int[np.ndarray, "h w"], numbers: Int[np.ndarray, " n"]
 ) -> list[tuple[int, tuple[slice, slice]]]:
-    """The wanted islands that have texels, each with the rectangle of the atlas that holds it."""
+    """The non-empty ones of the given islands, each with its bounding rectangle in the atlas."""
     from scipy.ndimage import find_objects
 
-    found = find_objects(island + 1)
-    return [(int(k), found[k]) for k in wanted if k < len(found) and found[k] is not None]
+    slices = find_objects(island + 1)
+    return [(int(k), slices[k]) for k in numbers if k < len(slices) and slices[k] is not None]

@@ -1,8 +1,8 @@
-"""Which texels are neighbours on the surface: in the grid of the atlas, and across the seams of its charts.
+"""Neighbours of texels on the surface: in the grid of the atlas, and across the seams of its charts.
 
-A chart's border is no border of the surface. Where a texel has no neighbour of its island on one side, the surface is
-followed by one texel's width in that direction, and the texel whose middle lies nearest to there takes that place.
-Charts often end where the material does, too: `weighted_seams` finds out where, as far as values are known.
+A chart's border is not a border of the surface. Where a texel has no neighbour of its island on one side, the surface
+is followed by one texel's width in that direction. The texel whose centre is nearest to that point is linked.
+Charts often end at material borders, too: `weighted_seams` detects these from the values.
 """
 
 from collections.abc import Iterable
@@ -16,19 +16,19 @@ from mistyle.atlas.texels import beside
 from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 
-STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns to the texel on the right, left, below and above
-NEAR = 1.0  # sides of a texel between where the surface goes on and the middle of the texel that is taken for it
-OTHER_SIDE = -0.5  # cosine between normals below which that is the other side of something thin
-BESIDE = 2  # rows and columns around a texel within which its own island is no seam away
-CANDIDATES = 8  # texels looked at for each
+STEPS = ((0, 1), (0, -1), (1, 0), (-1, 0))  # rows and columns to the right, left, lower and upper texel
+NEAR = 1.0  # largest distance of the linked texel's centre from the extrapolated point, in texel sides
+OTHER_SIDE = -0.5  # cosine between normals below which a texel is on the other side of a thin part
+BESIDE = 2  # rows and columns around a texel within which its own island is not across a seam
+CANDIDATES = 8  # nearest texels tried for each link
 
 Grid = Float[np.ndarray, "h w"]
 
 
 @dataclass(frozen=True)
 class Seam:
-    """Texels of one set (flat indices, each once) and those that stand in for their neighbours in one direction;
-    `share` is how much they are believed to, 0..1."""
+    """Texels of one set (flat indices, each once) and the texels linked as their neighbours in one direction; `share`
+    is the link's weight, 0..1."""
 
     here: Int[np.ndarray, " n"]
     there: Int[np.ndarray, " n"]
@@ -37,8 +37,8 @@ class Seam:
 
 @dataclass(frozen=True)
 class Links:
-    """The neighbours in one set: whether a texel and the one right of it, or below it, share an island; and one seam
-    for each of STEPS."""
+    """The neighbours in one set: whether a texel and its right or lower one share an island, and one seam for each of
+    STEPS."""
 
     right: Bool[np.ndarray, "h v"]
     below: Bool[np.ndarray, "u w"]
@@ -59,13 +59,14 @@ def of_islands(island: Int[np.ndarray, "h w"]) -> Links:
 
 
 def within(among: Links) -> Links:
-    """The same without seams."""
+    """The links without seams."""
     return replace(among, seams=(NONE, NONE, NONE, NONE))
 
 
 def weighted_seams(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
-    """The same with seams believed as far as the surface seems to go on there: half where any of `fields` (values and
-    their standard deviations) jumps by twice what these and the mean difference of neighbours in the grid let expect.
+    """The links with seams weighted by continuity. The weight is a half where any of `fields` (values and their
+    standard deviations) jumps by twice its expected difference, from these and the mean difference of neighbours in the
+    grid.
     """
     worst = [np.zeros(len(seam.here), np.float32) for seam in among.seams]
     for values, spread in fields:
@@ -82,8 +83,8 @@ def weighted_seams(among: Links, fields: Iterable[tuple[Grid, Grid]]) -> Links:
 
 
 def links(mesh: Mesh, texels: Texels) -> Links:
-    """The neighbours. Surfaces that only come near each other, within NEAR, count as one; charts of other sets do not
-    count."""
+    """The links of a mesh's texels. Separate surfaces within NEAR of each other are linked too; charts of other sets
+    are not."""
     return replace(of_islands(texels.island), seams=_seams(mesh, texels))
 
 
@@ -96,7 +97,7 @@ def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
     position, normal = texels.position.reshape(-1, 3)[at], texels.normal.reshape(-1, 3)[at]
     own, island = texels.island.ravel()[at], np.pad(texels.island, 1, constant_values=-1)
     row, column = np.divmod(at, texels.covered.shape[1])
-    sides, tree = _sides(mesh, texels.covered.shape)[texels.face.ravel()[at]], KDTree(position)
+    sides, tree = _texel_steps(mesh, texels.covered.shape)[texels.face.ravel()[at]], KDTree(position)
     most = min(CANDIDATES, len(at))
 
     def across(down: int, right: int) -> Seam:
@@ -114,6 +115,6 @@ def _seams(mesh: Mesh, texels: Texels) -> tuple[Seam, Seam, Seam, Seam]:
     return right, left, below, above
 
 
-def _sides(mesh: Mesh, size: tuple[int, ...]) -> Float[np.ndarray, "f 2 3"]:
-    """Where a step of one texel to the right, and one down, leads on every face."""
+def _texel_steps(mesh: Mesh, size: tuple[int, ...]) -> Float[np.ndarray, "f 2 3"]:
+    """The step on the surface of one texel to the right, and one down, on every face."""
     return (uv_derivatives(mesh) / np.array([[size[1]], [-size[0]]])).astype(np.float32)

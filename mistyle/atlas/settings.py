@@ -1,4 +1,4 @@
-"""What a user may choose about the texture sets."""
+"""User settings of the texture sets."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -9,4 +9,4 @@ class AtlasSettings(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     size: int = Field(default=2048, ge=16, le=16384, description="texels along each side of every texture set")
-    padding: int = Field(default=16, ge=0, le=1024, description="texels by which islands are continued outwards")
+    padding: int = Field(default=16, ge=0, le=1024, description="texels by which islands are extended outwards")

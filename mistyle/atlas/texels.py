@@ -1,8 +1,8 @@
-"""The atlas (paper 4.1.4): where on the surface every texel lies, the maps to start from, and padding around islands.
+"""The atlas (paper 4.1.4): surface point of every texel, initial maps, and padding around islands.
 
 A texel (row r, column c) of a `size` x `size` map has its centre at u = (c + 0.5) / size, v = 1 - (r + 0.5) / size.
-The paper maps rows as r = (1 - v) H and says that glTF puts (0, 0) at the bottom left; v points up here in memory and
-the row formula holds, but glTF files have their origin at the top left (glTF 2.0, 3.8.4): the writers turn it.
+The paper maps rows as r = (1 - v) H and states that glTF puts (0, 0) at the bottom left. In memory v points up and the
+row formula holds, but glTF files have their origin at the top left (glTF 2.0, 3.8.4): the writers flip it.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -24,12 +24,12 @@ from mistyle.geometry.uvs import islands
 from mistyle.process import memory
 from mistyle.process.cores import cores
 
-ROWS = 2**17  # texels handled at a time; the intermediate arrays then stay in the cache
-BAND_TEXELS = 2**20  # and where only the temporaries of large atlases count
+ROWS = 2**17  # texels per task; the intermediate arrays then fit the cache
+BAND_TEXELS = 2**20  # texels per band where only the memory of temporaries matters
 
 
 def bands(height: int, width: int, count: int = BAND_TEXELS) -> Iterator[slice]:
-    """The rows of a map in pieces of about `count` texels, for what works texel by texel: temporaries stay small."""
+    """Row ranges of a map with about `count` texels each, which bound the temporaries of texelwise work."""
     step = max(1, count // max(width, 1))
     return (slice(top, min(top + step, height)) for top in range(0, height, step))
 
@@ -42,7 +42,7 @@ def threaded(work: Callable[[int], None], count: int, progress: Callable[[float]
 
 
 def beside(island: Int[np.ndarray, "h w"]) -> tuple[Bool[np.ndarray, "h v"], Bool[np.ndarray, "u w"]]:
-    """Whether a texel and the one right of it, and the one below it, lie in one UV island (v = w - 1, u = h - 1)."""
+    """Whether a texel shares its UV island with the right one, and with the lower one (v = w - 1, u = h - 1)."""
     inside = island >= 0
     return (island[:, :-1] == island[:, 1:]) & inside[:, 1:], (island[:-1] == island[1:]) & inside[1:]
 
@@ -51,11 +51,10 @@ def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
     """Position, normal, island and face of every texel of texture set `part` whose centre a UV triangle covers.
 
     P = sum l_i v_i and n = normalised sum l_i n_i with the barycentric coordinates l of the texel's centre. A centre on
-    an edge belongs to exactly one of the two triangles; where several faces cover a centre the first one in order
-    has it; UVs outside the unit square wrap (see core/asset.py). An island is a set of faces joined by points with
-    equal position and UV; islands are numbered in face order. An island too thin to cover any centre takes the free
-    texels that its corners and face middles fall into, each with the surface point found there, so that it never has
-    to show the colours of a neighbour.
+    an edge belongs to exactly one of the two triangles. Where several faces cover a centre, the first one in order is
+    used. UVs outside the unit square wrap (see core/asset.py). An island is a set of faces joined by points with equal
+    position and UV; islands are numbered in face order. An island too thin to cover any centre takes the free texels at
+    its corners and face centres, each with the surface point there. It therefore never shows a neighbour's colours.
 
     Raises InputRefused for UVs that are not finite or farther than one tile outside the square.
     """
@@ -63,8 +62,8 @@ def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
     uv = mesh.corner_uvs[chosen].astype(np.float64)
     if not np.isfinite(uv).all() or (uv.size and (uv.min() < -1 or uv.max() > 2)):
         raise InputRefused(
-            f"texture set '{mesh.parts[part]}': its UVs reach from {uv.min():.3g} to {uv.max():.3g}, they must"
-            " lie within one tile of the unit square; unwrap the mesh anew with --uv new"
+            f"texture set '{mesh.parts[part]}': its UVs reach from {uv.min():.3g} to {uv.max():.3g}, expected"
+            " values within one tile of the unit square; unwrap the mesh again with --uv new"
         )
     corners = np.stack([uv[..., 0] * size, (1 - uv[..., 1]) * size], axis=-1)
     local = np.full(size * size, -1, np.int32)
@@ -72,7 +71,7 @@ def rasterise(mesh: Mesh, part: int, size: int) -> Texels:
     for face, texel in fragment_pieces(corners, size):
         drawn[face] = True
         free = local[texel] < 0
-        # Where faces share a texel the last one written stays: writing backwards leaves it to the first.
+        # Faces that share a texel overwrite each other; writing backwards keeps the first.
         local[texel[free][::-1]] = face[free][::-1]
     island = islands(same_points(mesh.positions)[mesh.faces[chosen]], mesh.corner_uvs[chosen])
     _claim_slivers(local, corners, drawn, island, size)
@@ -86,7 +85,7 @@ def _claim_slivers(
     island: Int[np.ndarray, " f"],
     size: int,
 ) -> None:
-    """Give islands of which nothing was drawn the free texels under their corners and face middles."""
+    """Give islands without covered texels the free texels under their corners and face centres."""
     has = np.zeros(int(island.max(initial=-1)) + 1, bool)
     has[island[drawn]] = True
     faces = np.flatnonzero(~has[island])[::-1]
@@ -105,7 +104,7 @@ def _interpolate(
     island: Int[np.ndarray, " f"],
     size: int,
 ) -> Texels:
-    """The barycentric interpolation, rows after rows; `local` holds indices into `chosen`."""
+    """The barycentric interpolation, row by row; `local` holds indices into `chosen`."""
     frame = _frames(corners)
     vertices = np.concatenate(
         [mesh.positions[mesh.faces[chosen]], mesh.corner_normals[chosen]], axis=-1, dtype=np.float32
@@ -154,7 +153,7 @@ def _frames(corners: Float[np.ndarray, "f 3 2"]) -> Float[np.ndarray, "f 6"]:
 
 def _weights(frame, face, x, y, wraps, size) -> list[Float[np.ndarray, " n"]]:
     """Barycentric coordinates of the points (x, y) in their faces, clamped to the triangle (which only matters for
-    slivers); a face that reaches outside the square is tried in the nine tiles around it."""
+    slivers); a face that extends outside the square is tried in the nine tiles around it."""
     m = frame.take(face, axis=0)
     dx, dy = x - m[:, 0], y - m[:, 1]
     l1, l2 = m[:, 2] * dx + m[:, 3] * dy, m[:, 4] * dx + m[:, 5] * dy
@@ -186,7 +185,7 @@ def corner_weights(
     height, width = texels.covered.shape
     point = np.stack([(columns + 0.5) / width, 1 - (rows + 0.5) / height], axis=1)
     uvs = mesh.corner_uvs[face].astype(np.float64)
-    # UVs count modulo 1: a face that crosses the border paints texels on the other side of the square.
+    # UVs are modulo 1: a face that crosses the border covers texels on the other side of the square.
     point += np.rint((uvs.min(axis=1) + uvs.max(axis=1)) / 2 - point)
     return rows, columns, face, _barycentric(uvs, point)
 
@@ -207,7 +206,7 @@ def start_maps(material: Material, texels: Texels, size: int, metallic: Literal[
     """The material's own maps at the atlas's size, factors applied; flat where it has none (paper 4.2 starts there).
 
     Larger pictures are averaged over each texel's area, smaller ones interpolated, both as repeating textures; normals
-    are made unit length again. `known` is False everywhere: nothing has been painted yet. `texels` only ties the size.
+    are renormalised. `known` is False everywhere, since nothing is painted yet. `texels` only sets the size.
     """
     if texels.covered.shape != (size, size):
         raise ValueError(f"the atlas has {texels.covered.shape} texels, not {size} x {size}")
@@ -241,9 +240,9 @@ def _resampled(picture: np.ndarray | None, factor: np.ndarray | float, size: int
 def pad(values: Float[np.ndarray, "h w *c"], texels: Texels, padding: int) -> Float[np.ndarray, "h w *c"]:
     """Continue islands outwards: every texel within `padding` texels of a covered one takes the nearest one's values.
 
-    Covered texels and those clearly farther away keep what they have (distances are those of `core.image.nearest`, and
-    the ring is never narrower than asked for). Filtered look-ups and mip levels near an island's border then do not
-    meet foreign colours (Blender's bake calls this its margin).
+    Covered texels and clearly farther ones keep their values (distances are those of `core.image.nearest`, and the ring
+    is never narrower than `padding`). Filtered look-ups and mip levels near an island's border then do not mix in
+    foreign colours (Blender's bake calls this its margin).
     """
     result = memory.copied(values)
     pad_in_place([result], texels, padding)
@@ -251,13 +250,13 @@ def pad(values: Float[np.ndarray, "h w *c"], texels: Texels, padding: int) -> Fl
 
 
 def sharpen_in_place(values: Float[np.ndarray, "h w *c"], texels: Texels) -> None:
-    """Make bilinear lookups of covered texels, of values 0..1, come nearest to what the texels were sampled from.
+    """Sharpen values 0..1 so that bilinear lookups of covered texels best match their sampled function.
 
-    As `surface.style.for_bilinear`, along both axes: less a twelfth of the second difference, within an island. For
-    values that were looked up texel by texel; what is averaged over texels needs none of it.
+    As `exemplar.for_bilinear`, along both axes: minus a twelfth of the second difference, within an island. For
+    point-sampled values only; area averages need no sharpening.
     """
     height, width = texels.covered.shape
-    above = None  # the last row of the band before, as it was
+    above = None  # the original last row of the previous band
     for rows in bands(height, width):
         wide = slice(max(rows.start - 1, 0), min(rows.stop + 1, height))
         was = values[wide].reshape(wide.stop - wide.start, width, -1).copy()
@@ -265,19 +264,19 @@ def sharpen_in_place(values: Float[np.ndarray, "h w *c"], texels: Texels) -> Non
             was[0] = above
         above = was[rows.stop - 1 - wide.start].copy()
         island, sharp = texels.island[wide], was.copy()
-        for one, other in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
-            joined = (island[one] == island[other])[..., None]
-            step = np.where(joined, was[other] - was[one], 0) / 12
+        for one, following in ((np.s_[:-1], np.s_[1:]), (np.s_[:, :-1], np.s_[:, 1:])):
+            joined = (island[one] == island[following])[..., None]
+            step = np.where(joined, was[following] - was[one], 0) / 12
             sharp[one] -= step
-            sharp[other] += step
-        here = texels.covered[rows]
+            sharp[following] += step
+        covered = texels.covered[rows]
         inner = sharp[rows.start - wide.start : rows.stop - wide.start]
-        values[rows][here] = np.clip(inner[here], 0, 1).reshape(-1, *values.shape[2:])
+        values[rows][covered] = np.clip(inner[covered], 0, 1).reshape(-1, *values.shape[2:])
 
 
 def pad_maps(maps: Maps, texels: Texels, padding: int, own: int = 0) -> Maps:
-    """`pad` for albedo, normal, roughness and metallic, with one search for the nearest texels. So many as `own` around
-    each island count as its own: they keep their values, and what lies beyond takes those."""
+    """`pad` for albedo, normal, roughness and metallic, with one search for the nearest texels. A ring of `own` texels
+    around each island counts as its own: these keep their values, and texels beyond take them."""
     arrays = {name: memory.copied(getattr(maps, name)) for name in ("albedo", "normal", "roughness", "metallic")}
     pad_in_place(list(arrays.values()), texels, padding, own)
     return replace(maps, **arrays)

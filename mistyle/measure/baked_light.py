@@ -1,7 +1,7 @@
-"""How much light an albedo holds: does it follow the direction of the surface, or how open the surface lies?
+"""Baked light in an albedo: dependence on the surface's direction and on its openness.
 
-An albedo without light in it has the same mean above and below, and is not correlated with the normal or with
-ambient occlusion. Pure functions of surface samples (texels, points), each with the area that it stands for.
+An albedo without baked light has the same mean above and below, and is not correlated with the normal or with ambient
+occlusion. Pure functions of surface samples (texels, points), each with its area.
 """
 
 from dataclasses import dataclass
@@ -11,18 +11,18 @@ from jaxtyping import Float
 
 from mistyle.core.image import luminance
 
-STEEP = 0.5  # height of the normal from which a sample faces up, and below minus which it faces down
-DARKEST = 1e-3  # linear luminance that the logarithm takes for black: a little more than 8-bit sRGB can tell from 0
-LEAST_SHARE = 1e-3  # share of the area that must face up, and down, for a ratio
-LEAST_SPREAD = 1e-6  # standard deviation under which a quantity counts as constant: nothing correlates with it
+STEEP = 0.5  # a sample faces up if its normal's y is above this, and down if it is below the negative
+DARKEST = 1e-3  # least linear luminance in the logarithm: slightly above the first step of 8-bit sRGB
+LEAST_SHARE = 1e-3  # least share of the area that faces up, and down, for a ratio
+LEAST_SPREAD = 1e-6  # standard deviation below which a quantity is constant and has correlation 0
 
 
 @dataclass(frozen=True)
 class BakedLight:
-    """What an albedo says about light.
+    """Indicators of baked light in an albedo.
 
-    ratio       mean luminance facing up over mean luminance facing down; 1 is no light from above. None where too
-                little of the surface faces one of them
+    ratio       mean luminance facing up over mean luminance facing down; 1 without light from above. None if too little
+                of the surface faces one of them
     x, y, z     correlation (-1..1) of log luminance with that axis of the normal
     openness    the same with the share of open sky
     """
@@ -35,7 +35,7 @@ class BakedLight:
 
     @property
     def strongest(self) -> float:
-        """The largest of the four correlations, without its sign."""
+        """The largest absolute value of the four correlations."""
         return max(abs(value) for value in (self.x, self.y, self.z, self.openness))
 
 
@@ -47,8 +47,8 @@ def baked_light(
 ) -> BakedLight:
     """Light in an albedo (linear Rec.709) of samples with unit normals (Y up), openness 0..1 and area.
 
-    Means and correlations are weighted by area. A painting may well be darker on one side: what one object shows is a
-    chance, what many styles show in the mean is light.
+    Means and correlations are weighted by area. One painting may be darker on one side by chance; only the mean over
+    many styles indicates baked light.
     """
     light = luminance(albedo).astype(np.float64)
     logarithm = np.log(np.maximum(light, DARKEST))
@@ -84,9 +84,9 @@ def correlation(a: Float[np.ndarray, " n"], b: Float[np.ndarray, " n"], weight: 
 
 
 def texel_areas(faces_of_texels: np.ndarray, face_areas: Float[np.ndarray, " f"]) -> Float[np.ndarray, " n"]:
-    """The surface that each texel (n; the face under it) stands for: a face's area shared among its texels.
+    """The surface area of each texel (n; the face under it): a face's area divided among its texels.
 
-    Faces too small for a texel stand for nothing.
+    Faces too small for a texel are omitted.
     """
     count = np.bincount(faces_of_texels, minlength=len(face_areas))
     return (face_areas / np.maximum(count, 1))[faces_of_texels]

@@ -1,4 +1,4 @@
-"""CIELAB and CIE Delta E 2000: how far two colours are from one another for the eye."""
+"""CIELAB and CIE Delta E 2000, perceptual colour differences."""
 
 import warnings
 

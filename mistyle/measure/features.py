@@ -1,8 +1,8 @@
 """Picture → feature maps: an embedded filter bank that needs no weights, or VGG-19 from the user's file.
 
 A feature extractor is a function: pictures (n, c, h, w), sRGB-encoded 0..1, c = 1 (grey) or 3, to a list of maps
-(n, k, h', w'), finest first. The filter bank takes both; VGG repeats a grey channel three times. All of them are
-differentiable and none keeps state.
+(n, k, h', w'), finest first. The filter bank accepts both; VGG repeats a grey channel three times. All of them are
+differentiable and stateless.
 """
 
 import math
@@ -25,7 +25,7 @@ ORIENTATIONS = 4
 # Below this response (in sRGB units per unit of contrast) the rectifier passes both signs, so that a picture
 # without detail still has a gradient towards detail of either polarity.
 SOFTNESS = 0.02
-# Blue, orange and green-magenta contrasts beside luma: fixed opponent axes, rows sum to 0.
+# Blue, orange and green-magenta contrasts in addition to luma: fixed opponent axes, rows sum to 0.
 OPPONENT = ((0.299, 0.587, 0.114), (0.5, 0.5, -1.0), (0.5, -1.0, 0.5))
 # The square roots of the mean energy of the six filters on pictures with a 1/f spectrum, so that odd, even and
 # low-pass maps weigh about the same.
@@ -46,8 +46,8 @@ def load_features(path: Path | None, levels: int = 5) -> Features:
     """The filter bank (None) or VGG-19 from `path`: .safetensors, .npz or .pth (process/weights.py).
 
     Accepted: torchvision's layer order (`features.N.weight` or `N.weight`, N = 0, 2, 5, …), truncated anywhere after
-    relu1_1; the normalised VGG of Li et al. (`0.weight` 1x1, then 2, 5, 9, 12, 16, …). Anything else is refused. Of
-    either, the first `levels` of relu1_1, relu2_1, … relu5_1 are computed, as far as the file has them.
+    relu1_1; the normalised VGG of Li et al. (`0.weight` 1x1, then 2, 5, 9, 12, 16, …). Other files are refused. The
+    first `levels` of relu1_1, relu2_1, … relu5_1 are computed, as far as the file has them.
     """
     if path is None:
         return filter_bank
@@ -71,12 +71,13 @@ def filter_bank(image: Float[torch.Tensor, "n c h w"]) -> list[torch.Tensor]:
     """Steerable derivative filters at LEVELS scales, a factor of two apart; no weights, no training.
 
     Per scale: first and second derivatives of a Gaussian at four orientations (8 maps), their rounded magnitudes (8),
-    their energy multiplied with the next coarser scale's (4 maps: where strokes, edges and their coarser course go
-    together), and the low-pass colour (1 or 3 maps) with, in colour and but for the finest scale, the gradients of the
-    two opponent channels (4). Luma is used for the oriented maps. The finest scale has the picture's own size.
+    and their energy multiplied with the next coarser scale's (4 maps: joint occurrence of strokes or edges and their
+    coarser course). The low-pass colour (1 or 3 maps) follows and, in colour and except for the finest scale, the
+    gradients of the two opponent channels (4). Luma is used for the oriented maps. The finest scale has the picture's
+    own size.
 
-    Derivative x and magnitude |x|, both over sqrt(2), are the two polarities (|x| + x) / 2 and (|x| - x) / 2 turned by
-    45 degrees: squared distances and Gram matrices' distances are those of the rectified maps, for half the work.
+    Derivative x and magnitude |x|, both over sqrt(2), are the two polarities (|x| + x) / 2 and (|x| - x) / 2 rotated by
+    45 degrees: squared distances and Gram matrices' distances are those of the rectified maps, at half the cost.
     """
     planes = _opponent(image)
     kernels, (rectified, crossed, correlation) = _kernels(image.device, image.dtype), _functions()
@@ -100,11 +101,11 @@ def filter_bank(image: Float[torch.Tensor, "n c h w"]) -> list[torch.Tensor]:
 
 @cache
 def _functions() -> tuple[Any, Any, Any]:
-    """The bank's two nonlinearities and its correlation, with gradients faster than those torch finds by itself."""
+    """The bank's two nonlinearities and its correlation, with faster gradients than torch's own."""
 
     class Rectified(torch.autograd.Function):
         """x (n, 8, h, w) over sqrt(2) -> rounded magnitude s = sqrt(x² + SOFTNESS² / 2), and the energy of the odd and
-        the even filter of each orientation, e = sqrt(2 (s_odd² + s_even²)), half of it rounding (n, 4, h, w)."""
+        the even filter of each orientation, e = sqrt(2 (s_odd² + s_even²)), (n, 4, h, w)."""
 
         @staticmethod
         def forward(ctx: Any, x: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -138,7 +139,7 @@ def _functions() -> tuple[Any, Any, Any]:
             return half / a, half / b
 
     class Correlation(torch.autograd.Function):
-        """Correlation of one channel with square kernels (k, 1, d, d). Its gradient is a correlation again, with turned
+        """Correlation of one channel with square kernels (k, 1, d, d). Its gradient is a correlation with rotated
         kernels; torch's own for so few channels takes up to five times as long."""
 
         @staticmethod
@@ -217,8 +218,8 @@ def _plan(weights: dict[str, torch.Tensor], convolutions, taps, pools_before, pa
             break
         weight, bias = weights.get(f"{n}.weight"), weights.get(f"{n}.bias")
         if weight is None or bias is None or weight.shape[2:] != (3, 3) or (channels and weight.shape[1] != channels):
-            found = "nothing" if weight is None else tuple(weight.shape)
-            raise InputRefused(f"{path}: layer {n} is {found}; expected a 3x3 convolution of {channels or 3} channels.")
+            shape = "nothing" if weight is None else tuple(weight.shape)
+            raise InputRefused(f"{path}: layer {n} is {shape}; expected a 3x3 convolution of {channels or 3} channels.")
         channels = weight.shape[0]
         plan.append((weight.contiguous(memory_format=torch.channels_last), bias, n in pools_before, n in taps))
     return plan

@@ -1,7 +1,7 @@
-"""What the fit minimises (paper 4.2): style on jittered masked crops, total variation, sliced Wasserstein.
+"""Losses of the map optimisation (paper 4.2): style on jittered masked crops, total variation, sliced Wasserstein.
 
-Pictures are (n, c, h, w) sRGB-encoded 0..1, masks (n, 1, h, w) bool or 0..1; every loss is a scalar tensor. Means are
-taken where the paper writes sums, so that a weight means the same at any resolution.
+Pictures are (n, c, h, w) sRGB-encoded 0..1, masks (n, 1, h, w) bool or 0..1; every loss is a scalar tensor. Means
+replace the paper's sums, so that a weight is independent of resolution.
 """
 
 from collections.abc import Sequence
@@ -17,21 +17,21 @@ from mistyle.measure.features import Features
 
 Statistic = Literal["gram", "mean-std", "swd"]
 
-# Directions and pixels of a crop by which the features' distributions are compared ("swd").
+# Directions and pixels of a crop in the comparison of the features' distributions ("swd").
 SWD_PROJECTIONS, SWD_SAMPLES = 16, 4096
-# Pixels of a crop over which statistics are as good as over more.
+# Pixels of a crop that suffice for its statistics.
 DENSE = 128 * 128
-# A crop without contrast is not blown up to noise: below this standard deviation (sRGB units) it stays faint.
+# Least standard deviation (sRGB units) in the division by contrast, so that a flat crop is not amplified to noise.
 FAINT = 0.02
-# Cosine below which a light only grazes the surface, and shading is no longer proportional to slope.
+# Cosine below which a light grazes the surface, and shading is not proportional to slope.
 GRAZING_LIGHT = 0.25
-# The mean difference of neighbouring pixels at which the adaptive weight has fallen to half.
+# The mean difference of neighbouring pixels at which the adaptive weight is a half.
 REFERENCE_GRADIENT = 0.05
 
 
 @dataclass(frozen=True)
 class Crop:
-    """A square window of a view: top left corner and side, in the view's pixels (not whole numbers)."""
+    """A square window of a view: top left corner and side, in the view's pixels (real numbers)."""
 
     view: int
     x: float
@@ -50,10 +50,10 @@ def sample_crops(
 ) -> list[Crop]:
     """Random crops with spatial and scaling jitter (paper 4.2, phase 1).
 
-    The crops of one call share their side: `size` times a log-uniform factor from `scale`, at most the view's own.
-    The place of each is uniform among a few tries, of which the first whose mask covers the share `covered` is taken,
-    else the fullest. Views are drawn uniformly, or come from `views` in turn. Positions are continuous: the caller
-    samples the target and moves the camera alike.
+    The crops of one call share their side: `size` times a log-uniform factor from `scale`, at most the view's own. Each
+    position is the first of a few uniform draws whose mask covers the share `covered`, else the fullest. Views are
+    drawn uniformly, or come from `views` in turn. Positions are continuous: the caller samples the target and moves the
+    camera alike.
     """
     crops = []
     factor = float(np.exp(rng.uniform(np.log(scale[0]), np.log(scale[1]))))
@@ -86,64 +86,64 @@ def crop_picture(picture: Float[torch.Tensor, "c h w"], crop: Crop, size: int) -
 
 
 def style_aligned(
-    maps: Sequence[torch.Tensor], wanted: Sequence[torch.Tensor], mask: torch.Tensor, weights: Sequence[float] = ()
+    maps: Sequence[torch.Tensor], targets: Sequence[torch.Tensor], mask: torch.Tensor, weights: Sequence[float] = ()
 ) -> torch.Tensor:
-    """sum_l w_l mean |Phi_l(R * M_R) - Phi_l(T * M_T)|² (paper 4.2); w_l is 1 for every level unless `weights` says.
+    """sum_l w_l mean |Phi_l(R * M_R) - Phi_l(T * M_T)|² (paper 4.2); w_l is 1 for every level without `weights`.
 
-    `maps` are the features of the masked render, `wanted` of the masked target; it only means something where both
-    show the same place: crops of the stylized view of the same camera. Since the pictures are masked before their
-    features are taken (`masked_features`), pixels outside have no influence at all. Divided by the share that the
-    mask covers, so that a crop half empty weighs as much per pixel as a full one.
+    `maps` are the features of the masked render, `targets` of the masked target. The loss is meaningful only if both
+    show the same place: crops of the stylized view of the same camera. The pictures are masked before feature
+    extraction (`masked_features`), so pixels outside have no influence at all. The sum is divided by the mask's share,
+    so that a half-empty crop weighs as much per pixel as a full one.
     """
     total = maps[0].new_zeros(())
-    for level, (a, b) in enumerate(zip(maps, wanted, strict=True)):
+    for level, (a, b) in enumerate(zip(maps, targets, strict=True)):
         total = total + _weight(weights, level) * functional.mse_loss(a, b)
     return total / mask.to(total.dtype).mean().clamp_min(1e-3)
 
 
 def style_statistics(
     maps: Sequence[torch.Tensor],
-    wanted: Sequence[torch.Tensor],
+    targets: Sequence[torch.Tensor],
     mask: torch.Tensor,
-    mask_wanted: torch.Tensor,
+    target_mask: torch.Tensor,
     weights: Sequence[float] = (),
     kind: Statistic = "gram",
     rng: np.random.Generator | None = None,
 ) -> torch.Tensor:
-    """Squared distance of what the features are like on the whole, relative to the target's mean energy per map.
+    """Squared distance of the features' global statistics, relative to the target's mean energy per map.
 
     `kind`: "gram", mean over the entries of the Gram matrices (relative to the energy squared); "mean-std", mean over
     means and standard deviations of the maps; "swd", sliced Wasserstein distance of the pixels' features, for which
-    `rng` draws directions and pixels. All forget where in a crop something stands, so render and target need not show
-    the same place and may even have different sizes. The masks are shrunk with the features; each crop counts alike.
-    Of maps as large as the mask and larger than DENSE every second row and column is looked at.
+    `rng` draws directions and pixels. All ignore positions within a crop, so render and target need not show the same
+    place and may differ in size. The masks are shrunk with the features; each crop counts alike. Maps as large as the
+    mask and larger than DENSE are subsampled to every second row and column.
     """
     total = maps[0].new_zeros(())
-    whole = mask, mask_wanted
-    for level, (a, b) in enumerate(zip(maps, wanted, strict=True)):
-        (a, mask), (b, mask_wanted) = (_thinned(*each) for each in zip((a, b), whole, strict=True))
+    whole = mask, target_mask
+    for level, (a, b) in enumerate(zip(maps, targets, strict=True)):
+        (a, mask), (b, target_mask) = (_subsampled(*each) for each in zip((a, b), whole, strict=True))
         if kind == "gram":
-            mine, theirs = gram(a, mask), gram(b, mask_wanted)
+            mine, theirs = gram(a, mask), gram(b, target_mask)
             energy = theirs.diagonal(dim1=1, dim2=2).mean(dim=1).clamp_min(1e-8)
             distance = ((mine - theirs) / energy[:, None, None]).square().mean()
         elif kind == "mean-std":
-            mine, theirs = _moments(a, mask), _moments(b, mask_wanted)
+            mine, theirs = _moments(a, mask), _moments(b, target_mask)
             energy = theirs.square().sum(dim=1).mean(dim=1).clamp_min(1e-8)
             distance = ((mine - theirs).square().mean(dim=(1, 2)) / energy).mean()
         else:
-            distance = _feature_swd(a, b, mask, mask_wanted, rng or np.random.default_rng(0))
+            distance = _feature_swd(a, b, mask, target_mask, rng or np.random.default_rng(0))
         total = total + _weight(weights, level) * distance
     return total
 
 
-def _thinned(maps: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def _subsampled(maps: torch.Tensor, mask: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     if maps.shape[2:] != mask.shape[2:] or maps[0, 0].numel() <= DENSE:
         return maps, mask
     return maps[:, :, ::2, ::2], mask[:, :, ::2, ::2]
 
 
 def _shares(maps: torch.Tensor, mask: torch.Tensor) -> Float[torch.Tensor, "n 1 p"]:
-    """How much of each pixel of `maps` lies in the mask."""
+    """The mask's share of each pixel of `maps`."""
     return functional.interpolate(mask.to(maps), size=maps.shape[2:], mode="area").flatten(2)
 
 
@@ -156,16 +156,16 @@ def _moments(maps: torch.Tensor, mask: torch.Tensor) -> Float[torch.Tensor, "n 2
     return torch.stack([mean, variance.clamp_min(1e-12).sqrt()], dim=1)
 
 
-def _feature_swd(a, b, mask, mask_wanted, rng: np.random.Generator) -> torch.Tensor:
-    """Mean over the crops that have pixels in both masks."""
-    inside = [_shares(maps, m)[:, 0] > 0.5 for maps, m in ((a, mask), (b, mask_wanted))]
-    found = []
+def _feature_swd(a, b, mask, target_mask, rng: np.random.Generator) -> torch.Tensor:
+    """Mean over the crops with pixels in both masks."""
+    inside = [_shares(maps, m)[:, 0] > 0.5 for maps, m in ((a, mask), (b, target_mask))]
+    distances = []
     for k in range(len(a)):
         mine, theirs = (maps[k].flatten(1).T[chosen[k]] for maps, chosen in zip((a, b), inside, strict=True))
         if len(mine) and len(theirs):
             distance = sliced_wasserstein(mine, theirs, rng, SWD_PROJECTIONS, SWD_SAMPLES)
-            found.append(distance / theirs.square().mean().clamp_min(1e-8))
-    return torch.stack(found).mean() if found else a.new_zeros(())
+            distances.append(distance / theirs.square().mean().clamp_min(1e-8))
+    return torch.stack(distances).mean() if distances else a.new_zeros(())
 
 
 def masked_features(
@@ -173,8 +173,8 @@ def masked_features(
 ) -> tuple[list[torch.Tensor], list[torch.Tensor]]:
     """Phi(R * M_R), with its gradient, and Phi(T * M_T), without."""
     with torch.no_grad():
-        wanted = features(target * mask_target)
-    return features(render * mask), wanted
+        targets = features(target * mask_target)
+    return features(render * mask), targets
 
 
 def gram(maps: Float[torch.Tensor, "n k h w"], mask: torch.Tensor) -> Float[torch.Tensor, "n k k"]:
@@ -186,11 +186,11 @@ def gram(maps: Float[torch.Tensor, "n k h w"], mask: torch.Tensor) -> Float[torc
 def without_light(
     picture: Float[torch.Tensor, "n 1 h w"], mask: torch.Tensor, radius: float, standard: bool = False
 ) -> Float[torch.Tensor, "n 1 h w"]:
-    """A grey picture without its mean and, if `standard`, without its contrast: what is left is the course of detail.
+    """A grey picture without its local mean and, if `standard`, without its contrast: the relative detail.
 
-    The mean is local (Gaussian of `radius` pixels inside the mask) and divided out, so that smooth shading, bright or
-    dark, leaves no trace: x / mean - 1. `standard` divides by each crop's standard deviation over the mask (faint
-    crops stay faint). Zero outside the mask.
+    The local mean (Gaussian of `radius` pixels inside the mask) is divided out, which removes smooth shading, bright or
+    dark: x / mean - 1. `standard` divides by each crop's standard deviation over the mask (faint crops stay faint).
+    Zero outside the mask.
     """
     mask = mask.to(picture)
     weight = blur(mask, radius).clamp_min(1e-3)
@@ -213,13 +213,13 @@ def stroke_shading(
     mask: torch.Tensor,
     slope: float,
 ) -> tuple[Float[torch.Tensor, "n 1 h w"], Float[torch.Tensor, "n 1 h w"]]:
-    """How a light would shade strokes that stand proud of the surface, bright ones most, and where that can be said.
+    """Shading of strokes in relief, bright ones highest, under a light, and the mask where it is valid.
 
     With the strokes' brightness s as height, the surface's normal turns by minus its gradient along the surface, and
     Lambert's shading changes by the factor 1 - (l . grad s) / (l . n) to first order. The gradient along the surface
-    follows from differences between pixels of s and of `position`. It is scaled so that its root mean square over
-    each crop is `slope` (faint crops less). The second result masks pixels whose neighbours lie on the surface too
-    and that the light does not graze.
+    follows from differences between pixels of s and of `position`. It is scaled so that its root mean square over each
+    crop is `slope` (less for faint crops). The mask selects pixels whose neighbours lie on the surface too and that the
+    light does not graze.
     """
     inside = 1 - functional.max_pool2d(functional.pad(1 - mask.to(strokes), (1, 1, 1, 1), value=1.0), 3, stride=1)
     across, down = _differences(position)
@@ -259,10 +259,10 @@ def mean_gradient(picture: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h
 
 
 def adaptive_tv_weight(gradient: float, largest: float) -> float:
-    """The total-variation weight of phase 2 for a style whose `mean_gradient` (sRGB) is given (paper 4.2).
+    """The total-variation weight of phase 2 for a style of this `mean_gradient` (sRGB) (paper 4.2).
 
-    largest / (1 + gradient / REFERENCE_GRADIENT): `largest` for a flat style, less the more texture it has. The paper
-    gives the idea, not the formula.
+    largest / (1 + gradient / REFERENCE_GRADIENT): `largest` for a flat style, less with more texture. The paper
+    describes the adaptation without a formula.
     """
     return float(largest / (1 + gradient / REFERENCE_GRADIENT))
 
@@ -276,7 +276,7 @@ def sliced_wasserstein(
 ) -> torch.Tensor:
     """E over directions of mean (sort(R.d) - sort(T.d))², in RGB (paper 4.2, L_color) or any k numbers a pixel.
 
-    Directions are uniform on the sphere. Both sides are drawn down to the same number of pixels (`samples`, or the
+    Directions are uniform on the sphere. Both sides are subsampled to the same number of pixels (`samples`, or the
     smaller side), without replacement.
     """
     count = min(len(render), len(target), samples or len(render))
@@ -291,8 +291,8 @@ def sliced_wasserstein(
 def _order(rows: Float[torch.Tensor, "k n"]) -> Int[torch.Tensor, "k n"]:
     """The stable order that sorts each row.
 
-    NumPy sorts whole numbers ten times faster than torch sorts with places: each is the value's bits, so turned that
-    they rise with it, above its place.
+    NumPy sorts integers ten times faster than torch sorts with indices. Each key is the value's bits, mapped to be
+    monotonic, above its index.
     """
     bits = np.ascontiguousarray(rows.detach().cpu().numpy(), np.float32).view(np.int32)
     rising = bits ^ ((bits >> 31) & 0x7FFFFFFF)
@@ -311,7 +311,7 @@ def _weight(weights: Sequence[float], level: int) -> float:
 
 
 def blur(x: Float[torch.Tensor, "n c h w"], radius: float) -> Float[torch.Tensor, "n c h w"]:
-    """Gaussian of standard deviation `radius` (pixels), zero beyond the border, at half resolution where it is wide."""
+    """Gaussian of standard deviation `radius` (pixels), zero beyond the border, at half resolution for large radii."""
     shrink = max(int(radius // 4), 1)
     size = x.shape[2:]
     if shrink > 1:
@@ -328,7 +328,7 @@ def blur(x: Float[torch.Tensor, "n c h w"], radius: float) -> Float[torch.Tensor
 
 
 def srgb_from_linear(linear: torch.Tensor) -> torch.Tensor:
-    """The sRGB transfer function on tensors; below 0 linear, above 1 it goes on (so that gradients do)."""
+    """The sRGB transfer function on tensors; linear below 0, extended above 1 (so that gradients exist)."""
     curve = 1.055 * linear.clamp_min(0.0031308).pow(1 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, 12.92 * linear, curve)
 

@@ -1,6 +1,6 @@
-"""Figures for the report, the benchmarks and the fit's own judgement; every definition stands with its function.
+"""Metrics for the report, the benchmarks and the fit's own checks; each function defines its metric.
 
-Pictures are float arrays (h, w, 3), sRGB-encoded 0..1 unless a name says linear; masks are bool. A figure over no
+Pictures are float arrays (h, w, 3), sRGB-encoded 0..1 unless a name contains linear; masks are bool. A metric over no
 pixels is NaN. Higher is better for psnr, detail_correlation and coverage; lower for the others.
 """
 
@@ -39,15 +39,15 @@ def patch_distance(
     """Sliced Wasserstein-1 distance of 5x5 Lab patches (L / 100), mean over full, half and quarter scale; times 100.
 
     Patches are pooled over all pictures and all style pictures; each random unit direction compares QUANTILES
-    quantiles. Only patches wholly inside a mask count. On its own it can be cheated by noise of the right histogram:
-    read it beside the detail correlation.
+    quantiles. Only patches fully inside a mask count. Noise with the right histogram alone scores well: read it beside
+    the detail correlation.
     """
     inside = style_masks or [np.ones(s.shape[:2], bool) for s in style]
     return PatchReference(masks, style, inside, projections, samples, seed).distance(pictures)
 
 
 class PatchReference:
-    """`patch_distance` to one style, whose patches are sorted once, of pictures that share their masks."""
+    """`patch_distance` to one style, whose patches are sorted once, for pictures with the same masks."""
 
     def __init__(self, masks, style, style_masks, projections: int = 64, samples: int = 20_000, seed: int = 0) -> None:
         self._scales = []
@@ -57,8 +57,8 @@ class PatchReference:
             axes /= np.linalg.norm(axes, axis=0)
             mine, theirs = (_places(m, scale, samples, rng) for m in (masks, style_masks))
             if any(len(chosen) for chosen in mine) and any(len(chosen) for chosen in theirs):
-                found = _quantiles(_patches(style, theirs, scale) @ axes)
-                self._scales.append((scale, axes, mine, found))
+                quantiles = _quantiles(_patches(style, theirs, scale) @ axes)
+                self._scales.append((scale, axes, mine, quantiles))
 
     def distance(self, pictures: Sequence[Float[np.ndarray, "h w 3"]]) -> float:
         total = [
@@ -79,12 +79,12 @@ def _quantiles(values: Float[np.ndarray, "n k"]) -> Float[np.ndarray, "k q"]:
 
 
 def _places(masks, scale: int, samples: int, rng: np.random.Generator) -> list[np.ndarray]:
-    """Where about `samples` patches stand at one scale, drawn evenly from the pictures: flat pixel numbers of each."""
-    found = []
+    """Positions of about `samples` patches at one scale, drawn evenly from the pictures: flat pixel numbers of each."""
+    places_by_picture = []
     for mask in masks:
         size = (mask.shape[0] // scale, mask.shape[1] // scale)
         if min(size) < PATCH:
-            found.append(np.zeros(0, np.int64))
+            places_by_picture.append(np.zeros(0, np.int64))
             continue
         whole = erode(resize(mask.astype(np.float32), size) > 0.999, PATCH // 2)
         edge = PATCH // 2
@@ -92,13 +92,13 @@ def _places(masks, scale: int, samples: int, rng: np.random.Generator) -> list[n
         places = np.flatnonzero(whole)
         if len(places):
             places = rng.choice(places, min(len(places), samples // len(masks)), replace=False)
-        found.append(places)
-    return found
+        places_by_picture.append(places)
+    return places_by_picture
 
 
 def _patches(pictures, places: Sequence[np.ndarray], scale: int) -> Float[np.ndarray, "n k"]:
     """The patches about chosen pixels of pictures at one scale, rows of Lab / 100."""
-    found = []
+    patches = []
     for picture, chosen in zip(pictures, places, strict=True):
         if len(chosen) == 0:
             continue
@@ -107,8 +107,8 @@ def _patches(pictures, places: Sequence[np.ndarray], scale: int) -> Float[np.nda
         row, column = chosen // size[1], chosen % size[1]
         offsets = np.arange(-(PATCH // 2), PATCH // 2 + 1)
         window = small[row[:, None, None] + offsets[:, None], column[:, None, None] + offsets]
-        found.append(window.reshape(len(chosen), -1))
-    return np.concatenate(found)
+        patches.append(window.reshape(len(chosen), -1))
+    return np.concatenate(patches)
 
 
 def gram_distance(
@@ -120,8 +120,8 @@ def gram_distance(
 ) -> float:
     """Relative distance |G - G_style| / |G_style| (Frobenius) of the features' Gram matrices, mean over levels.
 
-    `features` as in `measure.features` (None: the filter bank). Gram matrices are pooled over pictures by the pixels in
-    their masks; the masked picture's outside is the mask's mean colour, so that the silhouette adds little.
+    `features` as in `measure.features` (None: the filter bank). Gram matrices are pooled over the pixels in the
+    pictures' masks; outside, a masked picture has its mean colour, so that the silhouette contributes little.
     """
     inside = style_masks or [np.ones(s.shape[:2], bool) for s in style]
     return _gram_ratio(_pooled_gram(pictures, masks, features), _pooled_gram(style, inside, features))
@@ -162,7 +162,7 @@ def style_distance(pictures, masks, style, style_masks=None, seed: int = 0) -> f
 
 
 class StyleReference:
-    """`style_distance` to one style, whose statistics are taken once, of pictures that share their masks."""
+    """`style_distance` to one style, whose statistics are computed once, for pictures with the same masks."""
 
     def __init__(self, masks, style, style_masks, seed: int = 0) -> None:
         self._masks = masks
@@ -191,7 +191,7 @@ def detail(
 def detail_correlation(
     picture: Float[np.ndarray, "h w 3"], reference: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 ) -> float:
-    """Correlation of the pictures' `detail` over the mask, -1..1: whether strokes or shape stand where they should."""
+    """Correlation of the pictures' `detail` over the mask, -1..1: agreement of strokes or shapes in position."""
     return band_correlation(detail(picture, mask), detail(reference, mask), mask)
 
 
@@ -210,8 +210,8 @@ def warp_error(
 ) -> float:
     """View-to-view error: mean |Delta L| + |Delta a| + |Delta b| (Lab / 100, times 100) of points both views see.
 
-    Every pixel of `view` is lifted by its depth, looked up in `other`, and counted where the depths agree and both are
-    three pixels inside their masks, at the coarser of the two pixels (`overlap`).
+    Every pixel of `view` is reprojected by its depth into `other`. It counts where the depths agree and both are three
+    pixels inside their masks, at the coarser of the two pixels (`overlap`).
     """
     return shared_error(overlap(view, other), picture, other_picture)
 
@@ -226,5 +226,5 @@ def shared_error(
 
 
 def coverage(known: Bool[np.ndarray, "h w"], covered: Bool[np.ndarray, "h w"]) -> float:
-    """Share of the covered texels that were painted by something that saw them."""
+    """Share of the covered texels that a view sees and paints."""
     return float(known[covered].mean()) if covered.any() else float("nan")

@@ -1,9 +1,9 @@
-"""What two views see of the same places, compared at the coarser of their pixels.
+"""Shared surface points of two views, compared at the coarser of their pixels.
 
-A pixel shows the mean over its footprint on the surface. Where one view sees a place from nearer by or less flatly than
-the other, its pixels are finer, and two pictures of one painting differ there though they do not contradict each other.
-So each picture is averaged over the other's pixel where that is the larger: its footprint under the Jacobian of the
-mapping (Heckbert, Fundamentals of Texture Mapping and Image Warping, 1989).
+A pixel shows the mean over its footprint on the surface. Where one view sees a place from nearer or less obliquely than
+the other, its pixels are finer, and two consistent pictures of one painting differ there. Each picture is therefore
+averaged over the other's pixel where that is larger: its footprint under the Jacobian of the mapping (Heckbert,
+Fundamentals of Texture Mapping and Image Warping, 1989).
 """
 
 from dataclasses import dataclass
@@ -17,19 +17,20 @@ from mistyle.core.image import erode
 from mistyle.core.view import View
 
 DEPTH_TOLERANCE = 0.01  # working units: two views see the same point
-INSIDE = 3  # pixels from the rim of a mask that do not count: mixed colours, and what lookups beside them would reach
-FLAT = 0.05  # cosine to which flatter surfaces are set
-WIDEST = 4.0  # pixels; a wider footprint is cut, or it would reach over the rim
-LOOKS = 4  # along either axis of a footprint
+INSIDE = 3  # excluded pixels at the rim of a mask: mixed colours, and pixels whose lookups would reach them
+FLAT = 0.05  # least cosine between normal and ray; more oblique surfaces are clamped
+WIDEST = 4.0  # pixels; wider footprints are clipped, since they would reach over the rim
+LOOKS = 4  # lookups along either axis of a footprint
 
 
 @dataclass(frozen=True)
 class Overlap:
-    """The n places that both views see.
+    """The n surface points that both views see.
 
-    both                       which pixels of the first view these are, in row order
-    here, there                where they lie in the two pictures, in pixels (centres at +0.5)
-    around_here, around_there  columns: the axes by which lookups spread there, in pixels; 0 where pixels are not finer
+    both                       mask of these pixels in the first view, in row order
+    here, there                their positions in the two pictures, in pixels (centres at +0.5)
+    around_here, around_there  columns: half-axes of the lookups' footprint there, in pixels; 0 where pixels are not
+    finer
     """
 
     both: Bool[np.ndarray, "h w"]
@@ -40,12 +41,12 @@ class Overlap:
 
 
 def overlap(view: View, other: View) -> Overlap:
-    """The pixels of `view`, INSIDE from the rim of its mask, whose surface point `other` sees as far inside of its own,
-    at a depth that agrees within DEPTH_TOLERANCE. A pixel without a normal is taken to face its camera."""
+    """The pixels of `view`, INSIDE from the rim of its mask, whose surface points `other` also sees INSIDE its own
+    mask, at a depth that agrees within DEPTH_TOLERANCE. A pixel without a normal is assumed to face its camera."""
     chosen = erode(view.mask, INSIDE)
     here, depth = pixel_centres(view.camera.size)[chosen], view.depth[chosen].astype(np.float64)
     there, z = px_from_world(other.camera, world_from_px(view.camera, here, depth))
-    seen, both = _sees(other, there, z), np.zeros(chosen.shape, bool)
+    seen, both = _visible_in(other, there, z), np.zeros(chosen.shape, bool)
     both[chosen] = seen
     here, there, depth = here[seen], there[seen], depth[seen]
     steps = pixel_steps(view.camera, other.camera, here, depth, view.normal[both])
@@ -57,12 +58,12 @@ def overlap(view: View, other: View) -> Overlap:
 
 
 def seen_here(shared: Overlap, picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "n c"]:
-    """The first view's picture, of up to four channels, at the shared places."""
+    """The first view's picture, of up to four channels, at the shared points."""
     return _means(picture, shared.here, shared.around_here)
 
 
 def seen_there(shared: Overlap, picture: Float[np.ndarray, "h w c"]) -> Float[np.ndarray, "n c"]:
-    """The other view's picture, of up to four channels, at the shared places."""
+    """The other view's picture, of up to four channels, at the shared points."""
     return _means(picture, shared.there, shared.around_there)
 
 
@@ -92,8 +93,8 @@ def pixel_steps(
 
 
 def _axes(steps: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "n 2 2"]:
-    """What a pixel has to spread by to become as large as the footprint of one step: the square root of J J' - 1, each
-    of its eigenvalues from 0 on, to WIDEST."""
+    """Axes that widen a pixel to the footprint of one step: the square root of J J' - 1, with its eigenvalues clipped
+    to 0 .. WIDEST."""
     square = steps @ steps.transpose(0, 2, 1)
     a, b, c = square[:, 0, 0], square[:, 0, 1], square[:, 1, 1]
     mean, half = (a + c) / 2, np.hypot((a - c) / 2, b)
@@ -106,8 +107,8 @@ def _axes(steps: Float[np.ndarray, "n 2 2"]) -> Float[np.ndarray, "n 2 2"]:
 def _means(picture: np.ndarray, px: np.ndarray, axes: np.ndarray) -> Float[np.ndarray, "n c"]:
     """Means of LOOKS x LOOKS lookups over the parallelogram of `axes` around `px`.
 
-    Bicubic: bilinear lookups blur, and would count every sharp picture as one that contradicts itself. They overshoot
-    at edges, and OpenCV rounds their places to 1/32 pixel.
+    Bicubic: bilinear lookups blur, and every sharp picture would appear inconsistent. Bicubic ones overshoot at edges,
+    and OpenCV rounds positions to 1/32 pixel.
     """
     # OpenCV's maps have at least one row, and at most 32,767 rows and columns.
     count, width = len(px), 4096
@@ -117,12 +118,12 @@ def _means(picture: np.ndarray, px: np.ndarray, axes: np.ndarray) -> Float[np.nd
     for step in np.stack(np.meshgrid(offsets, offsets), axis=-1).reshape(-1, 2):
         places.reshape(-1, 2)[:count] = px - 0.5 + axes @ step
         x, y = places[..., 0].copy(), places[..., 1].copy()
-        found = cv2.remap(flat, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
-        total += found.reshape(-1, picture.shape[2])[:count]
+        values = cv2.remap(flat, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        total += values.reshape(-1, picture.shape[2])[:count]
     return total / LOOKS**2
 
 
-def _sees(view: View, px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
+def _visible_in(view: View, px: Float[np.ndarray, "n 2"], z: Float[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
     height, width = view.camera.size
     inside = (z > 0) & (px >= 0).all(axis=1) & (px[:, 0] < width) & (px[:, 1] < height)
     column, row = np.where(inside[:, None], px, 0).astype(np.int64).T

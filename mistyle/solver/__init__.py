@@ -1,1 +1,1 @@
-"""Materials, cameras and scene parameters from pictures: inverse problems without files or jobs."""
+"""Inverse problems without files or jobs: materials, cameras and scene parameters from pictures."""

@@ -1,4 +1,4 @@
-"""What all parts of one recovery share, and the references that they fit to."""
+"""Shared state of one recovery, and its reference pictures without indirect light."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -17,20 +17,20 @@ from mistyle.solver.table import Atlas
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
 
-DISTRUST = 10.0  # of indirect light: what a pixel counts is halved by one tenth of the direct light
+DISTRUST = 10.0  # a pixel's weight halves where indirect light is a tenth of the direct light
 
 Radiance = Float[np.ndarray, "h w 3"]
 
 
 @dataclass(frozen=True)
 class FitContext:
-    """What all parts of one fit share.
+    """State that all stages of one fit share.
 
     tangents  per face corner, None for Mitsuba's frames
     texels    of each texture set, at the atlas's resolution
     captures  the reference pictures with all their light
-    notes     sentences for the report, in the order in which they come up
-    trace     figures per round and step, by name
+    notes     sentences for the report, in chronological order
+    trace     values per round and step, by name
     """
 
     traced: Tracer
@@ -46,7 +46,7 @@ class FitContext:
     def renderer(
         self, subsamples: int | None = None, memory: float | None = None, gradients: bool = False
     ) -> "MaterialRenderer":
-        """Pictures of tables of this atlas; `memory` in bytes. Without either, those of the settings."""
+        """A renderer of tables of this atlas; `memory` in bytes. Arguments left out come from the settings."""
         from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
         s = self.settings
@@ -63,24 +63,24 @@ class FitContext:
 
 @dataclass(frozen=True)
 class DirectCaptures:
-    """Reference pictures, and the estimate of their indirect light: linear radiance per picture, perhaps coarser."""
+    """Reference pictures, and their estimated indirect light: linear radiance per picture, possibly coarser."""
 
     captures: Captures
     indirect: Mapping[int, Radiance] = field(default_factory=dict)
 
     def with_indirect(self, k: int, light: Radiance) -> "DirectCaptures":
-        """The same with another estimate for picture k."""
+        """A copy with another estimate for picture k."""
         return replace(self, indirect={**self.indirect, k: light})
 
     def load(self, k: int) -> Loaded:
-        """Picture k less its indirect light, and which pixels count."""
+        """Picture k less its indirect light, and its mask of valid pixels."""
         rgb, mask = self.captures.load(k)
         if k in self.indirect:
             rgb = rgb - self.enlarged(k)
         return rgb, mask
 
     def enlarged(self, k: int) -> Float[np.ndarray, "h w 3"]:
-        """The indirect light of picture k, as large as the picture."""
+        """The indirect light of picture k at the picture's size."""
         return enlarged(self.indirect[k], self.captures.cameras[k].size)
 
     def direct_only(self) -> Captures:
@@ -88,7 +88,7 @@ class DirectCaptures:
         return Captures(self.captures.cameras, self.captures.lights, self.load)
 
     def pixel_confidence(self, k: int) -> Float[np.ndarray, "h w"]:
-        """Weights of a picture's pixels, 0..1: a half where a tenth of the direct light was taken off as indirect."""
+        """Weights of a picture's pixels, 0..1: a half where the indirect light is a tenth of the direct light."""
         if k not in self.indirect:
             return np.ones(self.captures.cameras[k].size, np.float32)
         taken = self.enlarged(k).max(axis=-1)

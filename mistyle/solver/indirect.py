@@ -1,9 +1,10 @@
-"""Light that reaches the camera by way of more than one surface point: what a fit under direct light must take off.
+"""Indirect light by path tracing: radiance that reaches the camera over more than one surface point.
 
-Paths begin at the pixels and follow the reflectance; wherever they come after the first point, the lights are looked
-for. What they carry does not depend on the lights until then, so pictures of one camera under several lights share
-their paths, which are most of the work. What arrives is smooth along the surface, so few samples say enough, once they
-are divided by the albedo, averaged over pixels that show the same surface, and multiplied again (Dammertz et al. 2010).
+The solver fits direct light only, so this radiance is subtracted from the pictures. Paths begin at the pixels and
+sample the reflectance; from the second point on, every vertex samples the lights. Path throughput does not depend on
+the lights, so pictures of one camera under several lights share their paths, which are most of the cost. Incident light
+is smooth along the surface, so few samples suffice: they are divided by the albedo, averaged over pixels of the same
+surface, and multiplied again (Dammertz et al. 2010).
 """
 
 from collections.abc import Sequence
@@ -22,21 +23,21 @@ from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.emitters import emitters
 
-MOST = 512  # pixels along the longer side of the estimate at most; it is as large as the picture where that is smaller
-TOGETHER = 6  # pictures of one camera that share their paths; more make the kernel long
-ROUGH = 0.25  # least roughness past the first point: light that mirrors carry comes in few bright samples
-DEPTH = 5  # path segments: light comes over up to four surface points
-ALIKE = 0.15  # length of the difference of two unit normals at which pixels hardly belong together any more
-LEVEL = 0.7  # and how far, by pixels that lie between the two, one may lie above or below the other's tangent plane
-PALE = 0.04  # joins the albedo that light is divided by: what a surface reflects without taking its colour
-LIKE = 8  # pixels of the estimate around each over which it is compared with the picture,
-BRIGHTER = 2.0  # and what it may be multiplied by at most
-GRAZING = 0.1  # cosine below which what arrives counts for less in the vector irradiance: such paths are few and heavy
-FIREFLY = 20.0  # times its surroundings: the brightest that a pixel of the estimate may be
+MOST = 512  # pixels along the longer side of the estimate at most; smaller pictures keep their size
+TOGETHER = 6  # pictures of one camera that share their paths; larger batches make the kernel long
+ROUGH = 0.25  # least roughness past the first point: mirror paths are few bright samples
+DEPTH = 5  # path segments: up to four surface points
+ALIKE = 0.15  # bilateral scale of the difference of two unit normals
+LEVEL = 0.7  # bilateral scale of the distance from the tangent plane, in pixel widths on the surface
+PALE = 0.04  # added to the albedo before division: specular reflectance, which has no colour
+LIKE = 8  # pixels: Gaussian window of the comparison between estimate and picture
+BRIGHTER = 2.0  # largest scale factor of that comparison
+GRAZING = 0.1  # cosine below which the vector irradiance is attenuated: grazing paths are few with large weights
+FIREFLY = 20.0  # largest ratio of a pixel of the estimate to its surroundings
 
 
 class Indirect:
-    """The indirect light of pictures of one object; its maps stand until another object of this class is made."""
+    """Indirect light of pictures of one object. Constructing another instance replaces this one's maps."""
 
     def __init__(
         self, mesh: Mesh, maps: Sequence[Maps], *, model: scenery.Model = "principled", frame: scenery.Frame = "mikkt"
@@ -54,28 +55,29 @@ class Indirect:
     def pictures(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
     ) -> list[Float[np.ndarray, "h w 3"]]:
-        """Indirect radiance, linear Rec.709, in pictures of the camera of MOST pixels at most, for `enlarged`, under
-        each of `many`; beside the object that of the nearest pixel on it.
+        """Indirect radiance, linear Rec.709, in pictures of at most MOST pixels a side, under each of `many`
+        lights.
 
-        Lights of a scene file raise ValueError. `samples` are those of a pixel of such a picture.
+        Pixels beside the object have the value of the nearest pixel on it. `samples` are per pixel of the estimate.
+        Raises ValueError for lights of a scene file.
         """
-        return [light for light, _ in self._all(camera, many, samples, seed, False)]
+        return [light for light, _ in self._in_batches(camera, many, samples, seed, False)]
 
     def pictures_and_vectors(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int
     ) -> list[tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w 9"]]]:
-        """The same, and the vector irradiance E of indirect light at the first surface point, in world axes: x, y and z
-        of red, then of green and blue.
+        """`pictures`, with the vector irradiance E of indirect light at the first surface point: (9,) per pixel, world
+        x, y, z of red, then of green and blue.
 
-        What a matt surface of normal n and reflectance a shows is a / π E · n, as long as n stays near the mapped
-        normal: light from below its horizon is not in E, and little of what just grazes it (GRAZING).
+        A diffuse surface of normal n and reflectance a has the radiance a / π E · n while n stays near the mapped
+        normal. E excludes light from below the mapped normal's horizon and attenuates grazing light (GRAZING).
         """
-        return self._all(camera, many, samples, seed, True)
+        return self._in_batches(camera, many, samples, seed, True)
 
-    def _all(
+    def _in_batches(
         self, camera: Camera, many: Sequence[Lights], samples: int, seed: int, vectors: bool
     ) -> list[tuple[Any, Any]]:
-        """Pairs of light and vector irradiance, which is None where no `vectors` are asked for."""
+        """Pairs of radiance and vector irradiance; the latter is None without `vectors`."""
         pairs = []
         for k in range(0, len(many), TOGETHER):
             pairs += self._pictures(camera, many[k : k + TOGETHER], samples, seed, vectors)
@@ -88,7 +90,7 @@ class Indirect:
 
         mi: Any = mitsuba
         by = -(-max(camera.size) // MOST)
-        # Pixels that begin inside the picture and end beside it belong to the estimate.
+        # Partial pixels at the picture's border belong to the estimate.
         small = replace(binned(camera, by), size=(-(-camera.size[0] // by), -(-camera.size[1] // by)))
         lit = [[mi.load_dict(light) for light in emitters(lights, camera)] for lights in many]
         for emitter in (e for own in lit for e in own):
@@ -96,7 +98,7 @@ class Indirect:
         times, each = scenery.passes(samples)
         sensor = mi.load_dict(scenery.sensor_dict(small, each))
         options = (self.scene, self.sharp, sensor, lit, each)
-        passes = [_traced(*options, seed + k * 7919, vectors) for k in range(times)]
+        passes = [_trace_paths(*options, seed + k * 7919, vectors) for k in range(times)]
         whole = np.mean(passes, axis=0)
         share = whole[..., 0]
         inside = np.isfinite(whole).all(axis=-1) & (share > 0)
@@ -122,7 +124,7 @@ class Indirect:
         return list(zip(map(smooth, light[:count]), arriving, strict=True))
 
 
-def _traced(
+def _trace_paths(
     scene: Any,
     sharp: Sequence[tuple[Any, Any]],
     sensor: Any,
@@ -131,9 +133,10 @@ def _traced(
     seed: int,
     vectors: bool,
 ) -> np.ndarray:
-    """(h, w, 10 + 3 n) float32, means of `each` samples a pixel: coverage, position, shading normal and diffuse albedo
-    of the first surface point, and indirect radiance under each of n = len(lit) sets of emitters; with `vectors` 9 n
-    more, x, y and z of each set's vector irradiance there. `sharp`: of each shape the reflectance at that point."""
+    """(h, w, 10 + 3 n) float32, means of `each` samples a pixel: coverage, then position, shading normal and diffuse
+    albedo of the first surface point, then indirect radiance under each of n = len(lit) sets of emitters. With
+    `vectors`, 9 n more: world x, y, z of each set's vector irradiance. `sharp`: each shape's reflectance at the first
+    point."""
     import drjit as dr
     import mitsuba
 
@@ -146,7 +149,7 @@ def _traced(
         surface = dr.select(first.shape == mi.ShapePtr(shape), mi.BSDFPtr(reflectance), surface)
 
     def onward(si: Any, surface: Any, through: Any, active: Any, sampler: Any) -> tuple[Any, ...]:
-        """The next ray, what it carries, its density, where it begins, and whether it goes on."""
+        """The next ray, its throughput, density, origin, and whether the path continues."""
         sample, weight = surface.sample(context, si, sampler.next_1d(active), sampler.next_2d(active), active)
         through = dr.select(active, through * weight, 0)
         ray = si.spawn_ray(si.to_world(sample.wo))
@@ -155,10 +158,10 @@ def _traced(
     def body(*state: Any) -> tuple[Any, ...]:
         k, ray, through, density, last, active, sampler, *sums = state
         si = scene.ray_intersect(ray, active)
-        # What escapes from the first point is direct light; what escapes from the last is looked for, no more points.
+        # A ray that escapes from the first point carries direct light. The last segment only tests for escape.
         escaped, hit = active & ~si.is_valid() & (k > 0), active & si.is_valid() & (k < points)
         segment = PathSegment(ray, si, last, density, escaped, hit)
-        arriving = (sum((_arriving(scene, e, segment, sampler) for e in own), mi.Color3f(0)) for own in lit)
+        arriving = (sum((_emitter_radiance(scene, e, segment, sampler) for e in own), mi.Color3f(0)) for own in lit)
         more = (total + through * light for total, light in zip(sums, arriving, strict=True))
         return k + 1, *onward(si, si.bsdf(), through, hit, sampler), sampler, *more
 
@@ -180,7 +183,7 @@ def _traced(
 
 
 def _camera_samples(sensor: Any, each: int, seed: int) -> tuple[Any, Any, Any]:
-    """The seeded sampler, and the pixel and ray of each of `each` samples a pixel."""
+    """The seeded sampler, and pixel and ray of each of `each` samples a pixel."""
     import drjit as dr
     import mitsuba
 
@@ -200,7 +203,7 @@ def _camera_samples(sensor: Any, each: int, seed: int) -> tuple[Any, Any, Any]:
 def _vector_irradiance(first: Any, begin: Sequence[Any], totals: Sequence[Any]) -> list[Any]:
     """x, y and z of the vector irradiance at the points `first`, under each set of emitters.
 
-    `begin` is the first ray, what it carries and its density; `totals` are radiance · reflectance · cosine / density.
+    `begin` is the first ray, its throughput and its density; `totals` are radiance · reflectance · cosine / density.
     """
     import drjit as dr
 
@@ -215,7 +218,7 @@ def _vector_irradiance(first: Any, begin: Sequence[Any], totals: Sequence[Any]) 
 
 
 def _pixels(values: Sequence[Any], pixel: Any, seen: Any, count: int, each: int) -> np.ndarray:
-    """(count, n) float32: means over the `each` samples of every pixel, of n values a sample; 0 where not `seen`."""
+    """(count, n) float32: means over each pixel's `each` samples of n values; 0 where not `seen`."""
     import drjit as dr
 
     sums = [dr.zeros(type(values[0]), count) for _ in values]
@@ -226,7 +229,7 @@ def _pixels(values: Sequence[Any], pixel: Any, seen: Any, count: int, each: int)
 
 
 class PathSegment(NamedTuple):
-    """A ray that left the surface point `last` with a density, and where it `hit` a point `si` or `escaped`."""
+    """A ray that left the surface point `last` with a density, and either `hit` a point `si` or `escaped`."""
 
     ray: Any
     si: Any
@@ -236,10 +239,10 @@ class PathSegment(NamedTuple):
     hit: Any
 
 
-def _arriving(scene: Any, emitter: Any, segment: PathSegment, sampler: Any) -> Any:
-    """Radiance that one emitter sends back along the ray: over the surface point `si`, or past all of them.
+def _emitter_radiance(scene: Any, emitter: Any, segment: PathSegment, sampler: Any) -> Any:
+    """Radiance of one emitter along the ray: reflected at the surface point `si`, or directly where the ray escaped.
 
-    Soft light is looked for both ways and weighted by the power heuristic (Veach and Guibas 1995).
+    Environment light uses both sampling strategies, weighted by the power heuristic (Veach and Guibas 1995).
     """
     import drjit as dr
     import mitsuba
@@ -251,13 +254,13 @@ def _arriving(scene: Any, emitter: Any, segment: PathSegment, sampler: Any) -> A
     towards, power = emitter.sample_direction(si, place, hit)
     free = hit & (towards.pdf > 0)
     free &= ~scene.ray_test(si.spawn_ray_to(towards.p), free)
-    reflected, other = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(towards.d), free)
+    reflected, bsdf_pdf = si.bsdf().eval_pdf(mi.BSDFContext(), si, si.to_local(towards.d), free)
     if not soft:
         return dr.select(free, reflected * power, 0)
     along = dr.zeros(mi.DirectionSample3f)
     along.d = ray.d
     past = emitter.eval(si, escaped) * _heuristic(density, emitter.pdf_direction(last, along, escaped))
-    return dr.select(free, reflected * power * _heuristic(towards.pdf, other), 0) + dr.select(escaped, past, 0)
+    return dr.select(free, reflected * power * _heuristic(towards.pdf, bsdf_pdf), 0) + dr.select(escaped, past, 0)
 
 
 def _heuristic(own: Any, other: Any) -> Any:
@@ -265,7 +268,7 @@ def _heuristic(own: Any, other: Any) -> Any:
 
 
 def enlarged(light: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[np.ndarray, "H W c"]:
-    """What `Indirect.pictures` made, as large as the picture that it is of."""
+    """An estimate of `Indirect.pictures`, upsampled to the picture's size."""
     by = max(-(-whole // part) for whole, part in zip(size, light.shape, strict=False))
     return resize(light, (light.shape[0] * by, light.shape[1] * by))[: size[0], : size[1]]
 
@@ -273,16 +276,17 @@ def enlarged(light: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[
 def in_proportion(
     light: Float[np.ndarray, "h w 3"], direct: Float[np.ndarray, "H W 3"], picture: Float[np.ndarray, "H W 3"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """An estimate scaled so that with `direct`, of the same maps, it is around every pixel as bright as the picture.
+    """An estimate scaled so that direct plus indirect light matches the picture's local brightness.
 
-    Maps that were found while this light counted as direct are too bright, and what they send each other is twice so:
-    unscaled it would be taken off nearly twice where surfaces face each other. Where both show nothing, as it was.
+    `direct` is rendered from the same maps. Maps that were fitted before this light was subtracted are too bright, and
+    interreflection doubles that error: unscaled, concave places would lose it nearly twice. Where direct light and
+    estimate are black, the estimate stays unchanged.
     """
     size = light.shape[0], light.shape[1]
     shown = resize(direct, size)
-    made = gaussian(shown + np.where(shown > 0, light, 0), LIKE)
-    there = gaussian(np.where(shown > 0, resize(picture, size), 0), LIKE)
-    return light * np.where(made > 1e-9, np.clip(there / np.maximum(made, 1e-9), 0, BRIGHTER), 1)
+    rendered = gaussian(shown + np.where(shown > 0, light, 0), LIKE)
+    observed = gaussian(np.where(shown > 0, resize(picture, size), 0), LIKE)
+    return light * np.where(rendered > 1e-9, np.clip(observed / np.maximum(rendered, 1e-9), 0, BRIGHTER), 1)
 
 
 def averaged(
@@ -293,40 +297,40 @@ def averaged(
     inside: Bool[np.ndarray, "h w"],
     most: float = FIREFLY,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Mean of each pixel and the eight around it, as far as they show the same surface; `unit` is a pixel's width
-    there. Wider means take more detail of the light than they take noise.
+    """Bilateral mean over 3 x 3 pixels of the same surface; `unit` is a pixel's width on it. A wider window would blur
+    more of the light than it removes noise.
 
-    Pixels that are more than `most` times brighter than those around them are first brought down to that.
+    Pixels more than `most` times brighter than their surroundings are clamped first.
     """
     normal = normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-6)
     position, normal = (np.where(inside[..., None], field, 0).astype(np.float32) for field in (position, normal))
-    total, weights = _around(light, position, normal, unit, inside)
+    total, weights = _neighbour_sums(light, position, normal, unit, inside)
     if np.isfinite(most):
         brightest = most * (total / np.maximum(weights, 1e-6)[..., None])
         light = np.where(weights[..., None] > 1e-6, np.minimum(light, brightest), light)
     return (light + total) / (1 + weights)[..., None]
 
 
-def _around(
+def _neighbour_sums(
     light: np.ndarray, position: np.ndarray, normal: np.ndarray, unit: np.ndarray, inside: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Weighted sum and weights of the eight pixels around each."""
+    """Weighted sum and weights of each pixel's eight neighbours."""
     total, weights = np.zeros_like(light), np.zeros(inside.shape, np.float32)
     for dy in (-1, 0, 1):
         for dx in (-1, 0, 1):
             if not (dy or dx):
                 continue
-            rows, columns = _overlap(inside.shape[0], dy), _overlap(inside.shape[1], dx)
-            here, there = (rows[0], columns[0]), (rows[1], columns[1])
-            lift = ((position[there] - position[here]) * normal[here]).sum(axis=-1) / (LEVEL * unit[here])
-            turn2 = ((normal[there] - normal[here]) ** 2).sum(axis=-1)
+            rows, columns = _shifted_slices(inside.shape[0], dy), _shifted_slices(inside.shape[1], dx)
+            centre, neighbour = (rows[0], columns[0]), (rows[1], columns[1])
+            lift = ((position[neighbour] - position[centre]) * normal[centre]).sum(axis=-1) / (LEVEL * unit[centre])
+            turn2 = ((normal[neighbour] - normal[centre]) ** 2).sum(axis=-1)
             likeness = np.exp(-(lift**2) - turn2 / ALIKE**2) * (0.25 if dy and dx else 0.5)
-            weight = np.where(inside[here] & inside[there], likeness, 0)
-            total[here] += weight[..., None] * light[there]
-            weights[here] += weight
+            weight = np.where(inside[centre] & inside[neighbour], likeness, 0)
+            total[centre] += weight[..., None] * light[neighbour]
+            weights[centre] += weight
     return total, weights
 
 
-def _overlap(size: int, step: int) -> tuple[slice, slice]:
-    """Rows that have another one `step` further on, and those others."""
+def _shifted_slices(size: int, step: int) -> tuple[slice, slice]:
+    """Slices of the rows with a neighbour `step` further on, and of those neighbours."""
     return slice(max(0, -step), size - max(0, step)), slice(max(0, step), size + min(0, step))

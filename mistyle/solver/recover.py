@@ -1,16 +1,14 @@
 """Recovering materials: albedo, normal, roughness and metallic from pictures of known cameras under known light.
 
 1. `texels/solve.py` solves each texel alone by Levenberg-Marquardt. It renders nothing: cameras and lights are known.
-   Twenty such steps reach what hundreds of gradient steps on pictures do not.
+   Twenty such steps reach a result that hundreds of gradient steps on pictures do not.
 2. `pictures/descend.py` minimises the loss of whole pictures by Adam, through `render/deferred/renderer.py`, which
-models pixels
-   and interpolation exactly.
+   models pixels and interpolation exactly.
 3. `joint/gauss_newton.py` ends with a joint Gauss-Newton over all texels and pictures, under delta lights only.
 
-Smoothness priors (`solver/smoothing.py`) act before, between and after the passes of Adam. All parts fit to direct
-light: light between surfaces is estimated with the current maps and taken off the pictures (`bounces`). Lights and
-cameras are taken as given. A common factor of light and albedo is not identifiable: albedo is as right as the lights'
-units.
+Smoothness priors (`solver/smoothing.py`) act before, between and after the passes of Adam. All stages fit to direct
+light: indirect light is estimated with the current maps and subtracted from the pictures (`bounces`). Lights and
+cameras are fixed. A common factor of light and albedo is not identifiable: albedo is as accurate as the lights' units.
 """
 
 from collections.abc import Callable, Sequence
@@ -35,7 +33,7 @@ from mistyle.solver.validate import validate_captures
 
 __all__ = ["Checkpoints", "RecoverSettings", "Recovered", "recover"]
 
-# Standard deviations at which a texel's confidence has fallen to a half: normal (sine), roughness, albedo, metallic.
+# Standard deviations at which a texel's confidence is a half: normal (sine), roughness, albedo, metallic.
 HALF_SURE = {"normal": 0.05, "roughness": 0.1, "albedo": 0.05, "metallic": 0.2}
 CHANNELS = {
     "albedo": ALBEDO,
@@ -51,11 +49,11 @@ class Recovered:
     """The fitted maps and their uncertainty, per texture set.
 
     maps        `known` is True where at least one picture observed the texel in the light
-    confidence  0..1, 1 sure, 0 nothing seen: 1 / (1 + mean of (standard deviation / HALF_SURE)²)
+    confidence  0..1: 1 / (1 + mean of (standard deviation / HALF_SURE)²); 1 is certain, 0 unobserved
     spread      standard deviations of albedo, normal (of the tilt: radians), roughness and metallic
-    seen        how many pictures observed the texel in the light
-    views       how many different cameras did
-    trace       figures per round and step, by name
+    seen        number of pictures that observed the texel in the light
+    views       number of different cameras that did
+    trace       values per round and step, by name
     residuals   per picture by its name: root mean square of reference - render, relative to the reference's
     notes       sentences for the report
     """
@@ -83,16 +81,16 @@ def recover(
 ) -> Recovered:
     """Fit one set of maps per texture set to `captures`; equal input, settings, seed and threads give equal bytes.
 
-    `start` maps help the solver and keep their metallic where that is not fitted. `checkpoints` save what a later call
-    needs to end with the same bytes. Raises InputRefused where no picture can be used; a picture that cannot is left
-    out, and a note says so.
+    `start` maps initialise the solver and keep their metallic unless it is fitted. `checkpoints` save the state from
+    which a later call ends with the same bytes. Unusable pictures are skipped with a note. Raises InputRefused if all
+    are.
     """
     from mistyle.render.deferred.image_samples import tangents_of
     from mistyle.render.mitsuba.draw import tracer
 
     settings, notes = where_possible(settings, captures), []
     usable, traced = validate_captures(mesh, captures, notes), tracer(mesh)
-    # The steps on whole pictures know no neighbours.
+    # The steps on whole pictures have no neighbours.
     grid = atlas_of(texels) if settings.solver == "pictures" else linked(mesh, texels)
     tangents = tangents_of(mesh, settings.frame)
     context = FitContext(traced, tangents, texels, grid, usable, settings, seed, notes)
@@ -107,7 +105,7 @@ def recover(
     if descends:
         table, direct = optimise_on_pictures(context, renderer, estimate, direct, part(0.5, 0.85), checkpoints)
         if estimate.solved and settings.joint:
-            # Of finer pictures; what was kept for the others makes room.
+            # This renderer has finer pictures; the samples of the other one are freed first.
             renderer = context.renderer(subsamples=settings.joint_subsamples, memory=0)
             table, direct = joint_gauss_newton(context, renderer, table, direct, part(0.85, 0.95))
     if settings.polish:
@@ -124,7 +122,7 @@ def recover(
 def polished(context: FitContext, table: MaterialTable, progress: Callable[[float], None]) -> MaterialTable:
     """Steps through `prb` from `table`, against pictures with all their light.
 
-    A result that explains the pictures no better is dropped, with a note.
+    A result whose loss does not fall is dropped, with a note.
     """
     from mistyle.render.deferred.material_table import pack, unpack
     from mistyle.solver.pictures.polish import PolishSettings, polish
@@ -135,13 +133,15 @@ def polished(context: FitContext, table: MaterialTable, progress: Callable[[floa
     result = polish(context.traced.mesh, start, context.captures, chosen, context.seed, progress)
     context.trace["polish.loss"], context.trace["polish.whole"] = list(result.trace), list(result.loss)
     if not result.loss[1] < result.loss[0]:
-        context.notes.append(f"The polish was undone: the loss went from {result.loss[0]:.3g} to {result.loss[1]:.3g}.")
+        context.notes.append(
+            f"The polish was undone: the loss changed from {result.loss[0]:.3g} to {result.loss[1]:.3g}."
+        )
         return table
     return pack(result.maps)
 
 
 def _residual(direct: DirectCaptures, drawn: tuple[np.ndarray, np.ndarray], k: int) -> float:
-    """Of picture k and its render (`image_and_coverage`): root mean square, relative to the reference's."""
+    """RMS of reference - render (`image_and_coverage`) of picture k, relative to the RMS of the reference."""
     (rgb, mask), (image, coverage) = direct.load(k), drawn
     inside = mask & (coverage > 0.999)
     reference = rgb[inside].astype(np.float64)

@@ -1,4 +1,4 @@
-"""What a user may choose about fitting materials to pictures under known light."""
+"""User settings of fitting materials to pictures under known light."""
 
 from math import isqrt
 from typing import Literal
@@ -6,15 +6,15 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator
 
 SETTLING = 3
-FEWER = 8  # times as few samples for estimates of light between surfaces that others soon replace
-PASSES = 8  # over the pictures at most, the last twice as long
-SWEEPS = 2  # how often a pass looks at every picture at least, or there are fewer passes
+FEWER = 8  # factor of fewer samples for provisional estimates of indirect light
+PASSES = 8  # most passes over the pictures, the last twice as long
+SWEEPS = 2  # least epochs of a pass; fewer steps give fewer passes
 
 
 class RecoverSettings(BaseModel):
-    """Choices of `solver/recover.py`; defaults are what measuring on synthetic maps of known truth suggested.
+    """Settings of `solver/recover.py`; defaults come from measurements on synthetic maps with ground truth.
 
-    Lengths of radiance are relative to the brightest that was observed, so no default depends on the exposure.
+    Radiance settings are relative to the brightest observed radiance, so no default depends on the exposure.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -23,60 +23,60 @@ class RecoverSettings(BaseModel):
         default="principled", description="reflectance: Mitsuba's principled, or glTF's metallic-roughness exactly"
     )
     frame: Literal["mikkt", "mitsuba"] = Field(
-        default="mikkt", description="frame of the normal map: MikkTSpace as engines have it, or Mitsuba 3.9's per face"
+        default="mikkt", description="frame of the normal map: MikkTSpace as in engines, or Mitsuba 3.9's per face"
     )
     metallic: bool = Field(
         default=False,
-        description="fit metallic too, as 0 or 1 where little speaks for between; else the start's is kept (0 if none)",
+        description="fit metallic too, near 0 or 1 unless the data disagree; else the start's stays (0 if none)",
     )
     solver: Literal["both", "texels", "pictures"] = Field(
         default="both",
-        description="texel by texel (Levenberg-Marquardt), then whole pictures (Adam), or one of them alone",
+        description="per texel (Levenberg-Marquardt), then whole pictures (Adam), or one of them alone",
     )
     solver_texels: int = Field(
         default=2_000_000,
         ge=1,
-        description="most texels solved one by one, under soft light a 64th of it; a finer atlas is solved at a "
+        description="most texels of the per-texel solver, under soft light a 64th of it; a finer atlas is solved at a "
         "coarser level",
     )
-    solver_iterations: int = Field(default=12, ge=1, le=1000, description="steps from each start")
+    solver_iterations: int = Field(default=12, ge=1, le=1000, description="Levenberg-Marquardt steps from each start")
     rounds: int = Field(
         default=3,
         ge=0,
         le=100,
-        description="how often what the pictures still differ by is given back to the texels, which are solved again; "
-        "as often after each estimate of light between surfaces, with which they are solved anew, and three times as "
-        "often after the last",
+        description="rounds of defect correction: each adds the pictures' residual to the texels' targets and solves "
+        "again; as many after each estimate of indirect light, which restarts the solver, and three times as many "
+        "after the last",
     )
     neighbours: float = Field(
         default=0.03,
         gt=0,
-        description="standard deviation between a texel and its neighbours' mean; of tilts at most, less where smooth",
+        description="standard deviation between a texel and its neighbours' mean; for tilts its upper bound",
     )
     smooth: bool = Field(
         default=True,
-        description="albedo, tilt and roughness as smooth as the surface around them is measured to be, as far as the "
-        "pictures leave them open; a sharp edge that few pictures show is rounded",
+        description="Empirical-Bayes smoothing of albedo, tilt and roughness; its strength is estimated locally and "
+        "grows with their uncertainty; a sharp edge that few pictures show is rounded",
     )
     noise: float = Field(
         default=0.0005,
         gt=0,
         le=1,
-        description="standard deviation of a pixel in the dark, more than 8-bit sRGB rounds by: with 0.002 black "
-        "rubber shows too little for its roughness to be told",
+        description="standard deviation of a dark pixel, larger than the rounding of 8-bit sRGB; with 0.002 the "
+        "highlights of black rubber do not determine its roughness",
     )
     relative: float = Field(default=0.01, ge=0, le=1, description="standard deviation of a pixel relative to its value")
     facing: float = Field(
-        default=0.2, gt=0, lt=1, description="least cosine between a texel's normal and the camera that observes it"
+        default=0.2, gt=0, lt=1, description="least cosine between a texel's normal and the direction to the camera"
     )
     iterations: int = Field(
         default=2160,
         ge=0,
         le=1_000_000,
-        description="steps of Adam, one picture each; after the texels were solved in up to eight passes",
+        description="steps of Adam, one picture each; after the per-texel solver in up to eight passes",
     )
     rate: float = Field(
-        default=0.003, gt=0, le=1, description="Adam's first rate in each; it falls to zero along a cosine"
+        default=0.003, gt=0, le=1, description="Adam's initial rate in each pass; it falls to zero along a cosine"
     )
     levels: int = Field(default=5, ge=1, le=16, description="levels of the pyramid that preconditions Adam")
     loss: Literal["log_srgb_l1", "l2"] = Field(default="log_srgb_l1", description="loss that Adam minimises")
@@ -84,7 +84,7 @@ class RecoverSettings(BaseModel):
         default=9,
         ge=1,
         le=64,
-        description="samples a pixel, a square number; with 4 the gradient at highlights is three times as wrong",
+        description="samples a pixel, a square number; with 4 the gradient's error at highlights triples",
     )
     roughness_floor: float = Field(
         default=0.04, ge=0.0317, le=1, description="least roughness; below 0.0316 it has no effect and no gradient"
@@ -93,43 +93,42 @@ class RecoverSettings(BaseModel):
         default=6,
         ge=0,
         le=8,
-        description="how often light between surfaces is estimated and taken off the pictures; for joint steps twice "
-        "more",
+        description="number of estimates of indirect light, which is subtracted from the pictures; joint steps add two "
+        "estimates",
     )
     bounce_samples: int = Field(
         default=128,
         ge=1,
         le=4096,
         description="samples a pixel of those estimates; the first and those between passes on whole pictures have an "
-        "eighth, but for the last of all, and that of the last joint steps twice as many",
+        "eighth, except for the last of all; that of the last joint steps has twice as many",
     )
     joint: int = Field(
         default=3,
         ge=0,
         le=100,
-        description="steps after those on whole pictures that solve for all texels at once, from all pictures and with "
-        "what neighbours say, after each of two estimates of light between surfaces; under directional and point "
-        "lights only",
+        description="final joint Gauss-Newton steps over all texels and pictures with the smoothness prior, after each "
+        "of two estimates of indirect light; under directional and point lights only",
     )
     joint_subsamples: int = Field(
         default=25,
         ge=1,
         le=256,
-        description="samples a pixel in those steps, a square number: with 9, which miss more of a pixel's "
-        "edges and texture, a helmet's normals were wrong by 0.42° where light came directly, with 25 by 0.34°",
+        description="samples a pixel in those steps, a square number: with 9, which undersample a pixel's "
+        "edges and texture, a helmet's normals had an error of 0.42° under direct light, with 25 of 0.34°",
     )
     polish: int = Field(
         default=0,
         ge=0,
         le=100_000,
-        description="steps at the end through Mitsuba's prb, with light between surfaces in picture and gradient: slow",
+        description="final steps through Mitsuba's prb, with indirect light in picture and gradient: slow",
     )
     polish_rate: float = Field(
-        default=0.0005, gt=0, le=1, description="their first rate; their gradients are noisy, so it is small"
+        default=0.0005, gt=0, le=1, description="their initial rate, small because their gradients are noisy"
     )
-    polish_depth: int = Field(default=6, ge=2, le=64, description="path segments that those steps follow")
+    polish_depth: int = Field(default=6, ge=2, le=64, description="path segments of those steps")
     shadows: bool = Field(default=True, description="whether the object shadows itself")
-    memory: float = Field(default=4.0, gt=0, description="GB for what is kept of the pictures' samples")
+    memory: float = Field(default=4.0, gt=0, description="GB for cached samples of the pictures")
     checkpoint: float = Field(default=60.0, gt=0, description="seconds between checkpoints")
 
     @field_validator("subsamples", "joint_subsamples")
@@ -141,35 +140,34 @@ class RecoverSettings(BaseModel):
 
 
 def descent_steps(settings: RecoverSettings) -> int:
-    """How many steps on whole pictures there are: none where texels are only solved one by one."""
+    """Number of steps on whole pictures; 0 with `solver` "texels"."""
     return 0 if settings.solver == "texels" else settings.iterations
 
 
 def joint_steps(settings: RecoverSettings) -> int:
-    """How many joint steps there are: none where texels are not solved one by one before and then whole pictures, or
-    where neighbours shall have no word."""
+    """Number of joint steps; 0 unless the per-texel solver and whole pictures come before and `smooth` is on."""
     return settings.joint if settings.solver == "both" and settings.smooth and descent_steps(settings) else 0
 
 
 def joint_estimates(settings: RecoverSettings) -> tuple[int, ...]:
-    """Samples a pixel of each estimate of light between surfaces that such steps follow: the last one, of maps that
-    hardly change any more, is worth more."""
+    """Samples a pixel of each estimate of indirect light before joint steps: the last has more, since its maps hardly
+    change any more."""
     several = joint_steps(settings) and settings.bounces
     return (settings.bounce_samples, 2 * settings.bounce_samples) if several else ()
 
 
 def all_rounds(settings: RecoverSettings, pictures: int) -> int:
-    """How many rounds the texels are solved in: `rounds` at first and after each estimate of light between surfaces,
-    SETTLING times as many after the last, whose changes take them to settle."""
+    """Rounds of the per-texel solver: `rounds` at first and after each estimate of indirect light, SETTLING times as
+    many after the last, so that they converge."""
     among = len(estimates(settings, pictures)[0])
     return settings.rounds * (among + (SETTLING if among else 1))
 
 
 def estimates(settings: RecoverSettings, pictures: int) -> tuple[list[int], list[int]]:
-    """Samples a pixel of each estimate of light between surfaces: those among the rounds, those before last passes.
+    """Samples a pixel of each estimate of indirect light: those among the rounds, those before last passes.
 
-    Few have the first, whose maps are still far off, and those that the last will replace; where there are joint steps,
-    that is theirs.
+    The first has few, since its maps are inaccurate, and so have provisional ones. With joint steps the last estimate
+    is theirs.
     """
     few, many = -(-settings.bounce_samples // FEWER), settings.bounce_samples
     late = min(_passes(settings, pictures) - 1, settings.bounces // 2) if settings.solver == "both" else 0
@@ -178,7 +176,7 @@ def estimates(settings: RecoverSettings, pictures: int) -> tuple[list[int], list
 
 
 def passes(settings: RecoverSettings, pictures: int) -> list[tuple[int, int]]:
-    """Of each pass on whole pictures the steps, and the samples of the estimate before it, 0 for none."""
+    """Steps of each pass on whole pictures, and samples of the estimate before it, 0 for none."""
     count, late = _passes(settings, pictures), estimates(settings, pictures)[1]
     ends = [settings.iterations * k // (count + 1) for k in range(count)] + [settings.iterations]
     steps = [end - begin for begin, end in zip(ends[:-1], ends[1:], strict=True)]

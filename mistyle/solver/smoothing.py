@@ -1,16 +1,15 @@
 """Empirical-Bayes smoothing of the maps; its strength is estimated locally.
 
-A texel's own pictures tell its albedo, tilt and roughness with an error that is known roughly
-(`TexelEstimate.unconstrained`). What texels in a row differ by from a straight line through their neighbours has a
-variance that is the surface's own plus that of these errors; so the surface's own is measured around every texel
-(empirical Bayes), and the most likely values under both minimise
+The error of a texel's own albedo, tilt and roughness is approximately known (`TexelEstimate.unconstrained`). Second
+differences along a row have the surface's own variance plus that of these errors. Empirical Bayes subtracts the errors
+and so estimates the surface's own variance around every texel. The maximum a posteriori values minimise
 
     sum (x - estimate)² / noise²  +  sum (x[k] - (x[k-1] + x[k+1]) / 2)² / variance  +  SHARE sum x² / spread²
 
-over rows and columns of each island, of albedo and roughness also across seams (a Gaussian field of second
-differences: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.4). Where the surface is rough the variance is
-large, and the estimate stays. The last sum is of tilts alone: where little was seen, one that a few texels began
-would else go on along its slope, farther than any that is known. `spread` is measured around every texel too.
+over rows and columns of each island, for albedo and roughness also across seams (a Gaussian field of second
+differences: Rue and Held, Gaussian Markov Random Fields, 2005, section 3.4). On a rough surface the variance is large,
+and the estimate stays. The last sum is for tilts only. Without it, the slope of a few texels would continue through
+poorly observed regions, beyond all observed tilts. `spread` is estimated around every texel too.
 """
 
 from collections.abc import Iterator
@@ -25,30 +24,30 @@ from mistyle.render.deferred.material_table import ALBEDO, METALLIC, ROUGHNESS, 
 from mistyle.solver.prior import METAL_SPREAD
 from mistyle.solver.table import OVER_SEAMS, Atlas, diffused, fill, with_seam_weights
 
-# Channels of the table that are smoothed, and the least standard deviation of their second differences. Not metallic:
-# surfaces are metal or not.
+# The smoothed channels of the table, and the least standard deviation of their second differences. Metallic is not
+# smoothed: it is binary.
 LEAST = {0: 0.008, 1: 0.008, 2: 0.008, TILT_X: 0.006, TILT_Y: 0.006, ROUGHNESS: 0.008}
 TILTS = TILT_X, TILT_Y
-MOST = 0.3  # of that standard deviation
-ODD = 20  # times rarer than metals and others together: what is neither
-OPEN = 0.3  # what is taken for left open where nothing was seen
-SURE = 0.01  # standard deviation of a second difference below which one tells as much as another
-AROUND = 24  # steps over which the variance is measured
-KNOWN = 0.02  # what a texel may leave open of its tilt and still say how much tilts vary around it
-ELSEWHERE = 0.1  # what the whole atlas counts beside them, in texels that are known exactly
-SHARE = 0.3  # of what a tilt's spread would hold it by, were it independent of its neighbours'
-WIDER = 2.0  # times the variance over a seam, since what stands in for a neighbour lies beside its place
-STEPS, CLOSE = 300, 1e-4  # of conjugate gradients, at most; and what they may leave of the residual
+MOST = 0.3  # largest of these standard deviations
+ODD = 20  # prior odds of metallic near 0 or 1 against a value between them
+OPEN = 0.3  # standard deviation of unobserved texels
+SURE = 0.01  # standard deviation of a second difference that limits its weight
+AROUND = 24  # diffusion steps of the local variance
+KNOWN = 0.02  # standard deviation of a tilt that limits its weight in the local spread
+ELSEWHERE = 0.1  # weight of the whole atlas in the local spread, in exactly known texels
+SHARE = 0.3  # precision of a tilt relative to 1 / spread², since its neighbours are correlated
+WIDER = 2.0  # factor of the variance across a seam: the linked texel lies beside the neighbour's true place
+STEPS, CLOSE = 300, 1e-4  # most iterations of conjugate gradients, and their relative residual
 
 Grid = Float[np.ndarray, "h w"]
-Line = Bool[np.ndarray, "h v"]  # which texels have a neighbour on either side in their row
+Line = Bool[np.ndarray, "h v"]  # texels with a neighbour on either side in their row
 Both = tuple[np.ndarray, np.ndarray]  # along rows, and along columns (transposed)
 
 
 @dataclass(frozen=True)
 class Field:
     """One channel in one texture set: its rows of the table, the estimate and its errors, the variance of its second
-    differences, the weight of x², and which texels are neighbours."""
+    differences, the weight of x², and the links between neighbours."""
 
     part: slice
     estimate: Grid
@@ -65,16 +64,16 @@ def map_smoothing(
     floor: float,
     metallic: bool,
 ) -> Float[np.ndarray, "a 8"]:
-    """`table` with albedo, tilt and roughness (not below `floor`) as above, and with `metallic`, where that was fitted,
-    drawn to 0 or 1; uncovered texels move as the nearest covered one.
+    """`table` with smoothed albedo, tilt and roughness (not below `floor`). With `metallic`, metallic moves towards 0
+    or 1. Uncovered texels move as the nearest covered one.
 
-    `noise`: standard deviations of what the pictures tell, OPEN and above where they tell nothing. Cannot see edges: a
-    crease in a smooth surround is rounded by as much as its texels are uncertain.
+    `noise`: standard deviations under the pictures alone, at least OPEN without observations. Edges are not detected: a
+    crease in a smooth surround is rounded in proportion to its texels' uncertainty.
     """
     moved, atlas = np.zeros_like(table), with_seam_weights(atlas, table[:, SOLVED], noise)
     for c in LEAST:
         for one in _fields(table, noise, atlas, c):
-            moved[one.part, c] = (_likely(one) - one.estimate).ravel()
+            moved[one.part, c] = (_map_estimate(one) - one.estimate).ravel()
     result = table + fill(moved, atlas)
     if metallic:
         result = binarise_metallic(result, noise)
@@ -86,29 +85,29 @@ def map_smoothing(
 def prior_precision_matrix(
     table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"], atlas: Atlas, channel: int
 ) -> Any:
-    """The second and third sum above for one of LEAST's channels, as a sparse symmetric matrix P of the whole atlas:
-    x' P x, of variances as `map_smoothing` measures them on `table`. `atlas`: after `with_seam_weights`."""
+    """The second and third sum above for one of LEAST's channels, as a sparse symmetric matrix P of the whole atlas, x'
+    P x. Variances are those of `map_smoothing` on `table`. `atlas` comes from `with_seam_weights`."""
     from scipy.sparse import block_diag
 
-    return block_diag([_prior(one) for one in _fields(table, noise, atlas, channel)], format="csr")
+    return block_diag([_field_prior(one) for one in _fields(table, noise, atlas, channel)], format="csr")
 
 
 def _fields(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: int) -> Iterator[Field]:
-    """The channel in every texture set."""
+    """One channel as a field per texture set."""
     ridge = ridge_weight(table, noise, atlas, channel) if channel in TILTS else np.zeros(len(table), np.float32)
     for part, size, links in zip(atlas.parts, atlas.sizes, atlas.links, strict=True):
         estimate = table[part, channel].reshape(size)
         error = np.minimum(noise[part, channel].reshape(size), OPEN)
         among = links if OVER_SEAMS[channel] else within(links)
-        error, variance = _measured(estimate, error, among, LEAST[channel])
+        error, variance = _estimate_variance(estimate, error, among, LEAST[channel])
         yield Field(part, estimate, error, variance, ridge[part].reshape(size), among)
 
 
 def ridge_weight(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: int) -> Float[np.ndarray, " a"]:
-    """SHARE / spread² of every texel: of what the texels around it are known to be, and a little of those of the whole
-    atlas, which are the only ones where none around is known; 0 where none is known at all.
+    """SHARE / spread² of every texel, from well-observed tilts around it. The whole atlas has a small weight and
+    decides where no tilt around is known; 0 where none is known at all.
 
-    Errors are not taken off: they are thought larger than most are, and what was left would hold tilts too firmly.
+    Errors are not subtracted: most are overestimated, and the difference would regularise tilts too strongly.
     """
     x2, error = table[:, channel].astype(np.float64) ** 2, noise[:, channel].astype(np.float64)
     weight = np.where(error < OPEN, 1 / (error**2 + KNOWN**2) ** 2, 0)
@@ -121,9 +120,8 @@ def ridge_weight(table: np.ndarray, noise: np.ndarray, atlas: Atlas, channel: in
 
 
 def binarise_metallic(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, "a 7"]) -> Float[np.ndarray, "a 8"]:
-    """`table` with metallic drawn to 0 or 1, whichever is nearer, as far as it is left open: surfaces are metal or not.
-    What lies far from both is left alone, as if it were neither. What is no metal keeps its diffuse reflectance,
-    albedo (1 - metallic)."""
+    """`table` with metallic moved to the nearer of 0 and 1 in proportion to its uncertainty, since it is binary. Values
+    far from both stay. Dielectrics keep their diffuse reflectance, albedo (1 - metallic)."""
     metallic, nearer = table[:, METALLIC], np.round(table[:, METALLIC])
     away = metallic - nearer
     likely = np.exp(-0.5 * (away / METAL_SPREAD) ** 2)
@@ -135,29 +133,29 @@ def binarise_metallic(table: Float[np.ndarray, "a 8"], noise: Float[np.ndarray, 
     return result
 
 
-def _lines(among: Links) -> Both:
-    """Which texels have a neighbour in the grid on either side in their row, and in their column (transposed)."""
+def _inner_texels(among: Links) -> Both:
+    """Texels with a neighbour in the grid on either side, along rows and along columns (transposed)."""
     return among.right[:, :-1] & among.right[:, 1:], (among.below[:-1] & among.below[1:]).T
 
 
-def _second(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
-    """What each texel of a row differs by from the mean of its two neighbours, with its sign turned; 0 without them."""
+def _second_differences(x: Grid, links: Line) -> Float[np.ndarray, "h v"]:
+    """Second differences along rows, the mean of two neighbours less the texel; 0 without both neighbours."""
     return np.where(links, 0.5 * (x[:, :-2] + x[:, 2:]) - x[:, 1:-1], 0).astype(np.float32)
 
 
-def _measured(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
-    """Of what second differences vary by around every texel: how much is error, and the surface's own variance of them.
+def _estimate_variance(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[Grid, Grid]:
+    """Errors of the estimate, and the surface's own variance of second differences, both from a local window.
 
-    Where values vary less than their errors say, the errors are shared with the neighbours (the solver's prior made
-    them so): then only as much error is taken as the variation shows, since no smoothing could remove the rest.
+    Where values vary less than their errors predict, the errors are correlated (by the solver's prior). Errors then
+    shrink to the observed variation, since smoothing cannot remove the correlated part.
     """
     total = np.zeros((3, *estimate.shape, 1), np.float32)
-    for turned, link in enumerate(_lines(among)):
+    for turned, link in enumerate(_inner_texels(among)):
         x, e = (estimate.T, error.T) if turned else (estimate, error)
         noise = 0.25 * (e[:, :-2] ** 2 + e[:, 2:] ** 2) + e[:, 1:-1] ** 2
         weight = np.where(link, 1 / (noise + SURE**2) ** 2, 0)
         sums = total[..., 0].transpose(0, 2, 1) if turned else total[..., 0]
-        for own, value in zip(sums, (_second(x, link) ** 2, noise, 1), strict=True):
+        for own, value in zip(sums, (_second_differences(x, link) ** 2, noise, 1), strict=True):
             own[:, 1:-1] += weight * value
     varies, noise, weights = diffused(total, among, AROUND)[..., 0]
     own = np.clip((varies - noise) / np.maximum(weights, 1e-12), least**2, MOST**2)
@@ -165,19 +163,19 @@ def _measured(estimate: Grid, error: Grid, among: Links, least: float) -> tuple[
     return error * np.sqrt(share), own
 
 
-def _within(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
-    """Of every texel with neighbours in the grid on both sides, in its row or column: these two and itself (flat
-    indices), and one over the variance of what it differs by from their mean."""
+def _grid_differences(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
+    """Flat indices (both neighbours, the texel) of every texel with two neighbours in the grid, along rows and columns,
+    and the precisions of their second differences."""
     number, own = np.arange(variance.size, dtype=np.int32).reshape(variance.shape), variance.ravel()
-    lines, texels = _lines(among), []
+    lines, texels = _inner_texels(among), []
     for grid, link in zip((number, number.T), lines, strict=True):
         texels.append(np.stack([grid[:, :-2][link], grid[:, 2:][link], grid[:, 1:-1][link]], axis=1))
     every = np.concatenate(texels)
     return every, 1 / own[every[:, 2]]
 
 
-def _over_seams(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
-    """The same of texels with a seam on one side or both."""
+def _seam_differences(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
+    """Indices and precisions, as of `_grid_differences`, of texels with a seam on one or both sides."""
     width, rows, firm = variance.shape[1], [], []
     grids = np.pad(among.right, ((0, 0), (0, 1))).ravel(), np.pad(among.below, ((0, 1), (0, 0))).ravel()
     for grid, step, sides in zip(grids, (1, width), (among.seams[:2], among.seams[2:]), strict=True):
@@ -194,33 +192,35 @@ def _over_seams(variance: Grid, among: Links) -> tuple[np.ndarray, np.ndarray]:
     return np.concatenate(rows).astype(np.int32), np.concatenate(firm)
 
 
-def _differences(variance: Grid, among: Links) -> Any:
-    """As a sparse matrix: each row a second difference in units of its standard deviation."""
+def _difference_matrix(variance: Grid, among: Links) -> Any:
+    """Sparse matrix of second differences, each row divided by its standard deviation."""
     from scipy.sparse import csr_array
 
-    texels, firm = map(np.concatenate, zip(_within(variance, among), _over_seams(variance, among), strict=True))
+    texels, firm = map(
+        np.concatenate, zip(_grid_differences(variance, among), _seam_differences(variance, among), strict=True)
+    )
     root = np.sqrt(firm).astype(np.float32)[:, None]
     values = (root * np.array([0.5, 0.5, -1], np.float32)).ravel()
     starts = np.arange(0, values.size + 1, 3, dtype=np.int32)
     return csr_array((values, texels.ravel(), starts), shape=(len(texels), variance.size))
 
 
-def _prior(one: Field) -> Any:
-    """The second and third sum of one set, as a sparse matrix."""
+def _field_prior(one: Field) -> Any:
+    """The second and third sum of one set as a sparse matrix."""
     from scipy.sparse import dia_array
 
-    differences, size = _differences(one.variance, one.among), one.ridge.size
+    differences, size = _difference_matrix(one.variance, one.among), one.ridge.size
     return (differences.T @ differences + dia_array((one.ridge.ravel()[None], 0), shape=(size, size))).tocsr()
 
 
-def _likely(one: Field) -> Float[np.ndarray, "h w"]:
+def _map_estimate(one: Field) -> Float[np.ndarray, "h w"]:
     from scipy.sparse import dia_array
     from scipy.sparse.linalg import cg
 
-    prior = _prior(one)
+    prior = _field_prior(one)
     sure = (1 / np.maximum(one.error, 1e-4) ** 2).astype(np.float32).ravel()
     matrix = prior + dia_array((sure[None], 0), shape=prior.shape)
     inverse = dia_array((1 / matrix.diagonal()[None], 0), shape=prior.shape)
-    # From the estimate: the change is solved for, so that little of it is lost to rounding.
+    # Solves for the change from the estimate, which keeps rounding errors small.
     change, _ = cg(matrix, -(prior @ one.estimate.ravel()), rtol=CLOSE, maxiter=STEPS, M=inverse)
     return one.estimate + change.reshape(one.estimate.shape).astype(np.float32)

@@ -1,4 +1,4 @@
-"""What a recovery knows of all texels of all texture sets, as one table, and means over neighbours in it."""
+"""Table of all texels of all texture sets, and weighted means over neighbours in it."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -13,10 +13,10 @@ from mistyle.core.mesh import Mesh
 from mistyle.render.deferred.material_table import COLUMNS, ROUGHNESS, SOLVED
 from mistyle.solver.texels.observations import TexelObservations
 
-# Where a texel is thought to be before anything was seen.
+# Prior mean of a texel without observations.
 PRIOR_MEAN = (0.5, 0.5, 0.5, 0.0, 0.0, 0.5, 0.0)
-# Which of the unknowns go on across seams. Tilts would have to be turned into the other chart's frame, and where charts
-# meet at an edge, normal maps often bevel it: neighbours from beyond would level that.
+# Unknowns whose means cross seams. Tilts do not: they are in their chart's frame, and normal maps often bevel an edge
+# where charts meet, which a mean across it would flatten.
 OVER_SEAMS = np.array([1, 1, 1, 0, 0, 1, 1], np.float32)
 
 Table = Float[np.ndarray, "a 8"]
@@ -25,8 +25,8 @@ Values = Float[np.ndarray, "t 7"]
 
 @dataclass(frozen=True)
 class Atlas:
-    """All texels of all sets in one row after the other: which are covered, which covered one is closest to each, and
-    per set which are neighbours, where that was asked for."""
+    """All texels of all sets in one row after the other: coverage, the nearest covered texel of each, and per set the
+    links between neighbours (from `linked`)."""
 
     sizes: tuple[tuple[int, int], ...]
     covered: tuple[np.ndarray, ...]
@@ -40,12 +40,12 @@ class Atlas:
 
     @property
     def count(self) -> int:
-        """How many texels there are."""
+        """Number of texels."""
         return self.parts[-1].stop
 
 
 def atlas_of(texels: Sequence[Texels]) -> Atlas:
-    """The atlas of some texture sets."""
+    """The atlas of texture sets, without links."""
     covered = tuple(t.covered for t in texels)
     return Atlas(
         sizes=tuple((t.covered.shape[0], t.covered.shape[1]) for t in texels),
@@ -55,12 +55,12 @@ def atlas_of(texels: Sequence[Texels]) -> Atlas:
 
 
 def linked(mesh: Mesh, texels: Sequence[Texels]) -> Atlas:
-    """The same with neighbours."""
+    """The atlas of texture sets with links between neighbours."""
     return replace(atlas_of(texels), links=tuple(links(mesh, t) for t in texels))
 
 
 def scatter_to_atlas(values: Values, observed: TexelObservations, atlas: Atlas) -> Table:
-    """The table of an atlas: covered texels have their values, the others those of the nearest covered one."""
+    """The table of an atlas from the covered texels' values; uncovered texels take those of the nearest covered one."""
     table = np.zeros((atlas.count, COLUMNS), np.float32)
     table[:, SOLVED] = PRIOR_MEAN
     table[observed.texel, SOLVED] = values
@@ -68,7 +68,7 @@ def scatter_to_atlas(values: Values, observed: TexelObservations, atlas: Atlas) 
 
 
 def scatter(values: np.ndarray, observed: TexelObservations, atlas: Atlas, otherwise) -> np.ndarray:
-    """The covered texels' values in an array of the whole atlas, which has `otherwise` elsewhere."""
+    """An array of the whole atlas with the covered texels' values and `otherwise` elsewhere."""
     result = np.zeros((atlas.count, *values.shape[1:]), values.dtype)
     result[...] = otherwise
     result[observed.texel] = values
@@ -76,7 +76,7 @@ def scatter(values: np.ndarray, observed: TexelObservations, atlas: Atlas, other
 
 
 def fill(table: Float[np.ndarray, "a c"], atlas: Atlas, only: np.ndarray | None = None) -> Float[np.ndarray, "a c"]:
-    """Uncovered texels (of `only`, where given) take the values of the nearest covered one of their set."""
+    """Uncovered texels (only those in `only`, if any) take the values of the nearest covered one of their set."""
     result = table.copy()
     for part, covered, closest in zip(atlas.parts, atlas.covered, atlas.closest, strict=True):
         empty = ~covered.ravel()
@@ -94,8 +94,8 @@ def neighbourhood(
     steps: int,
     over: Float[np.ndarray, " c"] | float = 1.0,
 ) -> Float[np.ndarray, "t c"]:
-    """Weighted mean over the neighbours and theirs; `over`: how much those beyond seams count, 0..1 (of each column).
-    Where none has a weight, the texel's own value."""
+    """Weighted mean over a neighbourhood of `steps` diffusion steps; `over`: weight across seams, 0..1 (per column). A
+    texel without weights around it keeps its own value."""
     channels = values.shape[1]
     full = np.zeros((2, atlas.count, channels), np.float32)
     full[0, observed.texel], full[1, observed.texel] = values * weight, weight
@@ -109,8 +109,8 @@ def neighbourhood(
 def diffused(
     part: Float[np.ndarray, "n h w c"], among: Links, steps: int, over: Float[np.ndarray, " c"] | float = 1.0
 ) -> Float[np.ndarray, "n h w c"]:
-    """Sums that every texel shares with the four around it, step by step. What would go to others is lost, so sums mean
-    something only beside sums of weights."""
+    """Diffuse sums over the four neighbours, step by step. Shares beyond a border are lost, so sums need division by
+    diffused weights."""
     right, below = among.right[..., None], among.below[..., None]
     seams = among.seams if np.any(over) else ()
     for _ in range(steps):
@@ -127,7 +127,7 @@ def diffused(
 
 
 def with_seam_weights(atlas: Atlas, values: Float[np.ndarray, "a 7"], spread: Float[np.ndarray, "a 7"]) -> Atlas:
-    """The same with seams believed by albedo and roughness; `spread`: standard deviations."""
+    """The atlas with seams weighted by agreement of albedo and roughness; `spread`: standard deviations."""
     links_by_set = []
     for part, size, among in zip(atlas.parts, atlas.sizes, atlas.links, strict=True):
         fields = ((values[part, c].reshape(size), spread[part, c].reshape(size)) for c in (0, 1, 2, ROUGHNESS))

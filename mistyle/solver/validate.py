@@ -1,4 +1,4 @@
-"""Which reference pictures say something, and how far they may be downsampled."""
+"""Validation of reference pictures, and factors by which they can be downsampled."""
 
 from collections.abc import Sequence
 
@@ -12,16 +12,16 @@ from mistyle.core.maps import Texels
 from mistyle.core.mesh import Mesh
 
 LEAST_VIEWS = 3
-FINE = 0.25  # share of the texels that may be narrower than ACROSS blocks of averaged pixels
+FINE = 0.25  # largest share of texels narrower than ACROSS blocks of averaged pixels
 ACROSS = 2
-LEAST_PIXELS = 32  # along the shorter side of a picture that is left
+LEAST_PIXELS = 32  # along the shorter side of a downsampled picture
 
 
 def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captures:
-    """The pictures that say something. A picture of another size than its camera is refused, as are captures of which
-    nothing is left."""
+    """The usable pictures; notes name the others. Raises InputRefused for a picture whose size differs from its
+    camera's, and if none is usable."""
     if len(captures) == 0:
-        raise InputRefused("No reference pictures came; give at least three views of the object.")
+        raise InputRefused("Found no reference pictures; expected at least three views of the object.")
     usable, silent = [], []
     for k, camera in enumerate(captures.cameras):
         rgb, mask = captures.load(k)
@@ -30,10 +30,10 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
             raise InputRefused(
                 f"Picture '{camera.name}' has {size} pixels, its camera {expected}. Resize one to the other's size."
             )
-        reason = _why_not(mesh, camera, captures.lights[k], rgb, mask)
+        reason = _rejection(mesh, camera, captures.lights[k], rgb, mask)
         (silent if reason else usable).append((k, reason))
     for k, reason in silent:
-        notes.append(f"Picture '{captures.cameras[k].name}' is left out: {reason}.")
+        notes.append(f"Picture '{captures.cameras[k].name}' is skipped: {reason}.")
     if not usable:
         reasons = "; ".join(sorted({reason for _, reason in silent}))
         raise InputRefused(f"None of {len(captures)} reference pictures can be used ({reasons}). Check cameras, masks"
@@ -41,31 +41,31 @@ def validate_captures(mesh: Mesh, captures: Captures, notes: list[str]) -> Captu
     views = {captures.cameras[k].world_from_cam.tobytes() for k, _ in usable}
     if len(views) < LEAST_VIEWS:
         notes.append(
-            f"Only {len(views)} different view(s) can be used: the fit is singular, normals and roughness are guesses."
-            f" Give at least {LEAST_VIEWS} views, better 16 around the object."
+            f"Only {len(views)} different view(s) can be used: the fit is singular, normals and roughness are not"
+            f" reliable. Use at least {LEAST_VIEWS} views, better 16 around the object."
         )
     return subset(captures, [k for k, _ in usable])
 
 
-def _why_not(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: np.ndarray) -> str:
-    """Why a picture cannot be used, or nothing."""
+def _rejection(mesh: Mesh, camera: Camera, lights: Lights, rgb: np.ndarray, mask: np.ndarray) -> str:
+    """The reason why a picture cannot be used, or an empty string."""
     px, depth = px_from_world(camera, mesh.positions.astype(np.float64))
     if not (in_frame(camera, px) & (depth > 0)).any():
         return "its camera cannot see the mesh"
     if not lights:
-        return "no light is given for it"
+        return "it has no light"
     if not mask.any():
-        return "none of its pixels counts (all are saturated, masked or not numbers)"
+        return "none of its pixels is valid (all are saturated, masked or not finite)"
     if not (rgb[mask] > 0).any():
         return "it is all black"
     return ""
 
 
 def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) -> list[int]:
-    """How many pixels of each camera's picture, along a side, can be averaged and leave texels ACROSS blocks wide.
+    """Downsampling factor of each camera's picture at which texels are still ACROSS blocks wide.
 
-    Of the texels that face the camera, hidden ones too, three in four are at least that wide. With texels as wide as
-    one block the normals are nearly twice as wrong, with four a quarter less (`python -m benchmarks.photographs`).
+    At least three in four of the texels that face the camera, hidden ones included, are that wide. With texels one
+    block wide the normals' error nearly doubles; with four it falls by a quarter (`python -m benchmarks.photographs`).
     """
     from mistyle.solver.texels.observations import texel_sizes
 
@@ -79,8 +79,8 @@ def downsampling_factors(texels: Sequence[Texels], cameras: Sequence[Camera]) ->
     for camera in cameras:
         px, depth = px_from_world(camera, position)
         facing = ((camera.position - position) * normal).sum(axis=1) > 0
-        there = facing & (depth > 0) & (size > 0) & in_frame(camera, px)
-        wide = size[there] * camera.focal / depth[there] / ACROSS
+        visible = facing & (depth > 0) & (size > 0) & in_frame(camera, px)
+        wide = size[visible] * camera.focal / depth[visible] / ACROSS
         most = max(1, min(camera.size) // LEAST_PIXELS)
         result.append(int(np.clip(np.quantile(wide, FINE), 1, most)) if len(wide) else 1)
     return result

@@ -200,12 +200,12 @@ def test_a_symmetric_mesh_is_not_aligned_by_luck(rng):
     found, again = (align_points(box(), points, np.random.default_rng(2))[0] for _ in range(2))
     assert np.array_equal(found.work_from_cams, again.work_from_cams)
     assert found.rival < 1.1 and abs(scale_of(found.work_from_cams @ TRUE) - 1) < 0.01
-    with pytest.raises(InputRefused, match="two ways"):
+    with pytest.raises(InputRefused, match="two registrations"):
         align_by_points(box(), points, [], None, rng)
 
 
 def test_other_points_are_refused(mesh, rng):
-    with pytest.raises(InputRefused, match="mesh's radius away"):
+    with pytest.raises(InputRefused, match="mesh radii from the mesh"):
         align_by_points(mesh, rng.uniform(-3, 3, (150, 3)), [], None, rng)
 
 

@@ -88,7 +88,7 @@ def test_a_step_keeps_within_bounds():
     table[:, :6] = 0.5, 0.5, 0.5, 0.6, 0.6, 0.1
     change = np.full((3, 6), 9.0, np.float32)
     change[1], change[2, 5] = np.nan, -9
-    moved = joint._moved(table, UnknownTexels(np.array([0, 1, 3]), np.ones(3, bool)), change, 0.04)
+    moved = joint._updated(table, UnknownTexels(np.array([0, 1, 3]), np.ones(3, bool)), change, 0.04)
     np.testing.assert_allclose(moved[0, :3], 0.7, atol=1e-6)
     np.testing.assert_allclose(np.hypot(*moved[0, 3:5]), joint.STEEPEST, atol=1e-6)
     np.testing.assert_array_equal(moved[1:3], table[1:3])
@@ -164,7 +164,7 @@ def test_uncovered_texels_are_nearly_as_the_nearest_covered_one():
     table = np.full((144, 8), 0.5, np.float32)
     noise = np.full((144, 7), NOTHING, np.float32)
     rows = np.flatnonzero(covered.ravel() | (np.arange(144) % 12 == 9))
-    priors = joint._priors(table, noise, rows, where)
+    priors = joint._prior_matrices(table, noise, rows, where)
     ramp = np.minimum(np.arange(144) % 12, 8)[rows].astype(np.float32)
     assert len(priors) == 6
     for prior in priors:

@@ -64,7 +64,7 @@ def test_the_result_is_the_minimum_that_is_promised(rng: np.random.Generator):
     assert over >= 8
     wanted = np.linalg.solve(matrix, (found / error.astype(np.float64) ** 2).ravel())
     field = smoothing.Field(slice(0, found.size), found, error, variance, held, cut(covered, column))
-    got = smoothing._likely(field).ravel()
+    got = smoothing._map_estimate(field).ravel()
     assert np.abs(got - wanted).max() < 2e-3 * np.abs(wanted - found.ravel()).max()
 
 

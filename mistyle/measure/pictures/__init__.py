@@ -1,1 +1,1 @@
-"""Metrics between two pictures, as rendering people quote them."""
+"""Standard metrics between two pictures in rendering."""

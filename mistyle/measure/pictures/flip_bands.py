@@ -1,9 +1,8 @@
-"""FLIP of large pictures: in bands of rows, which bounds its memory, part of them in a second process.
+"""FLIP of large pictures: in bands of rows, which bounds its memory, partly in a second process.
 
-FLIP's filters reach a fraction of a degree, so that a band with its margin gives the same map as the whole picture. The
-package holds Python's lock while it works, hence a process and not a thread. `python -m
-mistyle.measure.pictures.flip_bands FOLDER` is that process: it reads the pictures and the order there, and writes its
-rows of the maps.
+FLIP's filters reach a fraction of a degree, so a band with its margin gives the same map as the whole picture. The
+package holds Python's lock, hence a process and not a thread. That process is `python -m
+mistyle.measure.pictures.flip_bands FOLDER`: it reads the pictures and the order there, and writes its rows of the maps.
 """
 
 import json
@@ -22,8 +21,8 @@ from jaxtyping import Float
 from mistyle.process.cores import cores
 
 BAND = 384  # rows
-SHARE = 0.6  # of the rows that the second process gets where the first has other things to do
-LARGE = 400_000  # pixels times exposures: below it a second process costs more than it saves
+SHARE = 0.6  # the second process's share of the rows while the first has other work
+LARGE = 400_000  # pixels times exposures; below, a second process costs more than it saves
 Exposures = tuple[float, float, int] | None
 
 
@@ -47,8 +46,8 @@ class FlipPair:
 def flip_maps(
     pairs: Mapping[str, FlipPair], ppd: float, meanwhile: Callable[[], None] | None = None
 ) -> dict[str, Float[np.ndarray, "h w"]]:
-    """`flip_map` of several pairs of one size; of large ones the lower rows in a second process, beside which
-    `meanwhile` runs first and then the upper rows."""
+    """`flip_map` of several pairs of one size. For large pairs a second process computes the lower rows, while this one
+    runs `meanwhile` and then computes the upper rows."""
     height, width = next(iter(pairs.values())).reference.shape[:2]
     work = sum(height * width * (p.exposures[2] if p.exposures else 1) for p in pairs.values())
     if work < LARGE or cores() < 2 or height < 64:
@@ -62,13 +61,13 @@ def flip_maps(
             if meanwhile is not None:
                 meanwhile()
             tops = {k: rows_of(p.reference, p.test, ppd, p.exposures, 0, cut) for k, p in pairs.items()}
-            said = helper.communicate()[1]
+            output = helper.communicate()[1]
         finally:
             if helper.poll() is None:
                 helper.kill()
                 helper.wait()
         if helper.returncode != 0:
-            raise RuntimeError(f"FLIP's second process ended with {helper.returncode}: {said.decode()[-500:]}")
+            raise RuntimeError(f"FLIP's second process ended with {helper.returncode}: {output.decode()[-500:]}")
         return {
             k: np.concatenate([top, np.load(Path(folder, f"map{n}.npy"), allow_pickle=False)])
             for n, (k, top) in enumerate(tops.items())
@@ -90,7 +89,8 @@ def _start(folder: Path, pairs: Mapping[str, FlipPair], ppd: float, cut: int) ->
 
 
 def reach(ppd: float) -> int:
-    """More pixels than FLIP's contrast filter (three deviations of its widest Gaussian) and edge filter look aside."""
+    """Margin in pixels, larger than the reach of FLIP's contrast filter (three deviations of its widest Gaussian) and
+    edge filter."""
     contrast = 3 * math.sqrt(0.04 / (2 * math.pi**2)) * ppd
     edges = 3 * 0.5 * 0.082 * ppd
     return math.ceil(contrast) + math.ceil(edges) + 4
@@ -127,8 +127,8 @@ def _band(reference, test, ppd: float, exposures: Exposures) -> Float[np.ndarray
         first, last, count = exposures
         chosen = {"ppd": ppd, "startExposure": first, "stopExposure": last, "numExposures": count}
     kind = "LDR" if exposures is None else "HDR"
-    found = flip_evaluator.evaluate(a, b, kind, applyMagma=False, computeMeanError=False, parameters=chosen)
-    return np.asarray(found[0], np.float32)[..., 0]
+    results = flip_evaluator.evaluate(a, b, kind, applyMagma=False, computeMeanError=False, parameters=chosen)
+    return np.asarray(results[0], np.float32)[..., 0]
 
 
 def main(folder: Path) -> None:

@@ -1,8 +1,8 @@
-"""How far a picture is from its reference, by the metrics that rendering people quote; each says what it is.
+"""Standard picture metrics of rendering, each with its definition.
 
 Pictures are linear Rec.709, premultiplied, float32 (h w 3); masks are bool (h w). Outside the mask the test takes the
-reference's pixels before a metric with a window looks at them, so that only differences inside count; means are over
-the mask. Nothing is rescaled and nothing is tone-mapped unless the definition says so.
+reference's pixels before a windowed metric, so that only differences inside count; means are over the mask. Nothing is
+rescaled or tone-mapped unless the definition states it.
 """
 
 import math
@@ -20,12 +20,12 @@ from mistyle.measure.pictures.flip_bands import FlipPair, flip_maps
 PPD = 3840 * math.pi / 180  # 0.7 m from a display of 3840 pixels and 0.7 m
 SMALL = 1e-2  # keeps relative errors of black pixels finite
 LPIPS_SMALLEST = 32  # pixels along each side
-ROWS = 32  # of a large picture at once: the temporaries then stay in the processor's cache
+ROWS = 32  # rows of a large picture per task: the temporaries then fit the processor's cache
 
 
 @dataclass(frozen=True)
 class Metric:
-    """A metric's name, which way is better, what it is measured in, and its whole definition."""
+    """A metric's name, better direction, unit, and full definition."""
 
     name: str
     better: Literal["lower", "higher"]
@@ -115,11 +115,11 @@ DATA = tuple(m.name for m in METRICS.values() if m.kind == "data")
 
 @dataclass(frozen=True)
 class Viewing:
-    """What metrics need to know besides the pictures.
+    """Inputs of metrics besides the pictures.
 
-    exposures   first and last exposure in stops and their number for HDR-FLIP; None: found from the reference
+    exposures   first and last exposure in stops and their number for HDR-FLIP; None: computed from the reference
     lpips       (reference, test, mask) -> distance, of sRGB-encoded pictures; None: LPIPS is not measured
-    lpips_text  what that function is
+    lpips_text  description of that function
     """
 
     ppd: float = PPD
@@ -139,7 +139,7 @@ class MetricValues:
 
 
 def definitions(viewing: Viewing, names: Sequence[str]) -> dict[str, str]:
-    """What every metric of `names` is, with the numbers of `viewing` filled in."""
+    """The definition of every metric in `names`, with the numbers of `viewing`."""
     if viewing.exposures is None:
         exposures = "as many exposures as the reference needs"
     else:
@@ -157,9 +157,9 @@ def measure_colour(
     viewing: Viewing | None = None,
     progress: Callable[[float], None] = lambda done: None,
 ) -> MetricValues:
-    """The metrics `names` of two linear pictures that are finite inside the mask. NaN where the mask is empty.
+    """The metrics `names` of two linear pictures that are finite inside the mask. NaN for an empty mask.
 
-    Raises ValueError where a pixel inside the mask is not finite.
+    Raises ValueError if a pixel inside the mask is not finite.
     """
     viewing = viewing or Viewing()
     values, maps = dict.fromkeys(names, math.nan), {}
@@ -177,7 +177,7 @@ def measure_colour(
     if "flip" in names and looks is not None:
         jobs["flip"] = FlipPair(*looks)
 
-    def others() -> None:
+    def other_metrics() -> None:
         values.update(_linear(a, b, mask, names, viewing))
         progress(0.1)
         if looks is not None:
@@ -185,16 +185,16 @@ def measure_colour(
         progress(0.4)
 
     if jobs:
-        maps |= flip_maps(jobs, viewing.ppd, others)
+        maps |= flip_maps(jobs, viewing.ppd, other_metrics)
         values |= {k: float(maps[k][mask].mean(dtype=np.float64)) for k in jobs}
     else:
-        others()
+        other_metrics()
     progress(1.0)
     return MetricValues(values, maps, exposures)
 
 
 def _linear(a, b, mask, names: Sequence[str], viewing: Viewing) -> dict[str, float]:
-    """The metrics that look at linear pictures."""
+    """The metrics on linear pictures."""
     values: dict[str, float] = {}
     if "psnr_linear" in names:
         values["psnr_linear"] = _decibels(_mean_square(a, b, mask), viewing.peak)
@@ -204,7 +204,7 @@ def _linear(a, b, mask, names: Sequence[str], viewing: Viewing) -> dict[str, flo
 
 
 def _encoded(a, b, mask, names: Sequence[str], viewing: Viewing, maps: dict[str, np.ndarray]) -> dict[str, float]:
-    """The metrics that look at sRGB-encoded pictures, FLIP aside; fills `maps`."""
+    """The metrics on sRGB-encoded pictures, except FLIP; fills `maps`."""
     values: dict[str, float] = {}
     if "psnr" in names:
         values["psnr"] = _decibels(_mean_square(a, b, mask), 1.0)
@@ -213,8 +213,8 @@ def _encoded(a, b, mask, names: Sequence[str], viewing: Viewing, maps: dict[str,
     if "de2000" in names or "de2000_p95" in names:
         maps["de2000"] = ciede_map(a, b)
         inside = maps["de2000"][mask]
-        found = {"de2000": float(inside.mean(dtype=np.float64)), "de2000_p95": float(np.percentile(inside, 95))}
-        values |= {k: v for k, v in found.items() if k in names}
+        figures = {"de2000": float(inside.mean(dtype=np.float64)), "de2000_p95": float(np.percentile(inside, 95))}
+        values |= {k: v for k, v in figures.items() if k in names}
     if "lpips" in names and viewing.lpips is not None and min(mask.shape) >= LPIPS_SMALLEST:
         values["lpips"] = float(viewing.lpips(a, b, mask))
     return values
@@ -226,20 +226,20 @@ def measure_data(
     mask: Bool[np.ndarray, "h w"],
     names: Sequence[str] = DATA,
 ) -> MetricValues:
-    """rmse, mae, max_error and (of three channels) angle of layers that are not colours; finite inside the mask."""
+    """rmse, mae, max_error and (of three channels) angle of non-colour layers; finite inside the mask."""
     values = {n: math.nan for n in names if n in DATA and (n != "angle" or reference.shape[2] == 3)}
     if not mask.any():
         return MetricValues(values)
     a, b = reference[mask].astype(np.float64), test[mask].astype(np.float64)
     gap = np.abs(a - b)
-    found = {"rmse": np.sqrt((gap**2).mean()), "mae": gap.mean(), "max_error": gap.max()}
+    figures = {"rmse": np.sqrt((gap**2).mean()), "mae": gap.mean(), "max_error": gap.max()}
     if "angle" in values:
-        found["angle"] = _angle(a, b)
-    return MetricValues({n: float(found[n]) for n in values})
+        figures["angle"] = _angle(a, b)
+    return MetricValues({n: float(figures[n]) for n in values})
 
 
 def _angle(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> float:
-    """By the half-angle formula: an arc cosine has no precision where vectors agree."""
+    """By the half-angle formula: an arc cosine loses precision where vectors agree."""
     lengths = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
     usable = (lengths[0] > 1e-6) & (lengths[1] > 1e-6)
     if not usable.any():
@@ -259,10 +259,10 @@ def encoded(linear: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
 def flip_exposures(
     reference: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None
 ) -> tuple[float, float, int]:
-    """First and last exposure (stops) and their number that HDR-FLIP's rule finds from a linear reference.
+    """First and last exposure (stops) and their number by HDR-FLIP's rule for a linear reference.
 
-    The rule looks at the largest and the median luminance; here of the pixels inside the mask that are not black, so
-    that an empty background does not ask for exposures that show nothing but noise. (0, 0, 2) without any light.
+    The rule uses the largest and the median luminance. Here they are over the pixels inside the mask that are not
+    black, so that an empty background does not add exposures of noise only. (0, 0, 2) without any light.
     """
     import flip_evaluator
 
@@ -275,9 +275,9 @@ def flip_exposures(
     middle = light[np.argpartition(bright, len(bright) // 2)[len(bright) // 2]]
     strip = np.tile(middle, (8, 8, 1)).astype(np.float32)
     strip[0, 0] = light[bright.argmax()]
-    found: Any = flip_evaluator.evaluate(strip, strip, "HDR", applyMagma=False, computeMeanError=False)[2]
-    first, last, count = float(found["startExposure"]), float(found["stopExposure"]), int(found["numExposures"])
-    # With one exposure the package answers 0 whatever the pictures are.
+    rule: Any = flip_evaluator.evaluate(strip, strip, "HDR", applyMagma=False, computeMeanError=False)[2]
+    first, last, count = float(rule["startExposure"]), float(rule["stopExposure"]), int(rule["numExposures"])
+    # With one exposure the package always returns 0.
     return (first, last, max(count, 2)) if math.isfinite(first) and math.isfinite(last) else (0.0, 0.0, 2)
 
 
@@ -291,7 +291,7 @@ def ciede_map(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"]) -> F
 
 
 def _inside(reference, test, mask) -> tuple[np.ndarray, np.ndarray]:
-    """Both pictures with the test equal to the reference outside the mask, and both 0 where that is not finite."""
+    """Both pictures, with the test equal to the reference outside the mask, and both 0 where that is not finite."""
     a, b = (picture.astype(np.float32, copy=False) for picture in (reference, test))
     if mask.all():
         return a, b
@@ -338,7 +338,7 @@ def ssim(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"], mask: Boo
         low, high = max(0, start - reach), min(len(a), start + band + reach)
         if high - low < 11:
             low = max(0, high - 11)
-        found: Any = structural_similarity(
+        result: Any = structural_similarity(
             a[low:high],
             b[low:high],
             data_range=1.0,
@@ -347,6 +347,6 @@ def ssim(a: Float[np.ndarray, "h w 3"], b: Float[np.ndarray, "h w 3"], mask: Boo
             use_sample_covariance=False,
             full=True,
         )
-        own = found[1][start - low : min(start + band, len(a)) - low]
+        own = result[1][start - low : min(start + band, len(a)) - low]
         total += float(own[mask[start : start + band]].sum(dtype=np.float64))
     return total / (3 * int(mask.sum()))

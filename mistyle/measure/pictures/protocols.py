@@ -1,4 +1,4 @@
-"""The numbers that other people's evaluation code prints, by their definitions: Stanford-ORB, TensoIR, OIIO's idiff."""
+"""Metrics by the definitions of published evaluation code: Stanford-ORB, TensoIR, OIIO's idiff."""
 
 import math
 from collections.abc import Mapping
@@ -17,7 +17,7 @@ PROTOCOLS: Mapping[str, str] = {
     "frame, black surroundings included, and never below that of constant 0.5. ssim: Gaussian window of 3 px, standard "
     "deviation 1.5, mirrored, on psnr_l's pictures. Its LPIPS (VGG) is not measured. "
     "A reference four times as large is reduced by area averages",
-    "tensoir": "TensoIR's relighting figures, on sRGB-encoded pictures in 0..1 over white. psnr: peak 1, all pixels. "
+    "tensoir": "TensoIR's relighting metrics, on sRGB-encoded pictures in 0..1 over white. psnr: peak 1, all pixels. "
     "ssim: Gaussian window of 11 px, standard deviation 1.5, variances kept from below zero, only where the window "
     "lies inside the picture, mean over channels",
     "idiff": "OpenImageIO's idiff on the values as stored, all channels, missing ones and missing pixels 0, over the "
@@ -69,7 +69,7 @@ def _orb_pair(reference, test, mask: Bool[np.ndarray, "h w"], most: float, brigh
 
 
 def _orb_encoded(linear: np.ndarray) -> np.ndarray:
-    """The sRGB curve, which goes on above 1."""
+    """The sRGB curve, extended above 1."""
     return np.where(linear > 0.0031308, 1.055 * np.maximum(linear, 0.0031308) ** (1 / 2.4) - 0.055, 12.92 * linear)
 
 
@@ -103,7 +103,7 @@ def tensoir(reference: Float[np.ndarray, "h w 3"], test: Float[np.ndarray, "h w 
 
 
 def _similarity(a: np.ndarray, b: np.ndarray, smooth, clamp: bool) -> np.ndarray:
-    """The SSIM map with peak 1, K = 0.01 and 0.03; `clamp` keeps (co)variances to what variances can be."""
+    """The SSIM map with peak 1, K = 0.01 and 0.03; `clamp` limits (co)variances to their valid range."""
     ma, mb = smooth(a), smooth(b)
     va, vb, vab = smooth(a * a) - ma**2, smooth(b * b) - mb**2, smooth(a * b) - ma * mb
     if clamp:
@@ -114,7 +114,7 @@ def _similarity(a: np.ndarray, b: np.ndarray, smooth, clamp: bool) -> np.ndarray
 
 
 def idiff(reference: Float[np.ndarray, "h w c"], test: Float[np.ndarray, "h w c"]) -> dict[str, float]:
-    """mean_error, rms_error, peak_snr, max_error and over; a NaN meets a NaN and an infinity an infinity."""
+    """mean_error, rms_error, peak_snr, max_error and over; NaN matches NaN and infinity matches infinity."""
     a, b = reference.astype(np.float64), test.astype(np.float64)
     finite = np.isfinite(a) & np.isfinite(b)
     alike = (np.isnan(a) & np.isnan(b)) | (np.isinf(a) & np.isinf(b))

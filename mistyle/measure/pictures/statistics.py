@@ -1,4 +1,4 @@
-"""Are two noisy renders of one scene renders of the same picture? And how fast does one converge?"""
+"""Welch's test whether two noisy renders have the same expectation, and convergence rates."""
 
 import math
 from collections.abc import Sequence
@@ -7,15 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-LEAST = 1e-6  # a difference that nobody need explain, in linear radiance
+LEAST = 1e-6  # negligible difference, in linear radiance
 
 
 @dataclass(frozen=True)
 class Tested:
-    """What a test of two means found.
+    """The result of a test of two means.
 
     passed    whether no block of any scale is rejected
-    share     share of the pixels in rejected blocks, the whole picture's aside
+    share     share of the pixels in rejected blocks, without the whole picture's
     worst     the largest |t|
     bias      mean of test minus reference over the reference's mean, all pixels together
     whole     whether the whole picture's mean is rejected
@@ -42,31 +42,31 @@ def same_picture(
 ) -> Tested:
     """Welch's test of the means of independent renders, per block and channel, at three scales.
 
-    The blocks are `block` pixels wide, four times as wide, and the whole picture: small ones find what is local, large
-    ones what is faint. Each seed's block mean is one observation; means and variances come from the seeds alone. The
+    The blocks are `block` pixels wide, four times as wide, and the whole picture: small ones detect local differences,
+    large ones faint ones. Each seed's block mean is one observation; means and variances come from the seeds alone. The
     hypothesis "both have the same expectation" is rejected for the picture at `level` with Šidák's correction over all
-    blocks, so that a pair without any difference fails at most once in 1 / level times. A standard error below `floor`
-    times the block's brightness counts as that (few seeds may agree by chance; differences below it are not looked
-    for). Fireflies make a block's mean less normal than the test supposes. ValueError for fewer than 2 seeds.
+    blocks, so that an equal pair fails at most once in 1 / level times. A standard error is at least `floor` times the
+    block's brightness (few seeds may agree by chance; smaller differences are ignored). Fireflies make block means less
+    normal than the test assumes. Raises ValueError for fewer than 2 seeds.
     """
     if len(reference) < 2 or len(test) < 2:
-        raise ValueError(f"{len(reference)} and {len(test)} renders came; a variance needs two of each at least")
+        raise ValueError(f"{len(reference)} and {len(test)} renders; expected at least two of each for a variance")
     size = reference.shape[1:3]
     sides = [block, 4 * block, max(size)]
-    found = [_welch(_blocks(reference, side), _blocks(test, side), floor) for side in sides]
-    limit = -math.expm1(math.log1p(-level) / sum(p.size for _, p in found))
-    rejected = [np.asarray((p < limit).any(axis=-1)) for _, p in found]
+    tests = [_welch(_blocks(reference, side), _blocks(test, side), floor) for side in sides]
+    limit = -math.expm1(math.log1p(-level) / sum(p.size for _, p in tests))
+    rejected = [np.asarray((p < limit).any(axis=-1)) for _, p in tests]
     bias = float((test.mean() - reference.mean()) / max(float(reference.mean()), 1e-12))
-    smallest = found[0][0]
+    smallest = tests[0][0]
     picked = np.take_along_axis(smallest, np.abs(smallest).argmax(axis=-1)[..., None], axis=-1)[..., 0]
     fine, coarse = (_spread(r, side, size) for r, side in zip(rejected[:2], sides[:2], strict=True))
-    # A large block shows only what no small one inside it does.
+    # The map omits a large rejected block that a small rejected one inside explains.
     explained = np.asarray(_blocks(np.repeat(fine[None, ..., None], 3, axis=3), sides[1])[0, ..., 0] > 0)
     where = fine | (coarse & ~_spread(explained, sides[1], size))
     return Tested(
         passed=not any(r.any() for r in rejected),
         share=float(where.mean()),
-        worst=max(float(np.abs(t).max()) for t, _ in found),
+        worst=max(float(np.abs(t).max()) for t, _ in tests),
         bias=bias,
         whole=bool(rejected[2].any()),
         t=_spread(picked, block, size).astype(np.float32),
@@ -89,7 +89,7 @@ def _welch(a: np.ndarray, b: np.ndarray, floor: float) -> tuple[np.ndarray, np.n
 
 
 def _blocks(stack: np.ndarray, block: int) -> Float[np.ndarray, "n r c 3"]:
-    """Block means; blocks that the border cuts are means of what is there."""
+    """Block means; blocks at the border average the pixels inside the picture."""
     rows, columns = (np.arange(0, s, block) for s in stack.shape[1:3])
     total = np.add.reduceat(np.add.reduceat(stack.astype(np.float64), rows, axis=1), columns, axis=2)
     heights, widths = (np.diff([*starts, s]) for starts, s in ((rows, stack.shape[1]), (columns, stack.shape[2])))
@@ -104,11 +104,11 @@ def interval(values: Sequence[float], level: float = 0.95) -> tuple[float, float
     """Mean and half the width of its confidence interval, by Student's t; NaN half-width for a single value."""
     from scipy.stats import t as student
 
-    found = np.asarray(values, np.float64)
-    if len(found) < 2:
-        return float(found.mean()), math.nan
-    half = student.ppf(0.5 + level / 2, len(found) - 1) * found.std(ddof=1) / math.sqrt(len(found))
-    return float(found.mean()), float(half)
+    numbers = np.asarray(values, np.float64)
+    if len(numbers) < 2:
+        return float(numbers.mean()), math.nan
+    half = student.ppf(0.5 + level / 2, len(numbers) - 1) * numbers.std(ddof=1) / math.sqrt(len(numbers))
+    return float(numbers.mean()), float(half)
 
 
 def slope(x: Sequence[float], y: Sequence[float]) -> float:

@@ -1,10 +1,10 @@
 """The two reflectance models in closed form, over Dr.Jit arrays in the tangent frame of a surface point.
 
-Both are isotropic, so that a normal map enters through four cosines and no frame is built, and both are linear in the
-albedo: f cos(theta_o) = albedo · linear + constant with two scalars (`terms`). Directions are unit vectors that point
-away from the surface, `wi` to the camera and `wo` to the light, as in Mitsuba. Everything is linear Rec.709;
-parameters are 0..1 and not clamped here. All functions take any Dr.Jit float type, are differentiable by its AD, trace
-about 150 operations and evaluate nothing. Where the result is 0 the gradient is 0, never NaN, for finite input.
+Both are isotropic, so a normal map enters through four cosines and no frame is built. Both are linear in the albedo:
+f cos(theta_o) = albedo · linear + constant with two scalars (`terms`). Directions are unit vectors that point away from
+the surface, `wi` to the camera and `wo` to the light, as in Mitsuba. Everything is linear Rec.709; parameters are 0..1
+and not clamped here. All functions take any Dr.Jit float type, are differentiable by its AD, trace about 150 operations
+and evaluate nothing. Where the result is 0 the gradient is 0, never NaN, for finite input.
 """
 
 from collections.abc import Callable
@@ -37,7 +37,7 @@ class Reflectance:
 class Angles(NamedTuple):
     """Cosines of wi and wo with the normal, of wi with the half vector; squared cosine and sine of the half vector.
 
-    They are safe numbers where `valid` is False: one of the directions is not above the surface there.
+    They are finite where `valid` is False: one of the directions is not above the surface there.
     """
 
     cos_i: Any
@@ -52,9 +52,9 @@ def principled(wi: Any, wo: Any, albedo: Any, roughness: Any, metallic: Any, *, 
     """f cos(theta_o) of Mitsuba 3.9.1's `principled` with base_color, roughness, metallic, specular; one sided.
 
     Burley diffuse and retro-reflection, not scaled by 1 - F; GGX with alpha = max(0.001, roughness²), separable Smith,
-    exact dielectric Fresnel of eta = 2 / (1 - sqrt(0.08 specular)) - 1, Schlick for the metal. With `specular` 0 the
-    plugin reflects nothing at the surface, metal neither; so does this. Unlike there the gradient by metallic at
-    exactly 1 counts the diffuse part too.
+    exact dielectric Fresnel of eta = 2 / (1 - sqrt(0.08 specular)) - 1, Schlick for the metal. With `specular` 0 plugin
+    and function have no specular reflection, not even for metals. Unlike the plugin's, the gradient by metallic at
+    exactly 1 includes the diffuse part.
     """
     return _reflected(_principled, wi, wo, albedo, roughness, metallic, specular)
 
@@ -88,7 +88,7 @@ def evaluate(
 def terms(reflectance: Reflectance, wi: Any, wo: Any, normal: Any, roughness: Any, metallic: Any) -> tuple[Any, Any]:
     """Albedo-linear and constant term: `evaluate` is albedo · linear + constant.
 
-    Several lights can be summed before the albedo comes in.
+    Several lights can be summed before multiplication by the albedo.
     """
     import drjit as dr
 
@@ -108,7 +108,7 @@ def terms(reflectance: Reflectance, wi: Any, wo: Any, normal: Any, roughness: An
 
 
 def upright(wi: Any, wo: Any) -> Angles:
-    """What the models need to know of two directions about the unperturbed normal; valid on the front side only."""
+    """The models' cosines of two directions about the unperturbed normal; valid on the front side only."""
     return _angles((0, 0, 1), (wi.x, wi.y, wi.z), (wo.x, wo.y, wo.z), True)
 
 
@@ -129,7 +129,7 @@ def _angles(n: tuple, wi: tuple, wo: tuple, valid: Any) -> Angles:
     valid = (cos_i > 0) & (cos_o > 0) & (length2 > 1e-12) & valid
     length2 = dr.select(valid, length2, 1)
     cos_i, cos_o = dr.select(valid, cos_i, 1), dr.select(valid, cos_o, 1)
-    # |n x h|² rather than 1 - (n·h)², which has no digits left where a smooth surface shines.
+    # |n x h|² rather than 1 - (n·h)², which loses all significant digits at highlights of smooth surfaces.
     cross = (
         dr.fma(n[1], half[2], -n[2] * half[1]),
         dr.fma(n[2], half[0], -n[0] * half[2]),
@@ -174,10 +174,9 @@ def layered(
 ) -> Any:
     """f cos(theta_o) of glTF's surface with KHR_materials_specular, KHR_materials_ior and KHR_materials_clearcoat.
 
-    `albedo` and `f0` (of the dielectric) are colours; F(f0) = f0 + (f90 - f0)(1 - |wi·h|)^5, of which the largest
-    channel is what the diffuse lobe loses. `coat` is (strength, roughness); of index 1.5, it
-    covers the base by its Fresnel term at the normal. With f0 = 0.04, f90 = 1 and no coat it is `gltf`.
-    Safe numbers where `a.valid` is False.
+    `albedo` and `f0` (of the dielectric) are colours; F(f0) = f0 + (f90 - f0)(1 - |wi·h|)^5, and the diffuse lobe loses
+    its largest channel. `coat` is (strength, roughness); of index 1.5, it covers the base by its Fresnel term at the
+    normal. With f0 = 0.04, f90 = 1 and no coat it is `gltf`. Finite where `a.valid` is False.
     """
     import drjit as dr
 
@@ -207,7 +206,7 @@ MODELS: dict[str, Callable[[Angles, Any, Any, float], tuple[Any, Any]]] = {"prin
 
 
 def _metal(lobe: Any, metallic: Any, edge: Any) -> tuple[Any, Any]:
-    """Schlick's albedo + (1 - albedo) · edge, by what it has of the albedo and without it."""
+    """Schlick's albedo + (1 - albedo) · edge, as its albedo-linear and constant term."""
     weighted = lobe * metallic
     return weighted * (1 - edge), weighted * edge
 
@@ -242,7 +241,7 @@ def _schlick(cosine: Any) -> Any:
 
 
 def _shadow_terminator(normal_z: Any, wo_z: Any) -> Any:
-    """Estevez et al. 2019, the bump terminator: how much of a light at wo reaches a surface bumped by `normal_z`."""
+    """Estevez et al. 2019, the bump terminator: attenuation of light at wo on a surface bumped by `normal_z`."""
     import drjit as dr
 
     z2 = dr.maximum(dr.square(normal_z), 1e-12)

@@ -1,8 +1,8 @@
-"""A differentiable renderer for people: texture maps in, a picture without noise out, gradients in torch and Dr.Jit.
+"""Public differentiable renderer: texture maps in, a noise-free picture out, gradients in torch and Dr.Jit.
 
-It shades what `deferred.trace` found once per camera: one ray through each pixel's centre, direct light with exact
-shadows. The reflectance is Mitsuba's `principled` in closed form (`render/deferred/bsdf.py`), so that the picture
-equals that of `mi.render` with the `direct` integrator. Without noise a finite difference is a fair test of a gradient.
+It shades the result of `integrator.trace`, traced once per camera: one ray through each pixel's centre, direct light
+with exact shadows. The reflectance is Mitsuba's `principled` in closed form (`render/deferred/bsdf.py`), so the picture
+equals that of `mi.render` with the `direct` integrator. Without noise, finite differences validate its gradients.
 """
 
 import sys
@@ -24,7 +24,7 @@ from mistyle.render.deferred import split, torch_bridge
 from mistyle.render.deferred.image_samples import FrameKind, own, tangents_of
 from mistyle.render.mitsuba.draw import tracer
 
-# The values of maps that are left out: grey, flat, half rough, not metallic.
+# Default values of omitted maps: grey, flat, half rough, not metallic.
 NEUTRAL = {"albedo": (0.5, 0.5, 0.5), "normal": (0.0, 0.0, 1.0), "roughness": (0.5,), "metallic": (0.0,)}
 
 # One texture set: a record, or NumPy arrays, torch or Dr.Jit tensors by the names of its maps.
@@ -32,7 +32,7 @@ MapSet = Maps | Mapping[str, Any]
 
 
 def lights_of_cameras(lights: Light | Sequence[Light] | Sequence[Sequence[Light]], count: int) -> tuple[Lights, ...]:
-    """One rig for each of `count` cameras, from a light, from a rig for all of them, or from a rig for each."""
+    """One rig for each of `count` cameras, from a light, a rig for all of them, or a rig for each."""
     if isinstance(lights, Light):
         lights = (lights,)
     single = [light for light in lights if isinstance(light, Light)]
@@ -40,15 +40,15 @@ def lights_of_cameras(lights: Light | Sequence[Light] | Sequence[Sequence[Light]
         return (tuple(single),) * count
     rigs = tuple(tuple(rig) for rig in lights if not isinstance(rig, Light))
     if single or len(rigs) != count:
-        raise UsageError(f"found {len(rigs)} rigs and {len(single)} lights for {count} cameras; give one rig for all"
-                         " cameras, or a rig for each")  # fmt: skip
+        raise UsageError(f"found {len(rigs)} rigs and {len(single)} lights for {count} cameras; expected one rig for"
+                         " all cameras, or one for each")  # fmt: skip
     return rigs
 
 
 class Renderer:
     """Pictures of known cameras under known lights as a differentiable function of the material.
 
-    It cannot do: environment maps and spherical Gaussians, indirect light, antialiasing, gradients by geometry, camera
+    Not supported: environment maps and spherical Gaussians, indirect light, antialiasing, gradients by geometry, camera
     or light. Ambient light is unoccluded and summed over 16 directions (errors up to 0.03 of its radiance).
 
         renderer = Renderer(mesh, cameras, lights)
@@ -77,13 +77,13 @@ class Renderer:
         self.mesh = mesh.mesh if isinstance(mesh, Asset) else mesh
         self.cameras = (cameras,) if isinstance(cameras, Camera) else tuple(cameras)
         self.lights = lights_of_cameras(lights, len(self.cameras))
-        other = {
+        unsupported = {
             type(x).__name__ for rig in self.lights for x in rig if not isinstance(x, Directional | Point | Ambient)
         }
-        if other:
+        if unsupported:
             raise UsageError(
-                f"Renderer: found {', '.join(sorted(other))}; expected Directional, Point and Ambient lights. "
-                "render_views draws the others, without gradients."
+                f"Renderer: found {', '.join(sorted(unsupported))}; expected Directional, Point and Ambient lights. "
+                "render_views supports the others, without gradients."
             )
         traced, tangents = tracer(self.mesh), tangents_of(self.mesh, frame)
         self._surfaces = [deferred.trace(traced, [camera], tangents) for camera in self.cameras]
@@ -98,7 +98,7 @@ class Renderer:
         return len(self.cameras)
 
     def mask(self, camera: int = 0) -> Bool[np.ndarray, "h w"]:
-        """Which pixels' centres see the mesh."""
+        """Mask of pixels whose centres see the mesh."""
         return self._surfaces[camera].mask.reshape(self.cameras[camera].size)
 
     def image(self, maps: MapSet | Sequence[MapSet], camera: int = 0) -> Any:
@@ -112,10 +112,10 @@ class Renderer:
             roughness  (r, c)     perceptual, 0..1; no gradient below 0.032
             metallic   (r, c)     0..1
 
-        Row 0 is v = 1; values are fetched bilinearly, textures repeat, nothing is clamped. A map that is left out is
-        neutral (0.5, flat, 0.5, 0). The picture is what the maps are: NumPy arrays give a NumPy array, torch tensors
-        a torch tensor (float32, on the CPU) through `dr.wrap`, Dr.Jit tensors an `mi.TensorXf` with its own AD. Arrays
-        and tensors of one kind may be mixed. Torch's gradients have the same bytes in every run; those of Dr.Jit add up
+        Row 0 is v = 1; values are fetched bilinearly, textures repeat, nothing is clamped. An omitted map is neutral
+        (0.5, flat, 0.5, 0). The picture has the maps' type: NumPy arrays give a NumPy array, torch tensors a torch
+        tensor (float32, on the CPU) through `dr.wrap`, Dr.Jit tensors an `mi.TensorXf` with its own AD. Arrays and
+        tensors of one kind may be mixed. Torch's gradients have the same bytes in every run; Dr.Jit's are summed
         atomically, in any order. Raises ValueError for maps of wrong shapes and unknown names.
         """
         sets = [maps] if isinstance(maps, Maps | Mapping) else list(maps)
@@ -144,7 +144,7 @@ class Renderer:
         return np.array(split.radiance(self._lit[camera], packed)).reshape(*self.cameras[camera].size, 3)
 
     def _torch_image(self, tables: Sequence[Mapping[str, Any]], sizes, where: torch_bridge.Taps, camera: int) -> Any:
-        """The fetch by a sparse product, whose gradient has a fixed order, then shading pixel by pixel."""
+        """The fetch as a sparse product, whose gradient has a fixed order, then shading of each pixel."""
         import drjit as dr
         import mitsuba as mi
         import torch
@@ -173,7 +173,7 @@ class Renderer:
         return self._wrapped[camera](padded).clone()
 
     def _drjit_image(self, tables: Sequence[Mapping[str, Any]], sizes, where: torch_bridge.Taps, camera: int) -> Any:
-        """The fetch by gathers, each channel by itself."""
+        """The fetch by gathers, one channel at a time."""
         import drjit as dr
         import mitsuba as mi
 
@@ -196,10 +196,10 @@ class Renderer:
 
 
 def _maps_of(one: MapSet) -> dict[str, Any]:
-    """The maps by name, with all shapes checked against each other; at least one is there."""
-    given = vars(one) if isinstance(one, Maps) else dict(one)
-    unknown = sorted(set(given) - {*NEUTRAL, "known"})
-    maps = {name: given[name] for name in NEUTRAL if name in given}
+    """The maps by name, at least one, with consistent shapes."""
+    named = vars(one) if isinstance(one, Maps) else dict(one)
+    unknown = sorted(set(named) - {*NEUTRAL, "known"})
+    maps = {name: named[name] for name in NEUTRAL if name in named}
     if unknown or not maps:
         raise ValueError(f"maps are called {', '.join(map(repr, unknown)) or 'nothing'}; expected {', '.join(NEUTRAL)}")
     size = _size(maps)

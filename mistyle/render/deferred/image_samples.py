@@ -1,13 +1,13 @@
-"""What the samples of a picture see of the surface and of its lights, traced once and kept in packed arrays.
+"""Samples of a picture: surface points and visible lights, traced once and stored in packed arrays.
 
-Geometry, cameras and lights stand still while materials are fitted. `collect` traces a fixed grid of rays a pixel and
-keeps of each sample that meets the mesh inside the picture's mask and that any light reaches: where it reads the
-textures, the direction to the camera and to the lights in its tangent frame, and how much of each light arrives. The
-work comes in blocks of rows, so that a picture of any size needs bounded memory.
+Geometry, cameras and lights are fixed while materials are fitted. `collect` traces a fixed grid of rays a pixel. It
+stores each lit sample that hits the mesh inside the picture's mask: texture footprint, directions to the camera and to
+the lights in the tangent frame, and each light's attenuation. The work is split into blocks of rows, so that a picture
+of any size needs bounded memory.
 
-Bytes: 29 a sample and 16 more per delta light (pixel 4, texel 4, step 1, place in the texel 8, wi 12; wo 12 and
-strength 4 per light), 32 a sample for the transpose, 12 a texel that is read, 8 a pixel; soft light adds 37 a sample
-and one bit per cell of the sky.
+Bytes: 29 a sample and 16 more per delta light (pixel 4, texel 4, step 1, position in the texel 8, wi 12; wo 12 and
+strength 4 per light), 32 a sample for the transpose, 12 per texel read, 8 a pixel; soft light adds 37 a sample and one
+bit per cell of the sky.
 """
 
 from collections.abc import Iterator, Sequence
@@ -29,7 +29,7 @@ from mistyle.render.mitsuba.draw import Tracer
 
 FrameKind = Literal["mikkt", "mitsuba"]
 
-# Rays per block: what tracing holds at once is about 500 bytes a ray.
+# Rays per block: tracing needs about 500 bytes a ray.
 BLOCK_RAYS = 1 << 20
 
 
@@ -47,9 +47,9 @@ class TexturedMesh:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How a picture is sampled: a square number of `subsamples` a pixel, whether the mesh throws `shadows` on itself.
+    """Sampling of a picture: a square number of `subsamples` a pixel, and whether the mesh casts `shadows` on itself.
 
-    Without `gradients` blocks have no transpose: they are good for pictures only, and are ready sooner.
+    Without `gradients` blocks have no transpose: they only render pictures, and build faster.
     """
 
     subsamples: int = 4
@@ -64,16 +64,16 @@ DEFAULT_SAMPLING = Sampling()
 class Samples:
     """n lit samples of a block, pixel after pixel, padded with samples of no strength (Dr.Jit arrays only).
 
-    slot      which of the block's lit pixels the sample belongs to
-    texel     row of the table of texels that is the top left one of the bilinear fetch
-    step      row of `steps(sizes)`: how far it is to the texels on the right and below
-    x, y      where between them the sample lies, 0..1
+    slot      the block's lit pixel that the sample belongs to
+    texel     row of the table of texels: top left of the bilinear fetch
+    step      row of `steps(sizes)`: offsets to the texels on the right and below
+    x, y      position between them, 0..1
     wi        unit direction to the camera, in the tangent frame, z > 0 (a back side is mirrored, as `twosided` does)
     wo        per delta light the unit direction to it, in the same frame
     strength  per delta light 0 where it is hidden or below the horizon, else 1 (directional) or 1 / distance² (point)
     frame     the tangent frame's axes (s, t, n) in the world, n mirrored with wi; None without soft light
-    variant   which part of the sky's cells the sample sees (`sky.VARIANTS`)
-    visible   UInt32 words: bit k of sample j's word i (at i · n + j) says whether it sees cell 32 i + k
+    variant   part of the sky's cells that the sample sees (`sky.VARIANTS`)
+    visible   UInt32 words: bit k of sample j's word i (at i · n + j) is set if it sees cell 32 i + k
     """
 
     slot: Any
@@ -91,11 +91,11 @@ class Samples:
 
 @dataclass(frozen=True)
 class Pixels:
-    """p lit pixels of a block, ascending, padded with pixels of no samples: Dr.Jit arrays only.
+    """p lit pixels of a block, ascending, padded with pixels without samples: Dr.Jit arrays only.
 
     index   row · width + column in the picture
     first   its first sample
-    count   how many samples it has
+    count   its number of samples
     """
 
     index: Any
@@ -105,7 +105,7 @@ class Pixels:
 
 @dataclass(frozen=True)
 class Transpose:
-    """The bilinear fetch the other way round: which samples read each of t texels (Dr.Jit arrays only).
+    """The transpose of the bilinear fetch: the samples that read each of t texels (Dr.Jit arrays only).
 
     texel ascends; texel k is read by `sample[begin[k]:end[k]]`, with the bilinear `weight`. Padding has begin = end.
     """
@@ -121,11 +121,11 @@ class Transpose:
 class SampleBlock:
     """One block of a picture. `counts` are the samples, pixels and texels without padding.
 
-    transpose only where gradients were asked for
+    transpose only if gradients were requested
     lights    colour of each delta light (irradiance, or intensity of a point), linear Rec.709
     sky       the soft light
-    covered   samples on the mesh of the block's pixels, lit or not; row 0 of it is row `row` of the picture
-    dark      pixels of the picture that are covered but that no light reaches
+    covered   number of samples on the mesh per pixel of the block, lit or not; row 0 of it is row `row` of the picture
+    dark      covered pixels of the picture that no light reaches
     bytes     of the Dr.Jit arrays
     """
 
@@ -142,7 +142,7 @@ class SampleBlock:
 
 
 def tangents_of(mesh: Mesh, frame: FrameKind) -> Float[np.ndarray, "f 3 4"] | None:
-    """What `collect` needs for a frame: MikkTSpace's tangents per face corner, or None for Mitsuba's own."""
+    """Tangents of a frame for `collect`: MikkTSpace's per face corner, or None for Mitsuba's own."""
     if frame == "mitsuba":
         return None
     return corner_tangents(mesh)
@@ -158,7 +158,7 @@ def grid(subsamples: int) -> Float[np.ndarray, "s 2"]:
 
 
 def steps(sizes: Sequence[tuple[int, int]]) -> Int[np.ndarray, "k 2"]:
-    """How far (in rows of the table) the right and the lower texel are: rows 4 · set + 2 · wraps down + wraps right."""
+    """Offsets (rows of the table) of the right and the lower texel: rows 4 · set + 2 · wraps down + wraps right."""
     table = []
     for rows, columns in sizes:
         for down in (columns, columns - rows * columns):
@@ -172,7 +172,7 @@ def bilinear_taps(
     place: Float[np.ndarray, "n 2"],
     sizes: Sequence[tuple[int, int]],
 ) -> tuple[Int[np.ndarray, "n 4"], Float[np.ndarray, "n 4"]]:
-    """The four texels, rows of the table, that each footprint is fetched from, and their bilinear weights."""
+    """The four texels (rows of the table) of each footprint, and their bilinear weights."""
     right, down = steps(sizes)[step].astype(np.int64).T
     index = texel[:, None] + np.stack([np.zeros_like(right), right, down, right + down], axis=1)
     x, y = place.T
@@ -184,8 +184,8 @@ def bilinear_footprint(
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], Float[np.ndarray, "n 2"]]:
     """Bilinear fetch from texture sets of `sizes` (rows, columns), all texels one after the other, row by row.
 
-    Top left texel, its row of `steps`, and the place (x, y) between the texels, 0..1. Texel centres at +0.5, row 0 is
-    v = 1, textures repeat: exactly what Mitsuba's bitmap texture does. `uv` is v up.
+    Top left texel, its row of `steps`, and the position (x, y) between the texels, 0..1. Texel centres at +0.5, row 0
+    is v = 1, textures repeat: exactly as in Mitsuba's bitmap texture. `uv` is v up.
     """
     offsets = np.cumsum([0] + [rows * columns for rows, columns in sizes])
     rows, columns = np.asarray(sizes, np.int64)[part].T
@@ -206,15 +206,15 @@ def collect(
 ) -> Iterator[SampleBlock]:
     """The blocks of one picture, top to bottom, without those that see nothing of the mesh.
 
-    `soft` is `sky.sky(lights)`, made here if it is not given. Shadow rays start where Mitsuba's start. ValueError for
+    `soft` is `sky.sky(lights)`, built here by default. Shadow rays start where Mitsuba's start. Raises ValueError for
     lights that only a scene file describes.
     """
     device.use()
     if mask.shape != camera.size:
-        raise ValueError(f"{camera.name}: a mask of {mask.shape} pixels came for a camera of {camera.size}")
+        raise ValueError(f"{camera.name}: found a mask of {mask.shape} pixels; expected the camera's {camera.size}")
     known = [light for light in lights if isinstance(light, Directional | Point)]
     if any(isinstance(light, SceneLights) for light in lights):
-        raise ValueError(f"{camera.name}: light that only a scene file describes cannot be collected")
+        raise ValueError(f"{camera.name}: lights that only a scene file describes are not supported")
     soft = soft or sky(lights)
     down, across = window(surface.traced.mesh, camera)
     near = np.zeros_like(mask)
@@ -228,11 +228,11 @@ def collect(
 
 
 def window(mesh: Mesh, camera: Camera) -> tuple[slice, slice]:
-    """Rows and columns of the picture that the mesh can be seen in: all, where some of it is behind the camera."""
+    """Rows and columns of the picture that can show the mesh: all, if part of it is behind the camera."""
     px, depth = px_from_world(camera, mesh.positions.astype(np.float64))
     if len(px) == 0 or not (depth > 0).all():
         return slice(0, camera.size[0]), slice(0, camera.size[1])
-    # A pixel more on each side, for what single precision may put there.
+    # A margin of one pixel covers the rounding of single precision.
     low, high = np.floor(px.min(axis=0)) - 1, np.ceil(px.max(axis=0)) + 1
     (left, top), (right, bottom) = (np.clip(edge, 0, camera.size[::-1]).astype(int).tolist() for edge in (low, high))
     return slice(top, bottom), slice(left, right)
@@ -240,7 +240,7 @@ def window(mesh: Mesh, camera: Camera) -> tuple[slice, slice]:
 
 @dataclass(frozen=True)
 class _Traced:
-    """What a block's rays found: Mitsuba's surface points and frames, and per ray (Dr.Jit) whether they count.
+    """Hits of a block's rays: Mitsuba's surface points and frames, and a mask of valid rays (Dr.Jit).
 
     `side` is -1 where the surface's back is seen; `wo` and `strength` per delta light as in `Samples`.
     """
@@ -264,7 +264,7 @@ def _block(
     sampling: Sampling,
     soft: Sky | None,
 ) -> SampleBlock | None:
-    """The rows of a picture from `row` on that `mask` has."""
+    """The block of a picture's rows from `row` on; `mask` selects its pixels. None without any sample."""
     import drjit as dr
     import mitsuba as mi
 
@@ -279,21 +279,21 @@ def _block(
     point = rays.point
     face = mi.UInt32(point.prim_index)
     dr.eval(rays.valid, rays.lit, rays.wi, rays.wo, rays.strength, face, point.uv)
-    on, kept = np.array(rays.valid), np.flatnonzero(np.array(rays.lit)).astype(np.uint32)
+    on, lit_rays = np.array(rays.valid), np.flatnonzero(np.array(rays.lit)).astype(np.uint32)
     hit = np.bincount(pixel[on] - row * width, minlength=mask.size).reshape(mask.shape)
     if not on.any():
         return None
-    part = surface.traced.mesh.part[np.array(face)[kept]]
-    uv = np.array(point.uv).T[kept]
+    part = surface.traced.mesh.part[np.array(face)[lit_rays]]
+    uv = np.array(point.uv).T[lit_rays]
     uv = np.stack([uv[:, 0], 1 - uv[:, 1].astype(np.float64)], axis=1)
     texel, step, place = bilinear_footprint(uv, part, surface.sizes)
-    size = padded(len(kept))
-    # Samples come pixel after pixel.
-    begins = np.concatenate([[True], np.diff(pixel[kept]) > 0])[: len(kept)]
+    size = padded(len(lit_rays))
+    # Samples are ordered by pixel.
+    begins = np.concatenate([[True], np.diff(pixel[lit_rays]) > 0])[: len(lit_rays)]
     first, slot = np.flatnonzero(begins), np.cumsum(begins) - 1
-    lit_pixels, count = pixel[kept][first], np.diff(first, append=len(kept))
-    variant = _variants(pixel[kept], kept % subsamples, subsamples, width)
-    samples = _samples(surface, rays, kept, (slot, texel, step, place), variant, soft, sampling.shadows)
+    lit_pixels, count = pixel[lit_rays][first], np.diff(first, append=len(lit_rays))
+    variant = _variants(pixel[lit_rays], lit_rays % subsamples, subsamples, width)
+    samples = _samples(surface, rays, lit_rays, (slot, texel, step, place), variant, soft, sampling.shadows)
     p = padded(len(lit_pixels))
     pixels = Pixels(*(own(mi.UInt32, _pad(a.astype(np.uint32), p)) for a in (lit_pixels, first, count)))
     transpose, touched = _transpose(texel, step, place, surface.sizes, size) if sampling.gradients else (None, 0)
@@ -310,7 +310,7 @@ def _block(
         row=row,
         covered=hit.astype(np.uint16),
         dark=np.flatnonzero(dark) + row * width,
-        counts=(len(kept), len(lit_pixels), touched),
+        counts=(len(lit_rays), len(lit_pixels), touched),
         bytes=size * (29 + 16 * len(lights) + soft_bytes)
         + 12 * p
         + (0 if transpose is None else 32 * size + 12 * padded(touched)),
@@ -348,20 +348,20 @@ def _trace(
 def _samples(
     surface: TexturedMesh,
     rays: _Traced,
-    kept: Integer[np.ndarray, " n"],
+    lit_rays: Integer[np.ndarray, " n"],
     columns: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     variants: Integer[np.ndarray, " n"],
     soft: Sky | None,
     shadows: bool,
 ) -> Samples:
-    """The rays `kept`, padded; `columns` are their slots, texels, steps and places, see `Samples`."""
+    """The rays `lit_rays`, padded; `columns` are their slots, texels, steps and positions, see `Samples`."""
     import drjit as dr
     import mitsuba as mi
 
     slot, texel, step, place = columns
-    size = padded(len(kept))
-    where = own(mi.UInt32, _pad(kept, size))
-    real = dr.arange(mi.UInt32, size) < len(kept)
+    size = padded(len(lit_rays))
+    where = own(mi.UInt32, _pad(lit_rays, size))
+    real = dr.arange(mi.UInt32, size) < len(lit_rays)
     axes: Any = None
     variant, visible = None, None
     if soft is not None:
@@ -386,13 +386,13 @@ def _samples(
 
 
 def padded(count: int) -> int:
-    """The next of eight sizes per octave: frozen functions are recorded once per size, so there must be few."""
+    """The next of eight sizes per octave: frozen functions are recorded once per size, so sizes must be few."""
     unit = max(64, 1 << max(0, (count - 1).bit_length() - 4))
     return max(unit, -(-count // unit) * unit)
 
 
 def own(kind: Any, values: np.ndarray) -> Any:
-    """A Dr.Jit array in memory of its own: NumPy's is aligned now so, now so, and a frozen function minds."""
+    """A Dr.Jit array in its own memory: NumPy's alignment varies, and frozen functions depend on alignment."""
     import drjit as dr
 
     return kind(aligned(values, values.dtype)) + dr.opaque(kind, 0)
@@ -405,21 +405,21 @@ def _pad(values: np.ndarray, size: int) -> np.ndarray:
 
 
 def camera_rays(camera: Camera, pixel: Any, x: Any, y: Any) -> Any:
-    """Rays through the places (x, y), 0..1, in the pixels (UInt32, row · width + column); unit directions."""
+    """Rays through the positions (x, y), 0..1, in the pixels (UInt32, row · width + column); unit directions."""
     import drjit as dr
     import mitsuba as mi
 
     width = camera.size[1]
     x = (mi.Float(pixel % width) + x - camera.centre[0]) / camera.focal
     y = (mi.Float(pixel // width) + y - camera.centre[1]) / camera.focal
-    # Made for every call: a product with a literal zero, as upright cameras have one, resizes that zero.
+    # New for every call: a product with a literal zero, which upright cameras contain, resizes that zero.
     axes: list[Any] = [mi.Vector3f(axis.tolist()) for axis in camera.world_from_cam[:3, :3].T]
     right, down, forward = axes
     return mi.Ray3f(mi.Point3f(camera.position.tolist()), dr.normalize(right * x + down * y + forward))
 
 
 def _arriving(traced, point, light, camera: Camera, valid, shadows: bool) -> tuple[Any, Any]:
-    """World direction to a delta light, and which share of its colour arrives from there."""
+    """World direction to a delta light, and the share of its colour that arrives."""
     import drjit as dr
     import mitsuba as mi
 
@@ -437,7 +437,7 @@ def _arriving(traced, point, light, camera: Camera, valid, shadows: bool) -> tup
 
 
 def _variants(pixel, subsample, subsamples: int, width: int) -> Integer[np.ndarray, " n"]:
-    """Different ones for the samples of a pixel and for pixels that are close."""
+    """Variants that differ between the samples of a pixel and between close pixels."""
     dither = 4 * (pixel % width % 4) + pixel // width % 4
     return ((subsample * max(1, VARIANTS // subsamples) + dither) % VARIANTS).astype(np.uint8)
 
@@ -471,7 +471,7 @@ def _colour(light: Directional | Point) -> tuple[float, float, float]:
 
 
 def _transpose(texel, step, place, sizes, size: int) -> tuple[Transpose, int]:
-    """A counting sort by texel; samples of one texel stay in order, so that its sum has one order."""
+    """A counting sort by texel; samples of one texel stay in order, so its sum has a fixed order."""
     import mitsuba as mi
     import scipy.sparse as sparse
 

@@ -1,10 +1,10 @@
 """A Mitsuba integrator that shades known surface points under known lights, without noise.
 
-Geometry, cameras and lights stand still while materials are fitted, so rays are traced once (`trace`), and what a
-BSDF needs of a pixel is kept: the direction to the camera and to each light in the pixel's own tangent frame. The
-integrator `mistyle_deferred` then sums BSDF times irradiance over all lights exactly, one sample per pixel. Each
-pixel reads its own texel of textures as large as the film, so that the gradient of a texture has one summand per
-texel and the same bytes in every run and at any number of threads.
+Geometry, cameras and lights are fixed while materials are fitted, so rays are traced once (`trace`). Each pixel stores
+the BSDF's inputs: the directions to the camera and to each light in its own tangent frame. The integrator
+`mistyle_deferred` then sums BSDF times irradiance over all lights exactly, one sample per pixel. Each pixel reads its
+own texel of textures as large as the film. The gradient of a texture therefore has one summand per texel, with the same
+bytes in every run and at any number of threads.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ _registered: set[str] = set()
 
 @dataclass(frozen=True)
 class Surface:
-    """What the pixels of several equal cameras see, camera after camera, row by row (n = cameras · h · w).
+    """Surface points of the pixels of several equal cameras, camera after camera, row by row (n = cameras · h · w).
 
     uv is v up (meant modulo 1), part is -1 and facing 0 off the mesh; facing is the cosine between the direction to the
     camera and the shading normal, negative where the surface's back is seen. `frame` and `towards` (Dr.Jit, world) are
@@ -53,7 +53,7 @@ class Surface:
 
 @dataclass(frozen=True)
 class Lit:
-    """A film's pixels with their lights, in their tangent frames: what the integrator sums over.
+    """A film's pixels with their lights, in their tangent frames: the integrator's input.
 
     `size` is (rows, columns) of the film; `directional` holds (direction, irradiance as seen from the pixel) pairs,
     `ambient` one radiance or None.
@@ -77,7 +77,7 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
 
     device.use()
     if len({camera.size for camera in cameras}) != 1:
-        raise ValueError(f"cameras of one size are needed, not {sorted({camera.size for camera in cameras})}")
+        raise ValueError(f"found cameras of sizes {sorted({camera.size for camera in cameras})}; expected one size")
     point, frame = intersect(traced, ray := _rays(cameras), tangents)
     valid = point.is_valid()
     towards = -ray.d
@@ -102,7 +102,7 @@ def trace(traced: Tracer, cameras: Sequence[Camera], tangents: Float[np.ndarray,
 
 
 def intersect(traced: Tracer, ray: Any, tangents: Float[np.ndarray, "f 3 4"] | None) -> tuple[Any, Any]:
-    """Where rays first meet the mesh: Mitsuba's surface interaction, and the frame of the normal map (see `trace`)."""
+    """First hits of rays on the mesh: Mitsuba's surface interaction, and the frame of the normal map (see `trace`)."""
     import mitsuba as mi
 
     first = traced.scene.ray_intersect_preliminary(ray, coherent=True)
@@ -116,8 +116,8 @@ def light(traced: Tracer, surface: Surface, lights: Lights, *, shadows: bool = T
     """Light that all cameras share: directional and point lights, one shadow ray each (`shadows`), and unoccluded
     ambient light.
 
-    Ambient light knows no occlusion, so that an albedo fitted under it does not turn bright in cavities; its radiance
-    is summed over AMBIENT_DIRECTIONS fixed directions per pixel. Other kinds of light raise ValueError.
+    Ambient light has no occlusion, so an albedo fitted under it does not turn bright in cavities. Its radiance is
+    summed over AMBIENT_DIRECTIONS fixed directions per pixel. Raises ValueError for other kinds of light.
     """
     beams, ambient = [], np.zeros(3)
     for source in lights:
@@ -127,7 +127,7 @@ def light(traced: Tracer, surface: Surface, lights: Lights, *, shadows: bool = T
             ambient += source.radiance
         else:
             raise ValueError(
-                f"{type(source).__name__} cannot be summed exactly; give directional, point or ambient light"
+                f"{type(source).__name__} cannot be summed exactly; expected directional, point or ambient light"
             )
     glow = (float(ambient[0]), float(ambient[1]), float(ambient[2])) if ambient.any() else None
     return _lit(traced, surface, beams, glow, shadows)
@@ -165,7 +165,7 @@ def _lit(
 
 
 def _beam(surface: Surface, row: Sequence[Directional] | Sequence[Point], camera_of: Any) -> tuple[Any, Any, Any]:
-    """Of one light for each camera: unit directions towards it, irradiance of what faces it, and shadow rays."""
+    """For one light per camera: unit directions towards it, irradiance at normal incidence, and shadow rays."""
     import drjit as dr
     import mitsuba as mi
 
@@ -186,9 +186,9 @@ def _beam(surface: Surface, row: Sequence[Directional] | Sequence[Point], camera
 def ambient_directions(wi: Any, count: int = AMBIENT_DIRECTIONS) -> list[tuple[Any, Any]]:
     """Directions and weights with which a constant radiance sums to the light scattered towards `wi` (tangent frame).
 
-    Spherical Fibonacci points: half of them follow the cosine about the shading normal, half a GGX lobe of
-    LOBE_ALPHA about the mirror direction; each is weighted by one over the density of both together (the balance
-    heuristic). The same at every call, so the sum has an error but no noise.
+    Spherical Fibonacci points: half follow the cosine about the shading normal, half a GGX lobe of LOBE_ALPHA about the
+    mirror direction; each weight is one over the combined density (the balance heuristic). They are constant, so the
+    sum has an error but no noise.
     """
     import drjit as dr
     import mitsuba as mi
@@ -220,7 +220,7 @@ def ambient_directions(wi: Any, count: int = AMBIENT_DIRECTIONS) -> list[tuple[A
 
 
 def register() -> None:
-    """Make the plugin `mistyle_deferred` known to the current variant of Mitsuba."""
+    """Register the plugin `mistyle_deferred` with the current variant of Mitsuba."""
     import mitsuba as mi
 
     variant = device.use()
@@ -240,13 +240,13 @@ def _integrator_class() -> type:
         lit: Lit | None = None
 
         def sample(self, scene, sampler, ray, medium=None, active=True):
-            """Radiance of the film's pixels in order; the ray is not looked at. Needs one sample per pixel."""
+            """Radiance of the film's pixels in order; the ray is ignored. Needs one sample per pixel."""
             lit = self.lit
             if lit is None:
                 raise RuntimeError(f"{INTEGRATOR}: set `lit` before rendering")
             rows, columns = lit.size
             if dr.width(ray.d) != rows * columns:
-                raise RuntimeError(f"{INTEGRATOR}: a film of {columns}x{rows} pixels at 1 spp is needed")
+                raise RuntimeError(f"{INTEGRATOR}: expected a film of {columns}x{rows} pixels at 1 spp")
             pixel = dr.arange(mi.UInt32, rows * columns)
             point = dr.zeros(mi.SurfaceInteraction3f, rows * columns)
             point.wi = lit.wi

@@ -1,8 +1,8 @@
-"""The kernels of `render/deferred/renderer.py`: pure functions of Dr.Jit arrays that trace no ray and wait for nothing.
+"""The kernels of `render/deferred/renderer.py`: pure functions of Dr.Jit arrays without ray tracing or host syncs.
 
-Every function can be frozen: sizes of arrays are constants of a recording, so there is one recording per size.
-`textures` is (table, steps to the right, steps down), `terms` a `bsdf.terms` with its model and options, `lights` the
-colours of the delta lights and the soft light, None where there is none.
+Every function can be frozen. Array sizes are constants of a recording, so there is one recording per size. `textures`
+is (table, steps to the right, steps down), `terms` a `bsdf.terms` with its model and options, `lights` the colours of
+the delta lights and the soft light, or None.
 """
 
 from collections.abc import Callable
@@ -61,7 +61,7 @@ def _fetch(textures: Any, samples: Samples) -> list[Any]:
 
 
 def _packets() -> Any:
-    """The type of eight numbers a lane; Mitsuba's stubs do not know it."""
+    """The type of eight numbers a lane; Mitsuba's stubs lack it."""
     import mitsuba as mi
 
     return mi.ArrayXf
@@ -74,7 +74,7 @@ def _tilted_z(x: Any, y: Any) -> Any:
 
 
 def _delta_light(terms: Callable, values: list[Any], samples: Samples, colours: tuple) -> tuple[Any, Any]:
-    """Albedo-linear and constant term of all delta lights: the sample sends albedo · linear + constant."""
+    """Albedo-linear and constant term of all delta lights: the radiance is albedo · linear + constant."""
     import mitsuba as mi
 
     linear, constant = mi.Color3f(0), mi.Color3f(0)
@@ -87,7 +87,7 @@ def _delta_light(terms: Callable, values: list[Any], samples: Samples, colours: 
 
 
 def _colour(terms: Callable, values: list[Any], samples: Samples, lights: tuple) -> Any:
-    """Light that each sample sends to the camera; differentiable only without soft light."""
+    """Radiance of each sample towards the camera; differentiable only without soft light."""
     import mitsuba as mi
 
     linear, constant = _delta_light(terms, values, samples, lights[0])
@@ -127,8 +127,8 @@ def step(terms, subsamples, loss, textures, block: BlockArrays, goal) -> Any:
 
     samples, pixels, lights = block.samples, block.pixels, block.lights
     values, (target, scale) = _fetch(textures, samples), goal
-    wanted = dr.gather(mi.Vector4f, target, dr.arange(mi.UInt32, dr.width(pixels.index)))
-    reference, weight = mi.Color3f(wanted.x, wanted.y, wanted.z), wanted.w * scale
+    packet = dr.gather(mi.Vector4f, target, dr.arange(mi.UInt32, dr.width(pixels.index)))
+    reference, weight = mi.Color3f(packet.x, packet.y, packet.z), packet.w * scale
     if subsamples == 1 and lights[1] is None:
         dr.enable_grad(values)
         lost = LOSSES[loss](_colour(terms, values, samples, lights), reference) * weight
@@ -143,7 +143,7 @@ def step(terms, subsamples, loss, textures, block: BlockArrays, goal) -> Any:
         packed = dr.ravel(mi.Vector4f(adjoint.x, adjoint.y, adjoint.z, 0))
         packed = _derivatives(terms, textures, samples, lights, dr.gather(mi.Vector4f, packed, samples.slot))
     lost = dr.detach(lost)
-    # Both at once: one kernel that shades each sample a single time.
+    # Both at once: one kernel that shades each sample once.
     dr.eval(lost, packed)
     return dr.sum(lost), _to_texels(textures[0], packed, block.transpose)
 
@@ -160,7 +160,7 @@ def pull(terms, subsamples, textures, block: BlockArrays, adjoint) -> Any:
 
 
 def _derivatives(terms, textures, samples, lights, adjoint) -> Any:
-    """Of Σ adjoint · colour by the eight fetched values of each sample, in packets."""
+    """Gradient of Σ adjoint · colour by the eight fetched values of each sample, in packets."""
     import drjit as dr
     import mitsuba as mi
 
@@ -179,7 +179,7 @@ def _derivatives(terms, textures, samples, lights, adjoint) -> Any:
 
 
 def _to_texels(table, packed, transpose) -> Any:
-    """Sum, texel by texel, weight · derivative of the samples that read it; then from (x, y, z) to the tilt."""
+    """Per texel, the sum of weight · derivative over the samples that read it; then from (x, y, z) to the tilt."""
     import drjit as dr
     import mitsuba as mi
 
@@ -202,7 +202,7 @@ def _to_texels(table, packed, transpose) -> Any:
 
 
 def add_rows(gradient: Any, rows: Any, transpose: Transpose) -> None:
-    """Not in a frozen function: there the gradient would be copied, for the caller holds it too."""
+    """Not frozen: a frozen function would copy the gradient, since the caller holds it too."""
     import drjit as dr
     import mitsuba as mi
 
@@ -235,7 +235,7 @@ def _log_srgb(x: Any) -> Any:
 LOSSES: dict[str, Callable[[Any, Any], Any]] = {"l2": _l2, "log_srgb_l1": _log_srgb_l1}
 
 
-# Directions per sample about the mirror direction, besides the sky's cells, and the least GGX alpha they follow.
+# Directions per sample about the mirror direction, in addition to the sky's cells, and the lobe's least GGX alpha.
 LOBE_DIRECTIONS = 16
 LEAST_ALPHA = 0.01
 
@@ -258,8 +258,8 @@ def upload(sky: Sky) -> tuple[Any, ...]:
 def soft_light(terms: Callable, values: list[Any], samples: Samples, sky: tuple) -> tuple[Any, Any]:
     """(linear, constant) of the sky: its visible cells, and a GGX lobe of the sample's own normal and roughness.
 
-    Both see all of the light; the balance heuristic shares it between them, with a cell's density 1 / solid angle. In
-    the lobe the radiance comes from the map and the visibility from the cell of the direction.
+    Both strategies cover all of the light; the balance heuristic combines them, with a cell's density 1 / solid angle.
+    The lobe takes radiance from the map and visibility from the cell of the direction.
     """
     import mitsuba as mi
 
@@ -272,7 +272,7 @@ def soft_light(terms: Callable, values: list[Any], samples: Samples, sky: tuple)
 
 
 def _soft_derivatives(terms, values: list[Any], samples: Samples, sky: tuple, adjoint: Any) -> list[Any]:
-    """Of Σ adjoint · colour by the fetched values, the directions held fast."""
+    """Gradient of Σ adjoint · colour by the fetched values, with fixed directions."""
     import drjit as dr
     import mitsuba as mi
 
@@ -291,7 +291,7 @@ def _soft_derivatives(terms, values: list[Any], samples: Samples, sky: tuple, ad
 
 
 def _over_sky(values: list[Any], samples: Samples, sky: tuple, total: list[Any], add: Callable) -> list[Any]:
-    """`add(total, wo, light)` for every direction from which light comes; light is zero where it is hidden."""
+    """`add(total, wo, light)` for every direction of incident light; light is zero where it is hidden."""
     import drjit as dr
     import mitsuba as mi
 
@@ -327,7 +327,7 @@ def _over_sky(values: list[Any], samples: Samples, sky: tuple, total: list[Any],
 
 
 class _Lobe:
-    """GGX's visible normals about the mapped normal, as fixed points; everything in the tangent frame, detached."""
+    """GGX's visible normals about the mapped normal at fixed points; everything in the tangent frame, detached."""
 
     def __init__(self, values: list[Any], samples: Samples) -> None:
         import drjit as dr
@@ -339,9 +339,9 @@ class _Lobe:
         self.variant = mi.Float(samples.variant)
         cosine = dr.clip(dr.dot(wi, self.normal), 1e-3, 1)
         side = wi - self.normal * dr.dot(wi, self.normal)
-        # Looking straight down on the normal any side will do.
-        other = mi.Vector3f(1, 0, 0) - self.normal * self.normal.x
-        self.x = dr.normalize(dr.select(dr.squared_norm(side) > 1e-8, side, other))
+        # At normal incidence any azimuth will do.
+        tangent = mi.Vector3f(1, 0, 0) - self.normal * self.normal.x
+        self.x = dr.normalize(dr.select(dr.squared_norm(side) > 1e-8, side, tangent))
         self.y = dr.cross(self.normal, self.x)
         self.cosine, self.sine = cosine, dr.sqrt(dr.maximum(1 - cosine * cosine, 0))
 
@@ -375,7 +375,7 @@ class _Lobe:
 
 
 def _pixel(world: Any, rows: int) -> Any:
-    """Of the sky's map (`render/deferred/sky.py`), in the direction `world`."""
+    """Radiance of the sky's map (`render/deferred/sky.py`) in the direction `world`."""
     import drjit as dr
     import mitsuba as mi
 

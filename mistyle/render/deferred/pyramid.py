@@ -1,12 +1,13 @@
 """Adam on a Laplacian pyramid of a texture: coarse and fine at once (Weier et al. 2025, section 4).
 
-A texture T is seen as the sum of its pyramid's levels, T = Σ_l U_l c_l, where U_l enlarges level l by 2^l with smooth
-weights. The gradient of a level is U_l^T dL/dT, so coarse levels hear many texels at once and move them together long
-before the fine ones have heard enough. Every level has its own Adam (beta_1 0.9, beta_2 0.99). Because T is linear in
-the levels, the levels themselves need not be kept: a step adds Σ_l U_l Δc_l to the texture.
+A texture T is the sum of its pyramid's levels, T = Σ_l U_l c_l, where U_l upsamples level l by 2^l with smooth weights.
+The gradient of a level is U_l^T dL/dT, so a coarse level pools many texels and moves them together, long before the
+fine levels have enough gradients. Every level has its own Adam (beta_1 0.9, beta_2 0.99). T is linear in the levels, so
+the levels themselves need no storage: a step adds Σ_l U_l Δc_l to the texture.
 
-Of noisy gradients Adam makes a bias: a gradient that is large by chance is also divided by more. `fair` divides every
-gradient by the root mean square of those before it, which do not know its noise, and takes the running mean afterwards.
+Noisy gradients bias Adam: a gradient that is large by chance is divided by a larger number. `fair` divides every
+gradient by the root mean square of the earlier ones, which are independent of its noise, and then takes the running
+mean.
 
 Everything here is NumPy in a fixed order: the same gradients give the same bytes.
 """
@@ -18,13 +19,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 BETA_1, BETA_2 = 0.9, 0.99
-WARM = 10  # gradients that are divided by a mean with themselves in it, because too few came before
-MOST = 10.0  # times the root mean square before it that a gradient counts at most, as in Adam
+WARM = 10  # first gradients, whose divisor includes themselves because earlier ones are too few
+MOST = 10.0  # limit of a gradient relative to the earlier root mean square, as in Adam
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Adam's state of one level, changed in place: running means of gradient and its square, steps a number took."""
+    """Adam's state of one level, changed in place: running means of gradient and its square, steps per number."""
 
     first: Float[np.ndarray, "..."]
     second: Float[np.ndarray, "..."]
@@ -40,7 +41,7 @@ def start(shape: tuple[int, ...], pyramid: bool = True) -> tuple[Moments, ...]:
 
 
 def sizes(shape: tuple[int, ...], pyramid: bool = True) -> list[tuple[int, ...]]:
-    """The levels' shapes, each half the one before, down to a side of one texel."""
+    """The levels' shapes, each half the previous one, down to a side of one texel."""
     result = [tuple(shape)]
     while pyramid and len(shape) == 3 and min(result[-1][:2]) > 1:
         rows, columns, channels = result[-1]
@@ -56,12 +57,12 @@ def change(
     fair: bool = False,
     damping: float = 0.0,
 ) -> Float[np.ndarray, "..."]:
-    """What to add to the texture, from dL/dT; the state moves on.
+    """The texture's change for the gradient dL/dT; the state advances.
 
-    Numbers whose gradient is exactly zero neither move nor forget (masked updates): most texels are not seen by the
-    one camera of a step. Every number counts its own steps for Adam's start-up correction. Level l moves at the rate
-    rate · share^l. `fair`: see the module; without it, `damping` times the root mean square of a level's gradients
-    joins Adam's denominator, so that numbers with little gradient, which is mostly noise, move little.
+    Numbers whose gradient is exactly zero keep value and moments (masked updates): one camera does not see most texels.
+    Every number counts its own steps for Adam's start-up correction. Level l moves at the rate rate · share^l. `fair`:
+    see the module. Otherwise `damping` times the root mean square of a level's gradients is added to Adam's
+    denominator, so that numbers with small gradients, mostly noise, move little.
     """
     steps = []
     level = np.ascontiguousarray(gradient, np.float32)
@@ -82,7 +83,7 @@ def _adam(
     flat = gradient.ravel()
     moved: Any = np.flatnonzero(flat)
     if len(moved) == flat.size:
-        moved = slice(None)  # spares the copies
+        moved = slice(None)  # avoids copies
     first, second, steps = state.first.ravel(), state.second.ravel(), state.steps.ravel()
     g = flat[moved]
     count = steps[moved] + 1
@@ -100,7 +101,7 @@ def _adam(
 
 
 def _fair(state: Moments, gradient: Float[np.ndarray, "..."], rate: float) -> Float[np.ndarray, "..."]:
-    """As `_adam`; `first` holds the running mean of gradients that were divided already."""
+    """As `_adam`; `first` holds the running mean of normalised gradients."""
     flat = gradient.ravel()
     moved = np.flatnonzero(flat)
     first, second, steps = state.first.ravel(), state.second.ravel(), state.steps.ravel()
@@ -121,7 +122,7 @@ def _fair(state: Moments, gradient: Float[np.ndarray, "..."], rate: float) -> Fl
 
 
 def enlarge(coarse: Float[np.ndarray, "h w c"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2 c"]:
-    """Twice as large, bilinear (weights 3/4 and 1/4), the border repeated, cut to `size`."""
+    """Upsampled by two, bilinear (weights 3/4 and 1/4), with a repeated border, cropped to `size`."""
     return _twice(_twice(coarse, 0), 1)[: size[0], : size[1]]
 
 

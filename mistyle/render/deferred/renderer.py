@@ -1,6 +1,6 @@
 """The differentiable renderer of the fits: known surface samples, known lights, one texture fetch, no noise.
 
-Nothing is traced while materials move: `hits.collect` has stored what each sample needs, and a picture is
+Nothing is traced while materials change: `image_samples.collect` stores each sample's geometry, and a picture is
 
     I_p = 1/S Σ_s Σ_l f(wi, wo_l; material at s) cos θ_l · strength_l · colour_l      (box filter over S samples)
 
@@ -8,10 +8,10 @@ summed over delta lights exactly. Materials are rows of one table of texels (`ma
 (x, y, z) of the normals, as Mitsuba and viewers do, and z follows from the tilt.
 
 Gradients by the table are gathers: each sample's eight derivatives are written in one packet, then each texel sums
-those of the samples that read it, in a fixed order. The same bytes come out at any run and any number of threads. Of
-the ways that `benchmarks/fit_speed.py` compares this is the fastest that gives the same picture: 1.3 ms where packed
-atomic adds take 11 ms (14 in the order of the texels, as neighbours then meet) and the sparse product of SciPy 2.0 ms
-and a wait for it; shading texels instead of pixels would be another picture.
+those of the samples that read it, in a fixed order. Bytes are equal in any run and at any number of threads. Of the
+methods in `benchmarks/fit_speed.py` this is the fastest that gives the same picture: 1.3 ms. Packed atomic adds take
+11 ms (14 in texel order, where neighbours collide), and SciPy's sparse product 2.0 ms plus a sync. Shading texels
+instead of pixels would give a different picture.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -39,16 +39,16 @@ Weights = Callable[[int], Float[np.ndarray, "h w"]]
 
 @dataclass(frozen=True)
 class RenderOptions:
-    """How a MaterialRenderer draws, and how much it keeps.
+    """Rendering and memory options of a MaterialRenderer.
 
     model, flip_invalid, shadowing, specular  as in `bsdf.Reflectance`
     frame       of the normal maps
     subsamples  samples a pixel, a square number
     shadows     whether the mesh shadows itself
-    directions  number of cells that soft light comes from
-    memory      bytes of samples and references that are kept of pictures
-    gradients   False: pictures only, and a third less is kept of them
-    freeze      False: every call is traced anew, which is slow and good for looking into it
+    directions  number of cells of soft light
+    memory      bytes of cached samples and references
+    gradients   False: pictures only, with a third less memory
+    freeze      False: every call is traced anew, which is slow and eases debugging
     """
 
     model: str = "principled"
@@ -70,10 +70,9 @@ DEFAULT_OPTIONS = RenderOptions()
 class MaterialRenderer:
     """Pictures of known cameras under known lights as a function of a material table, with gradients.
 
-    Built once for a fit. Samples of pictures are collected when they are first needed and kept within
-    `options.memory` bytes; those of the others are collected again each time, with the same result. A table is a
-    `MaterialTable`, or its Dr.Jit array from `upload`, which saves copies where several pictures are drawn of it.
-    One object is for one thread.
+    Built once for a fit. A picture's samples are collected at its first use and cached within `options.memory` bytes;
+    the others are collected again each time, with the same result. A table is a `MaterialTable`, or its Dr.Jit array
+    from `upload`, which saves copies when several pictures are rendered from it. One object is for one thread.
     """
 
     def __init__(
@@ -87,7 +86,7 @@ class MaterialRenderer:
         """`sizes` (rows, columns) of the texture sets; `weights` gives picture k's pixels a factor in the loss."""
         device.use()
         if len(sizes) != len(traced.mesh.parts):
-            raise ValueError(f"{len(sizes)} sizes came for {len(traced.mesh.parts)} texture sets")
+            raise ValueError(f"found {len(sizes)} sizes for {len(traced.mesh.parts)} texture sets")
         if options.model not in bsdf.MODELS:
             raise ValueError(f"model is {options.model!r}; expected one of {', '.join(bsdf.MODELS)}")
         self.traced, self.captures, self.weights = traced, captures, weights
@@ -97,7 +96,7 @@ class MaterialRenderer:
         reflectance = bsdf.Reflectance(options.model, options.flip_invalid, options.shadowing, options.specular)
         self._terms = partial(bsdf.terms, reflectance)
         self._steps = _steps(self.sizes)
-        self._kept: dict[int, list[Block]] = {}
+        self._cache: dict[int, list[Block]] = {}
         self._too_large: set[int] = set()
         self._skies: dict[Any, tuple[Sky | None, Any]] = {}
         self._frozen: dict[Any, Any] = {}
@@ -117,47 +116,47 @@ class MaterialRenderer:
         elif not isinstance(table, mi.Float):
             array = np.ascontiguousarray(table, np.float32)
             if array.shape != (self.texels, COLUMNS):
-                raise ValueError(f"a table of {array.shape} came; expected {(self.texels, COLUMNS)}")
+                raise ValueError(f"found a table of {array.shape}; expected {(self.texels, COLUMNS)}")
             table = collecting.own(mi.Float, array.ravel())
         dr.eval(table)
         return table
 
     def retarget(self, captures: Captures, weights: Weights | None, pictures: Iterable[int] | None = None) -> None:
-        """Compare with other references and weights from now on: kept samples of `pictures` (all) get theirs now.
+        """Replace references and weights; cached samples of `pictures` (default: all) are updated now.
 
-        Cameras, lights and masks of `captures` are those of before.
+        Cameras, lights and masks of `captures` must be unchanged.
         """
         import mitsuba
 
         mi: Any = mitsuba
         self.captures, self.weights = captures, weights
-        for k in self._kept if pictures is None else pictures:
-            if k not in self._kept:
+        for k in self._cache if pictures is None else pictures:
+            if k not in self._cache:
                 continue
             rgb, weight = captures.load(k)[0].reshape(-1, 3), self._weight(k).ravel()
-            for block in self._kept[k]:
+            for block in self._cache[k]:
                 target = np.array(block.target).reshape(-1, 4)
                 target[: len(block.pixel), :3] = rgb[block.pixel]
                 target[: len(block.pixel), 3] = weight[block.pixel]
                 block.target = mi.Float(aligned(target.ravel()))
 
     def with_memory(self, memory: float) -> "MaterialRenderer":
-        """The same renderer with nothing kept yet, and `memory` bytes to keep samples in."""
+        """The same renderer with an empty cache of `memory` bytes."""
         twin = copy(self)
-        twin.options, twin._kept, twin._too_large = replace(self.options, memory=memory), {}, set()
+        twin.options, twin._cache, twin._too_large = replace(self.options, memory=memory), {}, set()
         return twin
 
     def image(self, table: Any, picture: int) -> Float[np.ndarray, "h w 3"]:
-        """Picture k, linear Rec.709: the mean over all samples of a pixel, those beside the mesh black.
+        """Picture k, linear Rec.709: the mean over all samples of a pixel; samples beside the mesh are black.
 
-        Pixels that do not count for the fit (outside the picture's mask) are black.
+        Pixels outside the picture's mask are black.
         """
         return self.image_and_coverage(table, picture)[0]
 
     def image_and_coverage(
         self, table: Any, picture: int
     ) -> tuple[Float[np.ndarray, "h w 3"], Float[np.ndarray, "h w"]]:
-        """`image`, and which share of each pixel's samples meets the mesh, 0..1 (0 outside the picture's mask)."""
+        """`image`, and the share of each pixel's samples that hit the mesh, 0..1 (0 outside the picture's mask)."""
         size, textures = self.captures.cameras[picture].size, self._textures(table)
         rgb, share = np.zeros((size[0] * size[1], 3), np.float32), np.zeros(size, np.float32)
         for block in self.blocks(picture, gradients=False):
@@ -169,9 +168,9 @@ class MaterialRenderer:
         return rgb.reshape(*size, 3), share
 
     def step(self, table: Any, pictures: Sequence[int], loss: Loss = "log_srgb_l1") -> tuple[Any, Any]:
-        """(loss, gradient by the table) over some pictures, both Dr.Jit and not yet waited for.
+        """(loss, gradient by the table) over some pictures, both Dr.Jit arrays that are not yet synchronised.
 
-        loss = mean over pictures of 1/(3 h w) Σ_pixels weight Σ_channels ρ(I, R), over the covered pixels that count;
+        loss = mean over pictures of 1/(3 h w) Σ_pixels weight Σ_channels ρ(I, R), over the valid covered pixels;
         ρ is (I - R)² for "l2" and |g(I) - g(R)| for "log_srgb_l1", where g(x) = sRGB(log(1 + max(x, 0))) (nvdiffrec,
         eq. 7). The gradient is a TensorXf (texels, 8), its spare channel 0.
         """
@@ -213,7 +212,7 @@ class MaterialRenderer:
 
     @property
     def recordings(self) -> int:
-        """How many times a frozen function has been recorded so far."""
+        """Number of recordings of frozen functions so far."""
         return sum(f.n_recordings for f in self._frozen.values())
 
     def _empty_gradient(self) -> Any:
@@ -242,29 +241,29 @@ class MaterialRenderer:
         return self._frozen[key]
 
     def blocks(self, picture: int, gradients: bool = True) -> Iterator["Block"]:
-        """What is kept of a picture, top to bottom; collected now if it is not kept, then perhaps for pictures only."""
-        if picture in self._kept:
-            yield from self._kept[picture]
+        """The cached blocks of a picture, top to bottom, collected now if missing; then possibly for pictures only."""
+        if picture in self._cache:
+            yield from self._cache[picture]
             return
         camera, lights = self.captures.cameras[picture], self.captures.lights[picture]
         rgb, mask = self.captures.load(picture)
         weights = self._weight(picture)
         soft, soft_light = self._sky(lights)
-        kept: list[Block] | None = [] if self.options.memory and picture not in self._too_large else None
+        cached: list[Block] | None = [] if self.options.memory and picture not in self._too_large else None
         sampling = collecting.Sampling(
-            self.subsamples, self.options.shadows, self.options.gradients and (gradients or kept is not None)
+            self.subsamples, self.options.shadows, self.options.gradients and (gradients or cached is not None)
         )
         surface = collecting.TexturedMesh(self.traced, self.sizes, self._tangents)
         for hits in collecting.collect(surface, camera, lights, mask, sampling, soft):
             block = Block(hits, soft_light, rgb, weights)
-            if kept is not None:
-                kept.append(block)
-                if self.held() + sum(b.bytes for b in kept) > self.options.memory:
-                    kept = None
+            if cached is not None:
+                cached.append(block)
+                if self.held() + sum(b.bytes for b in cached) > self.options.memory:
+                    cached = None
                     self._too_large.add(picture)
             yield block
-        if kept is not None:
-            self._kept[picture] = kept
+        if cached is not None:
+            self._cache[picture] = cached
 
     def _weight(self, picture: int) -> Float[np.ndarray, "h w"]:
         if self.weights is not None:
@@ -272,7 +271,7 @@ class MaterialRenderer:
         return np.ones(self.captures.cameras[picture].size, np.float32)
 
     def _sky(self, lights: Lights) -> tuple[Sky | None, Any]:
-        """The soft light, as cells and as the arrays that shade; made once for pictures of the same records."""
+        """The soft light, as cells and as shading arrays; built once per set of light records."""
         soft = tuple(light for light in lights if isinstance(light, SOFT))
         key = tuple(map(id, soft))
         if key not in self._skies:
@@ -281,8 +280,8 @@ class MaterialRenderer:
         return self._skies[key]
 
     def held(self) -> int:
-        """Bytes of what is kept of the pictures' samples."""
-        return sum(block.bytes for blocks in self._kept.values() for block in blocks)
+        """Bytes of the cached samples."""
+        return sum(block.bytes for blocks in self._cache.values() for block in blocks)
 
 
 class Block:
@@ -310,7 +309,7 @@ class Block:
         dr.eval(self.target)
         self.lights = (colours, soft_light)
         self.arrays = kernels.BlockArrays(hits.samples, hits.pixels, hits.transpose, self.lights)
-        # A pixel that no light reaches stays black whatever the materials: its share of the loss is a constant.
+        # An unlit pixel is black for all materials: its part of the loss is constant.
         black, weight = rgb.reshape(-1, 3)[hits.dark].astype(np.float64), weights.ravel()[hits.dark]
         self.dark = {name: _dark(name, black, weight) for name in kernels.LOSSES}
         self.bytes = hits.bytes + target.nbytes + self.pixel.nbytes + hits.covered.nbytes

@@ -1,9 +1,9 @@
 """Soft light (environment maps, ambient light, spherical Gaussians) as a few directions and a map.
 
-The sphere is cut into D cells of about equal importance, half by luminance and half by solid angle, and each cell into
-VARIANTS parts. A sample sees one part of every cell, its neighbours see others: the mean over them has the accuracy of
-D · VARIANTS directions, and together the parts send exactly the light's energy. Where a glossy lobe is narrower than
-the cells, the map is looked up instead (`shading.soft_light`). Everything is in world axes, NumPy only.
+The sphere is divided into D cells of about equal importance, half by luminance and half by solid angle, and each cell
+into VARIANTS parts. A sample sees one part of every cell, and its neighbours see others. Their mean has the accuracy of
+D · VARIANTS directions, and the parts together preserve the light's energy exactly. Where a glossy lobe is narrower
+than the cells, the map is sampled instead (`kernels.soft_light`). Everything is in world axes, NumPy only.
 """
 
 import heapq
@@ -33,11 +33,11 @@ VARIANTS = 16
 class Sky:
     """d cells and a latitude-longitude map of h rows: θ from +Y down, φ = atan2(x, -z), pixel centres at +0.5.
 
-    direction  unit, the centre of light of each of a cell's v parts
+    direction  unit, the light's centroid in each of a cell's v parts
     energy     v times ∫ radiance dω over the part, linear Rec.709
     angle      solid angle of the cell
     radiance   mean radiance of each pixel of the map
-    cell       to which cell the pixel belongs
+    cell       the pixel's cell
     """
 
     direction: Float[np.ndarray, "d v 3"]
@@ -48,7 +48,7 @@ class Sky:
 
 
 def sky(lights: Sequence[Light], directions: int = 128) -> Sky | None:
-    """The soft light among `lights`, in `directions` cells; None where there is none."""
+    """The soft light among `lights`, in `directions` cells; None without any."""
     soft = [light for light in lights if isinstance(light, SOFT)]
     if not soft:
         return None
@@ -65,13 +65,13 @@ def sky(lights: Sequence[Light], directions: int = 128) -> Sky | None:
         return np.bincount(flat, values.ravel(), minlength=(cell.max() + 1) * VARIANTS).reshape(-1, VARIANTS)
 
     energy = np.stack([total(radiance[..., c] * angle) for c in range(3)], axis=-1)
-    # A black part still needs a direction: its solid angle decides there.
+    # A black part still needs a direction, so its solid angle is its weight.
     pull = bright + angle * max(bright.sum(), 1e-20) * 1e-9
     centre = np.stack([total(_directions(rows)[..., c] * pull) for c in range(3)], axis=-1)
     first = np.arange(VARIANTS) // times * times
     energy, centre = (np.take_along_axis(a, first[..., None], axis=1) for a in (energy, centre))
     energy *= (VARIANTS / times)[..., None]
-    # In no order, lest the parts that one sample sees all lie on the same side of their cells.
+    # Shuffled, so that the parts that one sample sees do not share a side of their cells.
     order = np.random.default_rng(0).permuted(np.tile(np.arange(VARIANTS), (len(energy), 1)), axis=1)[..., None]
     energy, centre = (np.take_along_axis(a, order, axis=1) for a in (energy, centre))
     centre /= np.linalg.norm(centre, axis=-1, keepdims=True)
@@ -81,11 +81,11 @@ def sky(lights: Sequence[Light], directions: int = 128) -> Sky | None:
 
 @dataclass(frozen=True)
 class EnvironmentCells:
-    """Soft light gathered in cells of the sphere, one directional light each.
+    """Soft light binned into cells of the sphere, one directional light each.
 
-    direction  unit, from the surface, towards the centre of light of the cell
+    direction  unit, from the surface towards the light's centroid in the cell
     irradiance ∫ radiance dω over it, linear Rec.709
-    width2     mean square of the angle by which the light in it lies beside that direction, along one axis
+    width2     mean squared angle between the cell's light and that direction, along one axis
     """
 
     direction: Float[np.ndarray, "k 3"]
@@ -102,7 +102,7 @@ def even_directions(count: int) -> Float[np.ndarray, "k 3"]:
 
 
 def bin_environment(lights: Sequence[Light], middles: Float[np.ndarray, "k 3"]) -> EnvironmentCells:
-    """The soft light among `lights`, each direction's light counted to the nearest of `middles`."""
+    """The soft light among `lights`; each direction's light is added to the nearest of `middles`."""
     radiance, angle = _map([light for light in lights if isinstance(light, SOFT)])
     rows = len(radiance)
     towards = _directions(rows).reshape(-1, 3)
@@ -173,9 +173,9 @@ def _radiance(lights: Sequence[Light], directions: Float[np.ndarray, "h w 3"]) -
 
 
 def _cut(share: Float[np.ndarray, "h w"], count: int, start: int, whole: int) -> list[tuple[int, int, int, int]]:
-    """Up to `count` boxes (top, bottom, left, right): the heaviest is halved along its longer side again and again.
+    """Up to `count` boxes (top, bottom, left, right): the heaviest is repeatedly halved along its longer side.
 
-    `share` begins at row `start` of a map of `whole` rows, on which it depends how wide a pixel is.
+    `share` begins at row `start` of a map of `whole` rows; the row determines a pixel's width.
     """
     rows, columns = share.shape
     table = np.zeros((rows + 1, columns + 1))
@@ -206,6 +206,6 @@ def _cut(share: Float[np.ndarray, "h w"], count: int, start: int, whole: int) ->
 
 
 def _middle(cumulative: np.ndarray) -> int:
-    """Where a box is cut in two halves of equal mass, neither of them empty."""
+    """The position that cuts a box into two halves of equal mass, neither empty."""
     half = (cumulative[0] + cumulative[-1]) / 2
     return int(np.clip(np.abs(cumulative - half).argmin(), 1, len(cumulative) - 2))

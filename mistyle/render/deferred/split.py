@@ -1,10 +1,10 @@
-"""The frozen split: a lit film's picture, and what a loss on it says about the materials, without tracing anew.
+"""Frozen forward and adjoint kernels around torch's loss, over the pixels of a lit film.
 
-Dr.Jit replays a recorded function several times faster than it traces it, but no gradient flows through a replay. So
-the way from materials to loss is cut at the picture: a frozen forward makes it, torch gives the loss and dL/dI, and a
-frozen backward turns dL/dI into gradients of each pixel's own material. The reflectance is the closed form of
-`render/deferred/bsdf.py`, as in `render/deferred/renderer.py`; the sum over lights is the one of `deferred.Deferred`,
-its plain twin.
+Dr.Jit replays a recorded function several times faster than it traces it, but no gradient flows through a replay. The
+computation is therefore split at the picture. A frozen forward renders it, torch gives the loss and dL/dI, and a frozen
+backward turns dL/dI into gradients of each pixel's own material. The reflectance is the closed form of
+`render/deferred/bsdf.py`, as in `render/deferred/renderer.py`; the sum over lights is that of `integrator.py`, its
+reference implementation.
 
 Materials are packed, 8 floats a pixel: albedo 3 (linear), normal 3 (tangent space, any length), roughness, metallic.
 """
@@ -31,9 +31,9 @@ COLUMNS = {
 
 
 class Split:
-    """Pictures of lit films and their gradients; a recording per kind of light and per set of maps that move.
+    """Pictures of lit films and their gradients; one recording per kind of light and per set of optimised maps.
 
-    `gloss` False leaves out the reflection at the surface. One object is for one thread.
+    `gloss` False omits the specular reflection. One object is for one thread.
     """
 
     def __init__(self, *, gloss: bool = True) -> None:
@@ -61,7 +61,7 @@ class Split:
 
     @property
     def recordings(self) -> int:
-        """How many times a frozen function has been recorded so far."""
+        """Number of recordings of frozen functions so far."""
         return sum(f.n_recordings for f in self._frozen.values())
 
     def _function(self, name: Any, lit: deferred.Lit, function: Callable, *fixed: Any) -> device.Frozen:
@@ -75,7 +75,7 @@ class Split:
 def radiance(lit: deferred.Lit, packed: Any) -> Any:
     """`Split.image` traced anew, for Dr.Jit's own gradients: packed materials (8n floats) to radiance (3n floats).
 
-    Both are Dr.Jit arrays, pixel after pixel. Each pixel reads its own material: the gradient adds nothing up.
+    Both are Dr.Jit arrays, ordered by pixel. Each pixel reads its own material, so the gradient sums nothing.
     """
     return _image(partial(bsdf.terms, bsdf.Reflectance("principled", specular=0.5)), _film(lit), packed)
 
@@ -91,7 +91,7 @@ def _film(lit: deferred.Lit) -> tuple[Any, Any, Any, Any]:
     import drjit as dr
     import mitsuba as mi
 
-    # Opaque, for a literal would be a constant of the recording.
+    # Opaque, since a literal would be a constant of the recording.
     ambient = None if lit.ambient is None else mi.Color3f(*(dr.opaque(mi.Float, c) for c in lit.ambient))
     return lit.wi, lit.mask, list(lit.directional), ambient
 
@@ -104,7 +104,7 @@ def _lights(wi: Any, directional: list[Any], ambient: Any) -> Iterator[tuple[Any
 
 
 def _image(terms: Callable, film: tuple, packed) -> Any:
-    """`film` is (wi, mask, directional lights, ambient light), as in `deferred.Lit`."""
+    """`film` is (wi, mask, directional lights, ambient light), as in `integrator.Lit`."""
     import drjit as dr
     import mitsuba as mi
 
@@ -118,7 +118,7 @@ def _image(terms: Callable, film: tuple, packed) -> Any:
 
 
 def _pull(terms: Callable, moving: tuple[str, ...], film: tuple, packed, adjoint) -> Any:
-    """Light by light, so that each has a short gradient of its own; the directions are held fast."""
+    """Light by light, so that each has its own short gradient; directions are fixed."""
     import drjit as dr
     import mitsuba
 
@@ -129,13 +129,13 @@ def _pull(terms: Callable, moving: tuple[str, ...], film: tuple, packed, adjoint
     at = dr.select(mask, dr.gather(mi.Color3f, adjoint, lane), 0)
     by_albedo, by_rest = mi.Color3f(0), [mi.Float(0)] * 5
     for wo, light in _lights(wi, directional, ambient):
-        rest, here = [mi.Float(x) for x in v[3:]], at * light
+        rest, weighted = [mi.Float(x) for x in v[3:]], at * light
         for name in moving:
             if name != "albedo":
                 dr.enable_grad(rest[COLUMNS[name].start - 3 : COLUMNS[name].stop - 3])
         p, g = terms(wi, wo, mi.Vector3f(*rest[:3]), rest[3], rest[4])
-        by_albedo += here * dr.detach(p)
-        value = p * dr.sum(here * albedo) + g * dr.sum(here)
+        by_albedo += weighted * dr.detach(p)
+        value = p * dr.sum(weighted * albedo) + g * dr.sum(weighted)
         if dr.grad_enabled(value):
             dr.backward(value)
             by_rest = [total + dr.grad(x) for total, x in zip(by_rest, rest, strict=True)]

@@ -1,16 +1,15 @@
-"""Where torch's gradients meet Dr.Jit's: maps (torch) ⇄ image (torch), by a frozen split or through one `dr.wrap`.
+"""Bridge between torch's and Dr.Jit's gradients: maps (torch) ⇄ image (torch), by frozen kernels or one `dr.wrap`.
 
-Torch owns the maps of every texture set, as one table of texels. A picture is made in two steps, each with a
+Torch owns the maps of every texture set, as one table of texels. A picture is rendered in two steps, each with a
 gradient whose bytes are the same in every run at any thread count:
 
-1. `taps` finds, once per traced surface, the four texels and weights of every pixel's bilinear fetch; `fetch` is a
+1. `taps` computes, once per traced surface, the four texels and weights of every pixel's bilinear fetch; `fetch` is a
    sparse matrix product, its gradient the product with the transpose, summed in a fixed order.
 2. A `Shader` shades the pixels' own materials, one texel per pixel: by the recorded functions of
-`render/deferred/split.py`,
-   or as textures as large as the film on the BSDF of `render/mitsuba/scene.py`, by the integrator of
-   `render/deferred/integrator.py`.
+   `render/deferred/split.py`, or as textures as large as the film on the BSDF of `render/mitsuba/scene.py`, by the
+   integrator of `render/deferred/integrator.py`.
 
-Mitsuba's own gradient of a shared texture adds up with atomics, in another order each run.
+Mitsuba's own gradient of a shared texture is summed by atomics, in varying order.
 """
 
 from collections.abc import Mapping, Sequence
@@ -36,8 +35,8 @@ Bridge = Literal["frozen", "wrap"]
 class Taps:
     """A bilinear fetch by n pixels from a table of texels (all texture sets one after the other, row by row).
 
-    `texels` (sorted, each once) are the rows of the table that are touched at all; `matrix` (n, texels) holds the
-    weights, at most four per row, none for pixels off the mesh.
+    `texels` (sorted, each once) are the referenced rows of the table; `matrix` (n, texels) holds the weights, at most
+    four per row, none for pixels off the mesh.
     """
 
     texels: Int[np.ndarray, " t"]
@@ -47,7 +46,7 @@ class Taps:
 def taps(surface: deferred.Surface, sizes: Sequence[tuple[int, int]]) -> Taps:
     """The bilinear fetch of every pixel of `surface` from texture sets of `sizes` (rows, columns).
 
-    Texel centres at +0.5, row 0 is v = 1, textures repeat: exactly what Mitsuba's bitmap texture does.
+    Texel centres at +0.5, row 0 is v = 1, textures repeat: exactly as in Mitsuba's bitmap texture.
     """
     offsets = np.concatenate([[0], np.cumsum([rows * columns for rows, columns in sizes])])
     on = np.flatnonzero(surface.mask)
@@ -80,13 +79,13 @@ def fetch(values: Any, where: Taps) -> Any:
 class Shader:
     """Shades a film of `size` pixels by one of two bridges between torch and Dr.Jit that give the same numbers.
 
-    "frozen" replays a recorded forward and a recorded backward (`render/deferred/split.py`); "wrap" is its plain twin,
-    Mitsuba's own BSDF and `mi.render` behind one `dr.wrap`, traced anew at each call. Reused, because building one
-    costs more than rendering it. One picture at a time: its gradient must be taken before the next call.
+    "frozen" replays a recorded forward and a recorded backward (`render/deferred/split.py`). "wrap" is its reference:
+    Mitsuba's own BSDF and `mi.render` behind one `dr.wrap`, traced anew at each call. A shader is reused, because
+    building one costs more than rendering. One picture at a time: its gradient must be computed before the next call.
     """
 
     def __init__(self, size: tuple[int, int], *, gloss: bool = True, bridge: Bridge = "frozen") -> None:
-        """`gloss` False leaves out the reflection at the surface of dielectrics: what remains is the paint's colour."""
+        """`gloss` False omits the specular reflection of dielectrics: only the diffuse colour remains."""
         if bridge not in ("frozen", "wrap"):
             raise ValueError(f"bridge is {bridge!r}; expected 'frozen' or 'wrap'")
         self.size = size
@@ -142,21 +141,21 @@ class _Wrapped:
         import torch
 
         self.integrator.lit = lit
-        wanted = {}
+        optimised = {}
         for name, values in zip(CHANNELS, pixels.split(list(CHANNELS.values()), dim=1), strict=True):
             image = values.reshape(*self.size, -1)
             if name == "normal":
                 image = image * 0.5 + 0.5
             if name in moving:
-                # A fresh tensor: Dr.Jit works on torch's memory, beyond its end too (core/drjit_arrays.py), and does
-                # not recognise nn.Parameter.
-                wanted[name] = torch.nn.functional.pad(image.reshape(-1), (0, LANES))[: image.numel()].view_as(image)
+                # A new tensor: Dr.Jit reads and writes torch's memory, also beyond its end (core/drjit_arrays.py), and
+                # does not recognise nn.Parameter.
+                optimised[name] = torch.nn.functional.pad(image.reshape(-1), (0, LANES))[: image.numel()].view_as(image)
             else:
                 self.parameters[self.names[name]] = mi.TensorXf(aligned(image.detach().numpy()))
-        if not wanted:
+        if not optimised:
             return self._still()
-        # Dr.Jit's wrapper makes every float argument ask for gradients, so only those that move are arguments.
-        return self._render(wanted).clone()
+        # Dr.Jit's wrapper enables gradients of every float argument, so only optimised maps are arguments.
+        return self._render(optimised).clone()
 
     def _draw(self, moving: dict[str, Any]) -> Any:
         import mitsuba as mi
@@ -191,7 +190,7 @@ def _each(description: Any, plugin: str, changes: Mapping[str, Any]) -> None:
 def _functions() -> dict[str, Any]:
     """torch's Functions for `matrix @ values` and for the frozen split; built at the first use, because importing torch
     takes seconds."""
-    if not _made:
+    if not _cached:
         import torch
 
         class SparseProduct(torch.autograd.Function):
@@ -216,8 +215,8 @@ def _functions() -> dict[str, Any]:
                 gradient = split.pull(lit, packed, grads[0].contiguous().numpy(), moving)
                 return torch.from_numpy(gradient), None, None, None
 
-        _made.update(sparse=SparseProduct, shaded=Shaded)
-    return _made
+        _cached.update(sparse=SparseProduct, shaded=Shaded)
+    return _cached
 
 
-_made: dict[str, Any] = {}
+_cached: dict[str, Any] = {}

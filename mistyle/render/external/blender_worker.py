@@ -1,8 +1,7 @@
-"""Runs inside Blender's Python (an environment of its own): opens files and counts what it finds.
+"""Runs inside Blender's Python (a separate environment): opens files and counts their contents.
 
 Takes one JSON file: files. Writes beside it a `.done` JSON with Blender's version and, for each file, its meshes,
-triangles and materials, the names of images that could not be loaded, and an error where the importer ended with one.
-Knows nothing of mistyle.
+triangles and materials, the names of missing images, and the importer's error, if any. Does not import mistyle.
 """
 
 import json
@@ -14,16 +13,16 @@ import bpy  # pyright: ignore[reportMissingImports]
 def main(path):
     with open(path, encoding="utf-8") as file:
         job = json.load(file)
-    found = []
+    counts = []
     for name in job["files"]:
         bpy.ops.wm.read_factory_settings(use_empty=True)
         try:
             opened(name)
-            found.append(counted())
+            counts.append(counted())
         except Exception as error:
-            found.append({"error": str(error).strip()[-300:]})
+            counts.append({"error": str(error).strip()[-300:]})
     with open(path + ".done", "w", encoding="utf-8") as file:
-        json.dump({"blender": bpy.app.version_string, "found": found}, file)
+        json.dump({"blender": bpy.app.version_string, "found": counts}, file)
 
 
 def opened(name):
@@ -37,7 +36,7 @@ def opened(name):
 
 
 def counted():
-    meshes = [thing.data for thing in bpy.context.scene.objects if thing.type == "MESH"]
+    meshes = [obj.data for obj in bpy.context.scene.objects if obj.type == "MESH"]
     for mesh in meshes:
         mesh.calc_loop_triangles()
     images = [image for image in bpy.data.images if image.source in ("FILE", "TILED")]

@@ -1,9 +1,9 @@
-"""Runs inside Blender's Python (an environment of its own): imports a GLB and renders it in Cycles.
+"""Runs inside Blender's Python (a separate environment): imports a GLB and renders it in Cycles.
 
 Takes one JSON file: glb, size (width, height), fov_x (degrees), camera (4x4, OpenGL axes, the GLB's world), distance,
 depth, threads, suns (direction towards, irradiance), environment (EXR in Blender's layout), and shots (out, spp, seed).
 Writes each shot as EXR and beside the job file a `.done` JSON with Blender's version and the seconds of each shot.
-Knows nothing of mistyle.
+Does not import mistyle.
 """
 
 import json
@@ -14,7 +14,7 @@ import time
 import bpy  # pyright: ignore[reportMissingImports]
 from mathutils import Matrix, Vector  # pyright: ignore[reportMissingImports]
 
-# glTF is Y-up, Blender Z-up; its importer turns +90 degrees about X.
+# glTF is Y-up, Blender Z-up; its importer rotates by +90 degrees about X.
 BLENDER_FROM_GLTF = Matrix(((1, 0, 0, 0), (0, 0, -1, 0), (0, 1, 0, 0), (0, 0, 0, 1)))
 
 
@@ -24,9 +24,9 @@ def main(path):
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.ops.import_scene.gltf(filepath=job["glb"])
     scene = bpy.context.scene
-    for thing in list(scene.objects):
-        if thing.type in ("LIGHT", "CAMERA"):
-            bpy.data.objects.remove(thing)
+    for obj in list(scene.objects):
+        if obj.type in ("LIGHT", "CAMERA"):
+            bpy.data.objects.remove(obj)
     camera(scene, job)
     lights(scene, job)
     settings(scene, job)
@@ -46,7 +46,7 @@ def settings(scene, job):
     scene.cycles.device = "CPU"
     scene.cycles.use_denoising = scene.cycles.use_adaptive_sampling = False
     scene.cycles.pixel_filter_type = "BOX"
-    # Whatever trades correctness for less noise is off: two renderers shall converge to the same picture.
+    # Biased noise reduction is off, so that two renderers converge to the same picture.
     scene.cycles.sample_clamp_direct = scene.cycles.sample_clamp_indirect = 0.0
     scene.cycles.blur_glossy = 0.0
     scene.cycles.caustics_reflective = scene.cycles.caustics_refractive = True
@@ -67,10 +67,10 @@ def camera(scene, job):
     data.sensor_fit = "HORIZONTAL"
     data.angle = math.radians(job["fov_x"])
     data.clip_start, data.clip_end = job["distance"] * 0.01, job["distance"] * 100
-    thing = bpy.data.objects.new("camera", data)
-    thing.matrix_world = BLENDER_FROM_GLTF @ Matrix(job["camera"])
-    scene.collection.objects.link(thing)
-    scene.camera = thing
+    obj = bpy.data.objects.new("camera", data)
+    obj.matrix_world = BLENDER_FROM_GLTF @ Matrix(job["camera"])
+    scene.collection.objects.link(obj)
+    scene.camera = obj
 
 
 def lights(scene, job):
@@ -79,10 +79,10 @@ def lights(scene, job):
         strength = max(sun["irradiance"])
         data.energy, data.angle = strength, 0.0
         data.color = [c / strength if strength else 0.0 for c in sun["irradiance"]]
-        thing = bpy.data.objects.new("sun", data)
+        obj = bpy.data.objects.new("sun", data)
         towards = BLENDER_FROM_GLTF.to_3x3() @ Vector(sun["direction"])
-        thing.rotation_euler = towards.to_track_quat("Z", "Y").to_euler()
-        scene.collection.objects.link(thing)
+        obj.rotation_euler = towards.to_track_quat("Z", "Y").to_euler()
+        scene.collection.objects.link(obj)
     world = bpy.data.worlds.new("world")
     scene.world = world
     world.use_nodes = True

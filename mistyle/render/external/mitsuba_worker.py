@@ -1,8 +1,8 @@
-"""Runs in an environment of its own, in which only Mitsuba need be: renders a scene file.
+"""Runs in a separate environment with Mitsuba only: renders a scene file.
 
 Takes one JSON file: scene (XML), sensor, integrator (a dictionary; null: the scene's own), variants in order of
 preference, and shots (out .npy, passes, spp of a pass, seed). Writes beside the job file a `.done` JSON with Mitsuba's
-version and the seconds of each shot. Knows nothing of mistyle.
+version and the seconds of each shot. Does not import mistyle.
 """
 
 import json
@@ -16,8 +16,8 @@ import numpy as np
 def main(path):
     with open(path, encoding="utf-8") as file:
         job = json.load(file)
-    there = mi.variants()
-    mi.set_variant(*[name for name in job["variants"] if name in there])
+    available = mi.variants()
+    mi.set_variant(*[name for name in job["variants"] if name in available])
     scene = mi.load_file(job["scene"])
     chosen = {} if job["integrator"] is None else {"integrator": mi.load_dict(job["integrator"])}
     seconds = []

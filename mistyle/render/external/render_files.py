@@ -1,4 +1,4 @@
-"""What renderers are given (subject, shot, files that other programs read), and how such programs are run."""
+"""Inputs of external renderers (subject, view, exchange files), and the processes that run them."""
 
 import json
 import os
@@ -31,7 +31,7 @@ class RenderView:
 
 @dataclass(frozen=True)
 class Subject:
-    """What is rendered. `folder` is for files that renderers need; `asset` is None for a scene file."""
+    """The mesh or scene to render. `folder` is for files that renderers need; `asset` is None for a scene file."""
 
     path: Path
     folder: Path
@@ -40,37 +40,37 @@ class Subject:
     threads: int = 0
 
 
-def exported(found: Subject, shot: RenderView) -> Path:
+def exported(subject: Subject, shot: RenderView) -> Path:
     """The shot as a Mitsuba scene file that any Mitsuba renders, with Mitsuba's own material."""
     from mistyle.render.lookdev.scenes import material_maps
     from mistyle.render.mitsuba.scene_folder import write_scene
 
-    folder = found.folder / f"scene_{shot.name}"
+    folder = subject.folder / f"scene_{shot.name}"
     if not (folder / "scene.xml").is_file():
         folder.mkdir(parents=True, exist_ok=True)
         if shot.camera is None:
             raise ValueError("a mesh needs a camera")
-        maps = [material_maps(m) for m in found.asset.materials]
-        path = write_scene(folder, "scene", found.asset.mesh, maps, [shot.camera], shot.lights)
-        # The surroundings shall light the asset and not be seen, as everywhere in a comparison.
+        maps = [material_maps(m) for m in subject.asset.materials]
+        path = write_scene(folder, "scene", subject.asset.mesh, maps, [shot.camera], shot.lights)
+        # The environment lights the asset but stays invisible, as everywhere in a comparison.
         text = path.read_text(encoding="utf-8")
         mark = '<integer name="max_depth" value="6" />'
         path.write_text(text.replace(mark, mark + '<boolean name="hide_emitters" value="true"/>'), encoding="utf-8")
     return folder / "scene.xml"
 
 
-def as_glb(found: Subject) -> Path:
-    """The file itself where it is glTF; any other mesh written as one."""
-    if found.path.suffix.lower() in (".glb", ".gltf"):
-        return found.path
-    path = found.folder / "asset.glb"
+def as_glb(subject: Subject) -> Path:
+    """The file itself if it is glTF; any other mesh is written as GLB."""
+    if subject.path.suffix.lower() in (".glb", ".gltf"):
+        return subject.path
+    path = subject.folder / "asset.glb"
     if not path.is_file():
-        write_asset_glb(path, found.asset)
+        write_asset_glb(path, subject.asset)
     return path
 
 
 def write_asset_glb(path: Path, asset: Any) -> None:
-    """An asset with its own material as our writers write it: a glTF patched, anything else new."""
+    """Write an asset with its own material by our exporters: a glTF is patched, any other format written anew."""
     from mistyle.io.gltf.write import patch_glb, write_glb
     from mistyle.render.lookdev.scenes import material_maps
 
@@ -81,7 +81,7 @@ def write_asset_glb(path: Path, asset: Any) -> None:
 
 
 def _of_one_size(maps: Maps) -> Maps:
-    """Constants spread, smaller maps enlarged: a glTF texture holds roughness and metalness together."""
+    """All maps at the largest map's size: a glTF texture holds roughness and metalness together."""
     planes = {name: getattr(maps, name) for name in ("albedo", "normal", "roughness", "metallic")}
     size = max((p.shape[:2] for p in planes.values()), key=lambda s: s[0] * s[1])
     even = {name: resize(p, size, "repeat") for name, p in planes.items()}
@@ -90,7 +90,7 @@ def _of_one_size(maps: Maps) -> Maps:
 
 
 def user_camera(asset: Any, camera: Camera) -> tuple[np.ndarray, float]:
-    """The camera in the file's own world (OpenGL axes), and how long a working unit is there."""
+    """The camera in the file's own world (OpenGL axes), and the length of a working unit there."""
     user_from_work = np.linalg.inv(asset.source.work_from_user)
     scale = float(np.cbrt(np.linalg.det(user_from_work[:3, :3])))
     matrix = user_from_work @ camera.world_from_cam @ OPENGL_FROM_OPENCV
@@ -98,22 +98,22 @@ def user_camera(asset: Any, camera: Camera) -> tuple[np.ndarray, float]:
     return matrix, scale
 
 
-def scene_for(found: Subject, shot: RenderView, spp: int, seed: int) -> Path:
-    """What a command gets as {scene}: the scene file, or for a mesh a JSON that names mesh, camera, lights and an
+def scene_for(subject: Subject, shot: RenderView, spp: int, seed: int) -> Path:
+    """The file for {scene} in a command: the scene file, or for a mesh a JSON that names mesh, camera, lights and an
     equal Mitsuba scene file."""
-    if found.asset is None or shot.camera is None:
-        return found.path.resolve()
+    if subject.asset is None or shot.camera is None:
+        return subject.path.resolve()
     from mistyle.io.images.write import write_exr
     from mistyle.render.lookdev import scenes as lookdev
 
-    xml = exported(found, shot)
+    xml = exported(subject, shot)
     sky = xml.with_name("blender_environment.exr")
     if not sky.is_file():
         radiance = lookdev.blender_environment(shot.lights)
         write_exr(sky, dict(zip("RGB", np.moveaxis(radiance, -1, 0), strict=True)))
-    matrix, _ = user_camera(found.asset, shot.camera)
+    matrix, _ = user_camera(subject.asset, shot.camera)
     text = {
-        "mesh": str(found.path.resolve()),
+        "mesh": str(subject.path.resolve()),
         "mitsuba": str(xml.resolve()),
         "size": list(shot.camera.size[::-1]),
         "fov_x": shot.camera.fov,
@@ -136,12 +136,12 @@ def run_job(program: Sequence[str], path: Path, job: Mapping[str, Any], name: st
     finished([*program, str(path)], name)
     done = Path(f"{path}.done")
     if not done.is_file():
-        raise MistyleError(f"{name}: the renderer ended without a result")
+        raise MistyleError(f"{name}: the renderer exited without a result")
     return json.loads(done.read_text())
 
 
 def finished(words: Sequence[str], name: str) -> None:
-    # What leads this process to its own packages would lead another environment astray.
+    # Variables of this process's environment would mislead another environment's Python.
     clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV")}
     try:
         done = subprocess.run(words, capture_output=True, text=True, errors="replace", env=clean, timeout=TIMEOUT)
@@ -150,5 +150,5 @@ def finished(words: Sequence[str], name: str) -> None:
     except subprocess.TimeoutExpired as error:
         raise MistyleError(f"{name}: no result within {TIMEOUT / 3600:.0f} hours") from error
     if done.returncode != 0:
-        said = (done.stderr.strip() or done.stdout.strip())[-1500:]
-        raise MistyleError(f"{name}: {Path(words[0]).name} ended with {done.returncode}:\n{said}")
+        output = (done.stderr.strip() or done.stdout.strip())[-1500:]
+        raise MistyleError(f"{name}: {Path(words[0]).name} ended with {done.returncode}:\n{output}")

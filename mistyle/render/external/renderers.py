@@ -1,13 +1,13 @@
-"""Renderers by name, all behind one call: (shot, spp, seeds) -> linear pictures and their seconds.
+"""Renderers by name behind one call: (view, spp, seeds) -> linear pictures and their seconds.
 
     mitsuba:path  mitsuba:direct  mitsuba:scene   this Mitsuba with that integrator (a scene file: with its defaults);
                                                   "scene" is the scene file's own
     mitsuba@VENV:path                             the Mitsuba of another environment, by its Python
     blender:cycles                                Cycles in the Python that --blender or MISTYLE_BLENDER_PYTHON names
-    NAME=command {scene} {out} …                  anything else; also {spp} {seed} {sensor}; no shell is involved
+    NAME=command {scene} {out} …                  any other program; also {spp} {seed} {sensor}; no shell is involved
 
-A mesh is drawn with glTF's own reflectance model; where a mitsuba@… takes part, every Mitsuba reads the same exported
-scene file instead, whose material is Mitsuba's `principled`, so that versions are compared and not materials.
+A mesh is rendered with glTF's own reflectance model. If a mitsuba@… takes part, every Mitsuba reads the same exported
+scene file with Mitsuba's `principled` material instead, so that versions are compared and not materials.
 """
 
 import os
@@ -39,7 +39,7 @@ MITSUBA_VARIANTS = ("cuda_ad_rgb", "metal_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 
 @dataclass(frozen=True)
 class Rendered:
-    """Pictures (h w 3 or 4, linear, premultiplied), the seconds of each, and what drew them."""
+    """Pictures (h w 3 or 4, linear, premultiplied), the seconds of each, and the renderer's version."""
 
     pictures: tuple[np.ndarray, ...]
     seconds: tuple[float, ...]
@@ -51,7 +51,7 @@ Draw = Callable[[Subject, RenderView, int, Sequence[int]], Rendered]
 
 @dataclass(frozen=True)
 class Renderer:
-    """A renderer's name as it is shown, its kind, and the call."""
+    """A renderer's display name, its kind, and its call."""
 
     name: str
     kind: Literal["mitsuba", "other mitsuba", "blender", "command"]
@@ -59,7 +59,7 @@ class Renderer:
 
 
 def renderer(text: str, blender: str | None = None) -> Renderer:
-    """The renderer that a --with names. UsageError says what there is, EnvironmentMissing what is not installed."""
+    """The renderer of a --with. UsageError lists the available ones, EnvironmentMissing names a missing program."""
     name, equals, command = text.partition("=")
     if equals and name.replace("_", "").replace("-", "").isalnum():
         if "{scene}" not in command or "{out}" not in command:
@@ -72,13 +72,13 @@ def renderer(text: str, blender: str | None = None) -> Renderer:
         python = _python(Path(who.removeprefix("mitsuba@")))
         return Renderer(text, "other mitsuba", lambda *a: _worker(python, how, *a))
     if text == "blender:cycles":
-        found = blender or os.environ.get(BLENDER)
-        if not found:
+        blender_python = blender or os.environ.get(BLENDER)
+        if not blender_python:
             raise EnvironmentMissing(
                 f"blender:cycles needs a Python in which `import bpy` works: pip install bpy into an environment of "
                 f"its own and name its python with --blender or {BLENDER}"
             )
-        return Renderer(text, "blender", lambda *a: _cycles(found, *a))
+        return Renderer(text, "blender", lambda *a: _cycles(blender_python, *a))
     raise UsageError(
         f"--with {text}: expected mitsuba:path, mitsuba:direct, mitsuba:scene, mitsuba@VENV:path, blender:cycles, or "
         "NAME='command {scene} {out}'"
@@ -86,27 +86,25 @@ def renderer(text: str, blender: str | None = None) -> Renderer:
 
 
 def _python(venv: Path) -> str:
-    """The Python of an environment; a path to the program itself will do too."""
+    """The Python of an environment, by the environment's folder or the program's path."""
     candidates = [venv] if venv.is_file() else [venv / "bin" / "python", venv / "Scripts" / "python.exe"]
     for path in candidates:
         if path.is_file():
             return str(path)
-    raise EnvironmentMissing(
-        f"mitsuba@{venv}: found no python there; expected a virtual environment with mitsuba in it"
-    )
+    raise EnvironmentMissing(f"mitsuba@{venv}: found no python; expected a virtual environment with mitsuba installed")
 
 
 def subject(path: Path, folder: Path, renderers: Sequence[Renderer], threads: int = 0) -> Subject:
     """Read FILE: a scene file, a mesh, or a run folder of ours with one GLB in `asset/`.
 
-    A scene file (.xml) is trusted like code, as Mitsuba opens whatever it names.
+    A scene file (.xml) is trusted like code, since Mitsuba opens all files that it names.
     """
     path = finished_asset(path) if path.is_dir() else path
     if path.suffix.lower() == ".xml":
         if not path.is_file():
             raise InputRefused(f"{path}: found nothing; expected a Mitsuba scene file. Check the path.")
         if any(r.kind == "blender" for r in renderers):
-            raise UsageError(f"{path}: Cycles reads no Mitsuba scenes; give a GLB, or leave out blender:cycles")
+            raise UsageError(f"{path}: Cycles reads no Mitsuba scenes; pass a GLB, or omit blender:cycles")
         return Subject(path, folder, threads=threads)
     from mistyle.io.read_mesh import read_mesh
 
@@ -116,20 +114,20 @@ def subject(path: Path, folder: Path, renderers: Sequence[Renderer], threads: in
 
 def finished_asset(folder: Path) -> Path:
     """The GLB of a run folder, or of its `asset` folder."""
-    found = sorted(folder.glob("*.glb")) or sorted((folder / "asset").glob("*.glb"))
-    if len(found) != 1:
-        raise InputRefused(f"{folder}: found {len(found)} .glb files; expected one, or one in asset/. Name the file.")
-    return found[0]
+    files = sorted(folder.glob("*.glb")) or sorted((folder / "asset").glob("*.glb"))
+    if len(files) != 1:
+        raise InputRefused(f"{folder}: found {len(files)} .glb files; expected one, or one in asset/. Name the file.")
+    return files[0]
 
 
-def left_out(found: Subject) -> list[str]:
-    """What a glTF asks for that Mitsuba's side does not draw: emission, transparency, material extensions."""
-    if found.path.suffix.lower() not in (".glb", ".gltf"):
+def left_out(source: Subject) -> list[str]:
+    """glTF features that Mitsuba's side does not render: emission, transparency, material extensions."""
+    if source.path.suffix.lower() not in (".glb", ".gltf"):
         return []
     from mistyle.io.read_mesh import load_gltf
 
     names: set[str] = set()
-    for material in load_gltf(found.path)[0].get("materials", []):
+    for material in load_gltf(source.path)[0].get("materials", []):
         if any(material.get("emissiveFactor", [0, 0, 0])):
             names.add("emission")
         if material.get("alphaMode", "OPAQUE") != "OPAQUE":
@@ -138,12 +136,12 @@ def left_out(found: Subject) -> list[str]:
     return sorted(names)
 
 
-def shots(found: Subject, lights: Sequence[str], views: int, size: int) -> list[RenderView]:
-    """Cameras all round a mesh under every light, or the sensors of a scene file."""
-    if found.asset is None:
+def shots(source: Subject, lights: Sequence[str], views: int, size: int) -> list[RenderView]:
+    """Cameras around a mesh under every light, or the sensors of a scene file."""
+    if source.asset is None:
         from mistyle.render.lookdev.scenes import file_scene
 
-        names = [s.id() for s in file_scene(found.path).sensors()]
+        names = [s.id() for s in file_scene(source.path).sensors()]
         usable = [n if n and not n.startswith(("__", "object_")) else f"sensor{k}" for k, n in enumerate(names)]
         return [RenderView(name, sensor=k) for k, name in enumerate(usable)]
     from mistyle.io.read import read_radiance
@@ -158,17 +156,17 @@ def shots(found: Subject, lights: Sequence[str], views: int, size: int) -> list[
     return result
 
 
-def _mitsuba(integrator: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
+def _mitsuba(integrator: str, source: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from importlib.metadata import version
 
     from mistyle.render.lookdev import scenes as lookdev
 
-    own = _integrator(integrator, found)
-    if found.asset is None or found.export:
-        path = found.path if found.asset is None else exported(found, shot)
+    own = _integrator(integrator, source)
+    if source.asset is None or source.export:
+        path = source.path if source.asset is None else exported(source, shot)
         scene, sensor = lookdev.file_scene(path), shot.sensor
     elif shot.camera is not None:
-        scene = lookdev.asset_scene(_shapes(found), shot.camera, shot.lights, integrator)
+        scene = lookdev.asset_scene(_shapes(source), shot.camera, shot.lights, integrator)
         sensor, own = 0, None
     else:
         raise ValueError("a mesh needs a camera")
@@ -180,41 +178,43 @@ def _mitsuba(integrator: str, found: Subject, shot: RenderView, spp: int, seeds:
     return Rendered(tuple(pictures), tuple(seconds), f"mitsuba {version('mitsuba')}")
 
 
-def _integrator(name: str, found: Subject) -> dict[str, Any] | None:
-    """A scene file gets the plugin with its defaults (None: its own); a mesh one that does not show its lights."""
+def _integrator(name: str, source: Subject) -> dict[str, Any] | None:
+    """For a scene file the plugin with its defaults (None: its own); for a mesh one with hidden emitters."""
     if name == "scene":
         return None
     from mistyle.render.lookdev.scenes import integrator_dict
 
-    return {"type": name} if found.asset is None else integrator_dict(name)
+    return {"type": name} if source.asset is None else integrator_dict(name)
 
 
-# The asset in hand and its shapes: loading textures takes longer than many a render.
-_KEPT: list[tuple[Any, Any]] = []
+# The current asset and its shapes: loading textures takes longer than many renders.
+_SHAPES: list[tuple[Any, Any]] = []
 
 
-def _shapes(found: Subject) -> Any:
+def _shapes(source: Subject) -> Any:
     from mistyle.render.lookdev.scenes import asset_shapes
 
-    if not _KEPT or _KEPT[0][0] is not found.asset:
-        _KEPT[:] = [(found.asset, asset_shapes(found.asset))]
-    return _KEPT[0][1]
+    if not _SHAPES or _SHAPES[0][0] is not source.asset:
+        _SHAPES[:] = [(source.asset, asset_shapes(source.asset))]
+    return _SHAPES[0][1]
 
 
-def _worker(python: str, integrator: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
+def _worker(
+    python: str, integrator: str, source: Subject, shot: RenderView, spp: int, seeds: Sequence[int]
+) -> Rendered:
     from mistyle.io.read import read_npy
     from mistyle.render.lookdev import scenes as lookdev
     from mistyle.render.mitsuba.scene import passes
 
-    path = found.path if found.asset is None else exported(found, shot)
+    path = source.path if source.asset is None else exported(source, shot)
     times, each = passes(spp)
-    folder = found.folder / f"worker_{abs(hash((python, integrator, shot.name, spp))):x}"
+    folder = source.folder / f"worker_{abs(hash((python, integrator, shot.name, spp))):x}"
     folder.mkdir(parents=True, exist_ok=True)
     outs = [folder / f"{seed}.npy" for seed in seeds]
     job = {
         "scene": str(path.resolve()),
         "sensor": shot.sensor,
-        "integrator": _integrator(integrator, found),
+        "integrator": _integrator(integrator, source),
         "variants": list(MITSUBA_VARIANTS),
         "shots": [{"out": str(o), "passes": times, "spp": each, "seed": s} for o, s in zip(outs, seeds, strict=True)],
     }
@@ -223,27 +223,27 @@ def _worker(python: str, integrator: str, found: Subject, shot: RenderView, spp:
     return Rendered(pictures, tuple(done["seconds"]), f"mitsuba {done['mitsuba']} ({done['variant']})")
 
 
-def _cycles(python: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
+def _cycles(python: str, source: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from mistyle.io.images.write import write_exr
     from mistyle.io.read import read_frame
     from mistyle.render.lookdev import scenes as lookdev
 
-    if shot.camera is None or found.asset is None:
-        raise UsageError(f"{found.path}: Cycles reads no Mitsuba scenes; give a GLB")
-    folder = found.folder / f"cycles_{shot.name}_{spp}"
+    if shot.camera is None or source.asset is None:
+        raise UsageError(f"{source.path}: Cycles reads no Mitsuba scenes; pass a GLB")
+    folder = source.folder / f"cycles_{shot.name}_{spp}"
     folder.mkdir(parents=True, exist_ok=True)
     sky = lookdev.blender_environment(shot.lights)
     write_exr(folder / "environment.exr", dict(zip("RGB", np.moveaxis(sky, -1, 0), strict=True)))
     outs = [folder / f"{seed}.exr" for seed in seeds]
-    matrix, scale = user_camera(found.asset, shot.camera)
+    matrix, scale = user_camera(source.asset, shot.camera)
     job = {
-        "glb": str(as_glb(found).resolve()),
+        "glb": str(as_glb(source).resolve()),
         "size": list(shot.camera.size[::-1]),
         "fov_x": shot.camera.fov,
         "camera": matrix.tolist(),
         "distance": 4.0 * scale,
         "depth": lookdev.DEPTH,
-        "threads": found.threads or os.cpu_count() or 1,
+        "threads": source.threads or os.cpu_count() or 1,
         "suns": lookdev.suns(shot.lights, shot.camera),
         "environment": str((folder / "environment.exr").resolve()),
         "shots": [{"out": str(o.resolve()), "spp": spp, "seed": s} for o, s in zip(outs, seeds, strict=True)],
@@ -253,27 +253,27 @@ def _cycles(python: str, found: Subject, shot: RenderView, spp: int, seeds: Sequ
     return Rendered(pictures, tuple(done["seconds"]), f"blender {done['blender']}")
 
 
-def _command(name: str, template: str, found: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
+def _command(name: str, template: str, source: Subject, shot: RenderView, spp: int, seeds: Sequence[int]) -> Rendered:
     from mistyle.io.read import read_frame
 
     pictures, seconds = [], []
     for seed in seeds:
-        folder = found.folder / f"command_{shot.name}_{spp}_{seed}"
+        folder = source.folder / f"command_{shot.name}_{spp}_{seed}"
         folder.mkdir(parents=True, exist_ok=True)
         out = folder / f"{name}.exr"
-        fields = {"scene": str(scene_for(found, shot, spp, seed)), "out": str(out), "spp": spp, "seed": seed}
+        fields = {"scene": str(scene_for(source, shot, spp, seed)), "out": str(out), "spp": spp, "seed": seed}
         words = [_filled(word, fields | {"sensor": shot.sensor}) for word in shlex.split(template)]
         start = time.perf_counter()
         finished(words, name)
         seconds.append(time.perf_counter() - start)
         if not out.is_file():
-            raise MistyleError(f"{name}: the command ended well but wrote no {out.name}; expected an EXR at {{out}}")
+            raise MistyleError(f"{name}: the command succeeded but wrote no {out.name}; expected an EXR at {{out}}")
         pictures.append(_rgba(read_frame(out)))
     return Rendered(tuple(pictures), tuple(seconds), name)
 
 
 def _filled(word: str, fields: Mapping[str, Any]) -> str:
-    """Plain replacement: braces that mean something else to the command stay."""
+    """Plain replacement: other braces in the command stay."""
     for key, value in fields.items():
         word = word.replace(f"{{{key}}}", str(value))
     return word

@@ -12,8 +12,8 @@ from mistyle.render.mitsuba.scene import passes
 def sensor_picture(
     scene: Any, sensor: int, spp: int = 64, seed: int = 0, integrator: Any = None
 ) -> Float[np.ndarray, "h w 3"]:
-    """Linear Rec.709 from sensor number `sensor`, at least `spp` samples a pixel; by the scene's own integrator where
-    none is given."""
+    """Linear Rec.709 from sensor number `sensor`, at least `spp` samples a pixel, by `integrator` or the scene's
+    own."""
     import mitsuba as mi
 
     device.use()
@@ -27,7 +27,7 @@ def sensor_picture(
 
 
 def values(scene: Any) -> dict[str, Any]:
-    """Every parameter of a scene as it is now, by key: what a fit of it depends on, textures and meshes included."""
+    """Every parameter of a scene as it is now, by key, textures and meshes included: the inputs of a fit."""
     import drjit as dr
     import mitsuba as mi
 

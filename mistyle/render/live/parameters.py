@@ -1,7 +1,7 @@
-"""The parameters of a live Mitsuba scene by name: which a fit can move, and why the others stay.
+"""The parameters of a live Mitsuba scene by name: which can be fitted, and why the others cannot.
 
-A parameter's key is the one of `mi.traverse`. Mitsuba gives every plugin one key even where several shapes share it,
-and an address (`object_9390…`) to what has no id; so a parameter has further names here: every way that leads to it
+A parameter's key is the one of `mi.traverse`. Mitsuba gives a plugin one key even if several shapes share it, and an
+address (`object_9390…`) if it has no id. A parameter therefore has further names here: every path that leads to it
 (`chair.bsdf.base_color.data` beside `wood.base_color.data`), the same without the wrappers `brdf_0` and
 `nested_bsdf`, and `unnamed1` in place of an address. Patterns are matched against all of them.
 """
@@ -36,16 +36,16 @@ class Parameter:
     """One parameter of a scene.
 
     key      of `mi.traverse`
-    names    what it may be called, the most telling one first; stable from run to run
+    names    all names, the most specific first; stable from run to run
     plugin   class of the plugin that holds it ("BitmapTextureImpl[uint8]", "UniformSpectrum", "Principled")
     owner    class of the plugin that uses it ("Principled", "NormalMap", "AreaLight")
-    role     what it is to its owner ("base_color")
+    role     its property name in the owner ("base_color")
     kind     "texture" (an image), "value" (one number or colour), "attribute" (of a mesh), "geometry" or "other"
-    shape    (h, w, c) of a texture, (n,) of the rest, () of what is no array
+    shape    (h, w, c) of a texture, (n,) of the rest, () if it is not an array
     storage  "float32", "float16", "uint8", …
-    reason   why a fit cannot move it; None where it can
-    notes    what a fit will do that one may not expect
-    channels numbers of a texel, of a vertex or face, or of the value
+    reason   why it cannot be fitted; None if it can
+    notes    unexpected effects of fitting it
+    channels numbers per texel, per vertex or face, or of the value
     """
 
     key: str
@@ -68,24 +68,24 @@ class Parameter:
 def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
     """Every parameter of a live `mi.Scene` (or of any other Mitsuba object), in the order of `mi.traverse`.
 
-    `engine` is the integrator that is to give the gradients (`scene_grad.ad_integrator`); None means `prb`.
+    `engine` is the integrator for the gradients (`gradients.ad_integrator`); None means `prb`.
     """
     import mitsuba as mi
 
-    found = mi.traverse(scene)
+    table = mi.traverse(scene)
     children = scene_walk.children(scene)
     ways = scene_walk.ways(scene, children)
     used = scene_reach.drawn(scene, children) if isinstance(scene, mi.Scene) else None
-    # Where several hold a plugin, the one that is not the scene says what it is for.
+    # If several plugins hold a plugin, a holder other than the scene gives its role.
     holders: dict[Any, tuple[str, Any]] = {}
     for holder, held in children.items():
         for name, child in held:
             if child not in holders or isinstance(holders[child][1], mi.Scene):
                 holders[child] = (name, holder)
     result = []
-    for key, (_, _, node, flags) in found.properties.items():
+    for key, (_, _, node, flags) in table.properties.items():
         leaf = key.rpartition(".")[2]
-        value: Any = found[key]
+        value: Any = table[key]
         held_as = isinstance(node, (mi.Texture, mi.Volume)) and node in holders
         role, owner = holders[node] if held_as else (leaf, node)
         names = scene_walk.names([f"{way}.{leaf}" if way else leaf for way in ways.get(node, ())] or [key])
@@ -95,7 +95,7 @@ def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
         kind = _kind(node, leaf, shape)
         reason = _reason(node, owner, role, kind, flags, value, storage)
         if reason is None and used is not None and node not in used:
-            reason = "no shape and no light uses it."
+            reason = "neither a shape nor a light uses it."
         if kind == "attribute":
             role, owner, unread = _reader(node, leaf, children)
             reason = reason or unread
@@ -110,7 +110,7 @@ def parameters(scene: Any, engine: Any = None) -> list[Parameter]:
 
 
 def merged(chosen: Sequence[Parameter]) -> tuple[str, ...]:
-    """Notes for a live scene: which parameters belong to several shapes, as those do that `mi.load_file` merged."""
+    """Notes for a live scene on parameters of several shapes, such as those that `mi.load_file` merged."""
     notes = []
     for p in chosen:
         heads = {name.partition(".")[0] for name in p.names if re.search(r"\.(bsdf|emitter)\.", name)}
@@ -129,11 +129,11 @@ def merged(chosen: Sequence[Parameter]) -> tuple[str, ...]:
 
 
 def _reader(shape: Any, attribute: str, children: scene_reach.Children) -> tuple[str, Any, str | None]:
-    """Role and owner of a mesh's attribute by the texture that reads it, or why it cannot be fitted."""
-    found = scene_reach.readers(shape, attribute, children)
-    if found:
-        return *found[0], None
-    return attribute, shape, None if found is None else f"no material of its shape reads {attribute}."
+    """Role and owner of a mesh's attribute by the texture that reads it, and the reason if none does."""
+    readers = scene_reach.readers(shape, attribute, children)
+    if readers:
+        return *readers[0], None
+    return attribute, shape, None if readers is None else f"no material of its shape reads {attribute}."
 
 
 def _channels(node: Any, leaf: str, kind: str, shape: tuple[int, ...]) -> int:
@@ -144,18 +144,18 @@ def _channels(node: Any, leaf: str, kind: str, shape: tuple[int, ...]) -> int:
 
 
 def match(scene: Any, patterns: Sequence[str], engine: Any = None) -> tuple[Parameter, ...]:
-    """The parameters that globs name, each once, in the scene's order; a final `.data` or `.value` may be left out.
+    """The parameters that globs match, each once, in the scene's order; a final `.data` or `.value` may be left out.
 
-    A pattern may match things that cannot move as long as it matches one that can. Raises UsageError naming the nearest
-    keys when a pattern matches nothing, and saying why when it matches only what cannot be moved.
+    A pattern may match parameters that cannot be fitted if it also matches one that can. Raises UsageError with the
+    nearest keys if a pattern matches nothing, and with the reasons if none of its matches can be fitted.
     """
     return choose(parameters(scene, engine), patterns)
 
 
 def choose(listed: Sequence[Parameter], patterns: Sequence[str]) -> tuple[Parameter, ...]:
-    """`match` in the list that `parameters` gave."""
+    """`match` in the list from `parameters`."""
     if not patterns:
-        raise UsageError("no parameter to optimise was named: give one or more keys or globs (`--list` shows them).")
+        raise UsageError("no parameter to optimise: name one or more keys or globs (`--list` shows them).")
     chosen: set[str] = set()
     for pattern in patterns:
         hits = [p for p in listed if any(fnmatchcase(name, pattern) for name in _spellings(p))]
@@ -165,13 +165,13 @@ def choose(listed: Sequence[Parameter], patterns: Sequence[str]) -> tuple[Parame
         if not usable:
             reasons = [f"{p.name}: {p.reason}" for p in hits[:5]]
             more = f" (and {len(hits) - 5} more)" if len(hits) > 5 else ""
-            raise UsageError(f"'{pattern}' names nothing that can be optimised. {' '.join(reasons)}{more}")
+            raise UsageError(f"'{pattern}' matches no parameter that can be optimised. {' '.join(reasons)}{more}")
         chosen.update(usable)
     return tuple(p for p in listed if p.key in chosen)
 
 
 def limits(parameter: Parameter) -> tuple[float, float] | None:
-    """The range of a parameter's values; None where it has none. A normal map's is kept by `project`."""
+    """The range of a parameter's values; None without one. `project` handles a normal map's range."""
     if parameter.role in ROUGH:
         return ROUGHNESS_FLOOR, 1.0
     if parameter.role in UNIT:
@@ -181,15 +181,16 @@ def limits(parameter: Parameter) -> tuple[float, float] | None:
     light = parameter.owner.endswith(("Emitter", "Light"))
     if light or any(word in parameter.role for word in ("radiance", "intensity", "emittance")):
         return 0.0, np.inf
-    # A spectrum of a role that nobody knows here, in a plugin of the user's for example.
+    # A spectrum in an unknown role, for example in a user's plugin.
     return (0.0, np.inf) if parameter.kind == "value" and "Spectrum" in parameter.plugin else None
 
 
 def project(parameter: Parameter, values: Float[np.ndarray, "..."], tilt: float = 0.95) -> Float[np.ndarray, "..."]:
-    """The nearest admissible values: inside the range; a normal map's texels unit vectors that lean at most asin(tilt).
+    """The nearest admissible values: inside the range; a normal map's texels are unit vectors tilted by at most
+    asin(tilt).
 
-    A normal map holds (n + 1) / 2; the lean is limited because a normal that faces away has no gradient. The
-    columns that an environment map repeats at its ends stay equal to those they repeat.
+    A normal map holds (n + 1) / 2; the tilt is limited because a normal that faces away has no gradient. The columns
+    that an environment map repeats at its ends stay equal to their originals.
     """
     if parameter.owner == "NormalMap" and values.ndim == 3 and values.shape[-1] == 3:
         normal = values.astype(np.float64) * 2 - 1
@@ -199,7 +200,7 @@ def project(parameter: Parameter, values: Float[np.ndarray, "..."], tilt: float 
         z = np.sqrt(np.maximum(1 - (xy**2).sum(axis=-1, keepdims=True), 0))
         return (np.concatenate([xy, z], axis=-1) * 0.5 + 0.5).astype(np.float32)
     if parameter.owner == "EnvironmentMapEmitter" and values.ndim == 3:
-        # Its last column stands once more before the first, and the first behind the last.
+        # Mitsuba repeats the last column before the first, and the first after the last.
         values = values.copy()
         values[:, 0], values[:, -1] = values[:, -2], values[:, 1]
     bounds = limits(parameter)
@@ -207,11 +208,11 @@ def project(parameter: Parameter, values: Float[np.ndarray, "..."], tilt: float 
 
 
 def fast_shapes(scene: Any, integrator: Any = None) -> dict[str, str | None]:
-    """Which shapes' direct light needs no Monte Carlo (`render/deferred/renderer.py`): None by shape id, or why that
-    does not hold.
+    """Shapes whose direct light needs no Monte Carlo (`render/deferred/renderer.py`): None by shape id, or the reason
+    against it.
 
-    It holds for a plain `principled`, alone or in `twosided` and `normalmap`, under lights that are points or
-    directions only, seen by an integrator that follows no light from surface to surface (max_depth 2).
+    They have a plain `principled`, alone or in `twosided` and `normalmap`. All lights are points or directions, and the
+    integrator renders direct light only (max_depth 2).
     """
     import mitsuba as mi
 
@@ -219,13 +220,13 @@ def fast_shapes(scene: Any, integrator: Any = None) -> dict[str, str | None]:
     engine = scene.integrator() if integrator is None else integrator
     depth = getattr(engine, "max_depth", None)
     if depth is None:
-        told = re.search(r"max_depth = (\d+)", str(engine))
-        depth = int(told[1]) if told else (2 if engine.class_name() == "DirectIntegrator" else -1)
+        printed = re.search(r"max_depth = (\d+)", str(engine))
+        depth = int(printed[1]) if printed else (2 if engine.class_name() == "DirectIntegrator" else -1)
     delta = mi.EmitterFlags.DeltaDirection | mi.EmitterFlags.DeltaPosition
     wide = [e.class_name() for e in scene.emitters() if not int(e.flags()) & int(delta)]
     everywhere = f"{wide[0]} is neither a point nor a direction." if wide else None
     if everywhere is None and not 0 <= depth <= 2:
-        everywhere = "the integrator follows light from surface to surface (its max_depth is above 2)."
+        everywhere = "the integrator renders indirect light (its max_depth is above 2)."
     result = {}
     for shape in scene.shapes():
         bsdf: Any = shape.bsdf()
@@ -254,12 +255,12 @@ def _unknown(listed: Sequence[Parameter], pattern: str) -> str:
     usable = list(dict.fromkeys(name for p in listed if p.reason is None for name in p.names))
     everything = list(dict.fromkeys(name for p in listed for name in p.names))
     near = get_close_matches(pattern, usable, 5, 0.4) or get_close_matches(pattern, everything, 5, 0.4) or usable[:5]
-    told = f"The nearest keys: {', '.join(near)}." if near else "Nothing in this scene can be optimised."
+    message = f"The nearest keys: {', '.join(near)}." if near else "Nothing in this scene can be optimised."
     if any(name.startswith("unnamed") for name in everything):
-        told += (
+        message += (
             " Shapes without a name may have been merged by mi.load_file or mi.load_dict; `optimize=False` keeps them."
         )
-    return f"'{pattern}' matches no parameter of the scene. {told}"
+    return f"'{pattern}' matches no parameter of the scene. {message}"
 
 
 def _kind(node: Any, leaf: str, shape: tuple[int, ...]) -> str:
@@ -274,7 +275,7 @@ def _kind(node: Any, leaf: str, shape: tuple[int, ...]) -> str:
 
 
 def _storage(value: Any) -> str:
-    """The numbers' type; "python" for numbers outside Dr.Jit, the class's name for what holds no plain numbers."""
+    """The numbers' type; "python" for numbers outside Dr.Jit, else the class's name."""
     import drjit as dr
 
     kind = type(value)
@@ -289,9 +290,9 @@ def _reason(node: Any, owner: Any, role: str, kind: str, flags: Any, value: Any,
     import mitsuba as mi
 
     if kind == "geometry":
-        return "it is geometry; the fit moves materials and lights, over surfaces that stand still."
+        return "it is geometry; only materials and lights can be fitted."
     if isinstance(node, (mi.Sensor, mi.Film, mi.Sampler, mi.Integrator, mi.Scene)):
-        return "it belongs to a camera or to the rendering; the fit moves materials and lights."
+        return "it belongs to a camera or to the rendering; only materials and lights can be fitted."
     if storage in ("uint8", "int8"):
         return (
             "its texture is stored with 8 bits (uint8), which has no gradient; load it with "
@@ -320,19 +321,19 @@ def _notes(node: Any, owner: Any, role: str, value: Any, storage: str) -> tuple[
     if "BitmapTexture" in node.class_name() and re.search(r"\braw = 0\b", str(node)):
         notes.append(
             'raw is false: every step waits for a check of its range; <boolean name="raw" value="true"/> is '
-            "faster, where the file holds linear values."
+            "faster if the file holds linear values."
         )
     if storage == "float16":
-        notes.append('its texture is stored with 16 bits; format "variant" keeps the whole result.')
+        notes.append('its texture is stored with 16 bits; format "variant" stores the result in full precision.')
     if role in ROUGH:
         low = float(np.mean(np.asarray(value) < ROUGHNESS_FLOOR))
         if low:
-            notes.append(f"{low:.1%} of it lies below {ROUGHNESS_FLOOR} and is raised to that.")
+            notes.append(f"{low:.1%} of its values lie below {ROUGHNESS_FLOOR} and are raised to it.")
     return tuple(notes)
 
 
 def _without_ambiguous(listed: list[Parameter]) -> list[Parameter]:
-    """Without the short names that would mean two parameters."""
+    """The parameters without ambiguous short names."""
     count: dict[str, int] = {}
     for parameter in listed:
         for name in parameter.names:

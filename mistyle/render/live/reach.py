@@ -1,8 +1,8 @@
-"""What a parameter of a live Mitsuba scene can do to a picture, and whether its integrator differentiates that.
+"""Whether a parameter of a live Mitsuba scene affects pictures, and whether its integrator differentiates it.
 
-Every rule is about a kind. Detached sampling (`prb`, `prbvolpath`) has no derivative of lobes without an extent: those
-of mirrors and smooth glass, and of what passes a mask. Attached sampling (`direct`) has one of their colours, and none
-of the share by which one of them was chosen.
+Every rule is about a kind of parameter. Detached sampling (`prb`, `prbvolpath`) has no derivative of delta lobes:
+mirrors, smooth glass, and transmission through a mask. Attached sampling (`direct`) has the derivative of their
+colours, but none of the probability of choosing a lobe.
 """
 
 import re
@@ -11,12 +11,12 @@ from typing import Any
 
 Children = Mapping[Any, list[tuple[str, Any]]]
 
-# Roles that decide between lobes, where sampling is attached.
+# Roles that determine the probabilities of lobes under attached sampling.
 SHARES = {"opacity", "weight", "eta", "int_ior", "ext_ior"}
 
 
 def below(node: Any, held: Children) -> Iterator[tuple[str, Any, Any]]:
-    """(name, holder, plugin) of everything that a plugin holds, itself left out, each plugin once a holder."""
+    """(name, holder, plugin) of all descendants of a plugin, each plugin once per holder."""
     left, seen = [node], set()
     while left:
         holder = left.pop()
@@ -29,7 +29,7 @@ def below(node: Any, held: Children) -> Iterator[tuple[str, Any, Any]]:
 
 
 def drawn(scene: Any, held: Children) -> set[Any]:
-    """The plugins that rendering reads: shapes, lights, cameras, integrators and what they hold."""
+    """The plugins that rendering reads: shapes, lights, cameras, integrators and their descendants."""
     import mitsuba as mi
 
     kinds = (mi.Shape, mi.Emitter, mi.Sensor, mi.Integrator)
@@ -38,34 +38,34 @@ def drawn(scene: Any, held: Children) -> set[Any]:
 
 
 def readers(shape: Any, attribute: str, held: Children) -> list[tuple[str, Any]] | None:
-    """(role, owner) of the textures that read a mesh's attribute; None where a user's plugin may read it itself."""
-    found, own = [], False
+    """(role, owner) of the textures that read a mesh's attribute; None if a user's plugin may read it itself."""
+    textures, own = [], False
     for name, holder, child in below(shape, held):
         if child.class_name() == "MeshAttribute" and re.search(rf'name = "{re.escape(attribute)}"', str(child)):
-            found.append((name, holder))
+            textures.append((name, holder))
         own |= type(child).__module__.partition(".")[0] not in ("mitsuba", "drjit")
-    return found if found or not own else None
+    return textures if textures or not own else None
 
 
 def no_gradient(node: Any, owner: Any, role: str, engine: Any) -> str | None:
-    """Why the integrator has no true gradient of a parameter; None where it has. `engine` None: `prb`."""
+    """Why the integrator has no correct gradient of a parameter; None if it has. `engine` None: `prb`."""
     import mitsuba as mi
 
     detached = engine is None or isinstance(engine, mi.ad.integrators.common.ADIntegrator)
     called = "prb" if engine is None else str(engine).partition("[")[0].removesuffix("Integrator").lower()
     inside = isinstance(owner, (mi.Medium, mi.PhaseFunction)) or isinstance(node, mi.Volume)
     if inside and engine is not None and "vol" not in called:
-        return f"it belongs to a medium, and the integrator {called} follows no light through media."
+        return f"it belongs to a medium, and the integrator {called} does not support media."
     if not isinstance(owner, mi.BSDF) or not int(owner.flags()) & int(mi.BSDFFlags.Delta):
         return None
     if role == "diffuse_reflectance":
-        return None  # that lobe's own; `prb` adds some of the mirrored light, which leaves the solution in place
+        return None  # `prb` adds some mirrored light to this gradient; the minimum stays
     kind = re.sub(r"(BSDF|BRDF)$", "", owner.class_name())
     if detached:
         return (
-            f"{kind} has a lobe without an extent (a mirror's, smooth glass's or what a mask lets pass), of which the "
-            f"integrator {called} has no true gradient; a rough material in its place can be fitted."
+            f"{kind} has a delta lobe (of a mirror, smooth glass or a mask), for which the "
+            f"integrator {called} has no correct gradient; a rough material in its place can be fitted."
         )
     if role in SHARES and "Conductor" not in kind:
-        return f"it decides how often {kind} takes one lobe or another, of which {called} has no true gradient."
+        return f"it sets the probabilities of the lobes of {kind}, for which {called} has no correct gradient."
     return None

@@ -1,4 +1,4 @@
-"""The text of a Mitsuba scene file as XML: its elements by place, its parameters set, its own folder kept in reach."""
+"""The XML text of a Mitsuba scene file: element positions, parameter values, and paths to its own folder."""
 
 import os
 import re
@@ -11,7 +11,7 @@ from xml.sax.saxutils import quoteattr
 
 from mistyle.core.errors import InputRefused
 
-Edit = tuple[int, int, str]  # first byte, byte after the last, what comes in their place
+Edit = tuple[int, int, str]  # first byte, byte after the last, replacement
 
 
 @dataclass(frozen=True)
@@ -27,20 +27,20 @@ class Element:
 
 
 def elements_of(source: bytes) -> list[Element]:
-    """The elements of a scene file's text in the order of their start tags. InputRefused where it is not XML."""
+    """The elements of a scene file's text in the order of their start tags. Raises InputRefused if it is not XML."""
     parser = expat.ParserCreate()
-    found: list[dict[str, Any]] = []
+    elements: list[dict[str, Any]] = []
     above: list[int] = []
 
     def opened(tag: str, attributes: dict[str, str]) -> None:
         begin = parser.CurrentByteIndex
         body = begin + len(re.match(rb"<(?:[^<>\"']|\"[^\"]*\"|'[^']*')*>", source[begin:])[0])  # pyright: ignore
         parent = above[-1] if above else None
-        above.append(len(found))
-        found.append({"tag": tag, "attributes": attributes, "begin": begin, "body": body, "parent": parent})
+        above.append(len(elements))
+        elements.append({"tag": tag, "attributes": attributes, "begin": begin, "body": body, "parent": parent})
 
     def closed(tag: str) -> None:
-        element = found[above.pop()]
+        element = elements[above.pop()]
         end = parser.CurrentByteIndex
         alone = source[: element["body"]].endswith(b"/>")
         element["end"] = element["body"] if alone else end + source[end:].index(b">") + 1
@@ -50,29 +50,29 @@ def elements_of(source: bytes) -> list[Element]:
         parser.Parse(source, True)
     except expat.ExpatError as error:
         raise InputRefused(f"found a scene file that is not XML ({error}); check the file.") from error
-    return [Element(**element) for element in found]
+    return [Element(**element) for element in elements]
 
 
 def include_edit(source: bytes, included: Path, defines: Mapping[str, str], new: str) -> list[Edit]:
-    """What makes `source` include the file `new` instead of `included`; nothing where it does not include that."""
+    """The edit by which `source` includes the file `new` instead of `included`; empty if it does not include it."""
     every = elements_of(source)
-    given = {e.attributes.get("name", ""): e.attributes.get("value", "") for e in every if e.tag == "default"}
-    given |= defines
+    values = {e.attributes.get("name", ""): e.attributes.get("value", "") for e in every if e.tag == "default"}
+    values |= defines
     for e in every:
         name = e.attributes.get("filename", "")
-        for key in sorted(given, key=len, reverse=True):
-            name = name.replace(f"${key}", given[key])
+        for key in sorted(values, key=len, reverse=True):
+            name = name.replace(f"${key}", values[key])
         if e.tag == "include" and name and included.as_posix().endswith(Path(name).as_posix().lstrip("./")):
             return [(e.begin, e.end, f"<include filename={quoteattr(new)}/>")]
     return []
 
 
 def surroundings(source: bytes, path: Path, defines: Mapping[str, str], out: Path) -> list[Edit]:
-    """Defaults as they were given, those that the file does not have too, and the way back to the original's folder."""
+    """Edits that set the given defaults, add missing ones, and keep paths to the original's folder valid."""
     edits: list[Edit] = []
     every = elements_of(source)
-    there = {e.attributes.get("name", "") for e in every if e.tag == "default"}
-    new = [f"\n<default name={quoteattr(k)} value={quoteattr(v)}/>" for k, v in defines.items() if k not in there]
+    present = {e.attributes.get("name", "") for e in every if e.tag == "default"}
+    new = [f"\n<default name={quoteattr(k)} value={quoteattr(v)}/>" for k, v in defines.items() if k not in present]
     for e in every:
         name = e.attributes.get("name", "")
         if e.tag == "default" and name in defines:
@@ -82,15 +82,15 @@ def surroundings(source: bytes, path: Path, defines: Mapping[str, str], out: Pat
         return edits + [(every[0].body, every[0].body, "".join(new))] if new else edits
     for e in every:
         if e.tag == "path" and not Path(e.attributes.get("value", "/")).is_absolute():
-            there = _from(out, path.parent / e.attributes["value"])
-            edits.append((e.begin, e.end, f"<path value={quoteattr(there)}/>"))
+            value = _from(out, path.parent / e.attributes["value"])
+            edits.append((e.begin, e.end, f"<path value={quoteattr(value)}/>"))
     body = every[0].body
     edits.append((body, body, f"\n<path value={quoteattr(_from(out, path.parent))}/>" + "".join(new)))
     return edits
 
 
 def resolved(path: Path, defines: Mapping[str, str], out: Path) -> bytes:
-    """A scene file's text for another folder, with its parameters as given: it loads as `path` does with `defines`."""
+    """A scene file's text for another folder, with its parameters set: it loads as `path` does with `defines`."""
     source = path.read_bytes()
     return spliced(source, surroundings(source, path, defines, out))
 
@@ -103,7 +103,7 @@ def _from(out: Path, folder: Path) -> str:
 
 
 def spliced(source: bytes, edits: Sequence[Edit]) -> bytes:
-    """The text with pieces of it replaced."""
+    """The text with all edits applied."""
     result, at = [], 0
     for begin, end, text in sorted(edits):
         result += [source[at:begin], text.encode()]

@@ -1,4 +1,4 @@
-"""The text of a Mitsuba scene file: where a parameter's element stands, and what replaces it."""
+"""The text of a Mitsuba scene file: position and replacement of a parameter's element."""
 
 import re
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from mistyle.render.live.source import Edit, Element, elements_of
 
 
 def children(node: Any) -> list[tuple[str, int]]:
-    """Property names and node numbers of what a parsed node holds, in the file's order."""
+    """Property names and node numbers of a parsed node's children, in the file's order."""
     import mitsuba as mi
 
     kind = mi.Properties.Type.ResolvedReference
@@ -43,7 +43,7 @@ def _find(state: Any, p: Parameter) -> tuple[Any, str | None] | None:
 
 
 def _child(state: Any, node: Any, name: str) -> int | None:
-    """The child that `mi.traverse` calls `name`: by its name in the file, else the n-th material, the emitter, …"""
+    """The child with the `mi.traverse` name `name`: by its name in the file, else the n-th material, the emitter, …"""
     import mitsuba as mi
 
     held = children(node)
@@ -61,16 +61,16 @@ def _child(state: Any, node: Any, name: str) -> int | None:
 def edits_of(
     state: Any, sources: Sequence[bytes], p: Parameter, values: np.ndarray, file: Path | None
 ) -> tuple[int, list[Edit]] | str:
-    """The number of the file and what to replace in its text for one parameter, or why that cannot be.
+    """The number of the file and its edits for one parameter, or the reason why it cannot be written.
 
-    `sources` are the texts of `state.files`: the scene's, then what it includes.
+    `sources` are the texts of `state.files`: the scene's, then its includes.
     """
     place = _find(state, p)
     if place is None:
         return "its element could not be distinguished from the others."
     node, literal = place
-    found = _edits(node, literal, sources[node.file_index], p, values, file)
-    return found if isinstance(found, str) else (node.file_index, found)
+    edits = _edits(node, literal, sources[node.file_index], p, values, file)
+    return edits if isinstance(edits, str) else (node.file_index, edits)
 
 
 def _edits(
@@ -86,12 +86,12 @@ def _edits(
             return "its texture has no file name that could be replaced."
         old = inner["filename"]
         edits = [(old.begin, old.end, f'<string name="filename" value={quoteattr(file.name)}/>')]
-        # An 8-bit or 16-bit format would round what the file holds.
+        # An 8-bit or 16-bit format would round the file's values.
         return edits + [(inner[name].begin, inner[name].end, "") for name in ("format",) if name in inner]
     if p.kind == "attribute":
         return _mesh_edits(elements, at, file)
     if p.kind != "value":
-        return f"a scene file cannot hold it; it was written as {file.name if file else 'nothing'}."
+        return f"a scene file cannot store it; it was written as {file.name if file else 'nothing'}."
     old = inner.get(literal)
     numbers = " ".join(f"{float(v):.9g}" for v in values)
     tag = "rgb" if len(values) == 3 else "float"
@@ -107,7 +107,7 @@ def _edits(
 
 
 def _mesh_edits(elements: Sequence[Element], at: int, file: Path | None) -> list[Edit] | str:
-    """A PLY mesh gives way to the written one, whose vertices stand in the world already."""
+    """The written mesh replaces a PLY mesh; its vertices are in world space already."""
     inner = {e.attributes.get("name"): e for e in elements if e.parent == at}
     if file is None or elements[at].attributes.get("type") != "ply" or "filename" not in inner:
         return (

@@ -1,4 +1,4 @@
-"""The plugins of a live Mitsuba scene and every way that leads to them, where `mi.traverse` keeps only the first."""
+"""The plugins of a live Mitsuba scene and all paths to them; `mi.traverse` keeps only the first path."""
 
 import re
 from collections.abc import Iterable
@@ -8,13 +8,13 @@ MAX_NAMES = 64
 
 
 def children(scene: Any) -> dict[Any, list[tuple[str, Any]]]:
-    """What every plugin holds and under which name, each child once a plugin."""
+    """Every plugin's children with their names, each child once per plugin."""
     import mitsuba as mi
 
     class Listing(mi.TraversalCallback):
         def __init__(self) -> None:
             super().__init__()
-            self.found: dict[Any, str] = {}
+            self.names: dict[Any, str] = {}
 
         def put(self, name: str, value: Any, flags: Any, cpptype: Any = None) -> None:
             if isinstance(value, mi.Object):
@@ -22,7 +22,7 @@ def children(scene: Any) -> dict[Any, list[tuple[str, Any]]]:
 
         def put_object(self, name: str, obj: Any, flags: Any) -> None:
             if obj is not None:
-                self.found.setdefault(obj, name)
+                self.names.setdefault(obj, name)
 
         def put_value(self, name: str, ptr: Any, flags: Any, cpptype: Any = None) -> None:
             pass
@@ -35,15 +35,15 @@ def children(scene: Any) -> dict[Any, list[tuple[str, Any]]]:
             continue
         listing = Listing()
         node.traverse(listing)
-        result[node] = [(name, child) for child, name in listing.found.items()]
-        left.extend(listing.found)
+        result[node] = [(name, child) for child, name in listing.names.items()]
+        left.extend(listing.names)
     return result
 
 
 def ways(scene: Any, held: dict[Any, list[tuple[str, Any]]]) -> dict[Any, list[str]]:
     """Every plugin's paths from the root, at most MAX_NAMES each; addresses become "unnamed1", "unnamed2", …"""
     unnamed: dict[str, str] = {}
-    found: dict[Any, list[str]] = {scene: [""]}
+    paths: dict[Any, list[str]] = {scene: [""]}
 
     def walk(node: Any, way: str, above: frozenset) -> None:
         taken: dict[str, int] = {}
@@ -53,19 +53,19 @@ def ways(scene: Any, held: dict[Any, list[tuple[str, Any]]]) -> dict[Any, list[s
             taken[name] = taken.get(name, 0) + 1
             if taken[name] > 1:
                 name = f"{name}_{taken[name] - 1}"
-            here = f"{way}.{name}" if way else name
-            known = found.setdefault(child, [])
-            if child in above or here in known or len(known) >= MAX_NAMES:
+            path = f"{way}.{name}" if way else name
+            known = paths.setdefault(child, [])
+            if child in above or path in known or len(known) >= MAX_NAMES:
                 continue
-            known.append(here)
-            walk(child, here, above | {child})
+            known.append(path)
+            walk(child, path, above | {child})
 
     walk(scene, "", frozenset([scene]))
-    return found
+    return paths
 
 
 def names(paths: Iterable[str]) -> tuple[str, ...]:
-    """The paths, those with an address last, each also without the wrappers around its material."""
+    """The paths, those with an address last, and each without the wrappers around its material."""
     ordered = sorted(dict.fromkeys(paths), key=lambda path: path.startswith("unnamed"))
     short = [re.sub(r"\.(brdf_0|nested_bsdf)(?=\.)", "", path) for path in ordered]
     return tuple(dict.fromkeys([*ordered, *short]))

@@ -1,7 +1,7 @@
-"""Mitsuba scene files: loading one so that it can be fitted, and writing the fitted one beside float textures.
+"""Mitsuba scene files: loading one for a fit, and writing the fitted one with float textures.
 
-Mitsuba's own parser reads the file (includes, defaults and paths are its business). What is written is the user's own
-text with the fitted elements replaced, not a new file: comments, ids and structure stay.
+Mitsuba's own parser reads the file, with includes, defaults and paths. The written file is the user's own text with the
+fitted elements replaced: comments, ids and structure stay.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,10 +26,10 @@ class SceneFile:
     """A loaded scene file.
 
     scene    the live `mi.Scene`, its textures stored as 32-bit floats
-    state    what Mitsuba's parser made of the file
+    state    the parsed file, from Mitsuba's parser
     path     the file
-    defines  the parameters it was loaded with
-    notes    sentences about what was changed while loading
+    defines  the parameters of the load
+    notes    sentences about changes while loading
     """
 
     scene: Any
@@ -41,7 +41,7 @@ class SceneFile:
 
 @dataclass(frozen=True)
 class WrittenScene:
-    """What `write_scene` wrote: the scene file (None where no element could be replaced), and every texture by key."""
+    """Files of `write_scene`: the scene file (None if no element could be replaced), and every texture by key."""
 
     xml: Path | None
     textures: dict[str, Path]
@@ -53,50 +53,50 @@ def load_scene_for_fit(path: Path | str, defines: Mapping[str, Any] | None = Non
 
     Three things differ. Bitmaps of 8 and 16 bits without a `format` are stored as 32-bit floats, because 8 bits have no
     gradient; the picture stays the same to 2e-7 (8 bits) or half a unit of the 16-bit float that Mitsuba would use.
-    Equal materials and meshes are not merged, so ids stay. What has no id gets one ("sphere1"), and top-level textures
-    are known by who uses them, because Mitsuba names both by an address. The file is trusted: Mitsuba opens whatever it
-    names. Raises InputRefused when it cannot be loaded, with Mitsuba's own words.
+    Equal materials and meshes are not merged, so ids stay. Elements without an id get one ("sphere1"), and top-level
+    textures are named by their users, because Mitsuba names both by an address. The file is trusted: Mitsuba opens all
+    files that it names. Raises InputRefused with Mitsuba's message if it cannot be loaded.
     """
     import mitsuba as mi
 
     file = Path(path)
     if not file.is_file():
         raise InputRefused(f"{file}: no such scene file.")
-    given = {name: str(value) for name, value in (defines or {}).items()}
+    parameters = {name: str(value) for name, value in (defines or {}).items()}
     config: Any = mi.parser.ParserConfig(device.use())
     config.merge_equivalent = config.merge_meshes = False
     try:
-        with _found_beside(file), device.file_threads():
-            state, converted = _parsed(config, file, given)
-            # Loading empties what was parsed, and `write_scene` needs it.
-            made = mi.parser.instantiate(config, _parsed(config, file, given)[0])
+        with _relative_to(file), device.file_threads():
+            state, converted = _parsed(config, file, parameters)
+            # Loading empties the parsed state, and `write_scene` needs it.
+            instances = mi.parser.instantiate(config, _parsed(config, file, parameters)[0])
     except RuntimeError as error:
         stopping.check()
         raise InputRefused(f"{file}: Mitsuba cannot load this scene. {error}") from error
-    scene: Any = made[0] if isinstance(made, list) else made
+    scene: Any = instances[0] if isinstance(instances, list) else instances
     if not isinstance(scene, mi.Scene):
         raise InputRefused(f"{file}: holds a {type(scene).__name__}, not a scene.")
     notes = []
     if converted:
         shown = ", ".join(sorted(set(converted))[:5]) + (", …" if len(set(converted)) > 5 else "")
         notes.append(f"{len(converted)} bitmaps were loaded as 32-bit floats, which have gradients ({shown}).")
-    return SceneFile(scene, state, file, given, tuple(notes))
+    return SceneFile(scene, state, file, parameters, tuple(notes))
 
 
 def _parsed(config: Any, file: Path, defines: dict[str, str]) -> tuple[Any, list[str]]:
-    """The parsed file, prepared, and the bitmaps that were converted."""
+    """The parsed and prepared file, and the converted bitmaps."""
     import mitsuba as mi
 
     state = mi.parser.parse_file(config, str(file), **defines)
     mi.parser.transform_all(config, state)
     converted = _as_floats(state)
-    _named(state)
+    _assign_ids(state)
     return state, converted
 
 
 @contextmanager
-def _found_beside(file: Path) -> Iterator[None]:
-    """Relative paths are looked up beside the file, as `mi.load_file` does."""
+def _relative_to(file: Path) -> Iterator[None]:
+    """Resolve relative paths beside the file, as `mi.load_file` does."""
     import mitsuba as mi
 
     door: Any = mi
@@ -111,7 +111,7 @@ def _found_beside(file: Path) -> Iterator[None]:
 
 
 def _as_floats(state: Any) -> list[str]:
-    """Ask for 32-bit floats wherever a bitmap says nothing; returns the files."""
+    """Set 32-bit floats for bitmaps without a format; returns the files."""
     changed = []
     for node in state.nodes:
         if node.props.plugin_name() == "bitmap" and "format" not in node.props and "filename" in node.props:
@@ -120,8 +120,8 @@ def _as_floats(state: Any) -> list[str]:
     return changed
 
 
-def _named(state: Any) -> None:
-    """Give what stands in the scene an id, and let its textures be reached only by way of their users."""
+def _assign_ids(state: Any) -> None:
+    """Give the scene's children ids, and remove textures that are reachable through their users."""
     import mitsuba as mi
 
     root = state.nodes[0]
@@ -146,12 +146,12 @@ def write_scene(
 ) -> WrittenScene:
     """Write the fitted values (a `FittedScene`) as float EXR textures, and the scene file that uses them at `path`.
 
-    The scene file is a copy of the one that was loaded: the fitted bitmaps' file names and the fitted literals' values
-    are replaced (in copies of the files that it includes too), `<default>`s hold the values it was loaded with, and a
-    `<path>` leads to the folder of the original, where its meshes and other files stay. A mesh with fitted attributes
-    is written as PLY. It needs no mistyle. It is loaded once and its values are compared with the
-    fitted ones; where that fails it is not kept and a note says why. From a live `mi.Scene` only textures are written.
-    `write_exr` is that of `io/images/write.py`, `write_file` may be `atomic_write` of `io/store/atomic.py`.
+    The scene file is a copy of the loaded one. The fitted bitmaps' file names and the fitted literals' values are
+    replaced, also in copies of included files. `<default>`s hold the values of the load, and a `<path>` leads to the
+    folder of the original with its meshes and other files. A mesh with fitted attributes is written as PLY. The file
+    needs no mistyle. It is loaded once and its values are compared with the fitted ones; if they differ it is deleted,
+    and a note gives the reason. From a live `mi.Scene` only textures are written. `write_exr` is that of
+    `io/images/write.py`, `write_file` may be `atomic_write` of `io/store/atomic.py`.
     """
     out = Path(path)
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -167,22 +167,22 @@ def write_scene(
     edits: dict[int, list[scene_source.Edit]] = {0: []}
     notes = []
     for p in fitted.parameters:
-        found = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
-        if isinstance(found, str):
-            notes.append(f"{p.name} is not in {out.name}: {found} Its value stands in run.json and in the report.")
+        replaced = scene_text.edits_of(scene.state, sources, p, fitted.values[p.key], textures.get(p.key))
+        if isinstance(replaced, str):
+            notes.append(f"{p.name} is not in {out.name}: {replaced} run.json and the report have its value.")
         else:
-            edits.setdefault(found[0], []).extend(found[1])
+            edits.setdefault(replaced[0], []).extend(replaced[1])
     if not any(edits.values()):
         return WrittenScene(None, textures, tuple(notes))
     notes += _rewrite_includes(scene, sources, edits, out, write_file)
     edits[0] += scene_source.surroundings(sources[0], scene.path, scene.defines, out)
     write_file(out, scene_source.spliced(sources[0], edits[0]))
-    wrong = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
-    if wrong:
+    difference = _differences(out, fitted, {note.split(" is not in ")[0] for note in notes})
+    if difference:
         out.unlink()
-        return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {wrong}"))
+        return WrittenScene(None, textures, (*notes, f"{out.name} was not kept: {difference}"))
     if out.parent.resolve() != scene.path.parent.resolve():
-        notes.append(f"{out.name} takes its other files from {scene.path.parent}.")
+        notes.append(f"{out.name} reads its other files from {scene.path.parent}.")
     return WrittenScene(out, textures, tuple(notes))
 
 
@@ -193,7 +193,7 @@ def _rewrite_includes(
     out: Path,
     write_file: Callable[[Path, bytes], Any],
 ) -> list[str]:
-    """Write included files with fitted values beside the scene, from the innermost outwards, and include those."""
+    """Write included files with fitted values beside the scene, innermost first, and include those instead."""
     notes = []
     for k in range(len(sources) - 1, 0, -1):
         if not edits.get(k):
@@ -213,7 +213,7 @@ def _rewrite_includes(
 def _write_value(
     out: Path, stem: str, p: Parameter, values: np.ndarray, write_exr: Callable[..., None], scene: Any
 ) -> dict[str, Path]:
-    """An image as EXR, a mesh's attribute as PLY in world space, nothing for a number or a colour."""
+    """Write an image as EXR, or a mesh's attribute as PLY in world space; numbers and colours need no file."""
     import mitsuba as mi
 
     if p.kind == "texture" and values.ndim == 3 and values.shape[2] <= 4:
@@ -237,12 +237,12 @@ def _write_value(
 
 
 def _without_seam(values: np.ndarray) -> np.ndarray:
-    """An environment map as its file holds it: Mitsuba repeats a column at either end."""
+    """An environment map without the columns that Mitsuba repeats at either end."""
     return np.ascontiguousarray(values[:, 1:-1, :3])
 
 
 def _differences(out: Path, fitted: Any, left_out: set[str]) -> str:
-    """Load what was written; say what is not as it should be, or nothing."""
+    """Load the written file; the first difference, or an empty string."""
     import mitsuba as mi
 
     try:
@@ -255,8 +255,8 @@ def _differences(out: Path, fitted: Any, left_out: set[str]) -> str:
             continue
         if p.key not in table:
             return f"it has no {p.key}."
-        value, wanted = np.array(table[p.key], dtype=np.float32).ravel(), fitted.values[p.key].ravel()
+        value, expected = np.array(table[p.key], dtype=np.float32).ravel(), fitted.values[p.key].ravel()
         # A light's single number comes back as a grey colour.
-        if len(wanted) not in (1, len(value)) or not np.allclose(value, wanted, rtol=1e-6, atol=1e-7):
+        if len(expected) not in (1, len(value)) or not np.allclose(value, expected, rtol=1e-6, atol=1e-7):
             return f"it holds another {p.key}."
     return ""

@@ -1,1 +1,1 @@
-"""Look-dev pictures: turntables, reference balls, AOVs, the studio."""
+"""Look-dev pictures: turntables, reference balls, AOVs, studio renders."""

@@ -1,5 +1,5 @@
-"""What lies behind a picture of an asset, drawn from one camera: albedo, normal, roughness, metallic, position, a UV
-checker, texel density, and anything that is kept per texel."""
+"""AOVs of an asset from one camera: albedo, normal, roughness, metallic, position, a UV checker, texel density, and any
+other map per texel."""
 
 from collections.abc import Mapping, Sequence
 
@@ -24,9 +24,9 @@ def aovs(
 ) -> dict[str, Float[np.ndarray, "h w 4"]]:
     """Pictures by name as straight sRGB-encoded colours and alpha; `extra` are encoded colours per texture set.
 
-    Data (normal, roughness, position, …) stand in the file as they are: a roughness of 0.5 is a value of 0.5. Normals
-    are those in the camera's axes (x right, y up, z towards it), normal map included, as (n + 1) / 2; positions run
-    from 0 to 1 through the asset's bounding box.
+    Data (normal, roughness, position, …) are stored without encoding: a roughness of 0.5 is a value of 0.5. Normals are
+    in the camera's axes (x right, y up, z towards it), normal map included, as (n + 1) / 2. Positions run from 0 to 1
+    through the asset's bounding box.
     """
     height, width = camera.size
     fine = resized(camera, (height * FINE, width * FINE))
@@ -37,7 +37,7 @@ def aovs(
         np.repeat(per_texel(hits, [getattr(m, n)[..., None] for m in maps]), 3, axis=-1)
         for n in ("roughness", "metallic")
     )
-    found = {
+    layers = {
         "albedo": srgb_from_linear(per_texel(hits, [m.albedo for m in maps])),
         "normal": normals(asset.mesh, hits, maps, camera) * 0.5 + 0.5,
         "roughness": roughness,
@@ -47,11 +47,11 @@ def aovs(
         "texel density": density(asset.mesh, hits, maps)[0],
         **{name: per_texel(hits, pictures) for name, pictures in (extra or {}).items()},
     }
-    return {name: _small(rgb, hits) for name, rgb in found.items()}
+    return {name: _small(rgb, hits) for name, rgb in layers.items()}
 
 
 def per_texel(hits: Hits, maps: Sequence[Float[np.ndarray, "_ _ c"]]) -> Float[np.ndarray, "h w c"]:
-    """What each hit shows of the maps of its texture set; zero off the mesh."""
+    """The maps of its texture set at each hit; zero off the mesh."""
     result = np.zeros((*hits.mask.shape, maps[0].shape[2]), np.float32)
     for part, values in enumerate(maps):
         at = hits.part == part

@@ -1,7 +1,7 @@
-"""Look-dev scenes: one asset, one camera and one light, said once and drawn the same by every renderer.
+"""Look-dev scenes: one asset, one camera and one light, equal for every renderer.
 
-Lights are records of core/light.py. Mitsuba takes them as `emitters` does; Blender takes the directional ones as suns
-of no size and everything soft as one latitude-longitude picture in its own layout.
+Lights are records of core/light.py. Mitsuba reads them through `emitters`. Blender gets the directional ones as suns of
+zero size and all soft lights as one latitude-longitude picture in its own layout.
 """
 
 from collections.abc import Sequence
@@ -31,10 +31,10 @@ from mistyle.render.mitsuba import appearance, device
 from mistyle.render.mitsuba.emitters import emitters
 from mistyle.render.mitsuba.scene import passes, sensor_dict
 
-DEPTH = 6  # vertices of a path at most, the light's included
-OWN = {"path": DEPTH, "direct": 2}  # vertices of the paths of `appearance.integrator` that stands in
+DEPTH = 6  # most vertices of a path, the light's included
+OWN = {"path": DEPTH, "direct": 2}  # path vertices of `appearance.integrator`, which replaces them
 ROWS = 512
-# Programs for other environments' Pythons, which know nothing of mistyle.
+# Programs for other environments' Pythons, which do not import mistyle.
 EXTERNAL = PACKAGE / "render" / "external"
 CYCLES_WORKER, MITSUBA_WORKER = (str(EXTERNAL / f"{n}_worker.py") for n in ("cycles", "mitsuba"))
 LIGHTS = ("studio", "key", "grazing")
@@ -57,8 +57,8 @@ def light_rig(name: str, read: Any) -> Lights:
 
 
 def material_maps(material: Material, metallic: Literal["keep", "zero"] = "keep") -> OwnMaps:
-    """The maps of a material as a renderer wants them: each at the file's resolution with its factor applied, and 2 x 2
-    texels (the renderer's least) where the file has no texture. "zero" leaves the file's metalness out."""
+    """The maps of a material for a renderer: each at the file's resolution with its factor applied, and 2 x 2 texels
+    (the renderer's least) where the file has no texture. "zero" ignores the file's metalness."""
 
     def full(texture: np.ndarray | None, factor: float | np.ndarray, channels: int) -> np.ndarray:
         if texture is None:
@@ -82,13 +82,13 @@ def material_maps(material: Material, metallic: Literal["keep", "zero"] = "keep"
 
 
 def asset_shapes(asset: Asset) -> dict[str, Any]:
-    """The asset as its file means it: glTF's own reflectance model, normal maps in MikkTSpace frames, and what
-    render/mitsuba/appearance.py has: opacity, emission, reflectance, coats."""
+    """The asset's shapes with the file's material: glTF's own reflectance model, normal maps in MikkTSpace frames, and
+    the features of render/mitsuba/appearance.py: opacity, emission, reflectance, coats."""
     return appearance.shapes(asset, [material_maps(m) for m in asset.materials])
 
 
 def asset_scene(shapes: dict[str, Any], camera: Camera, lights: Sequence[Light], integrator: str) -> Any:
-    """A loaded `mi.Scene`; the surroundings light the asset and are not seen. `integrator` is "path" or "direct"."""
+    """A loaded `mi.Scene` whose environment lights the asset but is invisible. `integrator` is "path" or "direct"."""
     import mitsuba as mi
 
     device.use()
@@ -111,7 +111,7 @@ def integrator_dict(name: str) -> dict[str, Any]:
 
 
 def file_scene(path: Path) -> Any:
-    """A Mitsuba scene file as `mi.load_file` loads it. The file is trusted: Mitsuba opens whatever it names."""
+    """A Mitsuba scene file as `mi.load_file` loads it. The file is trusted: Mitsuba opens all files that it names."""
     import mitsuba as mi
 
     from mistyle.core.errors import InputRefused
@@ -131,7 +131,7 @@ def file_scene(path: Path) -> Any:
 def drawn(
     scene: Any, sensor: int, spp: int, seed: int, integrator: dict[str, Any] | None = None
 ) -> Float[np.ndarray, "h w c"]:
-    """Linear Rec.709 and, where the film has it, alpha; exactly `spp` samples where that is a power of two.
+    """Linear Rec.709 and the film's alpha, if any; exactly `spp` samples for powers of two.
 
     `integrator` None: the scene's own.
     """
@@ -149,7 +149,7 @@ def drawn(
 
 
 def suns(lights: Sequence[Light], camera: Camera) -> list[dict[str, list[float]]]:
-    """The directional lights as Blender's job has them: `direction` towards them in the world, `irradiance`."""
+    """The directional lights in Blender's job format: `direction` towards them in the world, `irradiance`."""
     return [
         {"direction": direction_in_world(x, camera).tolist(), "irradiance": list(x.irradiance)}
         for x in lights
@@ -158,7 +158,7 @@ def suns(lights: Sequence[Light], camera: Camera) -> list[dict[str, list[float]]
 
 
 def blender_environment(lights: Sequence[Light]) -> Float[np.ndarray, "h w 3"]:
-    """The soft lights as one picture in Blender's equirectangular layout, for a Y-up world turned as its importer does.
+    """The soft lights as one picture in Blender's equirectangular layout, for a Y-up world rotated by its importer.
 
     Cycles: u = 0.5 - atan2(y, x) / 2π, v = 0.5 + asin(z) / π with Z up; the importer takes (x, y, z) to (x, -z, y).
     """

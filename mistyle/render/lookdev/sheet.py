@@ -1,8 +1,8 @@
-"""Look-dev pictures: an asset on a turntable under fixed light, and beside it, in the same light, a grey and a chrome
-ball and a ColorChecker.
+"""Look-dev sheet: an asset on a turntable under fixed light, beside a grey ball, a chrome ball and a ColorChecker in
+the same light.
 
-The camera and the light stand still and the asset turns: the light of a picture from azimuth a is the rig turned by a.
-Every rig is one latitude-longitude map, scaled so that the visible half of the 18 % ball has a mean luminance of 0.18.
+Camera and light are fixed and the asset turns: the light of a picture from azimuth a is the rig rotated by a. Every rig
+is one latitude-longitude map, scaled so that the visible half of the 18 % ball has a mean luminance of 0.18.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ GREY = 0.18
 FOV = 30.0
 # Name -> azimuth, elevation.
 CAMERAS = {"front": (0.0, 8.0), "3/4": (35.0, 15.0), "side": (90.0, 8.0), "back": (180.0, 8.0), "top": (0.0, 88.0)}
-# The column of references, in units of which 100 are COLUMN[0] pixels wide: balls above, chart below.
+# The column of references, in units of COLUMN[0] / 100 pixels: balls above, chart below.
 COLUMN = (240, 560)
 BALLS = {"grey": (-29.0, 76.0), "chrome": (19.0, 76.0)}
 BALL_RADIUS = 21.0
@@ -35,7 +35,7 @@ UNIT = 0.01
 
 @dataclass(frozen=True)
 class LightRig:
-    """A light of the sheet: its name, the map, and by how many stops it was exposed to bring the grey ball to 0.18."""
+    """A light of the sheet: its name, the map, and its exposure in stops that brings the grey ball to 0.18."""
 
     name: str
     light: Environment
@@ -57,7 +57,7 @@ def rigs(hdri: Float[np.ndarray, "h w 3"] | None, name: str = "", read: Any = No
 
 
 def clear_sky(rows: int) -> Float[np.ndarray, "h w 3"]:
-    """A simple clear sky of ours: blue above, pale at the horizon, a warm sun 35 degrees high, brownish ground."""
+    """A simple procedural clear sky: blue above, pale at the horizon, a warm sun 35 degrees high, brownish ground."""
     towards = environment_directions(rows, 2 * rows)
     up = towards[..., 1:2]
     zenith, horizon, ground = (np.array(c) for c in ((0.10, 0.24, 0.62), (0.75, 0.85, 1.0), (0.16, 0.13, 0.10)))
@@ -67,7 +67,7 @@ def clear_sky(rows: int) -> Float[np.ndarray, "h w 3"]:
     warm = np.array([1.0, 0.86, 0.66])
     glow = 1.6 * np.exp(18 * (cosine - 1))[..., None] * warm
     disc = 900.0 * np.exp(2500 * (cosine - 1))[..., None] * warm
-    # Half a degree of haze between sky and ground.
+    # Half a degree of blending between sky and ground.
     share = np.clip(up / 0.02 + 0.5, 0, 1)
     return (ground + share * (sky + glow + disc - ground)).astype(np.float32)
 
@@ -77,7 +77,7 @@ def colour_checker() -> Float[np.ndarray, "24 3"]:
     """Linear Rec.709 (D65) of the 24 patches, row by row of the chart held landscape, dark skin first.
 
     X-Rite's values after November 2014 (colour-science), adapted from their D50 to D65 by Bradford's matrix. Cyan lies
-    outside Rec.709: its red is negative, which no surface of a renderer reflects; who renders it takes 0.
+    outside Rec.709: its red is negative, which no reflectance can be; renderers clip it to 0.
     """
     import warnings
 
@@ -92,7 +92,7 @@ def colour_checker() -> Float[np.ndarray, "24 3"]:
 
 
 def chart_texture(side: int = 32, gap: int = 3) -> Float[np.ndarray, "h w 3"]:
-    """The chart held upright (four patches wide, six high: turned right by 90 degrees), black between the patches."""
+    """The chart in portrait (four patches wide, six high: rotated right by 90 degrees), black between the patches."""
     columns, rows = PATCHES
     landscape = np.clip(colour_checker(), 0, 1).reshape(columns, rows, 3)
     upright = np.rot90(landscape, -1)
@@ -114,7 +114,7 @@ def column_camera(scale: float = 1.0) -> Camera:
 
 
 def reference_shapes() -> dict[str, Any]:
-    """The two balls and the chart as Mitsuba describes them, in the plane z = 0, facing +Z."""
+    """Mitsuba shapes of the two balls and the chart, in the plane z = 0, facing +Z."""
     import mitsuba as mi
 
     device.use()
@@ -147,7 +147,7 @@ def reference_shapes() -> dict[str, Any]:
 def references(light: Environment, spp: int, seed: int = 0, scale: float = 1.0) -> Float[np.ndarray, "h w 4"]:
     """The column of references in a light: linear premultiplied Rec.709 and alpha.
 
-    Each stands alone in the light, so that none shades or tints another.
+    Each is rendered alone, so that none shades or tints another.
     """
     camera, total = column_camera(scale), np.zeros((), np.float32)
     for name, shape in reference_shapes().items():
@@ -156,7 +156,7 @@ def references(light: Environment, spp: int, seed: int = 0, scale: float = 1.0) 
 
 
 def pixel_of(x: float, y: float, scale: float = 1.0) -> tuple[float, float]:
-    """Where a point of the references' plane (units) lies in their picture: column, row."""
+    """Column and row in the references' picture of a point of their plane (units)."""
     camera = column_camera(scale)
     return camera.centre[0] + camera.focal * x * UNIT / 40.0, camera.centre[1] - camera.focal * y * UNIT / 40.0
 
@@ -178,7 +178,7 @@ def exposed(rig: LightRig, seed: int = 0) -> LightRig:
 
 
 class Stage:
-    """An asset ready to be drawn under many lights; a class because its shapes are loaded once."""
+    """An asset for rendering under many lights; a class because its shapes are loaded once."""
 
     def __init__(self, asset: Asset) -> None:
         self.asset, self.shapes = asset, asset_shapes(asset)
@@ -194,23 +194,23 @@ class Stage:
     def turn(
         self, frames: int, light: Environment, size: int, spp: int, seed: int, progress: Callable[[float], None]
     ) -> list[Float[np.ndarray, "h w 4"]]:
-        """The asset once round, camera and light standing still."""
-        made = []
+        """The asset turned by a full circle; camera and light are fixed."""
+        pictures = []
         for k in range(frames):
-            made.append(self.picture(CAMERAS["3/4"][0] + 360 * k / frames, 12.0, light, size, spp, seed))
+            pictures.append(self.picture(CAMERAS["3/4"][0] + 360 * k / frames, 12.0, light, size, spp, seed))
             progress((k + 1) / frames)
-        return made
+        return pictures
 
     def light_turn(
         self, frames: int, light: Environment, size: int, spp: int, seed: int, progress: Callable[[float], None]
     ) -> list[Float[np.ndarray, "h w 4"]]:
-        """The light once round, camera and asset standing still."""
-        made = []
+        """The light turned by a full circle; camera and asset are fixed."""
+        pictures = []
         for k in range(frames):
             turned = replace(light, turn=light.turn + 360 * k / frames)
-            made.append(self.picture(*CAMERAS["3/4"], turned, size, spp, seed))
+            pictures.append(self.picture(*CAMERAS["3/4"], turned, size, spp, seed))
             progress((k + 1) / frames)
-        return made
+        return pictures
 
 
 def asset_camera(azimuth: float, elevation: float, size: int) -> Camera:

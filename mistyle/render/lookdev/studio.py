@@ -1,15 +1,15 @@
-"""Pictures of an asset under the studio's environment, without noise: image-based lighting in one kernel.
+"""Noise-free pictures of an asset under the studio's environment: image-based lighting in one kernel.
 
 The light is prefiltered once (`prefiltered`): the irradiance of every normal, and for each of ROUGHNESS the radiance
-that a GGX lobe about a direction receives. A pixel sample then sends
+that a GGX lobe about a direction receives. The radiance of a pixel sample is
 
     albedo (1 - metallic) · o · E(b) / pi  +  (F0 A + B) · s · L(r, roughness)
 
-to the camera: b is the mean direction of the open sky at the sample (its bent normal) tilted as the normal map says, o
-the share of sky that is open (`occlusion.open_sky`), A and B the split-sum fit of B. Karis ("Physically based shading
-on mobile", 2014), s Lagarde's specular occlusion. The environment turns with the camera, as scenes/studio.xml has it.
+Here b is the sample's mean unoccluded direction (its bent normal), tilted by the normal map, and o the share of open
+sky (`occlusion.open_sky`). A and B are the split-sum fit of B. Karis ("Physically based shading on mobile", 2014), s
+is Lagarde's specular occlusion. The environment turns with the camera, as in scenes/studio.xml.
 
-Every ray is traced once and shades all looks (the asset with one set of maps or another): mesh, ray tracing structure,
+Every ray is traced once and shades all looks (the asset with one set of maps or another). Mesh, ray tracing structure,
 occlusion and light are uploaded once for any number of pictures. Maps are packed into 8 bytes a texel.
 """
 
@@ -32,9 +32,9 @@ from mistyle.render.deferred.image_samples import window
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.draw import Tracer
 
-# Perceptual roughness of the prefiltered maps; the first is the light itself, the last irradiance / pi as well: there
-# the lobe about the normal is the cosine. Rows of all maps (twice as many columns), and of those from COARSE on while
-# they are filtered.
+# Perceptual roughness of the prefiltered maps. The first is the light itself; the last equals irradiance / pi, since
+# the lobe about the normal is the cosine. Rows of all maps (with twice as many columns), and of those from COARSE on
+# during filtering.
 ROUGHNESS = (0.0, 0.15, 0.3, 0.5, 0.75, 1.0)
 ROWS, COARSE, COARSE_ROWS = 64, 2, 32
 GOLDEN = (5**0.5 - 1) / 2
@@ -61,15 +61,15 @@ def prefiltered(radiance: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "k ro
 
 
 def _resized(radiance: Float[np.ndarray, "h w 3"], rows: int) -> Float[np.ndarray, "rows w2 3"]:
-    """The map with so many rows; where it has fewer, each is the mean over what it stands for."""
+    """The map at this number of rows; with fewer rows, each is the mean over its source rows."""
     fine = max(1, 2 * len(radiance) // rows)
     light = Environment(radiance)
-    # Rows lie at both poles, so a finer grid of an odd number of rows a row has each one's middle among its own.
+    # Rows lie at both poles, so with an odd refinement the coarse rows' centres are rows of the fine grid.
     fine += 1 - fine % 2
     grid = environment_directions((rows - 1) * fine + 1, 2 * rows * fine)
-    found = environment_radiance(light, grid)
-    found = np.concatenate([found[: fine // 2][::-1], found, found[len(found) - fine // 2 :][::-1]])
-    return found.reshape(rows, fine, 2 * rows, fine, 3).mean(axis=(1, 3)).astype(np.float32)
+    samples = environment_radiance(light, grid)
+    samples = np.concatenate([samples[: fine // 2][::-1], samples, samples[len(samples) - fine // 2 :][::-1]])
+    return samples.reshape(rows, fine, 2 * rows, fine, 3).mean(axis=(1, 3)).astype(np.float32)
 
 
 def _filtered(radiance: Float[np.ndarray, "h w 3"], alpha: float) -> Float[np.ndarray, "h w 3"]:
@@ -80,7 +80,7 @@ def _filtered(radiance: Float[np.ndarray, "h w 3"], alpha: float) -> Float[np.nd
     mi: Any = mitsuba  # its type stubs know one variant only
 
     height, width = radiance.shape[:2]
-    # Rows lie at both poles: those stand for half a band.
+    # Rows lie at both poles: those cover half a band.
     edge = np.clip((np.arange(height + 1) - 0.5) / (height - 1), 0, 1) * np.pi
     angle = np.repeat((np.cos(edge[:-1]) - np.cos(edge[1:]))[:, None] * 2 * np.pi / width, width, axis=1)
     sources = np.concatenate([environment_directions(height, width), angle[..., None], radiance], axis=-1)
@@ -124,7 +124,7 @@ def packed(maps: Maps) -> UInt32[np.ndarray, "n 2"]:
 
 
 class Studio:
-    """An asset ready to be drawn; a class because mesh, light and materials are uploaded once for all pictures."""
+    """An asset for rendering; a class because mesh, light and materials are uploaded once for all pictures."""
 
     def __init__(self, traced: Tracer, light: np.ndarray, sky: StudioSky, looks: Sequence[Sequence[Maps]]) -> None:
         """`light` is `prefiltered`; `looks` are one `Maps` per texture set each; sets of a look may differ in size."""
@@ -141,7 +141,7 @@ class Studio:
         self._looks = [self._uploaded(look) for look in looks]
 
     def _uploaded(self, look: Sequence[Maps]) -> tuple[Any, ...]:
-        """Texels, and for each set where it begins, its rows and its columns."""
+        """Texels, and for each set its offset, rows and columns."""
         import mitsuba
 
         mi: Any = mitsuba  # its type stubs know one variant only
@@ -157,8 +157,8 @@ class Studio:
     def pictures(
         self, cameras: Sequence[Camera], looks: Sequence[int], spp: int = 8
     ) -> Iterator[list[Float[np.ndarray, "h w 4"]]]:
-        """For each camera a picture of each of the chosen looks: linear rgb, premultiplied, and coverage; nothing
-        stands behind the asset. `spp` rays a pixel lie on a lattice of rank 1, the same in every pixel."""
+        """For each camera a picture of each of the chosen looks: linear rgb, premultiplied, and coverage; the
+        background is empty. `spp` rays a pixel lie on a lattice of rank 1, the same in every pixel."""
         chosen = [self._looks[k] for k in looks]
         for camera in cameras:
             yield self._drawn(camera, chosen, spp)
@@ -183,7 +183,7 @@ class Studio:
             camera.centre[1] - down.start,
             camera.focal,
         ]
-        # Opaque: as literals every camera would compile a kernel of its own.
+        # Opaque: a literal would compile one kernel per camera.
         value = [dr.opaque(mi.Float, float(v)) for v in numbers]
         n, columns = height * width, dr.opaque(mi.UInt32, width)
         rays, step = dr.opaque(mi.UInt32, spp), dr.opaque(mi.Float, 1 / spp)
@@ -195,8 +195,8 @@ class Studio:
             x = (px + across - value[21]) / value[23]
             y = (py + down - dr.floor(down) - value[22]) / value[23]
             away = dr.normalize(_turned(value[3:12], mi.Vector3f(x, y, 1)))
-            found = self._shaded(mi.Ray3f(mi.Point3f(*value[:3]), away), value[12:21], looks)
-            return k + 1, *(total + colour for total, colour in zip(totals, found, strict=True))
+            colours = self._shaded(mi.Ray3f(mi.Point3f(*value[:3]), away), value[12:21], looks)
+            return k + 1, *(total + colour for total, colour in zip(totals, colours, strict=True))
 
         state = (mi.UInt32(0), *(dr.zeros(mi.Vector4f, n) for _ in looks))
         _, *totals = dr.while_loop(state, lambda k, *_: k < rays, body)
@@ -205,7 +205,7 @@ class Studio:
         return [memory.copied(picture) for picture in result] if memory.tight() else result
 
     def _shaded(self, ray: Any, turn: Sequence[Any], looks: Sequence[tuple[Any, ...]]) -> list[Any]:
-        """(r, g, b, 1) of what the ray meets, by look; zero where it meets nothing."""
+        """(r, g, b, 1) of the ray's hit, by look; zero without a hit."""
         import drjit as dr
         import mitsuba
 
@@ -224,11 +224,11 @@ class Studio:
         result = []
         for look in looks:
             albedo, tilt, roughness, metallic = _material(look, part, uv, valid)
-            # Two-sided as Mitsuba has it: seen from behind, the frame's normal is turned and its tangents are not.
+            # Two-sided as in Mitsuba: on the back, the frame's normal is flipped and its tangents are not.
             tilted = frame.s * tilt.x + frame.t * tilt.y + frame.n * (side * tilt.z)
             tilted = dr.normalize(tilted)
             facing = dr.dot(tilted, -ray.d)
-            # A mapped normal that faces away is seen at a grazing angle.
+            # A mapped normal that faces away is shaded at a grazing angle.
             tilted = dr.normalize(tilted - dr.minimum(facing - 1e-2, 0) * -ray.d)
             cosine = dr.clip(dr.dot(tilted, -ray.d), 1e-2, 1)
             towards = dr.normalize(bent + tilted - side * frame.n)
@@ -244,7 +244,7 @@ class Studio:
         return result
 
     def _open(self, part: Any, uv: Any, valid: Any) -> Any:
-        """Open sky (x, y, z, share) at a place, bilinear."""
+        """Open sky (x, y, z, share) at a texture position, bilinear."""
         import mitsuba
 
         mi: Any = mitsuba  # its type stubs know one variant only
@@ -255,7 +255,7 @@ class Studio:
         return _bilinear(mi.Vector4f, self._sky, _Page(start, columns, columns), uv, valid)
 
     def _fetched(self, levels: Sequence[Any], towards: Any) -> list[Any]:
-        """The light of each of the maps numbered `levels` from a unit direction (studio axes)."""
+        """The light of the maps numbered `levels` from a unit direction (studio axes)."""
         import drjit as dr
         import mitsuba
 
@@ -274,8 +274,8 @@ class Studio:
                 [dr.gather(mi.Vector4f, self._light, first + below * 2 * ROWS + c) for c in columns] for below in (0, 1)
             ]
             upper, lower = (dr.lerp(pair[0], pair[1], x) for pair in pixels)
-            found = dr.lerp(upper, lower, y)
-            return mi.Color3f(found.x, found.y, found.z)
+            colour = dr.lerp(upper, lower, y)
+            return mi.Color3f(colour.x, colour.y, colour.z)
 
         return [at(one) for one in levels]
 
@@ -305,7 +305,7 @@ def _turned(matrix: Sequence[Any], vector: Any) -> Any:
 
 
 def _material(look: tuple[Any, ...], part: Any, uv: Any, valid: Any) -> tuple[Any, Any, Any, Any]:
-    """Albedo, tangent-space normal (not unit), roughness and metallic at a place, bilinear."""
+    """Albedo, tangent-space normal (not unit), roughness and metallic at a texture position, bilinear."""
     import drjit as dr
     import mitsuba
 
@@ -332,7 +332,7 @@ def _material(look: tuple[Any, ...], part: Any, uv: Any, valid: Any) -> tuple[An
 
 
 class _Page(NamedTuple):
-    """Where a page of a table begins, and its size in texels."""
+    """Offset of a page in a table, and its size in texels."""
 
     start: Any
     height: Any
@@ -340,7 +340,7 @@ class _Page(NamedTuple):
 
 
 def _bilinear(kind: Any, table: Any, page: _Page, uv: Any, valid: Any, unpacked: Any = lambda row: row) -> Any:
-    """The value of a page at uv in [0, 1), its v down as Mitsuba has it; pages repeat."""
+    """The value of a page at uv in [0, 1), v down as in Mitsuba; pages repeat."""
     import drjit as dr
     import mitsuba
 

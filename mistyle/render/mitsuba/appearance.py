@@ -1,13 +1,13 @@
-"""An asset drawn as its file says: glTF's surface with F0, F90 and a clear coat, opacity, emission, unlit materials.
+"""An asset's full material: glTF's surface with F0, F90 and a clear coat, opacity, emission, unlit materials.
 
-Four plugins of ours for Mitsuba, in Python; plain materials do without them (`object_shapes`):
+Four Python plugins for Mitsuba; plain materials do not need them (`object_shapes`):
 
 - a BSDF `LayeredSurface`: `mistyle_gltf` with F0 as a texture, F90, and a clear coat (`bsdf.layered`);
 - a texture `Cut`: 1 where another one reaches a cutoff, else 0 (glTF's MASK);
-- an emitter `Glow`: what a mesh radiates from either side, times its opacity. Light paths find it by chance, emitter
-  sampling does not: it is seen without noise, and no sample of the surroundings is lost to it;
-- an integrator `Path`: as Mitsuba's `path` with hidden emitters, but it hides the surroundings alone, and surfaces
-  that are passed do not count as bounces.
+- an emitter `Glow`: radiance of a mesh to either side, times its opacity. Light paths find it by BSDF sampling, not by
+  emitter sampling: directly visible emission has no noise, and no sample of the environment is lost to it;
+- an integrator `Path`: Mitsuba's `path` with hidden emitters, but it hides only the environment, and surfaces that a
+  path passes through do not count as bounces.
 """
 
 from dataclasses import replace
@@ -24,14 +24,14 @@ from mistyle.render.deferred import bsdf
 from mistyle.render.mitsuba import device, plugins
 from mistyle.render.mitsuba import scene as scenery
 
-PASSED = 32  # surfaces that a path passes through at most
+PASSED = 32  # most surfaces that a path passes through
 LABELS = ("sampler", "ray", "active", "depth", "passed", "result", "throughput", "before", "pdf", "delta", "valid")
-LEAST_INDEX = 1.001  # Mitsuba refuses a solid of the index of air
-BARE = 0.8  # albedo of what has no material at all, as in Blender
+LEAST_INDEX = 1.001  # Mitsuba rejects a solid with the index of air
+BARE = 0.8  # albedo of a mesh without material, as in Blender
 
 
 def is_plain(material: Material) -> bool:
-    """Whether albedo, normal, roughness and metalness say all of a material."""
+    """Whether albedo, normal, roughness and metalness describe a material fully."""
     maps = (material.opacity, material.emission, material.specular)
     return material.shading == Shading() and all(m is None for m in maps)
 
@@ -43,7 +43,7 @@ def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray,
     device.use()
     plugins.register()
     material = asset.materials[part]
-    shading, made = material.shading, classes(mi.variant())
+    shading, plugin_types = material.shading, classes(mi.variant())
     if shading.stated == "nothing":
         maps = replace(maps, albedo=np.full((2, 2, 3), BARE, np.float32))
     elif shading.stated == "colour":
@@ -51,13 +51,13 @@ def shape_of(asset: Asset, part: int, maps: OwnMaps, tangents: Float[np.ndarray,
     glow = _radiance(material, maps)
     if shading.unlit or shading.black:
         maps = replace(maps, albedo=np.zeros((2, 2, 3), np.float32))
-    described: dict[str, Any] = {"type": "twosided", "bsdf": _relief(material, maps, made)}
+    described: dict[str, Any] = {"type": "twosided", "bsdf": _surface_bsdf(material, maps, plugin_types)}
     if shading.transmission > 0:
         described = _glass(shading, maps)
-    opacity = _opacity(material, made)
+    opacity = _opacity(material, plugin_types)
     if opacity is not None:
         described = {"type": "mask", "opacity": opacity, "nested": described}
-    emitter = None if glow is None else made["Glow"](_loaded(glow), opacity)
+    emitter = None if glow is None else plugin_types["Glow"](_loaded(glow), opacity)
     return scenery.mitsuba_mesh(
         asset.mesh, part, mi.load_dict(described), f"part{part}", tangents=tangents, emitter=emitter
     )
@@ -67,15 +67,15 @@ def shapes(asset: Asset, maps: list[OwnMaps]) -> dict[str, Any]:
     """Every texture set as one loaded shape, by name."""
     device.use()
     tangents = corner_tangents(asset.mesh)
-    there = [p for p in range(len(asset.mesh.parts)) if (asset.mesh.part == p).any()]
-    plain = [p for p in there if is_plain(asset.materials[p])]
+    present = [p for p in range(len(asset.mesh.parts)) if (asset.mesh.part == p).any()]
+    plain = [p for p in present if is_plain(asset.materials[p])]
     result = {f"part{p}": scenery.object_shape(asset.mesh, p, maps[p], tangents) for p in plain}
-    result |= {f"part{p}": shape_of(asset, p, maps[p], tangents) for p in there if p not in plain}
-    return {f"part{p}": result[f"part{p}"] for p in there}
+    result |= {f"part{p}": shape_of(asset, p, maps[p], tangents) for p in present if p not in plain}
+    return {f"part{p}": result[f"part{p}"] for p in present}
 
 
 def needs_path(shapes: dict[str, Any]) -> bool:
-    """Whether Mitsuba's own integrators would not show some shape as it is: it radiates, or is seen through."""
+    """Whether a shape emits or transmits light, which Mitsuba's own integrators would not render correctly."""
     import mitsuba as mi
 
     loaded = [s for s in shapes.values() if isinstance(s, mi.Shape)]
@@ -83,19 +83,19 @@ def needs_path(shapes: dict[str, Any]) -> bool:
 
 
 def integrator(depth: int) -> Any:
-    """A `Path` of `depth` vertices at most, the light's included."""
+    """A `Path` of at most `depth` vertices, the light's included."""
     import mitsuba as mi
 
     return classes(mi.variant())["Path"](depth)
 
 
-def _relief(material: Material, maps: OwnMaps, made: dict[str, type]) -> dict[str, Any]:
+def _surface_bsdf(material: Material, maps: OwnMaps, plugin_types: dict[str, type]) -> dict[str, Any]:
     """The normal map over the surface."""
     shading = material.shading
     bare = shading.unlit or shading.stated == "nothing"
     f0 = np.zeros(3, np.float32) if bare else np.array(shading.specular, np.float32)
     specular = np.broadcast_to(f0, (2, 2, 3)) if material.specular is None else material.specular * f0
-    surface = made["Surface"](
+    surface = plugin_types["Surface"](
         {
             "base_color": _loaded(maps.albedo),
             "roughness": _loaded(maps.roughness[..., None]),
@@ -111,23 +111,23 @@ def _relief(material: Material, maps: OwnMaps, made: dict[str, type]) -> dict[st
 
 
 def _glass(shading: Shading, maps: OwnMaps) -> dict[str, Any]:
-    """What lets light through, by Mitsuba's own material: with a volume a solid that refracts, else a thin sheet."""
-    told: dict[str, Any] = {
+    """Transmission by Mitsuba's own material: with a volume a refracting solid, else a thin sheet."""
+    parameters: dict[str, Any] = {
         "base_color": scenery.texture_dict(maps.albedo),
         "roughness": scenery.texture_dict(maps.roughness[..., None]),
         "spec_trans": shading.transmission,
         "eta": max(shading.ior, LEAST_INDEX),
     }
     if shading.thin:
-        return {"type": "principledthin", **told}
+        return {"type": "principledthin", **parameters}
     metallic = scenery.texture_dict(maps.metallic[..., None])
     normal = scenery.texture_dict(scenery.encoded(maps.normal))
-    inner = {"type": "principled", "metallic": metallic, **told}
+    inner = {"type": "principled", "metallic": metallic, **parameters}
     return {"type": plugins.NORMALMAP, "normalmap": normal, "bsdf": inner}
 
 
 def _radiance(material: Material, maps: OwnMaps) -> Float[np.ndarray, "h w 3"] | None:
-    """What a material radiates, linear; None where nothing."""
+    """Emitted radiance of a material, linear; None without emission."""
     shading = material.shading
     if shading.unlit:
         return maps.albedo
@@ -138,8 +138,8 @@ def _radiance(material: Material, maps: OwnMaps) -> Float[np.ndarray, "h w 3"] |
     return np.broadcast_to(factor, (2, 2, 3)) if texture is None else texture * factor
 
 
-def _opacity(material: Material, made: dict[str, type]) -> Any:
-    """The opacity as a texture; None where all is opaque."""
+def _opacity(material: Material, plugin_types: dict[str, type]) -> Any:
+    """The opacity as a texture; None if all is opaque."""
     shading = material.shading
     if shading.opacity == 1 and material.opacity is None and (shading.cutoff or 0) <= 1:
         return None
@@ -147,7 +147,7 @@ def _opacity(material: Material, made: dict[str, type]) -> Any:
     if material.opacity is not None:
         values = np.clip(material.opacity * np.float32(shading.opacity), 0, 1)
     texture = _loaded(values[..., None])
-    return texture if shading.cutoff is None else made["Cut"](texture, shading.cutoff)
+    return texture if shading.cutoff is None else plugin_types["Cut"](texture, shading.cutoff)
 
 
 def _loaded(values: Float[np.ndarray, "h w c"]) -> Any:
@@ -158,7 +158,7 @@ def _loaded(values: Float[np.ndarray, "h w c"]) -> Any:
 
 @cache
 def classes(variant: str) -> dict[str, type]:
-    """The plugins as classes of the bases of Mitsuba's current variant."""
+    """The plugins as classes derived from the current variant's base classes."""
     import mitsuba as mi
 
     return {"Surface": _surface_class(mi), "Cut": _cut_class(mi), "Glow": _glow_class(mi), "Path": _path_class(mi)}
@@ -258,8 +258,8 @@ def _path_class(mi: Any) -> type:
     return Path
 
 
-def _balanced(a: Any, b: Any) -> Any:
-    """Veach's power heuristic for a sample of density a that b could have made as well."""
+def _power_heuristic(a: Any, b: Any) -> Any:
+    """Veach's power heuristic for a sample of density a that a strategy of density b could have generated."""
     import drjit as dr
 
     total = dr.fma(a, a, b * b)
@@ -267,31 +267,30 @@ def _balanced(a: Any, b: Any) -> Any:
 
 
 def _next_surface(mi: Any, scene: Any, most: int, state: tuple[Any, ...]) -> tuple[Any, ...]:
-    """A path of at most `most` vertices one surface further: what is radiated there, what lights reach it, where it
-    goes on."""
+    """Extends a path of at most `most` vertices by one surface: its emission, its direct light, and the next ray."""
     import drjit as dr
 
     sampler, ray, active, depth, passed, result, throughput, before, pdf, delta, valid = state
     ctx = mi.BSDFContext()
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=depth == 0, active=active)
-    # The surroundings light the asset and are not seen.
+    # The environment lights the asset but is invisible.
     lit = active & (si.is_valid() | (depth > 0))
     ds = mi.DirectionSample3f(scene, si, before)
-    found = scene.pdf_emitter_direction(before, ds, lit & ~delta)
-    share = dr.select(delta, 1, _balanced(pdf, found))
+    density = scene.pdf_emitter_direction(before, ds, lit & ~delta)
+    share = dr.select(delta, 1, _power_heuristic(pdf, density))
     result = result + dr.select(lit, throughput * share * ds.emitter.eval(si, lit), 0)
-    here = active & si.is_valid()
-    goes = here & (depth + 1 < most) & (passed < PASSED)
+    hit = active & si.is_valid()
+    goes = hit & (depth + 1 < most) & (passed < PASSED)
     surface = si.bsdf(ray)
     direct = goes & mi.has_flag(surface.flags(), mi.BSDFFlags.Smooth)
     ds, weight = scene.sample_emitter_direction(si, sampler.next_2d(goes), True, direct)
     direct = direct & (ds.pdf != 0)
     value, at = surface.eval_pdf(ctx, si, si.to_local(ds.d), direct)
-    share = dr.select(ds.delta, 1, _balanced(ds.pdf, at))
+    share = dr.select(ds.delta, 1, _power_heuristic(ds.pdf, at))
     result = result + dr.select(direct, throughput * value * weight * share, 0)
     sampled, weight = surface.sample(ctx, si, sampler.next_1d(goes), sampler.next_2d(goes), goes)
     null = goes & mi.has_flag(sampled.sampled_type, mi.BSDFFlags.Null)
-    valid = valid | (here & ~null)
+    valid = valid | (hit & ~null)
     throughput = dr.select(goes, throughput * weight, throughput)
     return (
         sampler,
@@ -369,7 +368,7 @@ def _surface_class(mi: Any) -> type:
 
 
 def _strategy(mi: Any, layers: Any, values: Any) -> tuple[Any, Any, Any, Any]:
-    """The shares of samples that follow the visible normals of base and coat, and their distributions."""
+    """The shares of samples from the visible normals of base and coat, and their distributions."""
     import drjit as dr
 
     _, roughness, metallic, specular = values
@@ -384,7 +383,7 @@ def _strategy(mi: Any, layers: Any, values: Any) -> tuple[Any, Any, Any, Any]:
 
 
 def _density(mi: Any, layers: Any, si: Any, wo: Any, active: Any, values: Any) -> Any:
-    """The density with which a LayeredSurface's `sample` draws a direction."""
+    """The density of directions from a LayeredSurface's `sample`."""
     import drjit as dr
 
     shiny, coated, spread, coat = _strategy(mi, layers, values)

@@ -1,4 +1,4 @@
-"""Drawing: exact surface hits through pixel centres, the views of a job, and pictures for reports."""
+"""Rendering: exact surface hits through pixel centres, the views of a job, and pictures for reports."""
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
@@ -21,18 +21,18 @@ from mistyle.render.mitsuba import scene as scenery
 from mistyle.render.mitsuba.scene import STUDIO, Staging
 from mistyle.render.mitsuba.texture_pages import paged_shapes
 
-# Seeds of passes must not meet those of a neighbouring seed: an odd step visits every number once.
+# Seeds of passes must differ from those of a neighbouring seed: an odd step visits every number once.
 SEED_STEP = 0x9E3779B1
 
 
 @dataclass(frozen=True)
 class Hits:
-    """What the rays through the pixel centres meet first; zero, -1 or infinity where they meet nothing.
+    """First hits of the rays through the pixel centres; zero, -1 or infinity without a hit.
 
     position  world
     normal    interpolated shading normal, world, unit, without normal map; it belongs to the surface's front and is
               not turned towards the camera
-    uv        v up, as in `Mesh.corner_uvs` (meant modulo 1)
+    uv        v up, as in `Mesh.corner_uvs` (modulo 1)
     part      texture set of the face
     face      index into `Mesh.faces`
     depth     metric z in the camera
@@ -49,7 +49,7 @@ class Hits:
 
 @dataclass(frozen=True)
 class Tracer:
-    """A mesh ready for tracing; build once, use for any number of cameras."""
+    """A mesh ready for tracing, reusable for any number of cameras."""
 
     mesh: Mesh
     scene: Any
@@ -64,7 +64,7 @@ def tracer(mesh: Mesh) -> Tracer:
 
 
 def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
-    """One exact ray through each pixel centre of `camera`; a Tracer saves building the structure again."""
+    """One exact ray through each pixel centre of `camera`; a Tracer avoids rebuilding the structure."""
     import drjit as dr
     import mitsuba as mi
 
@@ -72,7 +72,7 @@ def gbuffer(mesh: Mesh | Tracer, camera: Camera) -> Hits:
     traced = mesh if isinstance(mesh, Tracer) else tracer(mesh)
     height, width = camera.size
     directions, cosines = _directions(camera)
-    # Opaque: as literals every camera would compile a kernel of its own.
+    # Opaque: a literal would compile one kernel per camera.
     origin = mi.Point3f(*(dr.opaque(mi.Float, float(v)) for v in camera.position))
     ray = mi.Ray3f(origin, mi.Vector3f(aligned(directions.T)))
     hit = traced.scene.ray_intersect(ray, mi.RayFlags.All, coherent=True)
@@ -103,7 +103,7 @@ def _directions(camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndar
     """Unit world directions through the pixel centres, row by row, and their cosine with the optical axis."""
     x, y = ((pixel_centres(camera.size).reshape(-1, 2) - np.asarray(camera.centre)) / camera.focal).T
     cosines = 1 / np.sqrt(1 + x * x + y * y)
-    # Written out: a product with so small a matrix spends its time on waking the BLAS's threads.
+    # Written out: for so small a matrix, waking the BLAS's threads dominates.
     rows = [(a * x + b * y + c) * cosines for a, b, c in camera.world_from_cam[:3, :3]]
     return np.stack(rows, axis=1).astype(np.float32), cosines.astype(np.float32)
 
@@ -119,9 +119,9 @@ def draw_views(
 ) -> list[View]:
     """Render the mesh with its maps (None: neutral grey) from every camera (paper 4.1.1).
 
-    `rgb` is linear and premultiplied by `coverage`, the share of the `spp` samples of a pixel that met the object;
-    the environment is not seen. Depth, normal, uv, part and mask belong to the ray through the pixel centre. The same
-    seed and thread count give the same bytes. `spp` is rounded up to a power of two.
+    `rgb` is linear and premultiplied by `coverage`, the share of a pixel's `spp` samples that hit the object; the
+    environment is invisible. Depth, normal, uv, part and mask belong to the ray through the pixel centre. The same seed
+    and thread count give the same bytes. `spp` is rounded up to a power of two.
     """
     traced = tracer(mesh)
     pictures = _pictures(mesh, maps, cameras, Staging(template, spp, seed, backdrop=False))
@@ -148,9 +148,8 @@ def view_of(traced: Tracer, camera: Camera, picture: Float[np.ndarray, "h w 4"])
 
 
 def as_fine_as(maps: Maps, pixels: int) -> Maps:
-    """Maps for pictures of so many pixels a side: where one is finer than that shows (`coarser`), a coarser mip level
-    (means over squares of texels; normals unit length again), so that textures do not take more memory and time than
-    they show. Each map counts by its own size."""
+    """Maps at the mip level that pictures of this many pixels a side resolve (`coarser`): means over squares of texels,
+    with normals renormalised. Finer maps would only cost memory and time. Each map is treated by its own size."""
     small = {name: _coarse(getattr(maps, name), pixels) for name in ("albedo", "normal", "roughness", "metallic")}
     if small["normal"] is not maps.normal:
         length = np.linalg.norm(small["normal"], axis=-1, keepdims=True)
@@ -162,7 +161,7 @@ def as_fine_as(maps: Maps, pixels: int) -> Maps:
 
 
 def _coarse(values: np.ndarray, pixels: int) -> np.ndarray:
-    """The mip level of a map (h w *c) that pictures of so many pixels a side show; itself where that is the finest."""
+    """The mip level of a map (h w *c) that pictures of this many pixels a side resolve; possibly the map itself."""
     by = coarser(min(values.shape[:2]), pixels)
     return values if by == 1 else resize(values, (values.shape[0] // by, values.shape[1] // by))
 
@@ -181,7 +180,7 @@ def pictures(
     staging: Staging = STUDIO,
     progress: Callable[[float], None] = lambda done: None,
 ) -> list[Float[np.ndarray, "h w 4"]]:
-    """`picture` for several cameras; the object and its textures are loaded once."""
+    """`picture` for several cameras; object and textures are loaded once."""
     result = []
     for image in _pictures(mesh, maps, cameras, staging):
         result.append(image)
@@ -191,7 +190,7 @@ def pictures(
 
 
 def passes(mesh: Mesh, maps: Sequence[Maps], camera: Camera, staging: Staging) -> Iterator[Float[np.ndarray, "h w 4"]]:
-    """`picture` again and again, without end, independent of one another; the scene is loaded once."""
+    """An endless iterator of independent `picture`s; the scene is loaded once."""
     import mitsuba as mi
 
     device.use()
@@ -203,7 +202,7 @@ def passes(mesh: Mesh, maps: Sequence[Maps], camera: Camera, staging: Staging) -
 
 
 def _shapes(mesh, maps, pixels):
-    """The object for pictures of so many pixels a side."""
+    """The object for pictures of this many pixels a side."""
     chosen = None if maps is None else [as_fine_as(m, pixels) for m in maps]
     if chosen is not None and len(chosen) > 1:
         shapes = paged_shapes(mesh, chosen, flip_invalid=True)
@@ -215,7 +214,7 @@ def _shapes(mesh, maps, pixels):
 
 
 def _pictures(mesh, maps, cameras, staging):
-    """Render camera after camera; the object is loaded once, a template that follows the camera anew for each."""
+    """Render camera after camera; the object is loaded once, a template that follows the camera for each."""
     import mitsuba as mi
 
     device.use()
@@ -229,7 +228,7 @@ def _pictures(mesh, maps, cameras, staging):
     standing = loaded(cameras[0]) if cameras and not scenery.follows_camera(staging.template) else None
 
     def drawn(camera):
-        # A function, so that its scene goes before the next comes: where two live, other kernels have to be compiled.
+        # A function, so that each scene is freed before the next: with two alive, other kernels have to be compiled.
         scene = loaded(camera) if standing is None else standing
         sensor = scene.sensors()[0] if standing is None else mi.load_dict(scenery.sensor_dict(camera, spp, seed))
         return mean_of_passes(scene, sensor, camera.size, spp, seed)
@@ -238,7 +237,7 @@ def _pictures(mesh, maps, cameras, staging):
 
 
 def mean_of_passes(scene: Any, sensor: Any, size: tuple[int, int], spp: int, seed: int) -> Float[np.ndarray, "h w 4"]:
-    """A picture of a loaded scene by at least `spp` samples a pixel, in passes of independent seeds."""
+    """A picture of a loaded scene with at least `spp` samples a pixel, in passes of independent seeds."""
     import mitsuba as mi
 
     times, each = scenery.passes(spp)

@@ -18,14 +18,14 @@ from mistyle.core.light import (
     position_in_world,
 )
 
-ROWS = 256  # of the map that several soft lights become
+ROWS = 256  # rows of the map that combines several soft lights
 
 
 def emitters(lights: Sequence[Light], camera: Camera) -> list[dict[str, Any]]:
-    """The dictionaries of a picture's lights, in the world, for a picture of `camera`; linear Rec.709.
+    """Emitter dictionaries of a picture's lights, in the world, for a picture of `camera`; linear Rec.709.
 
-    A Mitsuba scene has one environment at most and no spherical Gaussians: what is no plain map or ambient light alone
-    is baked into one map of ROWS rows. A light that only a scene file describes raises ValueError.
+    A Mitsuba scene has at most one environment and no spherical Gaussians. Soft lights other than a single map or
+    ambient light are baked into one map of ROWS rows. Raises ValueError for a light that only a scene file describes.
     """
     soft = [light for light in lights if isinstance(light, SOFT)]
     result = [_delta(light, camera) for light in lights if not isinstance(light, SOFT)]
@@ -46,7 +46,7 @@ def _delta(light: Light, camera: Camera) -> dict[str, Any]:
     if isinstance(light, Point):
         position = position_in_world(light, camera)
         return {"type": "point", "position": position.tolist(), "intensity": _colour(light.intensity)}
-    raise ValueError(f"{type(light).__name__} cannot be put into a scene")
+    raise ValueError(f"{type(light).__name__} cannot be an emitter of a scene")
 
 
 def _colour(values: Any) -> dict[str, Any]:

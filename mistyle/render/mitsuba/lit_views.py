@@ -27,10 +27,10 @@ def draw_lit_views(
 ) -> list[View]:
     """Render `mesh` with one set of maps per texture set (None: neutral grey), view k under the lights `lights[k]`.
 
-    Normal maps are in MikkTSpace frames, a perturbed normal that faces away from the camera is black: what the fits
-    assume. "path" follows light over several surface points, "direct" leaves indirect light out. `View.rgb` is linear
-    and premultiplied by the coverage; the environment lights the mesh and is not seen. Views have independent noise.
-    `spp` is rounded up to a power of two. ValueError for light that only a scene file describes.
+    Normal maps are in MikkTSpace frames, and a perturbed normal that faces away from the camera is black, as in the
+    fits. "path" includes indirect light, "direct" omits it. `View.rgb` is linear and premultiplied by the coverage; the
+    environment lights the mesh but is invisible. Views have independent noise. `spp` is rounded up to a power of two.
+    Raises ValueError for light that only a scene file describes.
     """
     traced = tracer(mesh)
     shapes = scenery.object_shapes(mesh, maps, frame="mikkt")

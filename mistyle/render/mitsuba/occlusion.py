@@ -1,4 +1,4 @@
-"""How much open sky points of a surface see."""
+"""Ambient occlusion and bent normals of surface points."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.draw import Tracer, tracer
 
 CHUNK = 1 << 18
-LIFT = 2e-3  # how far above the surface rays start, in working units: more than facets leave the smooth surface
+LIFT = 2e-3  # start of rays above the surface, in working units: exceeds the distance of facets from the smooth surface
 
 
 def ambient_occlusion(
@@ -26,8 +26,8 @@ def ambient_occlusion(
     """Share of unoccluded sky about unit `normals`, cosine-weighted (glTF's occlusion): 1 open, 0 closed.
 
     Rays up to `distance` (working units) against all faces from both sides, stratified per point by a rank-1 lattice
-    that is shifted by a hash of the point's index and `seed`. A Tracer saves building the structure again. Hollows
-    narrower than 0.002 are not seen.
+    that is shifted by a hash of the point's index and `seed`. A Tracer avoids rebuilding the structure. Hollows
+    narrower than 0.002 are missed.
     """
     return open_sky(mesh, positions, normals, rays=rays, distance=distance, seed=seed)[:, 3].copy()
 
@@ -41,7 +41,7 @@ def open_sky(
     distance: float = 1.2,
     seed: int = 0,
 ) -> Float[np.ndarray, "n 4"]:
-    """The mean direction of unoccluded sky (unit; the normal where there is none), and `ambient_occlusion`'s share."""
+    """The mean direction of unoccluded sky (unit; the normal without any), and `ambient_occlusion`'s share."""
     device.use()
     import drjit as dr
     import mitsuba

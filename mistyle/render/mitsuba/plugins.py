@@ -1,16 +1,16 @@
-"""Two BSDFs of ours for Mitsuba, in Python: glTF's metallic-roughness model, and normal maps in MikkTSpace frames.
+"""Two Python BSDFs for Mitsuba: glTF's metallic-roughness model, and normal maps in MikkTSpace frames.
 
-`register` makes them known to the variant that is current. They stand where `principled` and `normalmap` stand, inside
-`twosided`, with the same names in `mi.traverse`, under any integrator and under AD:
+`register` registers them with the current variant. They replace `principled` and `normalmap` inside `twosided`, with
+the same names in `mi.traverse`, under any integrator and under AD:
 
 - `mistyle_gltf`: textures `base_color`, `roughness`, `metallic`, float `specular` (0.5: the specification; see
-  `bsdf.gltf`). The front side reflects, the back is black. Half of the samples or more follow GGX's visible normals,
-  the rest the cosine. A `BSDFContext` that asks for one component gets both.
+  `bsdf.gltf`). The front side reflects, the back is black. At least half of the samples follow GGX's visible normals,
+  the rest the cosine. A `BSDFContext` that selects one component gets both.
 - `mistyle_normalmap`: texture `normalmap` holding (n + 1) / 2 and one nested BSDF. n is relative to the mesh attributes
-  `vertex_tangent` (3 floats, world space) and `vertex_handedness` (1 or -1): the tangent interpolated and made
-  perpendicular to the interpolated normal, bitangent = handedness · (normal x tangent). Where the mesh has none, or
-  there is no shape, the frame of the surface interaction is taken as it is. `flip_invalid_normals` (default False) as
-  in Mitsuba's `normalmap`; its shadowing function is left out, as glTF viewers leave it out.
+  `vertex_tangent` (3 floats, world space) and `vertex_handedness` (1 or -1): the interpolated tangent, orthogonalised
+  to the interpolated normal, and bitangent = handedness · (normal x tangent). Without these attributes or a shape, the
+  frame of the surface interaction is used. `flip_invalid_normals` (default False) as in Mitsuba's `normalmap`; its
+  shadowing function is omitted, as in glTF viewers.
 """
 
 from typing import Any
@@ -30,7 +30,7 @@ _registered: set[str] = set()
 
 
 def register() -> None:
-    """Make both plugins known to Mitsuba's current variant (any; where none is, the one of `device.use`)."""
+    """Register both plugins with Mitsuba's current variant (any; by default that of `device.use`)."""
     import mitsuba as mi
 
     variant = mi.variant() or device.use()
@@ -41,10 +41,10 @@ def register() -> None:
 
 
 def with_tangents(welded: Welded, tangents: Float[np.ndarray, "f 3 4"]) -> tuple[Welded, dict[str, np.ndarray]]:
-    """Split the indices whose corners differ in tangent; second, the attributes of the indices that result."""
+    """Split the indices whose corners differ in tangent; returns the attributes of the new indices too."""
     index, corners = welded.faces.reshape(-1), tangents.reshape(-1, 4).astype(np.float32)
     first, inverse = distinct(corner_rows(index, corners))
-    old, found = index[first], corners[first]
+    old, attributes = index[first], corners[first]
     split = Welded(
         positions=welded.positions[old],
         normals=welded.normals[old],
@@ -52,11 +52,11 @@ def with_tangents(welded: Welded, tangents: Float[np.ndarray, "f 3 4"]) -> tuple
         faces=inverse.reshape(-1, 3).astype(np.int32),
         vertex=welded.vertex[old],
     )
-    return split, {TANGENT: found[:, :3], HANDEDNESS: np.sign(found[:, 3:])}
+    return split, {TANGENT: attributes[:, :3], HANDEDNESS: np.sign(attributes[:, 3:])}
 
 
 def _gltf_class(mi: Any) -> type:
-    """The BSDF as a class of the base of `mi`'s current variant."""
+    """The BSDF as a class derived from `mi`'s current variant."""
     import drjit as dr
 
     class Gltf(mi.BSDF):
@@ -123,7 +123,7 @@ def _strategy(mi: Any, metallic: Any, roughness: Any) -> tuple[Any, Any]:
 
 
 def _density(mi: Any, si: Any, wo: Any, active: Any, metallic: Any, roughness: Any) -> Any:
-    """The density with which `sample` draws a direction."""
+    """The density of directions from `sample`."""
     import drjit as dr
 
     shiny, spread = _strategy(mi, metallic, roughness)
@@ -135,7 +135,7 @@ def _density(mi: Any, si: Any, wo: Any, active: Any, metallic: Any, roughness: A
 
 
 def reflected(mi: Any, wo: Any, glossy: Any) -> Any:
-    """A sample of reflection towards `wo`, of the glossy component or the diffuse one; its density is left open."""
+    """A sample of reflection towards `wo`, of the glossy component or the diffuse one; its density is not set."""
     import drjit as dr
 
     sampled = dr.zeros(mi.BSDFSample3f)
@@ -148,7 +148,7 @@ def reflected(mi: Any, wo: Any, glossy: Any) -> Any:
 
 
 def _normalmap_class(mi: Any) -> type:
-    """The BSDF as a class of the base of `mi`'s current variant."""
+    """The BSDF as a class derived from `mi`'s current variant."""
     import drjit as dr
 
     class NormalMap(mi.BSDF):
@@ -156,7 +156,7 @@ def _normalmap_class(mi: Any) -> type:
             super().__init__(props)
             nested = [child for _, child in props.objects() if isinstance(child, mi.BSDF)]
             if len(nested) != 1:
-                raise RuntimeError(f"{NORMALMAP}: exactly one nested BSDF is needed, {len(nested)} came")
+                raise RuntimeError(f"{NORMALMAP}: found {len(nested)} nested BSDFs; expected exactly one")
             self.nested = nested[0]
             self.normalmap = props.get_texture("normalmap")
             self.flip = bool(props.get("flip_invalid_normals", False))
@@ -235,16 +235,16 @@ def _tangents(mi: Any, si: Any, active: Any) -> tuple[Any, Any]:
     import drjit as dr
 
     # No `&=` here: Dr.Jit would change the caller's mask.
-    here = active
+    valid = active
     if dr.is_jit_v(mi.Float):
-        here = here & (si.shape != None)  # noqa: E711
-        here = here & si.shape.has_attribute(TANGENT, here)
+        valid = valid & (si.shape != None)  # noqa: E711
+        valid = valid & si.shape.has_attribute(TANGENT, valid)
     elif not (active and si.shape is not None and si.shape.has_attribute(TANGENT)):
         return mi.Vector2f(1, 0), mi.Vector2f(0, 1)
-    world = si.shape.eval_attribute_3(TANGENT, si, here)
-    hand = dr.mulsign(mi.Float(1), si.shape.eval_attribute_1(HANDEDNESS, si, here))
+    world = si.shape.eval_attribute_3(TANGENT, si, valid)
+    hand = dr.mulsign(mi.Float(1), si.shape.eval_attribute_1(HANDEDNESS, si, valid))
     local = si.to_local(mi.Vector3f(world.x, world.y, world.z))
     s = mi.Vector2f(local.x, local.y)
-    here = here & (dr.squared_norm(s) > 1e-12)
-    s = dr.select(here, dr.normalize(dr.select(here, s, 1)), mi.Vector2f(1, 0))
-    return s, mi.Vector2f(-s.y, s.x) * dr.select(here, hand, 1)
+    valid = valid & (dr.squared_norm(s) > 1e-12)
+    s = dr.select(valid, dr.normalize(dr.select(valid, s, 1)), mi.Vector2f(1, 0))
+    return s, mi.Vector2f(-s.y, s.x) * dr.select(valid, hand, 1)

@@ -1,4 +1,4 @@
-"""A rig made for a mesh (paper 6.2.1): as few views as it takes to see all of the surface well."""
+"""A camera rig for a mesh (paper 6.2.1): the fewest views that see all of the surface well."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -17,11 +17,11 @@ SAMPLES = 20_000
 
 @dataclass(frozen=True)
 class Planned:
-    """A rig in visiting order and what it sees; shares are of the surface's area.
+    """A rig in visiting order and its coverage; shares are of the surface's area.
 
-    reachable  share that some candidate sees at the asked-for weight
+    reachable  share that some candidate sees at the required weight
     covered    share of the reachable that the rig sees at that weight
-    overlap    least overlap of a view with the earlier one it overlaps most (NaN for a single view)
+    overlap    least overlap of a view with its best earlier view (NaN for a single view)
     """
 
     cameras: tuple[Camera, ...]
@@ -30,18 +30,18 @@ class Planned:
     overlap: float
 
     def sentence(self) -> str:
-        """What a person wants to know of it."""
+        """A one-line summary."""
         text = f"{len(self.cameras)} views see {100 * self.covered:.2f} % of the reachable surface"
         if self.covered < 1:
             text += f"; {100 * (1 - self.covered):.2f} % is left uncovered"
         if self.reachable < 1:
-            text += f" ({100 * (1 - self.reachable):.2f} % of the surface no camera about it sees well)"
+            text += f" ({100 * (1 - self.reachable):.2f} % of the surface is not seen well by any candidate camera)"
         return text
 
 
 @dataclass(frozen=True)
 class VisibilitySamples:
-    """Points that stand for equal areas: shading normals, and unit normals of their faces on the outer side."""
+    """Samples of equal area: shading normals, and unit normals of their faces on the outer side."""
 
     positions: Float[np.ndarray, "s 3"]
     normals: Float[np.ndarray, "s 3"]
@@ -51,11 +51,11 @@ class VisibilitySamples:
 def next_best_views(mesh: Mesh, settings: RigSettings, traced: Any = None) -> Planned:
     """The rig of kind 'nbv' for a mesh in working space, from its shape alone; the same mesh gives the same rig.
 
-    Every place is seen at a face-on weight of `settings.facing` or more by some view, if any of `settings.candidates`
-    cameras about the mesh sees it so, and neighbouring views have `settings.overlap` in common; at most
-    `settings.most_views`. `traced` is a `render.draw.Tracer` of the mesh, made here if it is not given. Places are
-    SAMPLES points of equal area: what is smaller than a few of them may be missed. Raises InputRefused for a mesh of
-    which no candidate sees anything.
+    Some view sees every point at a face-on weight of `settings.facing` or more, if any of the `settings.candidates`
+    cameras about the mesh does. Neighbouring views overlap by `settings.overlap`. There are at most
+    `settings.most_views`. `traced` is a `render.mitsuba.draw.Tracer` of the mesh, built here by default. The surface is
+    sampled at SAMPLES points of equal area, so features smaller than a few of them may be missed. Raises InputRefused
+    if no candidate sees the mesh.
     """
     from mistyle.render.mitsuba.draw import tracer
     from mistyle.render.mitsuba.visible import face_on

@@ -1,16 +1,17 @@
-"""Mesh + maps + camera + lights → a Mitsuba scene dictionary. Every plugin and parameter name of Mitsuba lives here.
+"""Mesh + maps + camera + lights → a Mitsuba scene dictionary. All plugin and parameter names of Mitsuba are here.
 
 A template is a Mitsuba scene file with a slot for the object: a shape whose id is "object". `scene_dict` takes the
-template's integrator, emitters and other shapes and puts one shape per texture set, each with a `principled` BSDF
-and its texture parameters, in place of the slot. The object is in the working space (bounding sphere of radius 1
-about the origin, Y up), whatever transform the slot's own shape has. The same works for a user's scene file.
+template's integrator, emitters and other shapes. It replaces the slot by one shape per texture set, each with a
+`principled` BSDF and its texture parameters. The object is in the working space (bounding sphere of radius 1 about the
+origin, Y up), whatever transform the slot's own shape has. The same works for a user's scene file.
 
-What a template may ask for besides:
-- an emitter whose id starts with "camera_" turns with the camera (its place in the file belongs to the file's sensor);
+Optional features of a template:
+- an emitter whose id starts with "camera_" turns with the camera (its transform in the file belongs to the file's
+  sensor);
 - `<default name="turn" .../>`: the parameter $turn receives the camera's heading, degrees about +Y, 0 looking along -Z;
 - `<default name="floor" .../>`: $floor receives the object's lowest y; shapes whose id starts with "floor" are left
-  out for cameras below it and where no backdrop is wanted;
-- `<default name="hdri" .../>`: $hdri receives the environment map that the caller names.
+  out for cameras below it and without a backdrop;
+- `<default name="hdri" .../>`: $hdri receives the caller's environment map.
 """
 
 import re
@@ -35,11 +36,11 @@ from mistyle.render.mitsuba import device, plugins
 
 TEMPLATES = ("paper_views", "phase1_directional", "phase2_ambient", "studio", "hdri")
 
-# Reflectance models and frames of normal maps: `plugins.py` has those that Mitsuba lacks.
+# Reflectance models and frames of normal maps; `plugins.py` adds those that Mitsuba lacks.
 Model = Literal["principled", "gltf"]
 Frame = Literal["mitsuba", "mikkt"]
 
-# `mi.traverse` names of the textures that an optimiser moves, for texture set {p}; of every model and frame.
+# `mi.traverse` names of the optimised textures, for texture set {p}; of every model and frame.
 PARAMETERS = {
     "albedo": "part{p}.bsdf.brdf_0.nested_bsdf.base_color.data",
     "normal": "part{p}.bsdf.brdf_0.normalmap.data",
@@ -66,9 +67,8 @@ def mitsuba_mesh(
 ) -> Any:
     """A Mitsuba mesh of one texture set (None: of all faces), faces in the order of `Mesh.faces`.
 
-    v is flipped here and nowhere else: Mitsuba's texture row 0 is v = 0, ours is v = 1. `bsdf` and `emitter` are
-    loaded. `tangents` (of all the mesh's faces, as `mikktspace` makes them) become the attributes that
-    `mistyle_normalmap` reads.
+    v is flipped only here: Mitsuba's texture row 0 is v = 0, ours is v = 1. `bsdf` and `emitter` are loaded. `tangents`
+    (of all the mesh's faces, from `mikktspace`) become the attributes that `mistyle_normalmap` reads.
     """
     import drjit as dr
     import mitsuba as mi
@@ -103,9 +103,9 @@ def mitsuba_mesh(
 
 
 def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
-    """A float texture (so that it can be differentiated; 8-bit ones cannot), never colour-converted.
+    """A float texture without colour conversion; unlike 8-bit textures it is differentiable.
 
-    It repeats, as `Mesh.corner_uvs` are meant modulo 1: an island may cross the border of the unit square.
+    It repeats, since `Mesh.corner_uvs` are modulo 1: an island may cross the border of the unit square.
     """
     import mitsuba as mi
 
@@ -114,7 +114,7 @@ def texture_dict(values: Float[np.ndarray, "h w c"]) -> dict:
 
 
 def encoded(normal: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
-    """A normal map as textures hold it: (n + 1) / 2."""
+    """A normal map in texture encoding: (n + 1) / 2."""
     return encoded_into(memory.empty(normal.shape), normal)
 
 
@@ -129,10 +129,10 @@ def bsdf_dict(
 ) -> dict[str, Any]:
     """twosided(normalmap(model)) with four textures; the normal texture holds (n + 1) / 2.
 
-    Shadowing correction is off, as glTF viewers have none. Dielectric index 1.5. A perturbed normal that faces away
-    from the camera is black, with no gradient; `flip_invalid` tilts it the other way instead, which pictures want and
-    gradients do not (it depends on the view and mirrors them). `frame` "mikkt" needs a mesh that carries tangents.
-    The plugins that `model` "gltf" and `frame` "mikkt" name are registered with Mitsuba's current variant.
+    Shadowing correction is off, as in glTF viewers. Dielectric index 1.5. A perturbed normal that faces away from the
+    camera is black, with no gradient. `flip_invalid` tilts it the other way instead; this suits pictures, but not
+    gradients (it depends on the view and mirrors them). `frame` "mikkt" needs a mesh with tangents. The plugins of
+    `model` "gltf" and `frame` "mikkt" are registered with Mitsuba's current variant.
     """
     textures = {
         "base_color": texture_dict(maps.albedo),
@@ -173,7 +173,9 @@ def object_shapes(
     device.use()
     chosen = list(maps) if maps is not None else [flat_maps(2, NEUTRAL_GREY)] * len(mesh.parts)
     if len(chosen) != len(mesh.parts):
-        raise ValueError(f"{len(chosen)} maps came for {len(mesh.parts)} texture sets ({', '.join(mesh.parts)})")
+        raise ValueError(
+            f"{len(chosen)} maps for {len(mesh.parts)} texture sets; expected one for each ({', '.join(mesh.parts)})"
+        )
     tangents = None
     if frame == "mikkt":
         tangents = corner_tangents(mesh)
@@ -186,7 +188,7 @@ def object_shapes(
 
 
 def object_shape(mesh: Mesh, part: int, maps: Maps, tangents: Float[np.ndarray, "f 3 4"]) -> Any:
-    """One texture set as `object_shapes` makes it with glTF's model in MikkTSpace frames, for pictures."""
+    """One texture set of `object_shapes` with glTF's model in MikkTSpace frames, for pictures."""
     import mitsuba as mi
 
     bsdf = mi.load_dict(bsdf_dict(maps, True, model="gltf", frame="mikkt"))
@@ -194,9 +196,9 @@ def object_shape(mesh: Mesh, part: int, maps: Maps, tangents: Float[np.ndarray, 
 
 
 def samples(spp: int) -> int:
-    """The number at or above `spp` to give to one `mi.render`: 2, 8 or a power of four.
+    """The least valid number of samples for one `mi.render` at or above `spp`: 2, 8 or a power of four.
 
-    With a power of two no two threads share a pixel, and its sum is the same in every run; the sampler rounds others.
+    With a power of two no two threads share a pixel, so sums are reproducible; the sampler rounds other numbers.
     """
     if spp < 1:
         raise ValueError(f"spp is {spp}; expected 1 or more")
@@ -204,9 +206,9 @@ def samples(spp: int) -> int:
 
 
 def passes(spp: int) -> tuple[int, int]:
-    """How to take at least `spp` samples a pixel in smaller steps: so many passes of so many samples, to be averaged.
+    """Number of passes and samples a pass that average to at least `spp` samples a pixel.
 
-    A power of two in all; a pass has at most 64 samples, which keeps the memory of large pictures small.
+    Their product is a power of two; a pass has at most 64 samples, which bounds the memory of large pictures.
     """
     total = 1 << (spp - 1).bit_length()
     each = 16 if total == 32 else min(total, 64)
@@ -214,10 +216,10 @@ def passes(spp: int) -> tuple[int, int]:
 
 
 def sensor_dict(camera: Camera, spp: int = 8, seed: int = 0) -> dict:
-    """A perspective sensor that sees exactly what `core/camera.py` describes; box filter: pixels are independent.
+    """A perspective sensor that matches `core/camera.py` exactly; box filter: pixels are independent.
 
-    Correlated multi-jittered samples: at 16 per pixel the error of the views is that of 44 independent ones. Give
-    `mi.render` the number that `samples(spp)` gives.
+    Correlated multi-jittered samples: the error of views at 16 per pixel is that of 44 independent samples. Render with
+    `samples(spp)`.
     """
     import mitsuba as mi
 
@@ -254,34 +256,34 @@ def template_path(template: str | Path) -> Path:
 
 
 def follows_camera(template: str | Path) -> bool:
-    """Whether what a template puts around the object hangs on the camera: turned with it, moved with it, or left out
-    where it looks from below."""
+    """Whether a template's surroundings depend on the camera: they turn or move with it, or are left out for cameras
+    from below."""
     text = template_path(template).read_text(encoding="utf-8", errors="replace")
     return bool(re.search(r'<default\s+name="turn"|id="(camera_|floor)|<include', text))
 
 
-def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | None = None, **wanted: float) -> Any:
-    """Load a template; of `hdri` and `wanted` (turn, floor) only what the file declares as `<default>` is passed on.
+def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | None = None, **values: float) -> Any:
+    """Load a template; `hdri` and `values` (turn, floor) are passed on only if the file declares them as `<default>`.
 
-    The file itself is trusted: Mitsuba opens whatever it names. `hdri` is linear radiance, latitude-longitude, +Y up.
-    Raises InputRefused when the file cannot be read as a scene, has no shape "object", or does not take an `hdri`.
+    The file itself is trusted: Mitsuba opens all files that it names. `hdri` is linear radiance, latitude-longitude, +Y
+    up. Raises InputRefused if the file is not a readable scene, has no shape "object", or does not accept an `hdri`.
     """
     import mitsuba as mi
 
     device.use()
     path = template_path(template)
     declared = set(re.findall(r'<default\s+name="(\w+)"', path.read_text(encoding="utf-8", errors="replace")))
-    given: dict[str, Any] = {name: repr(float(value)) for name, value in wanted.items() if name in declared}
+    defines: dict[str, Any] = {name: repr(float(value)) for name, value in values.items() if name in declared}
     if hdri is not None and "hdri" not in declared:
-        raise InputRefused(f'{path}: takes no environment map; it needs <default name="hdri" value="..."/>.')
+        raise InputRefused(f'{path}: accepts no environment map; it needs <default name="hdri" value="..."/>.')
     with TemporaryDirectory() as folder:
         try:
             with device.file_threads():
                 if hdri is not None:
-                    given["hdri"] = str(Path(folder, "hdri.exr"))
-                    mi.Bitmap(np.ascontiguousarray(hdri, np.float32)).write(given["hdri"])
+                    defines["hdri"] = str(Path(folder, "hdri.exr"))
+                    mi.Bitmap(np.ascontiguousarray(hdri, np.float32)).write(defines["hdri"])
                 # Merging meshes, an optimisation of the loader, would lose their ids.
-                scene = mi.load_file(str(path), optimize=False, **given)
+                scene = mi.load_file(str(path), optimize=False, **defines)
         except RuntimeError as error:
             raise InputRefused(f"{path}: Mitsuba cannot load this scene. {error}") from error
     if not isinstance(scene, mi.Scene) or all(shape.id() != "object" for shape in scene.shapes()):
@@ -294,11 +296,11 @@ def read_template(template: str | Path, *, hdri: Float[np.ndarray, "eh ew 3"] | 
 
 @dataclass(frozen=True)
 class Staging:
-    """What stands around the object, and how finely it is drawn.
+    """Surroundings of the object, and sampling.
 
     template  a name of `scenes/` or a file: lights, floor and integrator; `hdri` replaces the map of its environment
-    spp       samples a pixel, drawn from `seed`
-    backdrop  whether the floor is seen
+    spp       samples a pixel, with random seed `seed`
+    backdrop  whether the floor is visible
     """
 
     template: str | Path = "studio"
@@ -318,11 +320,11 @@ def scene_dict(
     staging: Staging,
     shapes: dict[str, Any] | None = None,
 ) -> dict:
-    """The scene as a dictionary for `mi.load_dict`, with a sensor when a camera is given.
+    """The scene as a dictionary for `mi.load_dict`, with a sensor if a camera is given.
 
-    `maps` None: neutral grey. `shapes` (of `object_shapes`) saves building the object again; mesh and maps are then not
-    looked at, except for the floor's height. Emitters with ids "camera_…" are placed for `camera` (without one they
-    keep the file's places).
+    `maps` None: neutral grey. `shapes` (of `object_shapes`) avoids building the object again; mesh and maps are then
+    ignored, except for the floor's height. Emitters with ids "camera_…" are placed for `camera` (without one they keep
+    the file's transform).
     """
     import mitsuba as mi
 
@@ -337,7 +339,7 @@ def scene_dict(
             continue
         result[_key(shape.id(), f"shape{k}")] = shape
     for k, emitter in enumerate(loaded.emitters()):
-        # An emitter that belongs to a shape comes with it.
+        # An emitter of a shape is loaded with the shape.
         if not mi.has_flag(emitter.flags(), mi.EmitterFlags.Surface):
             result[_key(emitter.id(), f"emitter{k}")] = emitter
     if camera is not None:
@@ -352,7 +354,7 @@ def scene_dict(
 
 
 def camera_emitters(emitters: dict[str, Any], sensor: Any, camera: Camera) -> dict[str, Any]:
-    """Where the emitters with ids "camera_…" go for `camera`: moved rigidly from the file's sensor."""
+    """Transforms of the emitters "camera_…" for `camera`: moved rigidly from the file's sensor."""
     import mitsuba as mi
 
     result: dict[str, Any] = {}
@@ -374,7 +376,7 @@ def _matrix(plugin: Any) -> Float[np.ndarray, "4 4"]:
 
 
 def _heading(camera: Camera) -> float:
-    """Degrees about +Y from a camera on the +Z axis; straight above or below, the up vector decides."""
+    """Degrees about +Y from a camera on the +Z axis; for vertical views the up vector decides."""
     x, z = camera.position[0], camera.position[2]
     if np.hypot(x, z) < 1e-6:
         x, z = camera.world_from_cam[0, 1], camera.world_from_cam[2, 1]
@@ -382,5 +384,5 @@ def _heading(camera: Camera) -> float:
 
 
 def _key(name: str, otherwise: str) -> str:
-    """A usable dictionary key: ids that Mitsuba made up start with an underscore."""
+    """A usable dictionary key: Mitsuba's automatic ids start with an underscore."""
     return name if re.fullmatch(r"[A-Za-z]\w*", name) else otherwise

@@ -1,12 +1,12 @@
-"""A folder with a Mitsuba scene of a finished asset, for people who do not have mistyle.
+"""A folder with a Mitsuba scene of a finished asset, for users without mistyle.
 
     <name>.xml                    shapes, materials, up to MOST_CAMERAS sensors (`mitsuba -s 3`), the lights of one view
     <part>.ply                    one mesh per texture set, in working units
     <part>_{albedo,normal,roughness,metallic}.exr    32-bit float, as the material reads them (raw)
     environment.exr               where an environment lights the scene
 
-Mitsuba's `principled` is the material; `normalmap` shades in Mitsuba's own tangent frame, so the normals that come
-here must be turned into it (`frames.py`).
+`principled` is the material; `normalmap` shades in Mitsuba's own tangent frame, so normals must be converted to it
+(`frames.py`).
 """
 
 import re
@@ -44,7 +44,7 @@ def write_scene(
 ) -> Path:
     """Write the scene and return the XML's path; `maps` hold normals in Mitsuba's frame (see the module).
 
-    Lights that are fixed to the camera stand as they do for the first of `cameras`. Linear Rec.709 throughout.
+    Lights that are fixed to the camera are placed for the first of `cameras`. Linear Rec.709 throughout.
     """
     root = Element("scene", version="3.9.0")
     SubElement(root, "default", name="spp", value="64")
@@ -114,7 +114,7 @@ def _emitter(light, camera: Camera, folder: Path, k: int) -> Element:
             turn = SubElement(emitter, "transform", name="to_world")
             SubElement(turn, "rotate", y="1", angle=repr(float(light.turn)))
     else:
-        raise ValueError(f"{type(light).__name__} cannot stand in a scene file")
+        raise ValueError(f"{type(light).__name__} cannot be written to a scene file")
     return emitter
 
 

@@ -1,9 +1,9 @@
-"""A path-traced picture from few samples: noise-free detail from a guide, light and shadow from the path tracer.
+"""Denoised path tracing with few samples: detail from a noise-free guide, light and shadow from the path tracer.
 
-The guide is the same picture without noise (`render/lookdev/studio.py`). Where the asset stands, the result is the
-guide times the ratio of both pictures' local means; behind it, it is the path-traced picture's own local mean.
-Demodulation, as real-time path tracers denoise: what the guide does not have (cast shadows, contact) is smooth, what
-the filter would blur (texture, outlines) the guide has.
+The guide is the same picture without noise (`render/lookdev/studio.py`). On the asset, the result is the guide times
+the ratio of both pictures' local means; on the background, it is the path-traced picture's own local mean. Real-time
+path tracers use the same demodulation: effects that the guide lacks (cast shadows, contact) are smooth, and the guide
+has the details that the filter would blur (texture, outlines).
 """
 
 from collections.abc import Iterable
@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from mistyle.core.image import gaussian, resize, srgb_from_linear
 
-SIGMA = 1 / 180  # of the filter, in picture heights
-# How much wider the filter is on the bare backdrop, and how soon near the asset it narrows.
+SIGMA = 1 / 180  # standard deviation of the filter, in picture heights
+# Factor of the filter's width on the bare backdrop, and the distance from the asset at which it narrows.
 WIDE, FADE = 6, 3
 Rgb = Float[np.ndarray, "h w 3"]
 
@@ -22,10 +22,10 @@ Rgb = Float[np.ndarray, "h w 3"]
 def settled(
     passes: Iterable[Float[np.ndarray, "h w 4"]], guide: Float[np.ndarray, "h w 4"], error: float, most: int
 ) -> tuple[Rgb, Rgb, int]:
-    """(picture, what stands behind the asset, passes taken), linear, from independent `passes` of one picture.
+    """(picture, background, number of passes), linear, from independent `passes` of one picture.
 
-    Two halves of the passes are filtered apart; when the mean difference of the results' sRGB, halved (the standard
-    error of their mean), is at most `error` (0..1), or after `most` passes, both together are the picture.
+    Two halves of the passes are filtered separately. Half the mean difference of their sRGB is the standard error of
+    their mean. When it is at most `error` (0..1), or after `most` passes, the picture is built from both.
     """
     halves: list[Rgb] = [np.zeros(guide[..., :3].shape, np.float32) for _ in range(2)]
     count = 0
@@ -39,25 +39,25 @@ def settled(
 
 
 def filtered(picture: Rgb, guide: Float[np.ndarray, "h w 4"]) -> tuple[Rgb, Rgb]:
-    """The denoised picture, and what stands behind the asset, continued under it; `guide` is premultiplied."""
+    """The denoised picture, and the background, continued under the asset; `guide` is premultiplied."""
     sigma = SIGMA * picture.shape[0]
     share = guide[..., 3:]
     away = (share == 0).astype(np.float32)
     whole = (share > 0.999).astype(np.float32)
-    behind = _behind(picture, away, sigma)
+    behind = _background(picture, away, sigma)
     least = 1e-4 * gaussian(whole, sigma) + 1e-8
     ratio = (gaussian(picture * whole, sigma) + least) / (gaussian(guide[..., :3] * whole, sigma) + least)
     return np.maximum(guide[..., :3] * ratio + (1 - share) * behind, 0), behind
 
 
-def _behind(picture: Rgb, away: Float[np.ndarray, "h w 1"], sigma: float) -> Rgb:
-    """The local mean of what the asset does not cover: by `sigma` close to it, by WIDE times that farther away."""
+def _background(picture: Rgb, away: Float[np.ndarray, "h w 1"], sigma: float) -> Rgb:
+    """The local mean of the background: with `sigma` close to the asset, with WIDE times that farther away."""
     height, width = picture.shape[:2]
     small = max(1, height // WIDE), max(1, width // WIDE)
     planes = np.concatenate([picture * away, away], axis=-1)
     close = gaussian(planes, sigma)
     far = resize(gaussian(resize(planes, small), sigma), (height, width))
-    # Far inside the asset nothing is known of what is behind it, and nothing of it shows.
+    # Far inside the asset the background is neither known nor visible.
     close, wide = (p[..., :3] / np.maximum(p[..., 3:], 1e-6) for p in (close, far))
     share = np.clip(FADE * (1 - far[..., 3:]), 0, 1)
     return (share * close + (1 - share) * wide).astype(np.float32)

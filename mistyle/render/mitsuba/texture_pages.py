@@ -1,8 +1,8 @@
-"""One material for a mesh of many texture sets: their maps lie one behind the other, and each face names its page.
+"""One material for a mesh of many texture sets: their maps are stacked, and each face has a page number.
 
-A renderer compiles every BSDF of a scene, so that twenty materials cost twenty times the time of one before the first
-ray. Here the mesh is one shape with one BSDF whatever the number of its materials. The pictures are those of
-`scene.object_shapes` up to rounding; there are no parameters to optimise.
+A renderer compiles every BSDF of a scene, so twenty materials take twenty times as long until the first ray. Here the
+mesh is one shape with one BSDF for any number of materials. The pictures are those of `scene.object_shapes` up to
+rounding; there are no parameters to optimise.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,7 +19,7 @@ from mistyle.process import memory
 from mistyle.render.mitsuba import device, plugins
 from mistyle.render.mitsuba import scene as scenery
 
-PAGE = "face_page"  # the attribute of a face that numbers its page
+PAGE = "face_page"  # face attribute with the page number
 
 
 def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -> dict[str, Any]:
@@ -28,10 +28,12 @@ def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -
 
     device.use()
     if len(maps) != len(mesh.parts):
-        raise ValueError(f"{len(maps)} maps came for {len(mesh.parts)} texture sets ({', '.join(mesh.parts)})")
+        raise ValueError(
+            f"{len(maps)} maps for {len(mesh.parts)} texture sets; expected one for each ({', '.join(mesh.parts)})"
+        )
     plugins.register()
-    made = _pages_class(mi)
-    textures = {name: _texture(made, [getattr(m, name) for m in maps]) for name in ("albedo", "roughness", "metallic")}
+    pages = _pages_class(mi)
+    textures = {name: _texture(pages, [getattr(m, name) for m in maps]) for name in ("albedo", "roughness", "metallic")}
     bsdf = {
         "type": "principled",
         "base_color": textures["albedo"],
@@ -41,7 +43,7 @@ def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -
     }
     relief = {
         "type": plugins.NORMALMAP,
-        "normalmap": _texture(made, [m.normal for m in maps], scenery.encoded_into),
+        "normalmap": _texture(pages, [m.normal for m in maps], scenery.encoded_into),
         "flip_invalid_normals": flip_invalid,
         "bsdf": bsdf,
     }
@@ -52,36 +54,36 @@ def paged_shapes(mesh: Mesh, maps: Sequence[Maps], flip_invalid: bool = False) -
 
 
 def table(values: Sequence[Float[np.ndarray, "_h _w *c"]]) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, "p 2"]]:
-    """Where each map begins in the table of all their texels, and its height and width."""
+    """Offset, height and width of each map in the table of all their texels."""
     sizes = np.array([v.shape[:2] for v in values], np.int64)
     return np.concatenate([[0], np.cumsum(sizes.prod(axis=1))[:-1]]), sizes
 
 
 def _texture(
-    made: type,
+    pages: type,
     values: Sequence[np.ndarray],
     fill: Callable[[np.ndarray, np.ndarray], object] = lambda to, values: np.copyto(to, values),
 ) -> Any:
-    """The texture of one kind of map; `fill(to, values)` writes the values as textures hold them."""
+    """The texture of one kind of map; `fill(to, values)` writes the values in texture encoding."""
     import mitsuba as mi
 
     start, sizes = table(values)
     channels = 1 if values[0].ndim == 2 else values[0].shape[2]
     count = int(sizes.prod(axis=1).sum()) * channels
-    texels = memory.empty(-(-count // LANES) * LANES)  # whole vectors: Dr.Jit reads it in place
+    texels = memory.empty(-(-count // LANES) * LANES)  # full vectors, since Dr.Jit reads it in place
     texels[count:] = 0
     for first, (height, width), one in zip(start, sizes, values, strict=True):
         page = texels[channels * first : channels * (first + height * width)]
         fill(page.reshape(one.shape), one)
-    return made(mi.Float(texels), *(mi.UInt32(aligned(n, np.uint32)) for n in (start, *sizes.T)), channels)
+    return pages(mi.Float(texels), *(mi.UInt32(aligned(n, np.uint32)) for n in (start, *sizes.T)), channels)
 
 
 def _pages_class(mi: Any) -> type:
-    """The texture as a class of the base of `mi`'s current variant."""
+    """The texture as a class derived from `mi`'s current variant."""
     import drjit as dr
 
     class Pages(mi.Texture):
-        """Bilinear lookups in the page of the face that was hit; pages repeat."""
+        """Bilinear lookups in the page of the hit face; pages repeat."""
 
         def __init__(self, texels, start, height, width, channels):
             super().__init__(mi.Properties())
@@ -124,11 +126,11 @@ def _pages_class(mi: Any) -> type:
             return dr.lerp(upper, lower, ty)
 
     def _neighbours(place, count):
-        """The two texels of `count` around a coordinate, which repeats, and how far it is from the first one."""
+        """The two texels of `count` around a repeating coordinate, and its distance from the first one."""
         at = place * mi.Float(count) - 0.5
         low = dr.floor(at)
         first = mi.Int32(low) - mi.Int32(dr.floor(low / mi.Float(count))) * mi.Int32(count)
-        # Rounding of the quotient may lead one row out.
+        # Rounding of the quotient may exceed the last row by one.
         first = mi.UInt32(dr.clip(first, 0, mi.Int32(count) - 1))
         second = dr.select(first + 1 < count, first + 1, 0)
         return first, second, at - low

@@ -1,4 +1,4 @@
-"""Views of a texture without any light: one kernel traces, fetches and averages."""
+"""Unlit views of a texture: one kernel traces, fetches and averages."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -28,7 +28,7 @@ def unlit(
 ) -> list[Picture]:
     """Linear rgb, premultiplied, and coverage of every camera: the mean over `fine` x `fine` exact rays a pixel.
 
-    Each ray takes the albedo of the texture set that it meets first, bilinear, UVs modulo 1.
+    Each ray takes the albedo of the texture set at its first hit, bilinear, UVs modulo 1.
     """
     device.use()
     import drjit as dr
@@ -46,7 +46,7 @@ def unlit(
     part = mi.UInt32(aligned(traced.mesh.part, np.uint32))
 
     def fetch(hit: Any) -> Any:
-        """Albedo at a hit (zero where there is none); Mitsuba's v points down, as rows do."""
+        """Albedo at a hit (zero without one); Mitsuba's v points down, as rows do."""
         valid = hit.is_valid()
         where = dr.gather(mi.UInt32, part, hit.prim_index, valid)
         height, width = (dr.gather(mi.UInt32, size, where, valid) for size in (rows, columns))
@@ -64,12 +64,12 @@ def unlit(
         lower = dr.lerp(texel(0, 1), texel(1, 1), x - left)
         return dr.lerp(upper, lower, y - top), dr.select(valid, mi.Float(1), 0)
 
-    found = []
+    pictures = []
     for camera in cameras:
         rgb, share = _picture(mi, dr, traced, camera, fine, fetch)
-        found.append((memory.copied(rgb), memory.copied(share)) if memory.tight() else (rgb, share))
-        progress(len(found) / len(cameras))
-    return found
+        pictures.append((memory.copied(rgb), memory.copied(share)) if memory.tight() else (rgb, share))
+        progress(len(pictures) / len(cameras))
+    return pictures
 
 
 def _picture(mi: Any, dr: Any, traced: Tracer, camera: Camera, fine: int, fetch: Callable[[Any], Any]) -> Picture:
@@ -78,7 +78,7 @@ def _picture(mi: Any, dr: Any, traced: Tracer, camera: Camera, fine: int, fetch:
     rgb, share = np.zeros((*camera.size, 3), np.float32), np.zeros(camera.size, np.float32)
     if height * width == 0:
         return rgb, share
-    # Opaque: as literals every camera would compile a kernel of its own.
+    # Opaque: a literal would compile one kernel per camera.
     corner = np.ravel(camera.centre) - (across.start, down.start)
     numbers = [*camera.position, *camera.world_from_cam[:3, :3].reshape(-1), *corner, camera.focal]
     value = [dr.opaque(mi.Float, float(v)) for v in numbers]
@@ -92,8 +92,8 @@ def _picture(mi: Any, dr: Any, traced: Tracer, camera: Camera, fine: int, fetch:
         y = (py + (mi.Float(k // fine) + 0.5) / fine - centre[1]) / focal
         away = mi.Vector3f(*(turn[3 * r] * x + turn[3 * r + 1] * y + turn[3 * r + 2] for r in range(3)))
         ray = mi.Ray3f(origin, dr.normalize(away))
-        found, share = fetch(traced.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True))
-        return k + 1, colour + found, coverage + share
+        rgb, share = fetch(traced.scene.ray_intersect(ray, mi.RayFlags.UV, coherent=True))
+        return k + 1, colour + rgb, coverage + share
 
     state = (mi.UInt32(0), dr.zeros(mi.Color3f, height * width), dr.zeros(mi.Float, height * width))
     _, colour, coverage = dr.while_loop(state, lambda k, *rest: k < fine * fine, body)

@@ -1,4 +1,4 @@
-"""Which points of a surface a camera sees, and how much they face it: exact, by rays to the cameras."""
+"""Exact visibility and facing weight of surface points from cameras, by rays to the cameras."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -11,8 +11,8 @@ from mistyle.core.drjit_arrays import aligned
 from mistyle.render.mitsuba import device
 from mistyle.render.mitsuba.draw import Tracer
 
-LIFT = 1e-3  # how far above the surface rays start, working units
-RAYS = 1 << 21  # traced at a time
+LIFT = 1e-3  # start of rays above the surface, working units
+RAYS = 1 << 21  # rays per batch
 
 
 def face_on(
@@ -22,11 +22,12 @@ def face_on(
     normals: Float[np.ndarray, "s 3"],
     fronts: Float[np.ndarray, "s 3"],
 ) -> Float[np.ndarray, "c s"]:
-    """How much each surface point faces each camera: max(0, n . (c - P) / |c - P|), 0 where the camera does not see it.
+    """Facing weight of each surface point and camera: max(0, n . (c - P) / |c - P|), 0 where the camera does not see
+    it.
 
-    A point is seen when it is in the frame, its face shows the camera its front and the straight line to the camera
-    meets nothing. `normals` are the shading normals n, `fronts` the unit normals of the faces on their outer side.
-    World space.
+    A point is visible if it is in the frame, its face shows the camera its front and no face blocks the line to the
+    camera. `normals` are the shading normals n, `fronts` the unit normals of the faces on their outer side. World
+    space.
     """
     import drjit as dr
     import mitsuba
@@ -48,7 +49,7 @@ def face_on(
         )
         towards = dr.normalize(eye - place)
         seen = (dr.dot(towards, front) > 0) & (dr.dot(towards, n) > 0)
-        # Twice, since one ray in some millions slips through an edge between two faces.
+        # Twice, since one ray in some millions passes through an edge between two faces.
         for lift in (LIFT, 1.5 * LIFT):
             origin = place + dr.opaque(mi.Float, lift) * mi.Point3f(front)
             away = eye - origin

@@ -1,9 +1,9 @@
-"""Bringing cameras and mesh together by what can be seen of the mesh: its silhouettes, and its shading where known.
+"""Registration of cameras and mesh by silhouettes and, where materials are known, by shading.
 
-A silhouette's residual is a distance in pixels. At every rim pixel of the mesh as drawn, the observed mask's signed
-distance d_seen less the drawn mask's own d_drawn is how far the rim must move along the gradient of d_seen; the rim's
-points on the mesh say how a motion moves it (to first order the rim stays the same points). Gauss-Newton on all rims
-gives the motion: seven parameters for a similarity of all cameras, six for a camera of its own.
+A silhouette's residual is a distance in pixels. At every rim pixel of the rendered mesh, d_seen is the observed mask's
+signed distance and d_drawn the rendered mask's. The rim must move by d_seen - d_drawn along the gradient of d_seen.
+A motion moves the rim through its surface points (to first order the rim keeps the same points). Gauss-Newton over all
+rims gives the motion: seven parameters for a similarity of all cameras, six for the pose of one camera.
 """
 
 from collections.abc import Callable, Sequence
@@ -23,23 +23,23 @@ from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.render.mitsuba.draw import Tracer, gbuffer, tracer
 
 LEVELS = (96, 256)  # pixels along the longer side, coarse to fine
-WAYS = 3  # of laying the visual hull on the mesh that the silhouettes are asked about
+WAYS = 3  # registrations of the visual hull that are compared by silhouettes
 STEPS = 12  # at most, per level
-FAR = 0.05  # root mean square distance of an object's points from its mesh that no reconstruction reaches
-STILL = 0.01  # pixels that a step moves the rims when nothing more is to be gained
-# How far a camera may plausibly be off: it holds the motions that neither silhouette nor shading shows.
+FAR = 0.05  # RMS distance of points from the mesh, in its radii; errors of a correct reconstruction are smaller
+STILL = 0.01  # pixels of rim motion per step at which iteration stops
+# Prior standard deviations of a camera's error; they regularise motions that neither silhouette nor shading constrains.
 TURN, SHIFT = np.radians(3.0), 0.03
 
-_View = tuple[Camera, np.ndarray, int]  # shrunk camera, its mask, how many pixels of the picture one of its is wide
+_View = tuple[Camera, np.ndarray, int]  # shrunk camera, its mask, downsampling factor
 
-# Linear radiance that camera (of whatever size) number k should see of the mesh.
+# Linear radiance of the mesh as camera k (of any size) should see it.
 Predict = Callable[[Camera, int], Float[np.ndarray, "h w 3"]]
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """A similarity to the working space and how well each view's silhouette fits: mean distance of the contours in
-    pixels of the full picture, with the starting similarity and with the one found. NaN where a view shows nothing."""
+    """A similarity to the working space, and each view's contour error: mean distance in pixels of the full picture,
+    before and after refinement. NaN where a view shows nothing."""
 
     work_from_cams: Float[np.ndarray, "4 4"]
     before: tuple[float, ...]
@@ -48,7 +48,7 @@ class Alignment:
 
 @dataclass(frozen=True)
 class Poses:
-    """Refined cameras and the mean distance of each one's contours, in pixels, before and after."""
+    """Refined cameras and each one's mean contour distance in pixels, before and after."""
 
     cameras: tuple[Camera, ...]
     before: tuple[float, ...]
@@ -62,10 +62,10 @@ def align_by_points(
     masks: Sequence[Bool[np.ndarray, "h w"]] | None,
     rng: np.random.Generator,
 ) -> Alignment:
-    """The similarity from COLMAP's points (those inside the masks, where there are masks), then from the silhouettes.
+    """The similarity from COLMAP's points (those inside the masks, if any), then from the silhouettes.
 
-    Without masks the points must be the object's own. InputRefused when they do not lie on the mesh, or when they lie
-    on it equally well another way round and no masks can tell.
+    Without masks all points must lie on the object. Raises InputRefused when they do not fit the mesh, or when two
+    registrations fit equally well and no masks can decide.
     """
     own = points if masks is None else points[in_masks(points, cameras, masks)]
     if len(own) < 20:
@@ -73,20 +73,20 @@ def align_by_points(
             f"--align: found {len(own)} of {len(points)} points on the object; expected at least 20. "
             "Check the masks, or reconstruct with more pictures."
         )
-    found, *_ = align_points(mesh, own, rng)
-    if found.residual > FAR:
+    registration, *_ = align_points(mesh, own, rng)
+    if registration.residual > FAR:
         raise InputRefused(
-            f"--align: the points stay {found.residual:.3f} of the mesh's radius away; expected less than {FAR}. "
-            "Hand in masks (the points show other things too), or check that this is the mesh of the pictures."
+            f"--align: found points {registration.residual:.3f} mesh radii from the mesh; expected less than {FAR}. "
+            "Pass masks (some points lie on other objects), or check that the pictures show this mesh."
         )
     if masks is None:
-        if found.rival < 1.1:
+        if registration.rival < 1.1:
             raise InputRefused(
-                "--align: found two ways to lay the points on the mesh that fit equally well (it is symmetric); "
-                "expected one. Hand in masks, or align the cameras by hand."
+                "--align: found two registrations of the points that fit equally well (the mesh is symmetric); "
+                "expected one. Pass masks, or align the cameras by hand."
             )
-        return Alignment(found.work_from_cams, (), ())
-    return align_by_masks(mesh, cameras, masks, rng, start=found.work_from_cams)
+        return Alignment(registration.work_from_cams, (), ())
+    return align_by_masks(mesh, cameras, masks, rng, start=registration.work_from_cams)
 
 
 def align_by_masks(
@@ -97,17 +97,17 @@ def align_by_masks(
     start: Float[np.ndarray, "4 4"] | None = None,
     levels: Sequence[int] = LEVELS,
 ) -> Alignment:
-    """The similarity from the cameras' space to the working space under which silhouettes fit the masks.
+    """The similarity from the cameras' space to the working space that best fits silhouettes to masks.
 
-    Without a `start`, the visual hull that the masks carve is laid on the mesh first; that needs views from around the
-    object. With one, it may be off by some 20 degrees and a third of the size.
+    Without a `start`, the visual hull of the masks is registered to the mesh first; that needs views from around the
+    object. A `start` may be off by some 20 degrees and a third of the size.
     """
     if not any(mask.any() for mask in masks):
-        raise InputRefused("--align: found only empty masks; expected the object's. Check that white is the object.")
+        raise InputRefused("--align: found only empty masks; expected the object's. Check that the object is white.")
     traced = tracer(mesh)
     coarse = [shrunk(camera, mask, levels[0]) for camera, mask in zip(cameras, masks, strict=True)]
     if start is None:
-        start = _from_hull(mesh, traced, cameras, masks, coarse, rng)
+        start = _register_hull(mesh, traced, cameras, masks, coarse, rng)
     matrix = _descend(traced, coarse, start)
     for side in levels[1:]:
         small = [shrunk(camera, mask, side) for camera, mask in zip(cameras, masks, strict=True)]
@@ -116,7 +116,7 @@ def align_by_masks(
     return Alignment(matrix, _distances(traced, finest, start), _distances(traced, finest, matrix))
 
 
-def _from_hull(
+def _register_hull(
     mesh: Mesh,
     traced: Tracer,
     cameras: Sequence[Camera],
@@ -124,13 +124,13 @@ def _from_hull(
     coarse: Sequence[_View],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "4 4"]:
-    """Of the ways in which the visual hull lies on the mesh, the one whose silhouettes fit best: a hull from few views
-    has humps that the mesh has not, so that its own residual may favour another."""
+    """The registration of the visual hull whose silhouettes fit best. A hull from few views has humps that the mesh
+    lacks, so its own residual may favour another registration."""
     try:
         shell = visual_hull(cameras, masks)
     except ValueError as error:
         raise InputRefused(f"--align: found that {error}; expected one object in all. Check the masks.") from error
-    ways = [found.work_from_cams for found in align_points(mesh, shell, rng, trim=0.8)]
+    ways = [registration.work_from_cams for registration in align_points(mesh, shell, rng, trim=0.8)]
     misfits = [_misfit(traced, coarse, way) for way in ways]
     order = np.argsort(misfits)[:WAYS]
     close = [ways[k] for k in order if misfits[k] <= 2 * misfits[order[0]]]
@@ -140,9 +140,9 @@ def _from_hull(
 
 
 def _misfit(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> float:
-    """Mean distance of the contours over the views; infinite where a view shows nothing of the mesh."""
-    found = _distances(traced, views, matrix)
-    return float(np.mean(np.nan_to_num(found, nan=np.inf)))
+    """Mean contour distance over the views; infinite where a view shows nothing of the mesh."""
+    distances = _distances(traced, views, matrix)
+    return float(np.mean(np.nan_to_num(distances, nan=np.inf)))
 
 
 def refine_poses(
@@ -155,14 +155,14 @@ def refine_poses(
     levels: Sequence[int] = (*LEVELS, 768),
     progress: Callable[[float], None] = lambda done: None,
 ) -> Poses:
-    """Every camera (working space), turned and shifted so that the mesh's silhouette fits its mask.
+    """Rotate and translate every camera (working space) so that the mesh's silhouette fits its mask.
 
-    With `pictures` (`Captures.load`) and `predict`, the shading's luminance is brought together too (up to a factor per
-    view): it shows the motions that a silhouette does not. What neither shows stays as it was, as do focal lengths. A
-    view whose contours would fit worse keeps its camera, and so does one that shows nothing of the mesh.
+    With `pictures` (`Captures.load`) and `predict`, luminance is aligned too (up to a factor per view): it constrains
+    motions that silhouettes do not. Unconstrained motions and focal lengths stay unchanged. A view keeps its camera if
+    its contours would fit worse or if it shows nothing of the mesh.
     """
     if (pictures is None) != (predict is None):
-        raise ValueError("shading needs both, the pictures and what they should show")
+        raise ValueError("shading needs both, the pictures and their prediction")
     traced = tracer(mesh)
     refined, before, after = [], [], []
     for k, (camera, mask) in enumerate(zip(cameras, masks, strict=True)):
@@ -171,21 +171,21 @@ def refine_poses(
             shading = _Shading(*pictures(k), lambda seen, k=k: predict(seen, k))
         pose = camera
         for side in levels:
-            pose = _settle(traced, pose, mask, side, shading)
+            pose = _refine_pose(traced, pose, mask, side, shading)
         finest = levels[-1]
         old, new = (_distance(traced, *shrunk(which, mask, finest)[:2]) for which in (camera, pose))
         times = shrunk(camera, mask, finest)[2]
-        kept = not np.isfinite(new) or (shading is None and new > old)
-        refined.append(camera if kept else pose)
+        worse = not np.isfinite(new) or (shading is None and new > old)
+        refined.append(camera if worse else pose)
         before.append(old * times)
-        after.append((old if kept else new) * times)
+        after.append((old if worse else new) * times)
         progress((k + 1) / len(cameras))
     return Poses(tuple(refined), tuple(before), tuple(after))
 
 
 @dataclass(frozen=True)
 class _Shading:
-    """A picture (linear, which pixels count) and what a camera should see."""
+    """A picture (linear, with its mask of valid pixels) and the predicted radiance."""
 
     picture: Float[np.ndarray, "h w 3"]
     counts: Bool[np.ndarray, "h w"]
@@ -193,8 +193,8 @@ class _Shading:
 
 
 def shrunk(camera: Camera, mask: np.ndarray, side: int) -> tuple[Camera, np.ndarray, int]:
-    """Camera and mask with about `side` pixels along the longer side, and how much smaller: by an odd number, so that
-    no pixel is half in and half out, which would move all contours outwards or all inwards."""
+    """Camera and mask downsampled to about `side` pixels along the longer side, and the factor. The factor is odd, so
+    that no pixel is half covered; that would shift all contours outwards or inwards."""
     if mask.shape != camera.size:
         raise ValueError(f"a mask of {mask.shape} for a camera of {camera.size}")
     times = 2 * round((max(camera.size) / side - 1) / 2) + 1 if max(camera.size) > side else 1
@@ -212,7 +212,7 @@ def _distances(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> tu
 
 
 def _rows(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Camera coordinates (n 3) of points, and how pixels move with them: (n 2 3)."""
+    """Camera coordinates (n 3) of points, and the derivative of their pixels (n 2 3)."""
     cam = points @ camera.cam_from_world[:3, :3].T + camera.cam_from_world[:3, 3]
     z = np.maximum(cam[:, 2], 1e-6)
     moves = np.zeros((len(cam), 2, 3))
@@ -221,7 +221,7 @@ def _rows(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return cam, moves * (camera.focal / z)[:, None, None]
 
 
-def _rotating(points: np.ndarray) -> np.ndarray:
+def _rotation_jacobian(points: np.ndarray) -> np.ndarray:
     """d (w x p) / d w = -[p]x, (n 3 3)."""
     x, y, z = points.T
     zero = np.zeros_like(x)
@@ -231,8 +231,8 @@ def _rotating(points: np.ndarray) -> np.ndarray:
 def _rim_rows(
     traced: Tracer, camera: Camera, seen: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
-    """The rim's points (n 3, working space), their camera coordinates, the residuals (n) and how these change with
-    the camera coordinates (n 3); None where the mesh or the mask shows no rim."""
+    """The rim's points (n 3, working space), their camera coordinates, the residuals (n) and the residuals' derivatives
+    by the camera coordinates (n 3). None where the mesh or the mask shows no rim."""
     hits = gbuffer(traced, camera)
     rim = rim_of(hits.mask)
     if not rim.any() or not seen.any():
@@ -246,23 +246,23 @@ def _rim_rows(
 
 
 def _weights(residual: np.ndarray) -> np.ndarray:
-    """Huber's, so that a hole in a mask or a cable beside the object pulls no more than a pixel's error does."""
+    """Huber's weights: a hole in a mask or a cable beside the object pulls no more than an error of one pixel."""
     limit = max(1.0, 1.5 * float(np.median(np.abs(residual))))
     return limit / np.maximum(np.abs(residual), limit)
 
 
 def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.ndarray:
-    """Gauss-Newton on the similarity: the mesh turns, shifts and grows in its own space, all cameras together."""
+    """Gauss-Newton on the similarity: the mesh rotates, translates and scales in its own space, with all cameras."""
     for _ in range(STEPS):
         lhs, rhs, rows = np.zeros((7, 7)), np.zeros(7), []
         for camera, seen, _ in views:
             placed = moved_camera(camera, matrix)
-            found = _rim_rows(traced, placed, seen)
-            if found is None:
+            rim = _rim_rows(traced, placed, seen)
+            if rim is None:
                 continue
-            points, _, residual, by_cam = found
+            points, _, residual, by_cam = rim
             by_world = by_cam @ placed.cam_from_world[:3, :3]
-            turning = np.einsum("nj,njk->nk", by_world, _rotating(points))
+            turning = np.einsum("nj,njk->nk", by_world, _rotation_jacobian(points))
             jacobian = np.concatenate([turning, by_world, (by_world * points).sum(axis=1, keepdims=True)], axis=1)
             weight = _weights(residual)
             lhs += (jacobian * weight[:, None]).T @ jacobian
@@ -273,25 +273,25 @@ def _descend(traced: Tracer, views: Sequence[_View], matrix: np.ndarray) -> np.n
         step = -np.linalg.solve(lhs + np.diag(1e-4 * lhs.diagonal() + 1e-9), rhs)
         step /= max(1.0, float(np.abs(step).max()) / 0.3)
         motion = similarity(float(np.exp(step[6])), Rotation.from_rotvec(step[:3]).as_matrix(), step[3:6])
-        # The mesh's motion, seen from the mesh, moves the cameras the other way.
+        # A motion of the mesh is the inverse motion of the cameras.
         matrix = np.linalg.inv(motion) @ matrix
         if np.sqrt(np.mean((np.concatenate(rows) @ step) ** 2)) < STILL:
             break
     return matrix
 
 
-def _settle(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading: _Shading | None) -> Camera:
+def _refine_pose(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading: _Shading | None) -> Camera:
     """Gauss-Newton on one camera's pose at one size."""
     small, seen, times = shrunk(camera, mask, side)
     depth = max(float(np.linalg.norm(camera.position)), 1e-6)
     prior = np.diag(1 / np.array([TURN] * 3 + [SHIFT * depth] * 3) ** 2)
     total = np.zeros(6)
     for _ in range(STEPS):
-        found = _rim_rows(traced, small, seen)
-        if found is None:
+        rim = _rim_rows(traced, small, seen)
+        if rim is None:
             break
-        _, cam, residual, by_cam = found
-        jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotating(cam)), by_cam], axis=1)
+        _, cam, residual, by_cam = rim
+        jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotation_jacobian(cam)), by_cam], axis=1)
         if shading is not None:
             more = _shading_rows(traced, small, times, shading)
             jacobian, residual = np.concatenate([jacobian, more[0]]), np.concatenate([residual, more[1]])
@@ -307,9 +307,10 @@ def _settle(traced: Tracer, camera: Camera, mask: np.ndarray, side: int, shading
 
 
 def _shading_rows(traced: Tracer, camera: Camera, times: int, shading: _Shading) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals of the luminance, as pixels (over the picture's mean slope), and how the camera's motion changes them.
+    """Luminance residuals in pixels (divided by the picture's mean slope), and their derivatives by the camera's
+    motion.
 
-    A point of the mesh keeps the luminance that the drawn view gives it; where the picture has it is asked.
+    A point of the mesh keeps its luminance from the rendered view; its position in the picture moves.
     """
     hits = gbuffer(traced, camera)
     drawn = luminance(shading.predict(camera))
@@ -325,5 +326,5 @@ def _shading_rows(traced: Tracer, camera: Camera, times: int, shading: _Shading)
         return np.zeros((0, 6)), np.zeros(0)
     cam, moves = _rows(camera, hits.position[inner].astype(float))
     by_cam = np.einsum("nk,nkj->nj", slope, moves) / scale
-    jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotating(cam)), by_cam], axis=1)
+    jacobian = np.concatenate([np.einsum("nj,njk->nk", by_cam, _rotation_jacobian(cam)), by_cam], axis=1)
     return jacobian, (seen - gain * drawn)[inner] / scale

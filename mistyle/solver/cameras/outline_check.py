@@ -1,8 +1,8 @@
-"""Whether cameras fit the mesh: its outline as they see it, against alpha or masks.
+"""Check of cameras against the mesh: overlap of its silhouette with alpha or masks.
 
-The overlap is the intersection over union of the two silhouettes. A frame that is turned, mirrored or in another space
-shows in it, unless the mesh looks the same from there: the overlaps with the mesh turned as other conventions have it
-tell whether it does, and which of them fits where the cameras' own does not.
+The overlap is the intersection over union of the two silhouettes. It detects a rotated, mirrored or mistaken frame,
+unless the mesh looks the same from there. The mesh is therefore also compared under the rotations of other conventions.
+They show whether the check can decide, and which frame fits where the cameras' own does not.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -19,20 +19,20 @@ from mistyle.geometry.similarity import moved_camera, similarity
 from mistyle.render.mitsuba.draw import gbuffer, tracer
 from mistyle.solver.cameras.align import shrunk
 
-SIDE = 160  # pixels of the longer side that is looked at: some 1 % of the overlap
-FEW = 6  # pictures that the mesh is turned for
-ALIKE = 0.02  # difference of mean overlaps that tells nothing
-# Frames that one convention takes for another's, as turns of the cameras about X, degrees.
+SIDE = 160  # pixels of the longer side: resolves some 1 % of the overlap
+FEW = 6  # pictures that are also compared under rotated cameras
+ALIKE = 0.02  # insignificant difference of mean overlaps
+# Frames that conventions confuse, as rotations of the cameras about X, degrees.
 TURNS = {"by 90 degrees about X": 90.0, "by -90 degrees about X": -90.0, "by 180 degrees about X": 180.0}
 
 
 @dataclass(frozen=True)
 class Outlines:
-    """How well outlines fit.
+    """Silhouette overlaps of all pictures.
 
     overlap  0..1 of each picture; NaN where it has no outline
-    base     the mean over the few pictures that the cameras were turned for; NaN where there is none
-    turned   the same with all cameras turned about the mesh, by the names of TURNS
+    base     the mean over the few pictures that are also compared under rotated cameras; NaN if there are none
+    turned   the same mean with all cameras rotated about the mesh, by the names of TURNS
     """
 
     overlap: tuple[float, ...]
@@ -46,8 +46,8 @@ def check_outlines(
     outlines: Iterable[Bool[np.ndarray, "h w"] | None],
     progress: Callable[[float], None] = lambda done: None,
 ) -> Outlines:
-    """The overlaps of the mesh (working space) with the outlines, which have their cameras' size and are asked for one
-    at a time. None, everything and nothing inside are no outline."""
+    """The overlaps of the mesh (working space) with the outlines, each of its camera's size and read one at a time.
+    None, a full mask and an empty mask count as no outline."""
     traced = tracer(mesh)
 
     def drawn(camera: Camera) -> np.ndarray:
@@ -79,11 +79,11 @@ def overlap_line(names: Sequence[str], overlaps: Sequence[float]) -> str:
 
 
 def overlap_notes(
-    names: Sequence[str], found: Outlines, least: float, fix: str, *, trusted: bool = False
+    names: Sequence[str], outlines: Outlines, least: float, fix: str, *, trusted: bool = False
 ) -> tuple[str, ...]:
-    """What there is to say: overlaps below `least`, cameras that could not be checked, turns that do not show (unless
-    the cameras' frame is `trusted`, as that of our own files is)."""
-    known = [(o, n) for n, o in zip(names, found.overlap, strict=True) if np.isfinite(o)]
+    """Notes on overlaps below `least`, on unchecked cameras, and on rotations that the check cannot detect (these only
+    unless the cameras' frame is `trusted`, such as that of our own files)."""
+    known = [(o, n) for n, o in zip(names, outlines.overlap, strict=True) if np.isfinite(o)]
     if not known:
         return (
             "The pictures have neither alpha nor masks with an outline: it was not checked whether the cameras fit the "
@@ -93,14 +93,14 @@ def overlap_notes(
     if bad:
         mean = float(np.mean([o for o, _ in known]))
         worst = ", ".join(f"{n} {o:.2f}" for o, n in bad[:3])
-        best = max(found.turned, key=lambda name: found.turned[name])
-        better = f"With the cameras turned {best} it would be {found.turned[best]:.2f} on average. "
-        hint = better if found.turned[best] >= max(least, found.base + ALIKE) else ""
+        best = max(outlines.turned, key=lambda name: outlines.turned[name])
+        better = f"With the cameras turned {best} it would be {outlines.turned[best]:.2f} on average. "
+        hint = better if outlines.turned[best] >= max(least, outlines.base + ALIKE) else ""
         return (
             f"Warning: the cameras do not fit the mesh in {len(bad)} of {len(known)} pictures: its outline overlaps "
             f"alpha or masks by less than {least:g} there (worst: {worst}; mean of all {mean:.2f}). {hint}{fix}",
         )
-    alike = [name for name, value in found.turned.items() if value >= found.base - ALIKE]
+    alike = [name for name, value in outlines.turned.items() if value >= outlines.base - ALIKE]
     if trusted or not alike:
         return ()
     return (

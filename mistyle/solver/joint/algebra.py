@@ -1,5 +1,5 @@
-"""The algebra of the joint steps (`joint/gauss_newton.py`): normal equations of pictures that are linear in what their
-pixels fetch from texels, and conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, section 5.1)."""
+"""Linear algebra of the joint Gauss–Newton steps (`joint/gauss_newton.py`): normal equations of pictures linearised in
+texels, and conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, section 5.1)."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-STEPS, CLOSE = 60, 1e-4  # of conjugate gradients at most; and the share of r' M r that they may leave
+STEPS, CLOSE = 60, 1e-4  # most iterations of conjugate gradients, and the relative r' M r at which they stop
 
 Unknowns = Float[np.ndarray, "t 6"]
 Blocks = Float[np.ndarray, "t 6 6"]
@@ -16,8 +16,8 @@ Blocks = Float[np.ndarray, "t 6 6"]
 
 @dataclass(frozen=True)
 class LinearisedImage:
-    """A picture around the maps: what its pixels fetch (sparse, pixels x texels: B), its channels' derivatives by their
-    own albedo, tilt (2) and roughness (D), the weights of its channels (W), and reference - picture."""
+    """A picture linearised at the maps: bilinear weights (B, sparse, pixels x texels), derivatives of its channels by
+    their own albedo, tilt (2) and roughness (D), channel weights (W), and reference - picture."""
 
     fetch: Any
     derivative: Float[np.ndarray, "p 3 4"]
@@ -26,14 +26,14 @@ class LinearisedImage:
 
 
 def _full(derivative: Float[np.ndarray, "p 3 4"]) -> Float[np.ndarray, "p 3 6"]:
-    """Derivatives by all six unknowns: each channel by its own albedo only."""
+    """Derivatives by all six unknowns; each channel depends on its own albedo only."""
     full = np.zeros((len(derivative), 3, 6), np.float32)
     full[:, range(3), range(3)], full[:, :, 3:] = derivative[:, :, 0], derivative[:, :, 1:]
     return full
 
 
 def diagonal_blocks(images: Sequence[LinearisedImage], count: int) -> Blocks:
-    """What the pictures say about each texel if all others stand still: sum of b² D' W D."""
+    """Block diagonal of the normal matrix, one block a texel: sum of b² D' W D."""
     above = np.triu_indices(6)
     total = np.zeros((count, len(above[0])), np.float32)
     for each in images:
@@ -64,14 +64,14 @@ def rhs(images: Sequence[LinearisedImage], count: int) -> Unknowns:
 
 
 def apply_transpose(each: LinearisedImage, channels: Float[np.ndarray, "p 3"]) -> Unknowns:
-    """B' D' W of values of a picture's channels."""
+    """B' D' W applied to values of a picture's channels."""
     weighted, d = each.weight * channels, each.derivative
     pixels = np.concatenate([d[:, :, 0] * weighted, np.einsum("pcj,pc->pj", d[:, :, 1:], weighted)], axis=1)
     return each.fetch.T @ pixels
 
 
 def pcg(applied: Callable[[Unknowns], Unknowns], right: Unknowns, inverse: Blocks) -> Unknowns:
-    """Conjugate gradients from zero, preconditioned by `inverse`, texel by texel."""
+    """Conjugate gradients from zero; `inverse` is the block-diagonal preconditioner."""
 
     def dot(a: np.ndarray, b: np.ndarray) -> float:
         return float((a * b).sum(dtype=np.float64))

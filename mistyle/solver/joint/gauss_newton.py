@@ -1,23 +1,23 @@
-"""The last part of a recovery: a joint Gauss-Newton over all texels and pictures, with the smoothness prior.
+"""Joint Gauss-Newton over all texels and pictures with the smoothness prior: the last part of a recovery.
 
 Where few pictures show a texel, albedo, roughness and tilt are nearly interchangeable, and gradient descent follows
 that valley slowly. Gauss-Newton steps follow it at once. Around the current maps x a pixel is
 
     I_p(x + d) = I_p(x) + D_p sum_t b_pt d_t
 
-with b the bilinear weights, averaged over the pixel's lit samples, and D its derivative by a change that all its texels
-share, from central differences of whole pictures. (D takes the samples of a pixel as equal. The pictures themselves are
-exact, so the fixed point of the steps is, up to that.) With R the references and P the priors of `solver/smoothing.py`,
-whose variances are measured alike, each step solves
+Here b are the bilinear weights, averaged over the pixel's lit samples. D is the pixel's derivative by a change that all
+its texels share, from central differences of whole pictures. (D treats the samples of a pixel as equal. The pictures
+are exact, so the fixed point is exact up to that approximation.) R are the references. P are the priors of
+`solver/smoothing.py`, with variances estimated in the same way. Each step solves
 
     (B' D' W D B + P) d = B' D' W (R - I(x)) - P x
 
-by conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, sections 10.3 and 5.1), preconditioned by the
-texels' own blocks. W are Cauchy's weights (Huber, Robust Statistics, 1981, section 7.8) of residuals r of standard
-deviation s, 1 / (s² (1 + (r / (CAUCHY_SCALE s))²)): some pixels at edges of shadows and outlines are outliers. R is
-without the estimated light between surfaces. Its change with the texels that reflect it to the camera is in D and in I
-(`joint/pixels.py`), so places without direct light count too. Metallic stays. Soft light, whose pictures take long to
-draw, has no such steps.
+by conjugate gradients (Nocedal and Wright, Numerical Optimization, 2006, sections 10.3 and 5.1) with a block-diagonal
+preconditioner. W are Cauchy weights (Huber, Robust Statistics, 1981, section 7.8) of residuals r of standard deviation
+s, 1 / (s² (1 + (r / (CAUCHY_SCALE s))²)): some pixels at edges of shadows and outlines are outliers. R excludes the
+estimated indirect light. The change of that light with the texels that reflect it to the camera is in D and in I
+(`joint/pixels.py`), so texels without direct light count too. Metallic stays fixed. Soft light is excluded because its
+pictures are slow to render.
 """
 
 from collections.abc import Callable, Sequence
@@ -51,26 +51,26 @@ from mistyle.solver.texels.solve import estimate_indirect
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
 
-# By which the pictures' derivatives are taken: columns of the table that move together, and how far to either side. A
-# channel of a picture knows its own channel of the albedo only.
+# Finite differences: columns of the table that move together, and the step to either side. A channel of a picture
+# depends on its own channel of the albedo only.
 MOVES = (((0, 1, 2), 0.02), ((TILT_X,), 0.003), ((TILT_Y,), 0.003), ((ROUGHNESS,), 0.01))
-# The standard deviation of residuals as a multiple of what `noise` and `relative` say: LOOSE times what the median
-# residual proves, since there are about as many unknowns as pixels and most fit better than they tell; FIT at least.
+# Scale of the residuals' standard deviation relative to `noise` and `relative`: LOOSE times the median's estimate,
+# since there are about as many unknowns as pixels and most pixels overfit; FIT at least.
 LOOSE, FIT = 1.4, 0.1
-JUMP = 3.0  # times a change to one side is larger than to the other where it is none of a smooth function
-CAUCHY_SCALE = 1.4  # standard deviations from which on a residual counts for less
-EDGE = 0.1  # standard deviation where only some of a pixel's samples are lit, relative to those that are
-BETWEEN = 0.15  # that of light between surfaces, relative to it
-FREE = 0.5  # standard deviation that what no picture tells is left
-ALIKE = 0.03  # between an uncovered texel, which pixels at charts' borders see, and the nearest covered one
-LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # of a step
-STEEPEST = 0.98  # of a tilt
-SEED = 104_729  # between the seeds of these and others
+JUMP = 3.0  # ratio of the two one-sided differences above which the function counts as discontinuous
+CAUCHY_SCALE = 1.4  # scale of the Cauchy loss, in standard deviations
+EDGE = 0.1  # standard deviation of partly lit pixels, relative to the radiance of their lit samples
+BETWEEN = 0.15  # relative standard deviation of indirect light
+FREE = 0.5  # standard deviation of unobserved unknowns
+ALIKE = 0.03  # standard deviation between an uncovered texel, seen at chart borders, and the nearest covered one
+LONGEST = np.array([0.2, 0.2, 0.2, 0.15, 0.15, 0.15], np.float32)  # largest change of an unknown in one step
+STEEPEST = 0.98  # largest length of a tilt
+SEED = 104_729  # offset of these seeds from those of other stages
 
 
 @dataclass(frozen=True)
 class ResidualStd:
-    """Of one picture's pixels the standard deviations of residuals, and how far they count at all, 0..1."""
+    """Standard deviations of one picture's residuals per pixel, and the pixels' weights, 0..1."""
 
     std: Float[np.ndarray, " p"]
     counts: Float[np.ndarray, " p"]
@@ -78,10 +78,10 @@ class ResidualStd:
 
 @dataclass(frozen=True)
 class JointProblem:
-    """What stays the same over all steps after one estimate of the light between surfaces.
+    """State that all steps after one estimate of indirect light share.
 
     footprints  of every picture
-    reflected   derivatives of that light per picture, see `indirect_jacobian`
+    reflected   derivatives of indirect light per picture, see `indirect_jacobian`
     """
 
     context: FitContext
@@ -92,12 +92,12 @@ class JointProblem:
     reflected: Sequence[Float[np.ndarray, "_ 3 3"]]
 
     def images(self, table: MaterialTable) -> list[Float[np.ndarray, "_ 3"]]:
-        """The footprints' pixels of all pictures."""
+        """The footprints' pixels of all rendered pictures."""
         uploaded = self.renderer.upload(table)
         return [self.renderer.image(uploaded, k).reshape(-1, 3)[p.index] for k, p in enumerate(self.footprints)]
 
     def references(self) -> list[Float[np.ndarray, "_ 3"]]:
-        """The same of the references, without light between surfaces."""
+        """The footprints' pixels of the references, without indirect light."""
         return [self.direct.load(k)[0].reshape(-1, 3)[p.index] for k, p in enumerate(self.footprints)]
 
 
@@ -108,18 +108,18 @@ def joint_gauss_newton(
     direct: DirectCaptures,
     progress: StageProgress,
 ) -> tuple[MaterialTable, DirectCaptures]:
-    """`settings.joint` such steps from `table`, after one more estimate of light between surfaces, and as many after
-    another one, of the better maps; and the captures with the last estimate.
+    """`settings.joint` steps from `table` after each of `joint_estimates`, new estimates of indirect light; the second
+    uses the improved maps. Returns the captures with the last estimate too.
 
-    `renderer` keeps nothing; what the steps' own arrays leave of `settings.memory` is for samples. Steps after which
-    the pictures fit worse are undone, and steps that need more than there is are left out; a note says so.
+    `renderer` holds no samples; they get the part of `settings.memory` that the steps' arrays leave. Steps that worsen
+    the fit are undone, and steps that exceed the memory are skipped, with a note.
     """
     settings = context.settings
     footprints = image_footprints(context, renderer)
     if footprints is None:
         context.notes.append(
-            f"The joint steps at the end were left out: they need more than the {settings.memory:g} GB of "
-            "recover.memory. Give more, or fewer or smaller pictures."
+            f"The joint steps were skipped: they need more than the {settings.memory:g} GB of "
+            "recover.memory. Raise it, or use fewer or smaller pictures."
         )
         return table, direct
     pictures, unknown, memory = footprints
@@ -145,7 +145,7 @@ def joint_gauss_newton(
 
 
 def _steps(problem: JointProblem, table: MaterialTable, progress: Callable[[float], None]) -> MaterialTable | None:
-    """All steps after one estimate; None, with a note, where the pictures then fit worse."""
+    """All steps after one estimate; None, with a note, if they worsen the fit."""
     settings, pictures, unknown = problem.context.settings, problem.footprints, problem.unknown
     errors = _residual_stds(problem)
     references = problem.references()
@@ -163,9 +163,9 @@ def _steps(problem: JointProblem, table: MaterialTable, progress: Callable[[floa
             for p, d, r, e in zip(pictures, derivatives, residuals, errors, strict=True)
         ]
         progress((k + 0.5) / settings.joint)
-        x = _moved(x, unknown, _step(x, linearised, unknown, problem.context.atlas), settings.roughness_floor)
+        x = _updated(x, unknown, _step(x, linearised, unknown, problem.context.atlas), settings.roughness_floor)
         images = problem.images(x)
-        # Light between surfaces was taken off as the maps were when it was estimated.
+        # The indirect light was subtracted for the maps of its estimate.
         moved = (x - table)[unknown.rows]
         changed = [indirect_delta(p, more, moved) for p, more in zip(pictures, problem.reflected, strict=True)]
         residuals = [r - c for r, c in zip(_differences(references, images), changed, strict=True)]
@@ -174,14 +174,14 @@ def _steps(problem: JointProblem, table: MaterialTable, progress: Callable[[floa
     problem.context.trace.setdefault("joint.cost", []).extend(costs)
     if not costs[-1] < costs[0]:
         problem.context.notes.append(
-            f"The joint steps were undone: the cost went from {costs[0]:.3g} to {costs[-1]:.3g}."
+            f"The joint steps were undone: the cost changed from {costs[0]:.3g} to {costs[-1]:.3g}."
         )
         return None
     return x
 
 
 def where_possible(settings: RecoverSettings, captures: Captures) -> RecoverSettings:
-    """The settings without joint steps where there are none (`joint_steps`), or where a light is soft."""
+    """The settings, with `joint` 0 where no joint steps are planned (`joint_steps`) or a light is soft."""
     some = 0 if has_soft(captures.lights) else joint_steps(settings)
     return settings.model_copy(update={"joint": some})
 
@@ -215,7 +215,7 @@ def _differences(references: Sequence[np.ndarray], images: Sequence[np.ndarray])
 
 
 def _robust_std(residuals: Sequence[np.ndarray], errors: Sequence[ResidualStd]) -> float:
-    """What residuals are to their standard deviations: by the median, as if they were normally distributed."""
+    """Ratio of residuals to their standard deviations, from the median under a normal distribution."""
     every = np.concatenate(
         [(np.abs(w) / e.std[:, None])[e.counts > 0].ravel() for w, e in zip(residuals, errors, strict=True)]
     )
@@ -223,7 +223,7 @@ def _robust_std(residuals: Sequence[np.ndarray], errors: Sequence[ResidualStd]) 
 
 
 def _cost(residuals: Sequence[np.ndarray], errors: Sequence[ResidualStd]) -> float:
-    """Cauchy's, the mean over the channels of all pixels that count."""
+    """Cauchy loss, the mean over the channels of all valid pixels."""
     total, count = 0.0, 0.0
     for w, e in zip(residuals, errors, strict=True):
         units = np.nan_to_num(w / (CAUCHY_SCALE * e.std[:, None]))
@@ -243,42 +243,42 @@ def _weights(residuals: np.ndarray, derivative: np.ndarray, errors: ResidualStd)
 def _derivatives(
     problem: JointProblem, table: MaterialTable, images: Sequence[Float[np.ndarray, "_ 3"]]
 ) -> list[Float[np.ndarray, "_ 3 4"]]:
-    """Of `images`, which the table gives, by MOVES."""
+    """Finite differences of `images`, the renders of `table`, by MOVES."""
     pictures, floor = problem.footprints, problem.context.settings.roughness_floor
     result = [np.zeros((len(p.index), 3, len(MOVES)), np.float32) for p in pictures]
     for j, (columns, far) in enumerate(MOVES):
         up, down = table.copy(), table.copy()
         up[:, columns] += far
         down[:, columns] -= far
-        if columns == (ROUGHNESS,):  # at its bounds roughness moves to one side only
+        if columns == (ROUGHNESS,):  # one-sided at the bounds of roughness
             up[:, ROUGHNESS] = np.minimum(up[:, ROUGHNESS], 1)
             down[:, ROUGHNESS] = np.maximum(down[:, ROUGHNESS], floor)
         high, low = problem.images(up), problem.images(down)
         moved = (up - down)[problem.unknown.rows, columns[0]]
-        for each, p, here, a, b in zip(result, pictures, images, high, low, strict=True):
-            change = _without_jumps(a - here, here - b) if columns in ((TILT_X,), (TILT_Y,)) else a - b
+        for each, p, image, a, b in zip(result, pictures, images, high, low, strict=True):
+            change = _without_jumps(a - image, image - b) if columns in ((TILT_X,), (TILT_Y,)) else a - b
             each[:, :, j] = change / np.maximum(p.fetch @ moved, far / 10)[:, None]
     return result
 
 
 def _without_jumps(ahead: np.ndarray, back: np.ndarray) -> np.ndarray:
-    """Their sum, or twice the smaller where they differ by more than JUMP: reflectance jumps where the mapped normal
-    turns away from the camera or the light, and that is no slope."""
+    """Their sum, or twice the smaller where they differ by more than JUMP: reflectance is discontinuous where the
+    mapped normal turns away from the camera or the light."""
     first = np.abs(ahead) < np.abs(back)
     smaller, larger = np.where(first, ahead, back), np.where(first, back, ahead)
     return np.where(np.abs(larger) > JUMP * np.abs(smaller), 2 * smaller, ahead + back)
 
 
 def _step(table: MaterialTable, images: Sequence[LinearisedImage], unknown: UnknownTexels, atlas: Atlas) -> Unknowns:
-    """The change that solves the equations of the module."""
+    """The solution d of the module's linear system."""
     rows = unknown.rows
-    # One after the other, in place: these are most of what the steps hold of each texel.
+    # In place and one after the other: these arrays are most of the steps' memory per texel.
     blocks, of = diagonal_blocks(images, len(rows)), np.arange(6)
     blocks[:, of, of] += 1 / FREE**2
     own = np.einsum("tii->ti", np.linalg.inv(blocks)).copy()
     std = np.full((len(table), 7), NOTHING, np.float32)
     std[rows, JOINT] = np.where(unknown.seen[:, None], np.sqrt(MARGIN * np.maximum(own, 1e-12)), NOTHING)
-    priors, x = _priors(table, std, rows, atlas), table[rows, JOINT]
+    priors, x = _prior_matrices(table, std, rows, atlas), table[rows, JOINT]
     right = rhs(images, len(rows)) - _product(priors, x)
     diagonal = np.stack([prior.diagonal() for prior in priors], axis=1)
     blocks[:, of, of] += np.maximum(diagonal, 1e-6) - 1 / FREE**2
@@ -291,10 +291,10 @@ def _step(table: MaterialTable, images: Sequence[LinearisedImage], unknown: Unkn
     return pcg(applied, right, inverse)
 
 
-def _priors(
+def _prior_matrices(
     table: MaterialTable, std: Float[np.ndarray, "a 7"], rows: Int[np.ndarray, " t"], atlas: Atlas
 ) -> list[Any]:
-    """P of each unknown: the priors of covered texels; uncovered ones are nearly as the nearest covered one."""
+    """P of each unknown: the priors of covered texels; uncovered texels are tied to the nearest covered one."""
     from scipy.sparse import csr_array
 
     number = np.full(len(table), -1, np.int64)
@@ -318,8 +318,8 @@ def _product(priors: Sequence[Any], v: Unknowns) -> Unknowns:
     return np.stack([prior @ v[:, c] for c, prior in enumerate(priors)], axis=1)
 
 
-def _moved(table: MaterialTable, unknown: UnknownTexels, change: Unknowns, floor: float) -> MaterialTable:
-    """The table after a step: none where it is no number, LONGEST at most, within the bounds of its channels."""
+def _updated(table: MaterialTable, unknown: UnknownTexels, change: Unknowns, floor: float) -> MaterialTable:
+    """The table after a step, clipped to LONGEST and to the channels' bounds; no step where it is not finite."""
     result, change = table.copy(), np.where(np.isfinite(change).all(axis=1, keepdims=True), change, 0)
     values = result[unknown.rows, JOINT] + np.clip(change, -LONGEST, LONGEST)
     values[:, ALBEDO] = np.clip(values[:, ALBEDO], 0, 1)

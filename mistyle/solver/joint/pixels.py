@@ -1,11 +1,10 @@
-"""What the joint steps (`joint/gauss_newton.py`) know of pictures' pixels: which texels each fetches, and how the light
-that reaches it by way of other surfaces depends on them.
+"""Footprints of pixels for the joint steps (`joint/gauss_newton.py`), and derivatives of indirect light.
 
-Of that light the first surface point reflects albedo / π E · n by Lambert's law, with n the mapped normal and E the
-vector irradiance (Gershun, The Light Field, 1939): the sum of what arrives, each part along where it comes from. E is
-smooth along the surface and does not depend on n, so n and albedo change the pixel by known amounts. What metals
-reflect is in proportion to their albedo. Places that no light reaches directly are seen by this light alone. Otherwise
-highlights, and how a metal's tilt turns what it mirrors, are taken to stay.
+The first surface point reflects indirect light as albedo / π E · n by Lambert's law. n is the mapped normal and E the
+vector irradiance (Gershun, The Light Field, 1939): incident radiance integrated along its directions. E is smooth along
+the surface and independent of n, so the pixel's derivatives by n and albedo are known. Metals reflect in proportion to
+their albedo. Places without direct light are constrained by this light alone. Highlights of indirect light, and the
+change of a metal's reflection with its tilt, are treated as constant.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,7 +28,7 @@ if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
 
 PIXEL, WEIGHT = 240, 8  # bytes of a pixel, and of a bilinear weight
-LEAST_Z = 0.2  # of a mapped normal
+LEAST_Z = 0.2  # least z of a mapped normal
 FLASH = (Point((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), "camera"),)
 
 Frames = Float[np.ndarray, "t 9"]
@@ -37,8 +36,8 @@ Frames = Float[np.ndarray, "t 9"]
 
 @dataclass(frozen=True)
 class ImageFootprint:
-    """Pixels of one picture: flat indices, which share of their samples is lit, and the mean bilinear weights of those,
-    as a sparse matrix, pixels x unknown texels; of all samples where none is lit."""
+    """Pixels of one picture: flat indices, the share of lit samples, and mean bilinear weights over the lit samples, a
+    sparse matrix of pixels x unknown texels. Where no sample is lit, the mean is over all samples."""
 
     index: Int[np.ndarray, " p"]
     lit: Float[np.ndarray, " p"]
@@ -47,7 +46,7 @@ class ImageFootprint:
 
 @dataclass(frozen=True)
 class UnknownTexels:
-    """The texels that are solved for, rows of the table: those that are covered or that a picture shows (`seen`)."""
+    """The solved texels, as rows of the table: those that are covered or that a picture shows (`seen`)."""
 
     rows: Int[np.ndarray, " t"]
     seen: Bool[np.ndarray, " t"]
@@ -56,15 +55,15 @@ class UnknownTexels:
 def image_footprints(
     context: FitContext, renderer: "MaterialRenderer"
 ) -> tuple[list[ImageFootprint], UnknownTexels, float] | None:
-    """All pictures' lit pixels, and where light between surfaces is looked for the others that show the mesh; what is
-    solved for; and the bytes that they leave of the memory. None where it does not suffice."""
+    """All pictures' lit pixels and, if indirect light is estimated, the other pixels of the mesh; the unknown texels;
+    and the bytes of memory that remain. None if the memory does not suffice."""
     settings, cameras = context.settings, context.captures.cameras
     left, images, seen = settings.memory * 1e9, dict[int, ImageFootprint](), np.zeros(renderer.texels, bool)
     for group in by_camera(cameras):
         every = _covered_pixels(context, renderer, cameras[group[0]]) if settings.bounces else None
         for k in group:
             lit = _lit_pixels(renderer, k)
-            images[k] = lit if every is None else _and_dark(lit, every)
+            images[k] = lit if every is None else _with_unlit(lit, every)
             fetch = images[k].fetch
             seen[fetch.indices] = True
             left -= PIXEL * fetch.shape[0] + WEIGHT * fetch.nnz
@@ -81,12 +80,12 @@ def image_footprints(
 
 
 def _lit_pixels(renderer: "MaterialRenderer", picture: int) -> ImageFootprint:
-    """Those that a light reaches."""
+    """Pixels that a light reaches."""
     return _footprint((block.hits for block in renderer.blocks(picture)), renderer.sizes, renderer.subsamples)
 
 
 def _covered_pixels(context: FitContext, renderer: "MaterialRenderer", camera: Camera) -> ImageFootprint:
-    """Those that show the mesh: by a flash at the camera, which throws no shadow."""
+    """Pixels of the mesh, rendered with a flash at the camera, which casts no visible shadow."""
     surface = TexturedMesh(context.traced, renderer.sizes, context.tangents)
     sampling = Sampling(renderer.subsamples, shadows=False, gradients=False)
     blocks = collect(surface, camera, FLASH, np.ones(camera.size, bool), sampling)
@@ -113,8 +112,8 @@ def _footprint(blocks: Iterable[SampleBlock], sizes: Sequence[tuple[int, int]], 
     return ImageFootprint(np.concatenate(index), np.concatenate(lit), vstack(fetches, format="csr"))
 
 
-def _and_dark(pixels: ImageFootprint, every: ImageFootprint) -> ImageFootprint:
-    """`pixels`, and those of `every` that are not among them."""
+def _with_unlit(pixels: ImageFootprint, every: ImageFootprint) -> ImageFootprint:
+    """`pixels`, then the pixels of `every` that they lack."""
     from scipy.sparse import vstack
 
     dark = np.flatnonzero(~np.isin(every.index, pixels.index))
@@ -126,7 +125,7 @@ def _and_dark(pixels: ImageFootprint, every: ImageFootprint) -> ImageFootprint:
 
 
 def unknown_frames(context: FitContext, unknown: UnknownTexels) -> Frames:
-    """Tangent, bitangent and normal of the unknown texels; of uncovered ones those of the nearest covered one."""
+    """Tangent, bitangent and normal of the unknown texels; uncovered texels take those of the nearest covered one."""
     position, normal, face = points_of(context.texels)
     every = np.zeros((context.atlas.count, 9), np.float32)
     own = texel_frames(context.traced.mesh, face, position, normal, context.tangents)
@@ -142,8 +141,8 @@ def indirect_jacobian(
     values: Float[np.ndarray, "t 8"],
     axes: Frames,
 ) -> Float[np.ndarray, "p 3 3"]:
-    """Derivatives of the light between surfaces in a picture of `size`: of each channel by its own albedo, and by the
-    tilt (2). `light` and `vectors` as of `Indirect.pictures_and_vectors`; `values` and `axes` of the unknown texels."""
+    """Derivatives of indirect light in a picture of `size`: of each channel by its own albedo and by the tilt (2).
+    `light` and `vectors` as from `Indirect.pictures_and_vectors`; `values` and `axes` of the unknown texels."""
     arriving = enlarged(vectors, size).reshape(-1, 3, 3)[pixels.index]
     frame = (pixels.fetch @ axes).reshape(-1, 3, 3)
     frame /= np.maximum(np.linalg.norm(frame, axis=2, keepdims=True), 1e-6)
@@ -166,6 +165,6 @@ def indirect_jacobian(
 def indirect_delta(
     pixels: ImageFootprint, derivative: Float[np.ndarray, "p 3 3"], moved: Float[np.ndarray, "t 8"]
 ) -> Float[np.ndarray, "p 3"]:
-    """What light between surfaces changes by when the unknown texels move."""
+    """Linear change of indirect light when the unknown texels move."""
     fetched = pixels.fetch @ moved[:, : TILT.stop]
     return derivative[:, :, 0] * fetched[:, ALBEDO] + np.einsum("pcj,pj->pc", derivative[:, :, 1:], fetched[:, TILT])

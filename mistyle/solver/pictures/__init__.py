@@ -1,1 +1,1 @@
-"""Descent on whole pictures: Adam through the deferred renderer, and through `prb`."""
+"""Descent on whole pictures: Adam through the deferred renderer and through `prb`."""

@@ -1,13 +1,12 @@
-"""Adam on the table of texels (`render/deferred/renderer.py`), preconditioned by an image pyramid, without ever waiting
-for it.
+"""Adam on the table of texels (`render/deferred/renderer.py`), preconditioned by an image pyramid, without host syncs.
 
-A texture moves by the sum of what every level of its pyramid moves by: level 0 is the texture, each further level has
-half the rows and columns and sees the sum of the gradients of its texels. Adam's step has the same length on every
-level, so that what is wrong over a wide area is mended at once (Weier et al. 2025, Laplacian mipmaps). A texel whose
-gradient is zero neither moves nor forgets (masked updates). A texel whose gradient is not a number stands still from
-then on, and the first picture and channel of which that was true are kept.
+A texture's step is the sum of the steps of all levels of its pyramid. Level 0 is the texture; each further level has
+half the rows and columns and sums the gradients of its texels. Adam's step has the same length on every level, so
+low-frequency errors are corrected at once (Weier et al. 2025, Laplacian mipmaps). Texels with a zero gradient keep
+value and moments (masked updates). A texel whose gradient is not finite is frozen from then on; the first picture and
+channel where that happened are recorded.
 
-Everything runs in one frozen function per step; sums are gathers in a fixed order.
+Each step is one frozen function; sums are gathers in a fixed order.
 """
 
 from collections.abc import Sequence
@@ -23,18 +22,18 @@ from mistyle.render.mitsuba import device
 
 CHANNELS = ("albedo", "albedo", "albedo", "normal", "normal", "roughness", "metallic")
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-12
-FINE = 0xFFFFFFFF  # nothing went wrong in this texel
+FINE = 0xFFFFFFFF  # all gradients of this texel were finite
 
 
 @dataclass(frozen=True)
 class AdamOptions:
-    """How a Descent steps.
+    """Settings of a Descent's steps.
 
     levels   of the pyramid, 1: the texture alone
     floor    least roughness
-    tilt     bounds |tilt|; all else stays within 0..1
-    damping  times the root mean square of a level's gradients in a channel joins Adam's denominator: without it a
-             number on which the pictures hardly depend moves as fast as all others, by nothing but chance
+    tilt     bounds |tilt|; all other channels stay within 0..1
+    damping  this multiple of a channel's RMS gradient on a level is added to Adam's denominator: without it an unknown
+             that hardly affects the pictures moves as fast as all others, driven by noise
     """
 
     levels: int = 1
@@ -49,8 +48,8 @@ DEFAULT_OPTIONS = AdamOptions()
 class Descent:
     """Moments of every level of every texture set's pyramid, and the step.
 
-    `rates` are factors of the rate per channel of the table (8 of them, 0: stands still), `shares` further ones by
-    texel and channel; `still` names texels that do not move at all.
+    `rates` are factors of the rate per channel of the table (8; 0 freezes a channel), `shares` further factors by texel
+    and channel; `still` marks frozen texels.
     """
 
     def __init__(
@@ -81,7 +80,7 @@ class Descent:
         self._run = device.Frozen(self._step)
 
     def step(self, table: Any, gradient: Any, rate: float, picture: int) -> Any:
-        """The table (a Dr.Jit Float, 8 a texel) after one step against `gradient` (likewise) of `picture`."""
+        """The table (a Dr.Jit Float, 8 a texel) after one step along `gradient` (same layout) of `picture`."""
         import drjit as dr
         import mitsuba
 
@@ -93,7 +92,7 @@ class Descent:
         return table
 
     def state(self) -> dict[str, np.ndarray]:
-        """All that a resumed descent needs besides the table."""
+        """The state, beside the table, from which a descent resumes."""
         names = ("first", "second")
         result = {
             f"{n}{k}": np.array(a) for n, part in zip(names, self.moments, strict=True) for k, a in enumerate(part)
@@ -101,7 +100,7 @@ class Descent:
         return result | {f"age{k}": np.array(a) for k, a in enumerate(self.ages)} | {"blame": np.array(self.blame)}
 
     def restore(self, state: dict[str, np.ndarray]) -> None:
-        """Go on from `state()`."""
+        """Resume from `state()`."""
         import mitsuba
 
         mi: Any = mitsuba
@@ -111,13 +110,13 @@ class Descent:
         self.blame = mi.UInt32(aligned(state["blame"], np.uint32))
 
     def stopped(self) -> list[tuple[int, str, int]]:
-        """(texel, map, picture) of every texel whose gradient was not a number."""
+        """(texel, map, picture) of every texel whose gradient was not finite."""
         blame: Int[np.ndarray, " t"] = np.array(self.blame)
         bad = np.flatnonzero(blame < FINE - 1)
         return [(int(k), CHANNELS[int(blame[k]) % 8], int(blame[k]) // 8) for k in bad]
 
     def _step(self, table, gradient, state, shares, rate, picture) -> Any:
-        """New table, moments, ages and blame; `state` are the old ones."""
+        """New table, moments, ages and records of non-finite gradients; `state` holds the old ones."""
         import drjit as dr
         import mitsuba
 
@@ -242,7 +241,7 @@ def _upsample(coarse: Any, shape: tuple[int, int], size: tuple[int, int]) -> Any
 
 
 def table_on_device(table: Float[np.ndarray, "t 8"]) -> Any:
-    """The table as Dr.Jit array, in memory that starts at a multiple of 64 bytes."""
+    """The table as a Dr.Jit array in memory aligned to 64 bytes."""
     import mitsuba
 
     mi: Any = mitsuba

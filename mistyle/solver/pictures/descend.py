@@ -1,8 +1,8 @@
-"""Adam on whole pictures: one picture a step, in an order that is shuffled anew for each round of all pictures.
+"""Adam on whole pictures: one picture a step, in an order that is shuffled anew for each epoch.
 
-The steps form passes. Smoothing (`solver/smoothing.py`) follows each pass, and an estimate of the light between
-surfaces precedes the last ones. Both draw texels that few pictures show, or hardly light, towards their surroundings.
-The next pass corrects them by the pictures.
+The steps form passes. Smoothing (`solver/smoothing.py`) follows each pass, and an estimate of indirect light precedes
+the last ones. Smoothing draws texels that few pictures show, or hardly light, towards their surroundings. The next pass
+corrects them by the pictures.
 """
 
 import time
@@ -28,27 +28,27 @@ if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
     from mistyle.solver.pictures.adam import Descent
 
-JUDGES = 48  # pictures that say whether the steps helped
-SEEDS = 7907  # between the seeds of two estimates: more than there are rounds
-# Multiples of the rate by channel where the texels were solved before: their albedo is nearly right already, and longer
-# steps would follow the pictures' noise, ...
+JUDGES = 48  # pictures whose loss accepts or rejects the steps
+SEEDS = 7907  # seed offset between two estimates; exceeds the number of rounds
+# Factors of the rate by channel after the per-texel solver: albedo is nearly right already, and longer steps would
+# follow the pictures' noise, ...
 SOLVED_RATES = (0.15, 0.15, 0.15, 0.5, 0.5, 1, 0.5, 0)
-# ... and by texel, the noise of what is known of it as a multiple of the usual one, within these bounds. Roughness
-# takes no long steps: where little speaks for one, albedo can stand for it.
+# ... and by texel: its standard deviation relative to the median, within these bounds. Roughness takes no long steps:
+# with few observations albedo and roughness are interchangeable.
 SHORTEST, LONGEST = 0.3, np.array([3, 3, 3, 3, 3, 1, 3], np.float32)
-# What is left open after a pass, as multiples of what is usual: whole pictures show parts of texels of which the solver
-# had no observation, so what it knew least of is known better then than it promised.
+# Standard deviations after a pass, as multiples of the median: whole pictures show parts of texels that the solver did
+# not observe, so the least certain texels are known better than the solver estimated.
 LEFT = np.array([6, 6, 6, 7, 7, 5, np.inf], np.float32)
-# By channel where they were not: soft light says little of normals, less of roughness, most of albedo.
+# By channel without the per-texel solver: soft light constrains albedo best, normals less, roughness least.
 UNSOLVED_RATES = (2, 2, 2, 0.2, 0.2, 0.6, 0.6, 0)
 DAMPING = 0.3
 
 
 @dataclass(frozen=True)
 class Checkpoints:
-    """`save` receives what a later run needs as `resume`, every `settings.checkpoint` seconds.
+    """`save` receives the arrays that a later run needs as `resume`, every `settings.checkpoint` seconds.
 
-    Only the steps on whole pictures are saved; what comes before is computed again.
+    Only the steps on whole pictures are saved; earlier stages are computed again.
     """
 
     save: Callable[[dict[str, np.ndarray]], None] | None = None
@@ -57,7 +57,7 @@ class Checkpoints:
 
 @dataclass(frozen=True)
 class Pass:
-    """Steps `begin` : begin + steps of all, from the table `base`."""
+    """The steps `begin` : begin + steps, from the table `base`."""
 
     base: MaterialTable
     begin: int
@@ -72,10 +72,10 @@ def optimise_on_pictures(
     progress: StageProgress,
     checkpoints: Checkpoints,
 ) -> tuple[MaterialTable, DirectCaptures]:
-    """What all passes make of `estimate`, and the captures with the last estimate of their indirect light.
+    """The table after all passes from `estimate`, and the captures with the last estimate of their indirect light.
 
-    Where that explains the pictures no better, the table is `estimate`'s own, and a note says so. The pass that
-    `checkpoints` resume makes its estimate of indirect light again, from the same maps.
+    If the loss does not fall, the table is `estimate`'s own, with a note. A pass that `checkpoints` resume repeats its
+    estimate of indirect light from the same maps.
     """
     settings, resume = context.settings, checkpoints.resume
     parts = passes(settings, len(context.captures)) if estimate.solved else [(settings.iterations, 0)]
@@ -107,7 +107,7 @@ def optimise_on_pictures(
     context.trace["pictures.whole"] = [before, after]
     if not after < before:
         context.notes.append(
-            f"The steps on whole pictures were undone: the loss went from {before:.3g} to {after:.3g}."
+            f"The steps on whole pictures were undone: the loss changed from {before:.3g} to {after:.3g}."
         )
         return estimate.table, direct
     return smoothed(table), direct
@@ -167,54 +167,54 @@ def _descent(context: FitContext, estimate: TexelEstimate) -> "Descent":
 def _state(
     descent: "Descent", table: Any, base: MaterialTable, step: int, losses: list[float]
 ) -> dict[str, np.ndarray]:
-    """What a later run needs to go on at `step`."""
+    """The arrays from which a later run resumes at `step`."""
     own = {"iteration": np.array(step), "losses": np.array(losses), "base": base}
     return descent.state() | own | {"table": np.array(table).reshape(-1, COLUMNS)}
 
 
 def _unconstrained_std(estimate: TexelEstimate) -> Float[np.ndarray, "a 7"]:
-    """Standard deviations of what a pass leaves open: those of `estimate`, which approach LEFT times the usual."""
+    """Standard deviations after a pass: those of `estimate`, which approach LEFT times the median."""
     std = estimate.unconstrained
-    return (std / np.sqrt(1 + (std / (LEFT * _usual(estimate))) ** 2)).astype(np.float32)
+    return (std / np.sqrt(1 + (std / (LEFT * _median_std(estimate))) ** 2)).astype(np.float32)
 
 
 def _rate_factors(estimate: TexelEstimate, atlas: Atlas) -> MaterialTable:
-    """Multiples of Adam's rate. A step has the same length however little speaks for it, so texels that are known well
-    take shorter ones; and a tilt that its neighbours decided would wander off. Uncovered texels, which pixels at the
-    borders of islands see, go at the pace of the nearest covered one, or what pixels tell would be lost to them."""
+    """Factors of Adam's rate. Adam's steps ignore how well an unknown is observed, so well-known texels take shorter
+    steps, and a tilt that its neighbours decided would drift. Uncovered texels, seen by pixels at island borders, take
+    the rate of the nearest covered one, so that these pixels still have an effect."""
     factors = np.ones((len(estimate.data_weight), COLUMNS), np.float32)
-    if _known(estimate).any():
-        factors[:, SOLVED] = np.clip(estimate.unconstrained / _usual(estimate), SHORTEST, LONGEST)
+    if _observed(estimate).any():
+        factors[:, SOLVED] = np.clip(estimate.unconstrained / _median_std(estimate), SHORTEST, LONGEST)
     factors[:, TILT] *= np.sqrt(estimate.data_weight)[:, None]
     return fill(factors, atlas)
 
 
-def _known(estimate: TexelEstimate) -> Bool[np.ndarray, " a"]:
+def _observed(estimate: TexelEstimate) -> Bool[np.ndarray, " a"]:
     return np.asarray((estimate.seen > 0) & (estimate.unconstrained < NOTHING).all(axis=1))
 
 
-def _usual(estimate: TexelEstimate) -> Float[np.ndarray, "7"]:
-    """The median standard deviation of texels that something is known of."""
-    known = _known(estimate)
+def _median_std(estimate: TexelEstimate) -> Float[np.ndarray, "7"]:
+    """The median standard deviation of observed texels."""
+    known = _observed(estimate)
     usual = np.median(estimate.unconstrained[known], axis=0) if known.any() else np.full(7, NOTHING, np.float32)
     return np.maximum(usual, 1e-9)
 
 
 def _note_stopped(context: FitContext, stopped: list[tuple[int, str, int]]) -> None:
-    """Say which texels stood still because their gradient was not a number."""
+    """Note the texels that were frozen because their gradient was not finite."""
     for texel, name, picture in stopped[:3]:
         part, row, column = place_of(texel, context.atlas.sizes)
         label = context.traced.mesh.parts[part]
         context.notes.append(
-            f"The gradient of map '{name}' at texel (row {row}, column {column}) of set '{label}' is not a number in"
+            f"The gradient of map '{name}' at texel (row {row}, column {column}) of set '{label}' is not finite in"
             f" picture '{context.captures.cameras[picture].name}': the texel keeps its last good value."
         )
     if len(stopped) > 3:
-        context.notes.append(f"The same held for {len(stopped) - 3} more texels.")
+        context.notes.append(f"{len(stopped) - 3} more texels had such gradients.")
 
 
 def total_loss(renderer: "MaterialRenderer", table: MaterialTable, settings: RecoverSettings) -> float:
-    """Mean loss over the pictures, or over JUDGES of them, evenly chosen."""
+    """Mean loss over the pictures, or over JUDGES of them, evenly spaced."""
     uploaded, last = renderer.upload(table), len(renderer.captures) - 1
     chosen = np.unique(np.linspace(0, last, min(JUDGES, last + 1)).round().astype(int)).tolist()
     return float(np.mean([np.array(renderer.step(uploaded, [k], settings.loss)[0])[0] for k in chosen]))

@@ -1,8 +1,8 @@
-"""The last steps of a material fit through `prb`: light between surfaces is in the picture and in its gradient.
+"""Final refinement of a material fit through `prb`: picture and gradient include indirect light.
 
-The fits before it know direct light only, or take an estimate of the rest off the pictures. Here every picture is
-rendered as it came about, with all bounces, and Adam on the Laplacian pyramid of every map (`pyramid.py`) goes on from
-the maps found. Gradients are Monte Carlo estimates, so it is slow and the steps are small.
+Earlier stages know direct light only, or subtract an estimate of indirect light. Here every picture is rendered with
+all bounces, and Adam on the Laplacian pyramid of every map (`pyramid.py`) continues from the fitted maps. Gradients are
+Monte Carlo estimates, so it is slow and the steps are small.
 """
 
 import gc
@@ -25,16 +25,16 @@ from mistyle.solver.scene import gradients as scene_grad
 
 SHARE = 0.7  # of the rate that each coarser level of the pyramid has
 LAST_RATE = 0.1  # share of the rate at the end
-SOLID = 0.999  # coverage from which a pixel counts: the others mix with what lies behind the object
-JUDGES = 8  # pictures by which the result is compared with the start
-# The normals' encoding halves their lengths, and their error matters most: they move more slowly than the rest.
+SOLID = 0.999  # least coverage of a valid pixel: the others mix with the background
+JUDGES = 8  # pictures whose loss compares result and start
+# Normals have a smaller rate: their encoding halves lengths, and their errors matter most.
 RATES = {"albedo": 1.0, "normal": 0.3, "roughness": 1.0, "metallic": 1.0}
 
 
 @dataclass(frozen=True)
 class Polished:
-    """maps    as given where the result is no better
-    loss    before and after, mean over the judged pictures
+    """maps    the given maps if the loss does not fall
+    loss    before and after, mean over the compared pictures
     trace   loss of each step
     """
 
@@ -45,9 +45,9 @@ class Polished:
 
 @dataclass(frozen=True)
 class PolishSettings:
-    """How maps are polished.
+    """Settings of the refinement.
 
-    loss      a name of `scene_grad.LOSSES`
+    loss      a name of `gradients.LOSSES`
     rate      of Adam, on the albedo (see RATES)
     metallic  whether it moves too
     depth     path segments at most
@@ -76,9 +76,9 @@ def polish(
 ) -> Polished:
     """Adam from `maps`, one picture a step; see the module.
 
-    Pixels count where the picture's mask says so and the object covers them whole. The same bytes come out with one
-    thread only: Mitsuba adds up texture gradients in another order in every run. Roughness stays at or above
-    `scene_keys.ROUGHNESS_FLOOR`.
+    Pixels are valid inside the picture's mask where the object covers them fully. Bytes are reproducible with one
+    thread only: Mitsuba sums texture gradients in varying order. Roughness stays at or above
+    `parameters.ROUGHNESS_FLOOR`.
     """
     device.use()
     job = _Job(mesh, maps, captures, settings)
@@ -105,7 +105,7 @@ def polish(
 
 
 class _Job:
-    """The object with its textures, which all scenes share, and one scene per picture, made when it is needed."""
+    """The object with its textures, which all scenes share, and one lazily built scene per picture."""
 
     def __init__(self, mesh: Mesh, maps: Sequence[Maps], captures: Captures, settings: PolishSettings) -> None:
         import mitsuba
@@ -118,36 +118,36 @@ class _Job:
         self._environments: dict[tuple[int, ...], list[Any]] = {}
         moving = [n for n in RATES if n != "metallic" or settings.metallic]
         parts = [p for p in range(len(maps)) if f"part{p}" in self.shapes]
-        wanted = {scenery.parameters(p)[name]: (p, name) for p in parts for name in moving}
-        found = scene_keys.match(self.scene(0), list(wanted))
-        gc.collect()  # that scene; kernels are other ones, to be compiled anew, while two scenes live
-        self.places = [wanted[p.key] for p in found]
+        places = {scenery.parameters(p)[name]: (p, name) for p in parts for name in moving}
+        moved = scene_keys.match(self.scene(0), list(places))
+        gc.collect()  # frees that scene: with two scenes alive, Dr.Jit compiles other kernels
+        self.places = [places[p.key] for p in moved]
         self.names = [name for _, name in self.places]
-        # What holds a normal map is known here; its plugin may be ours.
+        # The parameter is a normal map even if its plugin is one of ours.
         self.chosen = [
-            replace(p, owner="NormalMap") if name == "normal" else p for p, name in zip(found, self.names, strict=True)
+            replace(p, owner="NormalMap") if name == "normal" else p for p, name in zip(moved, self.names, strict=True)
         ]
 
     def scene(self, k: int) -> Any:
-        """Picture k's."""
+        """The scene of picture k."""
         camera = self.captures.cameras[k]
         described = {"type": "scene", "sensor": scenery.sensor_dict(camera, 16), **self.shapes}
         described |= {f"light{j}": light for j, light in enumerate(self._lights(k))}
         return self.mi.load_dict(described, optimize=False)
 
     def _lights(self, k: int) -> list[Any]:
-        """Environment maps are loaded once; other lights may depend on the camera and are nothing to load."""
+        """The lights of picture k. Environment maps are cached; other lights may depend on the camera and load fast."""
         lights, camera = self.captures.lights[k], self.captures.cameras[k]
         key = tuple(map(id, lights))
         if key in self._environments:
             return self._environments[key]
-        made = emitters(lights, camera)
-        if all(light["type"] == "envmap" for light in made):
-            made = self._environments[key] = [self.mi.load_dict(light) for light in made]
-        return made
+        emitter_dicts = emitters(lights, camera)
+        if all(light["type"] == "envmap" for light in emitter_dicts):
+            emitter_dicts = self._environments[key] = [self.mi.load_dict(light) for light in emitter_dicts]
+        return emitter_dicts
 
     def values(self) -> dict[str, np.ndarray]:
-        """The start by key."""
+        """The start values by key."""
         result = {}
         for p, (part, name) in zip(self.chosen, self.places, strict=True):
             grid = getattr(self.start[part], name)
@@ -156,7 +156,7 @@ class _Job:
         return result
 
     def maps(self, values: dict[str, np.ndarray]) -> list[Maps]:
-        """The start with the values in place of its own."""
+        """The start maps with `values` in place of their own."""
         result = list(self.start)
         for p, (part, name) in zip(self.chosen, self.places, strict=True):
             grid = values[p.key]
@@ -167,8 +167,8 @@ class _Job:
             result[part] = replace(result[part], **{name: np.ascontiguousarray(grid, np.float32)})
         return result
 
-    def _look(self, scene: Any, k: int, spp: int, seed: int) -> tuple[Any, Any]:
-        """The picture, and what it is compared with."""
+    def _render_pair(self, scene: Any, k: int, spp: int, seed: int) -> tuple[Any, Any]:
+        """The picture and its reference."""
         sensor = scene.sensors()[0]
         shown = scene_grad.picture(scene, self.engine, sensor, spp, seed)
         rgb, mask = self.captures.load(k)
@@ -176,7 +176,7 @@ class _Job:
         clean = np.ascontiguousarray(np.where(counts[..., None], rgb, 0), np.float32)
         wide = self.mi.TensorXb(aligned(np.broadcast_to(counts[..., None], clean.shape), bool))
         share = max(float(counts.mean()), 1e-9)
-        # The weights are the relative loss's, which a polish does not take.
+        # These weights belong to the relative loss, which this stage does not support.
         return shown, scene_grad.ReferenceView(sensor, self.mi.TensorXf(aligned(clean)), wide, None, share)
 
     def gradient(self, values, k: int, spp: tuple[int, int], seeds: tuple[int, int]):
@@ -186,7 +186,7 @@ class _Job:
         scene = self.scene(k)
         table = self._table(scene)
         moving = scene_grad.put(table, self.chosen, values, grad=True)
-        shown, view = self._look(scene, k, spp[0], seeds[0])
+        shown, view = self._render_pair(scene, k, spp[0], seeds[0])
         value, pixels, _ = scene_grad.compare(shown, view, self.loss)
         self.engine.render_backward(
             scene, table, pixels, view.sensor, seed=dr.opaque(self.mi.UInt32, seeds[1]), spp=spp[1]
@@ -194,13 +194,13 @@ class _Job:
         return value, {p.key: scene_grad.array(dr.grad(moving[p.key]), p) for p in self.chosen}
 
     def judge(self, values, pictures: Sequence[int], spp: int, seed: int) -> float:
-        """Mean loss of some pictures, with the same random numbers each time."""
+        """Mean loss of some pictures, with fixed random numbers."""
 
         def one(k: int) -> float:
-            # A function, so that its scene goes before the next comes.
+            # A function, so that each scene is freed before the next is built.
             scene = self.scene(k)
             scene_grad.put(self._table(scene), self.chosen, values)
-            shown, view = self._look(scene, k, 4 * spp, scene_grad.seeds(seed, 2**31 + k)[0])
+            shown, view = self._render_pair(scene, k, 4 * spp, scene_grad.seeds(seed, 2**31 + k)[0])
             return scene_grad.compare(shown, view, self.loss)[0]
 
         return float(np.mean([one(k) for k in pictures]))

@@ -1,10 +1,9 @@
-"""Gradients of a live Mitsuba scene without Monte Carlo, where that is the same picture
-(`render/deferred/renderer.py`).
+"""Noise-free gradients of a live Mitsuba scene by the deferred renderer (`render/deferred/renderer.py`).
 
-It is where only points and directions light the scene, the integrator follows no light from surface to surface, films
-have a box filter, and what is fitted are the maps (or literals) of plain `principled` materials on meshes. Other shapes
-cast shadows; pixels that see their materials do not count. What Mitsuba does not tell about its plugins (wrapping,
-shadowing of normal maps) is found out by comparing pictures: where they disagree, `prb` it is, and a note says why.
+All lights must be points or directions, the integrator must render direct light only, and films need a box filter.
+The fitted parameters must be maps (or literals) of plain `principled` materials on meshes. Other shapes cast
+shadows; pixels that see their materials are masked. Mitsuba does not expose some plugin settings (wrapping, shadowing
+of normal maps), so renders of both are compared. If they disagree, `prb` is used and a note gives the reason.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,23 +30,23 @@ ROLES = {
     "roughness": slice(ROUGHNESS, ROUGHNESS + 1),
     "metallic": slice(METALLIC, METALLIC + 1),
 }
-# Lobes of `principled` that the fast path does not have.
+# Lobes of `principled` that the fast path lacks.
 ABSENT = ("anisotropic", "spec_trans", "spec_tint", "sheen", "sheen_tint", "flatness", "clearcoat")
-CHECKS = 3  # cameras whose pictures are compared
+CHECKS = 3  # cameras whose renders are compared
 CHECK_SPP = 64
-MANY_PIXELS = 1 << 18  # from which the check takes fewer samples
-AGREEMENT = 0.01  # of the root mean square, beyond the noise
+MANY_PIXELS = 1 << 18  # picture size from which the check takes fewer samples
+AGREEMENT = 0.01  # largest relative RMS difference beyond the noise
 
 
 class Unsupported(Exception):
-    """Why a scene needs Monte Carlo."""
+    """The reason why a scene needs Monte Carlo."""
 
 
 @dataclass(frozen=True)
 class MaterialTexels:
     """One shape's material.
 
-    roles     what `ROLES` names -> (key of `mi.traverse`, its value as stored: (h, w, c), or (n,) of a literal)
+    roles     names of `ROLES` -> (key of `mi.traverse`, stored value: (h, w, c), or (n,) of a literal)
     size      (rows, columns) of its textures
     specular  of `principled`
     """
@@ -58,7 +57,7 @@ class MaterialTexels:
 
 
 class DeferredRenderer:
-    """The scene's pictures as a function of the chosen parameters."""
+    """Renders of the scene as a function of the chosen parameters."""
 
     def __init__(
         self,
@@ -69,9 +68,9 @@ class DeferredRenderer:
         engine: Any,
         subsamples: int = 4,
     ) -> None:
-        """Raises Unsupported with a sentence where the pictures would not be the scene's; `subsamples` a pixel."""
+        """Raises Unsupported, with a reason, if renders would differ from the scene's; `subsamples` a pixel."""
         if loss not in scene_grad.LOSSES:
-            raise Unsupported("the loss is a function of its own.")
+            raise Unsupported("the loss is a custom function.")
         self.loss, self.chosen, self.subsamples = loss, tuple(chosen), subsamples
         reasons = scene_keys.fast_shapes(scene, engine)
         self.materials = _materials(scene, reasons)
@@ -85,16 +84,16 @@ class DeferredRenderer:
             raise Unsupported("its materials differ in `specular`.")
         traced = tracer(_mesh(scene))
         cameras = [_camera(view.sensor, k) for k, view in enumerate(views)]
-        masks = [self._counts(traced, camera, view) for camera, view in zip(cameras, views, strict=True)]
+        masks = [self._valid_pixels(traced, camera, view) for camera, view in zip(cameras, views, strict=True)]
         references = [np.array(view.reference) for view in views]
         captures = in_memory(cameras, [lights] * len(cameras), references, masks)
         self.shares = [max(view.share, 1e-9) for view in views]
-        self.renderer = self._agreeing(scene, traced, captures, views, engine, kinds.pop())
+        self.renderer = self._best_variant(scene, traced, captures, views, engine, kinds.pop())
 
     def gradients(self, values: Mapping[str, np.ndarray], k: int) -> tuple[float, dict[str, np.ndarray]]:
-        """Loss of camera k and its gradient by key, as `scene_grad.gradients` has them, without noise.
+        """Noise-free loss of camera k and its gradient by key, like `gradients.gradients`.
 
-        What lies beside the fitted materials adds nothing to the loss.
+        Pixels beside the fitted materials do not contribute to the loss.
         """
         value, gradient = self.renderer.step(self._table(values), [k], self.loss)
         rows = np.array(gradient).reshape(-1, COLUMNS) / np.float32(self.shares[k])
@@ -106,7 +105,7 @@ class DeferredRenderer:
             start += count
             for role, (key, _) in material.roles.items() if material is not None else ():
                 if key in result:
-                    result[key] += _by_value(role, part[:, ROLES[role]], values[key])
+                    result[key] += _stored_gradient(role, part[:, ROLES[role]], values[key])
         return float(np.array(value)[0]) / self.shares[k], result
 
     def _table(self, values: Mapping[str, np.ndarray]) -> Float[np.ndarray, "t 8"]:
@@ -123,8 +122,8 @@ class DeferredRenderer:
             parts.append(rows)
         return np.concatenate(parts)
 
-    def _counts(self, traced: Tracer, camera: Camera, view: scene_grad.ReferenceView) -> np.ndarray:
-        """Pixels that count: those of the mask that see no other material, not even next to them."""
+    def _valid_pixels(self, traced: Tracer, camera: Camera, view: scene_grad.ReferenceView) -> np.ndarray:
+        """Valid pixels: those of the mask that neither see nor touch another material."""
         counts = np.array(view.counts)[..., 0].astype(bool)
         foreign = [k for k, material in enumerate(self.materials) if material is None]
         if foreign:
@@ -133,8 +132,8 @@ class DeferredRenderer:
             counts &= ~dilate(np.isin(gbuffer(traced, camera).part, foreign), 1)
         return counts
 
-    def _agreeing(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
-        """The renderer whose pictures are the scene's, of the variants of a normal map that Mitsuba has."""
+    def _best_variant(self, scene: Any, traced: Tracer, captures, views, engine, specular: float) -> Any:
+        """The renderer that matches the scene best, over Mitsuba's variants of a normal map."""
         from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
 
         sizes = [(2, 2) if m is None else m.size for m in self.materials]
@@ -154,21 +153,21 @@ class DeferredRenderer:
             return MaterialRenderer(traced, captures, sizes, options)
 
         def error(variant: tuple[bool, bool]) -> float:
-            # Edges inside a pixel are all that differs by nature: many samples, kept nowhere.
+            # Both renderers antialias edges differently, so the check takes many samples and stores none.
             fine = [64 if np.prod(captures.cameras[k].size) <= MANY_PIXELS else 16 for k in looked]
             exact = renderer(*variant, min(fine), memory=0)
             table = exact.upload(self._table({}))
 
-            def wrong(k: int) -> float:
+            def deviation(k: int) -> float:
                 image, coverage = exact.image_and_coverage(table, k)
-                return _beyond_noise(image, pairs[k], captures.load(k)[1], coverage)
+                return _excess_rms(image, pairs[k], captures.load(k)[1], coverage)
 
-            return max(wrong(k) for k in looked)
+            return max(deviation(k) for k in looked)
 
         variants = [(f, s) for f in (False, True) for s in (False, True)] if bumped else [(False, False)]
         errors = [error(variant) for variant in variants]
         if min(errors) > AGREEMENT:
-            raise Unsupported(f"its pictures differ from the scene's own by {min(errors):.1%}.")
+            raise Unsupported(f"its pictures differ from the scene's by {min(errors):.1%}.")
         return renderer(*variants[int(np.argmin(errors))], self.subsamples)
 
 
@@ -176,15 +175,15 @@ def _picture(scene: Any, engine: Any, sensor: Any, seed: int) -> np.ndarray:
     return np.array(scene_grad.picture(scene, engine, sensor, CHECK_SPP, seed))[..., :3]
 
 
-def _beyond_noise(ours: np.ndarray, pair: Sequence[np.ndarray], counts: np.ndarray, coverage: np.ndarray) -> float:
-    """Root mean square difference of two renderers beyond the noise of one, relative to the picture's."""
+def _excess_rms(ours: np.ndarray, pair: Sequence[np.ndarray], counts: np.ndarray, coverage: np.ndarray) -> float:
+    """RMS difference of two renderers beyond the noise of one, relative to the picture's RMS."""
     at = counts & (coverage > 0.999)
     if not at.any():
         return 0.0
     mean, noise = (pair[0] + pair[1])[at] / 2, np.square(pair[0] - pair[1], dtype=np.float64)[at].mean() / 4
-    wrong = np.square(mean - ours[at], dtype=np.float64).mean()
-    # Both hold the samples' places within the pixel too; twice the noise covers that.
-    return float(np.sqrt(max(wrong - 2 * noise, 0) / max(np.square(mean, dtype=np.float64).mean(), 1e-30)))
+    squared_error = np.square(mean - ours[at], dtype=np.float64).mean()
+    # Both also contain noise of sample positions within the pixel; twice the noise covers that.
+    return float(np.sqrt(max(squared_error - 2 * noise, 0) / max(np.square(mean, dtype=np.float64).mean(), 1e-30)))
 
 
 def _unit(stored: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -192,8 +191,8 @@ def _unit(stored: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return normal / np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-12)
 
 
-def _by_value(role: str, gradient: Float[np.ndarray, "n c"], value: np.ndarray) -> np.ndarray:
-    """The gradient by what is stored: literals hear all texels, encoded normals through n = unit(2 t - 1)."""
+def _stored_gradient(role: str, gradient: Float[np.ndarray, "n c"], value: np.ndarray) -> np.ndarray:
+    """The gradient by stored values: literals sum over all texels, encoded normals go through n = unit(2 t - 1)."""
     if role == "normalmap":
         flat = value.reshape(-1, 3)
         length = np.maximum(np.linalg.norm(flat * 2 - 1, axis=-1, keepdims=True), 1e-12)
@@ -208,12 +207,12 @@ def _by_value(role: str, gradient: Float[np.ndarray, "n c"], value: np.ndarray) 
 
 
 def _missing(scene: Any, parameter: Parameter, reasons: Mapping[str, str | None]) -> str:
-    told = next((f"{name}: {reason}" for name, reason in reasons.items() if reason is not None), None)
-    return told or f"{parameter.name} is not a map of a plain `principled` on a mesh."
+    first_reason = next((f"{name}: {reason}" for name, reason in reasons.items() if reason is not None), None)
+    return first_reason or f"{parameter.name} is not a map of a plain `principled` on a mesh."
 
 
 def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[MaterialTexels | None]:
-    """One per shape; None for those that the fast path cannot shade."""
+    """One per shape; None where the fast path cannot shade it."""
     import mitsuba as mi
 
     keys: dict[Any, str] = {}
@@ -223,7 +222,7 @@ def _materials(scene: Any, reasons: Mapping[str, str | None]) -> list[MaterialTe
     held = scene_walk.children(scene)
     result = []
     for shape in scene.shapes():
-        # A rectangle counts as a mesh but has no vertices to show.
+        # A rectangle counts as a mesh but exposes no vertices.
         if "vertex_positions" not in mi.traverse(shape).keys():
             raise Unsupported(f"{shape.id()} is not a mesh ({shape.class_name()}).")
         plain = reasons.get(shape.id()) is None
@@ -265,7 +264,7 @@ def _stored(texture: Any, keys: Mapping[Any, str]) -> tuple[str, np.ndarray]:
 
     table: Any = mi.traverse(texture)
     if "to_uv" in table.keys() and not np.allclose(np.array(table["to_uv"].matrix).squeeze(), np.eye(3), atol=1e-6):
-        raise Unsupported("a texture is scaled or turned (to_uv).")
+        raise Unsupported("a texture is transformed (to_uv).")
     name = next((n for n in ("data", "value") if n in table.keys()), None)
     if name is None or texture not in keys:
         raise Unsupported(f"a texture is {texture.class_name()}.")
@@ -315,7 +314,7 @@ def _camera(sensor: Any, k: int) -> Camera:
 
 
 def _mesh(scene: Any) -> Mesh:
-    """All shapes as one mesh in the scene's own units, a part each."""
+    """All shapes as one mesh in the scene's units, one part each."""
     import mitsuba as mi
 
     positions, faces, normals, uvs, part, names = [], [], [], [], [], []

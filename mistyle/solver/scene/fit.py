@@ -1,9 +1,9 @@
 """Fitting texture parameters of any Mitsuba scene to pictures of known cameras, through `prb` or another integrator.
 
-Nothing is assumed about the materials: whatever plugin passes gradients to its parameters can be fitted, several at
-once. The few numbers of literals and colours go by Gauss–Newton (`scene_newton`). Textures and attributes go by Adam on
-the Laplacian pyramid (`pyramid.py`), with a rate that falls; from noisy gradients the mean of the last steps is the
-result. Values stay in their ranges (`scene_keys.limits`). A result worse than its start is undone.
+Nothing is assumed about the materials: any parameter whose plugin has gradients can be fitted, several at once. The
+few numbers of literals and colours use Gauss–Newton (`gauss_newton.py`). Textures and attributes use Adam on the
+Laplacian pyramid (`pyramid.py`) with a falling rate; with noisy gradients the result is the mean of the last steps.
+Values stay in their ranges (`parameters.limits`). A result worse than its start is undone.
 """
 
 import time
@@ -26,10 +26,10 @@ from mistyle.solver.scene.state import Bad, Regularizer
 RATE = 0.02
 SHARE = 0.7  # of the rate that each coarser level of the pyramid has
 LAST_RATE = 0.05  # share of the rate at the end
-COURSE = 0.3  # share of the steps at the end that are looked at for drift and spread
-TAIL = 0.15  # share of them whose mean is the result where gradients are noisy
+COURSE = 0.3  # share of the last steps that estimate drift and spread
+TAIL = 0.15  # share of the last steps whose mean is the result with noisy gradients
 DOING = "the scene was fitted"
-MOST_BAD = 100  # numbers that are reported one by one
+MOST_BAD = 100  # non-finite gradients that are reported one by one
 
 
 def fit_scene(
@@ -58,13 +58,14 @@ def fit_scene(
     resume: Mapping[str, np.ndarray] | None = None,
     progress: Callable[[float], None] = lambda done: None,
 ) -> FittedScene:
-    """`mistyle.fit_scene`, which has the arguments; besides:
+    """`mistyle.fit_scene`, which documents the arguments; in addition:
 
     save, resume   `save` receives a dictionary of arrays every `save_every` seconds, and when the callback ends or
-                   breaks off the fit; given back as `resume`, with all else as it was, the fit goes on to the same
-                   result: the same bytes with one thread; with more, Mitsuba's texture gradient adds up in another
-                   order in every run, and results differ as those of two runs do
-    progress       receives the share that is done, 0..1
+    aborts
+                   the fit. Passed back as `resume` with all other arguments equal, it resumes the fit to the same
+                   result. One thread gives the same bytes; with more, Mitsuba sums texture gradients in varying order,
+                   and results differ as between any two runs.
+    progress       receives the finished share, 0..1
     """
     device.use()
     plan = scene_job.FitPlan(iterations, spp, spp_grad, rate, pyramid, sensors_per_step, seed, solver)
@@ -84,7 +85,7 @@ def fit_scene(
 def _descend(
     job: scene_job.SceneProblem, state: scene_job.FitState, callback: Any, save: Any, save_every: float, progress: Any
 ) -> None:
-    """All steps that are left; ends early where the callback says so."""
+    """All remaining steps; ends early if the callback returns true."""
     saved, stopped = time.monotonic(), False
     while state.iteration < job.plan.iterations and not stopped:
         with device.plain_errors(DOING):
@@ -106,7 +107,7 @@ def _descend(
 
 
 def _interrupted(job: scene_job.SceneProblem, state: scene_job.FitState, save: Any) -> None:
-    """A request to stop came within a round: what was known before it is kept."""
+    """Save the state before an unfinished round, after a request to stop."""
     if save is not None:
         save(scene_job.checkpoint(state, job))
     stopping.check()
@@ -119,10 +120,10 @@ def _finished(
     notes: Sequence[str],
     progress: Any,
 ) -> FittedScene:
-    """The result, measured against the start, undone where it is worse."""
-    if (count := state.iteration - _first(job, TAIL)) > 0 and not (job.newton or job.fast):
+    """The result, compared with the start and undone where it is worse."""
+    if (count := state.iteration - _first_of_last(job, TAIL)) > 0 and not (job.newton or job.fast):
         mean = {p.key: (state.tail[p.key] / count).astype(np.float32) for p in job.chosen}
-        # What stands still keeps its bytes.
+        # Unchanged values keep their bytes.
         state.values = {k: np.where(state.values[k] == state.start[k], state.start[k], v) for k, v in mean.items()}
     after = scene_result.looks(job, state.values, progress)
     undone = scene_result.worse(job, before, after)
@@ -156,18 +157,18 @@ def _step(job: scene_job.SceneProblem, state: scene_job.FitState) -> None:
     total = 0.0
     for slot in range(plan.sensors_per_step):
         k = _camera(job, step, slot)
-        value, found, broken = _gradients(job, state, k, scene_grad.seeds(plan.seed, step, slot))
+        value, added, broken = _gradients(job, state, k, scene_grad.seeds(plan.seed, step, slot))
         total += value / plan.sensors_per_step
         state.broken[k] = state.broken.get(k, 0) + broken
-        _add(gradient, found, state, 1 / plan.sensors_per_step, k)
+        _add_gradients(gradient, added, state, 1 / plan.sensors_per_step, k)
     if job.regularizers:
-        value, found = scene_grad.regularized(job.table, job.chosen, state.values, job.regularizers)
+        value, added = scene_grad.regularized(job.table, job.chosen, state.values, job.regularizers)
         total += value
-        _add(gradient, found, state, 1.0, None)
+        _add_gradients(gradient, added, state, 1.0, None)
     noisy, paces = job.fast is None, []
     for p in job.chosen:
         usable = job.free[p.key] & ~state.held[p.key]
-        rate = plan.rate * _falling(step, plan.iterations, noisy) * job.scales[p.key]
+        rate = plan.rate * _rate_factor(step, plan.iterations, noisy) * job.scales[p.key]
         own = np.where(usable, gradient[p.key], 0)
         change = laplacian.change(state.moments[p.key], own, rate, SHARE, fair=noisy)
         moved = scene_keys.project(p, state.values[p.key] + change)
@@ -176,27 +177,27 @@ def _step(job: scene_job.SceneProblem, state: scene_job.FitState) -> None:
         paces.append(scene_result.pace(p, state.values[p.key] - old, rate))
     state.trace.append(total)
     state.iteration += 1
-    if step >= _first(job, TAIL):
+    if step >= _first_of_last(job, TAIL):
         for p in job.chosen:
             state.tail[p.key] += state.values[p.key]
-    if step >= _first(job, COURSE):
+    if step >= _first_of_last(job, COURSE):
         state.paces.append(np.concatenate(paces))
         state.course.append(np.concatenate([scene_result.brief(p, state.values[p.key]) for p in job.chosen]))
 
 
-def _first(job: scene_job.SceneProblem, share: float) -> int:
-    """The first of the last steps that are the share of all."""
+def _first_of_last(job: scene_job.SceneProblem, share: float) -> int:
+    """The first of the last steps that form this share of all."""
     return int(np.ceil((1 - share) * job.plan.iterations))
 
 
-def _falling(step: int, steps: int, noisy: bool) -> float:
-    """The rate's share: along a cosine; where gradients are noisy, it has ended before the steps that are averaged."""
+def _rate_factor(step: int, steps: int, noisy: bool) -> float:
+    """Factor of the rate, along a cosine; with noisy gradients it ends before the averaged steps."""
     end = (1 - TAIL) * steps if noisy else steps
     return LAST_RATE + (1 - LAST_RATE) * 0.5 * (1 + np.cos(np.pi * min(step / end, 1.0)))
 
 
 def _gradients(job: scene_job.SceneProblem, state: scene_job.FitState, k: int, seeds: tuple[int, int]):
-    """Loss and gradient of camera k, and how many values of its picture were no numbers."""
+    """Loss and gradient of camera k, and the number of non-finite values in its picture."""
     if job.fast is not None:
         return *job.fast.gradients(state.values, k), 0
     samples = (job.plan.spp, job.plan.spp_grad or 1)
@@ -204,21 +205,21 @@ def _gradients(job: scene_job.SceneProblem, state: scene_job.FitState, k: int, s
     return scene_grad.gradients(live, state.values, job.views[k], job.losses[k], samples, seeds)
 
 
-def _add(total: dict, found: dict, state: scene_job.FitState, weight: float, sensor: int | None) -> None:
-    """Add gradients; texels with a number that is none are noted and held."""
-    for key, gradient in found.items():
-        wrong = ~np.isfinite(gradient)
-        if wrong.any():
-            where = np.argwhere(wrong & ~state.held[key])
+def _add_gradients(total: dict, gradients: dict, state: scene_job.FitState, weight: float, sensor: int | None) -> None:
+    """Add gradients; texels with non-finite gradients are recorded and frozen."""
+    for key, gradient in gradients.items():
+        invalid = ~np.isfinite(gradient)
+        if invalid.any():
+            where = np.argwhere(invalid & ~state.held[key])
             state.lost += len(where)
             room = max(MOST_BAD - len(state.bad), 0)
             state.bad += [Bad(key, tuple(int(n) for n in row), sensor, state.iteration) for row in where[:room]]
-            state.held[key] |= wrong.any(axis=-1, keepdims=True) if wrong.ndim == 3 else wrong
-            gradient = np.where(wrong, 0, gradient)
+            state.held[key] |= invalid.any(axis=-1, keepdims=True) if invalid.ndim == 3 else invalid
+            gradient = np.where(invalid, 0, gradient)
         total[key] += np.float32(weight) * gradient
 
 
 def _camera(job: scene_job.SceneProblem, step: int, slot: int) -> int:
-    """Which camera is next: every one once a round, each round in another order."""
+    """The next camera: each once per epoch, in an order that is shuffled anew."""
     place, views = step * job.plan.sensors_per_step + slot, len(job.views)
     return int(np.random.default_rng([job.plan.seed, place // views]).permutation(views)[place % views])

@@ -1,12 +1,12 @@
 """Gauss–Newton on the few numbers of a scene: literals and colours under a squared loss, from noisy renders.
 
-A round renders the picture's derivative J by every number (forward mode) at the values θ, then pictures I by other
-random numbers, and solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ W J. Φ is J without outliers: at the solution
-the expected I is R, so that any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds
-with the J of others, so it has no bias from J's noise.
+A round renders the picture's derivative J by every number (forward mode) at the values θ, then pictures I with other
+random numbers. It solves H Δ = -g with g = Φᵀ W (mean I - R) and H = Φᵀ W J. Φ is J without outliers. At the solution
+the expected I is R, so any Φ that does not depend on I gives a g without bias. H multiplies the Φ of some rounds with
+the J of others, so it has no bias from J's noise.
 
-The first rounds are short and walk to the neighbourhood of the solution. The rest share the remaining steps and do
-not replace one another: the result is the mean of their solutions, and their disagreement its standard error.
+The first rounds are short and approach the solution. The rest share the remaining steps and do not replace one another:
+the result is the mean of their solutions, and their disagreement its standard error.
 """
 
 import math
@@ -23,21 +23,21 @@ from mistyle.render.live.parameters import Parameter
 from mistyle.solver.scene import gradients as scene_grad
 
 MOST_NUMBERS = 32
-MOST_BYTES = 2.5e8  # of the derivatives that are kept, in checkpoints too
-SPP = (8, 64)  # fewest and most of the derivatives, unless given: as many as cost about what the pictures do
-OUTLIER, BESIDE = 8.0, 5  # a derivative counts at most so many times the mean size around it, in a square of pixels
-APPROACH = 0.6  # share of the steps at most that the short rounds take
-SHORT = 4  # steps of a short round, at least
-NEAR = 0.1  # relative change from which the long rounds begin
+MOST_BYTES = 2.5e8  # largest size of the stored derivatives, also in checkpoints
+SPP = (8, 64)  # range of the derivatives' default samples, which cost about as much as the pictures
+OUTLIER, BESIDE = 8.0, 5  # limit of a derivative relative to its local mean size, and the window's side in pixels
+APPROACH = 0.6  # largest share of the steps in short rounds
+SHORT = 4  # least steps of a short round
+NEAR = 0.1  # relative change below which the long rounds begin
 LONG = (4, 8)  # fewest and most long rounds
-LOST = 0.01  # share of a picture's values that are no numbers from which a round goes half the way back
-WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays as it is
+LOST = 0.01  # share of non-finite values above which a round returns half the way
+WEAK = 1e-3  # eigenvalues of the scaled H below which a direction stays unchanged
 DAMPING = 1e-3  # of the short rounds
 
 
 @dataclass(frozen=True)
 class Round:
-    """A long round: cameras, steps, where it stood, and g there."""
+    """A long round: cameras, steps, its values, and g at them."""
 
     views: tuple[int, ...]
     steps: int
@@ -47,7 +47,8 @@ class Round:
 
 @dataclass
 class Newton:
-    """What moves; `columns` are sums of derivatives by camera, of every other round, and `counts` their numbers."""
+    """The changing state; `columns` are sums of derivatives by camera, of alternating rounds, and `counts` their
+    numbers."""
 
     theta: Float[np.ndarray, " n"]
     round: int = 0
@@ -61,7 +62,7 @@ class Newton:
 
 
 @dataclass
-class _Seen:
+class _PictureSums:
     """Sums of I - R and of its square over one camera's pictures of a round, and the weights of the loss."""
 
     weights: Float[np.ndarray, "h w 3"]
@@ -81,7 +82,7 @@ class _Seen:
 
 
 def refusal(chosen: Sequence[Parameter], free: Mapping[str, np.ndarray], views: Sequence[Any], loss: Any) -> str:
-    """Why Gauss–Newton does not suit a fit; nothing where it does."""
+    """The reason why Gauss–Newton does not suit a fit; empty if it does."""
     count = sum(int(free[p.key].sum()) for p in chosen)
     if any(p.kind != "value" for p in chosen):
         return "textures and attributes have too many numbers"
@@ -94,12 +95,12 @@ def refusal(chosen: Sequence[Parameter], free: Mapping[str, np.ndarray], views: 
 
 
 def gathered(job: Any, values: Mapping[str, np.ndarray]) -> Float[np.ndarray, " n"]:
-    """The numbers that move, in one vector."""
+    """The free numbers as one vector."""
     return np.concatenate([values[p.key][job.free[p.key]] for p in job.chosen]).astype(np.float64)
 
 
 def spread(job: Any, theta: Float[np.ndarray, " n"], fill: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """The reverse of `gathered`; numbers that stand still come from `fill`."""
+    """The inverse of `gathered`; fixed numbers come from `fill`."""
     result, start = {}, 0
     for p in job.chosen:
         free = job.free[p.key]
@@ -110,34 +111,34 @@ def spread(job: Any, theta: Float[np.ndarray, " n"], fill: Mapping[str, np.ndarr
 
 
 def advance(job: Any, state: Any, camera: Callable[[int, int], int]) -> bool:
-    """One round; False, with nothing changed, where the run was asked to stop. `camera` of a step and a slot."""
+    """One round; False, without changes, on a request to stop. `camera` maps a step and a slot to a camera."""
     newton: Newton = state.newton
     size, long = _size(job, state)
     turns = [[camera(state.iteration + m, slot) for slot in range(job.plan.sensors_per_step)] for m in range(size)]
     views = tuple(sorted({k for turn in turns for k in turn}))
-    # A short round needs both halves where it stands: H then has no bias from J's noise there either.
+    # A short round needs both halves at its own values: H then has no bias from J's noise either.
     parts = [{k: _columns(job, state.values, newton, k, size, part) for k in views} for part in range(1 if long else 2)]
     scene_grad.put(job.table, job.chosen, state.values)
-    seen = {k: _Seen(_weights(job, k)) for k in views}
+    seen = {k: _PictureSums(_weights(job, k)) for k in views}
     losses, broken = [], dict.fromkeys(views, 0)
     for m, turn in enumerate(turns):
         if stopping.asked():
             return False
         numbers = [scene_grad.seeds(job.plan.seed, state.iteration + m, slot)[0] for slot in range(len(turn))]
-        found = [_look(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
-        losses.append(float(np.mean([value for value, _ in found])))
-        for k, (_, wrong) in zip(turn, found, strict=True):
-            broken[k] += wrong
-    _remember(newton, parts)
+        renders = [_render_view(job, k, number, seen[k]) for k, number in zip(turn, numbers, strict=True)]
+        losses.append(float(np.mean([value for value, _ in renders])))
+        for k, (_, invalid) in zip(turn, renders, strict=True):
+            broken[k] += invalid
+    _store_derivatives(newton, parts)
     old, gradient = newton.theta, _gradient(newton, seen)
     if long:
         newton.size = newton.size or size
         newton.rounds.append(Round(views, size, old, gradient))
         newton.noise = _reference_noise(newton, seen)
-        new = _bounded(job, old, *_system(job, newton, _used(newton)))
+        new = _bounded(job, old, *_system(job, newton, _averaged_rounds(newton)))
     else:
         lost = sum(broken.values()) / (size * job.plan.sensors_per_step * np.size(next(iter(seen.values())).weights))
-        new = _short(job, newton, gradient, seen, lost)
+        new = _short_step(job, newton, gradient, seen, lost)
         newton.near = newton.round >= 2 and bool((np.abs(new - old) < NEAR * (np.abs(new) + 0.02 * _scales(job))).all())
     newton.theta, newton.round = new, newton.round + 1
     state.values = spread(job, new, state.values)
@@ -167,7 +168,7 @@ def _size(job: Any, state: Any) -> tuple[int, bool]:
 
 
 def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) -> Float[np.ndarray, "n h w 3"]:
-    """The picture's derivatives of camera k where the round of `size` steps stands."""
+    """The derivatives of camera k's picture at the values of the round, which has `size` steps."""
     theta = newton.theta
     values, zero = spread(job, theta, fill), {p.key: np.zeros(p.shape, np.float32) for p in job.chosen}
     own = size * job.plan.spp * job.plan.sensors_per_step // (2 * len(theta) * len(job.views))
@@ -182,8 +183,8 @@ def _columns(job: Any, fill: Any, newton: Newton, k: int, size: int, part: int) 
     return np.stack(result)
 
 
-def _remember(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n h w 3"]]]) -> None:
-    """Add a long round's derivatives to one half; a short round's two take the place of all before: J was another."""
+def _store_derivatives(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n h w 3"]]]) -> None:
+    """Add a long round's derivatives to one half. A short round's two replace all earlier ones, since its J differs."""
     for part, columns in enumerate(parts):
         for k, new in columns.items():
             if k not in newton.columns:
@@ -196,14 +197,14 @@ def _remember(newton: Newton, parts: Sequence[Mapping[int, Float[np.ndarray, "n 
 
 
 def _halves(newton: Newton, k: int) -> tuple[np.ndarray, np.ndarray]:
-    """The mean derivatives (n, values) of either half of the rounds; twice the same where there is one half only."""
+    """The mean derivatives (n, values) of either half of the rounds; twice the same if only one half exists."""
     means = [s.reshape(len(s), -1) / max(c, 1) for s, c in zip(newton.columns[k], newton.counts[k], strict=True)]
     first, second = (means[h if newton.counts[k][h] else 1 - h].astype(np.float64) for h in (0, 1))
     return first, second
 
 
-def _tamed(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[np.ndarray, "n v"]:
-    """Derivatives without outliers: each at most OUTLIER times the mean size beside it, plus that of its picture."""
+def _without_outliers(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[np.ndarray, "n v"]:
+    """Derivatives without outliers: each is limited to OUTLIER times its local mean size, plus its picture's mean."""
     result = []
     for column in columns:
         size = np.abs(column.reshape(shape))
@@ -215,29 +216,29 @@ def _tamed(columns: Float[np.ndarray, "n v"], shape: tuple[int, ...]) -> Float[n
 
 
 def _weights(job: Any, k: int) -> Float[np.ndarray, "h w 3"]:
-    """Of the squared differences, so that their sum is the loss: 0 where nothing counts."""
+    """Weights of the squared differences whose sum is the loss; 0 at invalid values."""
     view = job.views[k]
     counts = np.array(view.counts).astype(np.float64)
     weights = counts * np.array(view.weights) if job.loss == "relative" else counts
     return weights / counts.sum()
 
 
-def _look(job: Any, k: int, seed: int, seen: _Seen) -> tuple[float, int]:
-    """Render camera k, add the picture; its loss with its noise, and how many values are no numbers."""
+def _render_view(job: Any, k: int, seed: int, seen: _PictureSums) -> tuple[float, int]:
+    """Render camera k and add the picture; returns its loss with noise and its number of non-finite values."""
     view = job.views[k]
     shown = np.array(scene_grad.picture(job.scene, job.engine, view.sensor, job.plan.spp, seed))[..., :3]
     finite = np.isfinite(shown)
-    wrong = np.where(finite, shown - np.array(view.reference), 0).astype(np.float64)
-    square = wrong**2
-    seen.count, seen.total, seen.square = seen.count + 1, seen.total + wrong, seen.square + square
+    residual = np.where(finite, shown - np.array(view.reference), 0).astype(np.float64)
+    square = residual**2
+    seen.count, seen.total, seen.square = seen.count + 1, seen.total + residual, seen.square + square
     return float((seen.weights * square).sum()), int((~finite).sum())
 
 
-def _gradient(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, " n"]:
-    """g of half the loss, mean over the cameras that were seen."""
+def _gradient(newton: Newton, seen: Mapping[int, _PictureSums]) -> Float[np.ndarray, " n"]:
+    """g of half the loss, mean over the rendered cameras."""
     total: Any = 0.0
     for k, sums in seen.items():
-        test = _tamed(np.mean(_halves(newton, k), axis=0), sums.weights.shape)
+        test = _without_outliers(np.mean(_halves(newton, k), axis=0), sums.weights.shape)
         total = total + test @ (sums.weights * sums.total / sums.count).ravel()
     return total / len(seen)
 
@@ -248,28 +249,29 @@ def _matrices(job: Any, newton: Newton, views: Sequence[int]) -> dict[int, Float
     for k in views:
         weights, shape = _weights(job, k).ravel(), _weights(job, k).shape
         first, second = _halves(newton, k)
-        product = (_tamed(first, shape) * weights) @ second.T + (_tamed(second, shape) * weights) @ first.T
+        robust = [_without_outliers(half, shape) * weights for half in (first, second)]
+        product = robust[0] @ second.T + robust[1] @ first.T
         result[k] = (product + product.T) / 4
     return result
 
 
-def _reference_noise(newton: Newton, seen: Mapping[int, _Seen]) -> Float[np.ndarray, "n n"]:
-    """Covariance of g by what is left of I - R without render noise: Σ Φ W² r² Φᵀ."""
+def _reference_noise(newton: Newton, seen: Mapping[int, _PictureSums]) -> Float[np.ndarray, "n n"]:
+    """Covariance of g by the residuals I - R without render noise: Σ Φ W² r² Φᵀ."""
     total: Any = 0.0
     for k, sums in seen.items():
-        first, second = (_tamed(half, sums.weights.shape) for half in _halves(newton, k))
+        first, second = (_without_outliers(half, sums.weights.shape) for half in _halves(newton, k))
         product = (first * (sums.weights**2 * sums.products()).ravel()) @ second.T
         total = total + (product + product.T) / 2
     return total / len(seen) ** 2
 
 
-def _short(
-    job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _Seen], lost: float
+def _short_step(
+    job: Any, newton: Newton, gradient: np.ndarray, seen: Mapping[int, _PictureSums], lost: float
 ) -> Float[np.ndarray, " n"]:
-    """Where a short round goes: a damped step, or half the way back to the best place so far.
+    """The values after a short round: a damped step, or half the way back to the best values so far.
 
-    It goes back where the pictures have become worse, or where `lost`, the share of their values that are no numbers,
-    says that the last step left the plugins' domain.
+    It returns if the loss has increased, or if `lost`, the share of non-finite values, shows that the last step left
+    the plugins' domain.
     """
     loss = float(np.mean([(s.weights * s.products()).sum() for s in seen.values()]))
     noise = float(np.mean([s.noise() for s in seen.values()]))
@@ -282,13 +284,13 @@ def _short(
     return _bounded(job, newton.theta, matrix, matrix @ newton.theta - gradient)
 
 
-def _used(newton: Newton) -> list[Round]:
-    """The long rounds that count: all but the first, which began furthest away."""
+def _averaged_rounds(newton: Newton) -> list[Round]:
+    """The long rounds that are averaged: all but the first, which began furthest away."""
     return newton.rounds[int(len(newton.rounds) >= LONG[0]) :]
 
 
 def _system(job: Any, newton: Newton, rounds: Sequence[Round]) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix and right side whose solution is the rounds' mean, each weighted by its steps."""
+    """Matrix and right-hand side whose solution is the rounds' mean, each weighted by its steps."""
     each = _matrices(job, newton, sorted({k for r in rounds for k in r.views}))
     matrix: Any = 0.0
     right: Any = 0.0
@@ -300,7 +302,7 @@ def _system(job: Any, newton: Newton, rounds: Sequence[Round]) -> tuple[np.ndarr
 
 
 def _inverse(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """Pseudo-inverse of the scaled matrix: directions of which the pictures say next to nothing stay."""
+    """Pseudo-inverse of the scaled matrix: directions that the pictures hardly constrain stay unchanged."""
     size = np.sqrt(np.maximum(np.diag(matrix), 0))
     scale = np.where(size > 0, 1 / np.where(size > 0, size, 1), 0)
     values, vectors = np.linalg.eigh(matrix * np.outer(scale, scale))
@@ -317,9 +319,9 @@ def _bounded(job: Any, theta: np.ndarray, matrix: np.ndarray, right: np.ndarray)
     high = np.minimum(high, theta + reach)
     held = np.zeros(len(theta), bool)
     step = np.zeros(len(theta))
-    wanted = right - matrix @ theta
+    residual = right - matrix @ theta
     for _ in range(len(theta)):
-        step[~held] = _inverse(matrix[np.ix_(~held, ~held)]) @ (wanted - matrix[:, held] @ step[held])[~held]
+        step[~held] = _inverse(matrix[np.ix_(~held, ~held)]) @ (residual - matrix[:, held] @ step[held])[~held]
         new = theta + step
         outside = ~held & ((new < low) | (new > high))
         if not outside.any():
@@ -342,11 +344,11 @@ def _bounds(job: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
-    """Standard error of every number (NaN where nothing tells), and whether its rounds still drift.
+    """Standard error of every number (NaN if unconstrained), and whether its rounds still drift.
 
-    Render noise comes from the long rounds' disagreement, the references' noise from what is left of the residuals.
+    Render noise is estimated from the long rounds' disagreement, the references' noise from the residuals.
     """
-    count, used = len(newton.theta), _used(newton)
+    count, used = len(newton.theta), _averaged_rounds(newton)
     if len(used) < 2 or newton.noise is None:
         return np.full(count, np.nan), np.zeros(count, bool)
     inverse = _inverse(_system(job, newton, used)[0])
@@ -364,7 +366,7 @@ def errors(job: Any, newton: Newton) -> tuple[np.ndarray, np.ndarray]:
 
 
 def saved(newton: Newton) -> dict[str, np.ndarray]:
-    """Everything, as arrays."""
+    """The whole state as arrays."""
     count = len(newton.theta)
     best = (np.nan, np.full(count, np.nan)) if newton.best is None else newton.best
     result = {
@@ -382,7 +384,7 @@ def saved(newton: Newton) -> dict[str, np.ndarray]:
 
 
 def brought_back(arrays: Mapping[str, np.ndarray]) -> Newton:
-    """The reverse of `saved`."""
+    """The inverse of `saved`."""
     held = {name: np.array(value) for name, value in arrays.items()}
     number, near, size, rounds = (int(n) for n in held["numbers"])
     count = len(held["theta"])

@@ -1,10 +1,11 @@
-"""One camera's loss and its derivatives for the parameters of a live Mitsuba scene.
+"""One camera's loss and its derivatives by the parameters of a live Mitsuba scene.
 
-The picture I is rendered with many samples and no gradient, the loss is differentiated for the pixels, and that goes
-back through the scene with few samples (`render_backward`). The two take independent random numbers: E[dL/dI · dI'] =
-dL/df · df for the expected picture f wherever dL/dI is linear in I. So the squared losses have no bias from render
-noise at any number of samples, and the logarithmic one has. The relative loss divides by the reference around a pixel,
-without the pixel itself: a weight that knew the reference's own noise there would prefer darker pictures.
+The picture I is rendered with many samples and no gradient. The derivative of the loss by the pixels is backpropagated
+through the scene with few samples (`render_backward`). The two renders use independent random numbers, so
+E[dL/dI · dI'] = dL/df · df for the expected picture f wherever dL/dI is linear in I. The gradients of squared losses
+therefore have no bias from render noise at any number of samples; that of the logarithmic loss has. The relative loss
+divides by the reference around a pixel, without the pixel itself: a weight that depended on the reference's own noise
+would prefer darker pictures.
 """
 
 import re
@@ -26,27 +27,27 @@ from mistyle.render.mitsuba import scene as scenery
 Loss = Callable[[Any, Any], Any]
 
 
-# Of the relative loss: the square around a pixel and the hole in it (a film's filter mixes neighbours), in pixels, and
-# the share of the median radiance below which differences count as absolute.
+# Relative loss: sides of the window around a pixel and of the hole in it (a film's filter mixes neighbours), in pixels,
+# and the share of the median radiance below which differences count as absolute.
 AROUND, HOLE, DARK = 7, 3, 0.1
 
 
 @dataclass(frozen=True)
 class ReferenceView:
-    """A camera and what it should see: tensors (h, w, 3) of the reference, of the values that count, and of the
-    relative loss's weights."""
+    """A camera and its reference: tensors (h, w, 3) of the reference, of valid values, and of the relative loss's
+    weights."""
 
     sensor: Any
     reference: Any
     counts: Any
     weights: Any
-    share: float  # of the pixels that count
+    share: float  # of valid pixels
 
 
 def log_srgb_l1(picture: Any, reference: Any) -> Any:
     """Mean |s(picture) - s(reference)| with s(x) = sRGB(log(x + 1)) (Munkberg et al. 2022, equation 7).
 
-    Highlights weigh no more than what lies beside them.
+    Highlights weigh as much as their surroundings.
     """
     import drjit as dr
 
@@ -70,10 +71,10 @@ def relative(weights: Any) -> Loss:
 def relative_weights(
     reference: Float[np.ndarray, "h w 3"], used: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """1 / (m + ε): m the mean square of the reference's used values around a pixel, without its own and its
-    neighbours' (AROUND, HOLE); ε the square of DARK times the median of its positive values.
+    """1 / (m + ε): m is the mean square of the reference's valid values around a pixel, without its own and its
+    neighbours' (AROUND, HOLE); ε is the square of DARK times the median of its positive values.
 
-    Renders have noise in proportion to their radiance, so every pixel counts about as much as it is known.
+    The noise of renders is proportional to radiance, so every pixel's weight follows its precision.
     """
     square = np.where(used[..., None], np.square(reference, dtype=np.float64), 0)
     count = used[..., None].astype(np.float64)
@@ -84,7 +85,7 @@ def relative_weights(
 
 
 def sums_around(values: Float[np.ndarray, "h w c"], side: int) -> Float[np.ndarray, "h w c"]:
-    """Sums over squares around every pixel; nothing lies outside."""
+    """Sums over a square window around every pixel; zero outside."""
     for axis in (0, 1):
         edge = [(0, 0)] * 3
         edge[axis] = (side // 2 + 1, side // 2)
@@ -96,7 +97,7 @@ def sums_around(values: Float[np.ndarray, "h w c"], side: int) -> Float[np.ndarr
 
 LOSSES: dict[str, Loss] = {"log_srgb_l1": log_srgb_l1, "l2": l2}
 NAMES = ("relative", *LOSSES)
-# Their gradients are linear in the picture, which makes them free of bias under render noise.
+# Their gradients are linear in the picture, so render noise causes no bias.
 SQUARED = ("relative", "l2")
 
 
@@ -132,28 +133,28 @@ def total_variation(weight: float, keys: Sequence[str] | None = None) -> Callabl
     return penalty
 
 
-def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]:
-    """An integrator with gradients, and notes: `wanted` (a plugin's name, a dictionary or an integrator), the scene's
-    own where it has them, else `prb` (`prbvolpath` in a scene with media) with the depth of the scene's own.
+def ad_integrator(scene: Any, requested: Any = None) -> tuple[Any, tuple[str, ...]]:
+    """An integrator with gradients, and notes: `requested` (a plugin's name, a dictionary or an integrator), else the
+    scene's own if it has gradients, else `prb` (`prbvolpath` in a scene with media) with the depth of the scene's own.
     """
     import mitsuba as mi
 
-    if isinstance(wanted, mi.Integrator):
-        return wanted, ()
-    if wanted is not None:
+    if isinstance(requested, mi.Integrator):
+        return requested, ()
+    if requested is not None:
         try:
-            made: Any = mi.load_dict({"type": wanted} if isinstance(wanted, str) else dict(wanted))
+            integrator: Any = mi.load_dict({"type": requested} if isinstance(requested, str) else dict(requested))
         except RuntimeError as error:
             raise UsageError(
-                f"the integrator '{wanted}' cannot be made; expected for example 'prb'. {error}"
+                f"the integrator '{requested}' cannot be made; expected for example 'prb'. {error}"
             ) from error
-        if not isinstance(made, mi.Integrator):
-            raise UsageError(f"'{wanted}' is not an integrator; expected for example 'prb'.")
-        return made, ()
+        if not isinstance(integrator, mi.Integrator):
+            raise UsageError(f"'{requested}' is not an integrator; expected for example 'prb'.")
+        return integrator, ()
     own = scene.integrator()
     if own is None:
-        return mi.load_dict({"type": "prb"}), ("The scene has no integrator; prb takes its place.",)
-    # `aov` and `moment` hold the integrators whose pictures they are about; the first one's comes first.
+        return mi.load_dict({"type": "prb"}), ("The scene has no integrator; prb replaces it.",)
+    # `aov` and `moment` wrap other integrators; the first one's picture comes first.
     inner = own
     while held := [x for _, x in scene_walk.children(inner)[inner] if isinstance(x, mi.Integrator)]:
         inner = held[0]
@@ -165,7 +166,7 @@ def ad_integrator(scene: Any, wanted: Any = None) -> tuple[Any, tuple[str, ...]]
     if depth:
         # Unlimited depth is stored as 2^32 - 1.
         replacement["max_depth"] = int(depth[1]) if int(depth[1]) < 2**31 else -1
-    note = f"{own.class_name()} has no gradients; {plugin} takes its place"
+    note = f"{own.class_name()} has no gradients; {plugin} replaces it"
     return mi.load_dict(replacement), (f"{note} with max_depth {replacement.get('max_depth', 6)}.",)
 
 
@@ -210,13 +211,13 @@ def sight(sensor: Any, reference: np.ndarray, mask: np.ndarray | None, name: str
 
 
 def seeds(*numbers: int) -> tuple[int, int]:
-    """Seeds of a picture and of its gradient, never the same; they follow from the numbers."""
+    """Seeds of a picture and of its gradient, always different and determined by the numbers."""
     first, second = (int(n) for n in np.random.SeedSequence(numbers).generate_state(2))
     return first, second if second != first else first ^ 1
 
 
 def picture(scene: Any, integrator: Any, sensor: Any, spp: int, seed: int) -> Any:
-    """The linear picture, a tensor without gradient; memory is that of at most 64 samples a pixel."""
+    """The linear picture, a tensor without gradient; memory is bounded by 64 samples a pixel."""
     import drjit as dr
     import mitsuba as mi
 
@@ -232,9 +233,9 @@ def picture(scene: Any, integrator: Any, sensor: Any, spp: int, seed: int) -> An
 
 
 def compare(shown: Any, view: ReferenceView, loss: Loss) -> tuple[float, Any, int]:
-    """The loss over the pixels that count, its gradient for the picture, and how many values of it are no numbers.
+    """The loss over the valid pixels, its gradient by the picture, and the number of non-finite values.
 
-    Pixels that do not count, or are NaN or infinite, are set to the reference's: they have no gradient.
+    Pixels that are masked, NaN or infinite are set to the reference's, so they have no gradient.
     """
     import drjit as dr
     import mitsuba as mi
@@ -253,7 +254,7 @@ def compare(shown: Any, view: ReferenceView, loss: Loss) -> tuple[float, Any, in
 
 @dataclass(frozen=True)
 class LiveScene:
-    """A scene whose chosen parameters change, what `mi.traverse` gave of it, and the integrator that draws it."""
+    """A scene with chosen parameters, its `mi.traverse` result, and the integrator that renders it."""
 
     scene: Any
     table: Any
@@ -269,19 +270,20 @@ def gradients(
     spp: tuple[int, int],
     seeds: tuple[int, int],
 ) -> tuple[float, dict[str, np.ndarray], int]:
-    """Loss of one camera, dL/dvalue of every chosen parameter by key, and the picture's values that are no numbers.
+    """Loss of one camera, dL/dvalue of every chosen parameter by key, and the number of non-finite values in the
+    picture.
 
-    The values are put into the scene first. `spp` and `seeds`: of the picture, of the gradient.
+    The values are written into the scene first. `spp` and `seeds`: of the picture, then of the gradient.
     """
     import drjit as dr
     import mitsuba as mi
 
     scene, table, chosen, integrator = live.scene, live.table, live.chosen, live.integrator
-    # Fresh variables each time: a backward pass takes the graph of the one before with it.
+    # New variables each time: a backward pass frees the graph of the previous one.
     moving = put(table, chosen, values, grad=True)
     shown = picture(scene, integrator, view.sensor, spp[0], seeds[0])
     value, pixels, broken = compare(shown, view, loss)
-    # The gradient of a mean is tiny, too small for textures of 16 bits; it is scaled here and back below.
+    # The gradient of a mean underflows in 16-bit textures; it is scaled here and back below.
     scale = float(np.prod(pixels.shape[:2]))
     integrator.render_backward(
         scene, table, pixels * scale, view.sensor, seed=dr.opaque(mi.UInt32, seeds[1]), spp=spp[1]
@@ -300,7 +302,7 @@ def derivative(
 ) -> Float[np.ndarray, "h w 3"]:
     """The picture's derivative along one direction of the parameters, an unbiased estimate in forward mode.
 
-    Numbers that are none are zero.
+    Non-finite values are zero.
     """
     import drjit as dr
     import mitsuba as mi
@@ -334,7 +336,7 @@ def regularized(
 
 
 def psnr(shown: Any, view: ReferenceView) -> float:
-    """PSNR in dB of clipped sRGB over the pixels that count; infinite for equal pictures."""
+    """PSNR in dB of clipped sRGB over the valid pixels; infinite for equal pictures."""
     counts = np.array(view.counts)
     images = [srgb_from_linear(np.clip(np.nan_to_num(np.array(x)[..., :3]), 0, 1)) for x in (shown, view.reference)]
     error = float(np.square(images[0] - images[1], dtype=np.float64)[counts].mean())
@@ -344,7 +346,7 @@ def psnr(shown: Any, view: ReferenceView) -> float:
 def put(
     table: Any, chosen: Sequence[Parameter], values: Mapping[str, np.ndarray], grad: bool = False
 ) -> dict[str, Any]:
-    """Set parameters of the scene; with `grad` they ask for gradients. Returns what was set."""
+    """Set parameters of the scene, with gradients enabled by `grad`. Returns the values as set."""
     import drjit as dr
 
     result = {}
@@ -363,7 +365,7 @@ def array(value: Any, parameter: Parameter) -> np.ndarray:
 
 
 def typed(kind: Any, values: np.ndarray) -> Any:
-    """The reverse of `array`; never a literal, which would compile a kernel for each value."""
+    """The inverse of `array`; never a literal, which would compile a kernel for each value."""
     import drjit as dr
     import mitsuba as mi
 

@@ -1,4 +1,4 @@
-"""A fit of a scene before it begins and when it is interrupted: what stands still, what moves, what is refused."""
+"""State of a scene fit: constants, changing values, checkpoints, and validation of its inputs."""
 
 import json
 from collections.abc import Callable, Mapping, Sequence
@@ -23,8 +23,8 @@ Regularizer = Callable[[Mapping[str, Any]], Any]
 
 @dataclass(frozen=True)
 class Bad:
-    """A number of a gradient that was NaN or infinite: `texel` is its index in the value of `key` (row, column, …).
-    `sensor` is None where a regularizer made it."""
+    """A NaN or infinite number of a gradient: `texel` is its index in the value of `key` (row, column, …). `sensor` is
+    None if a regularizer caused it."""
 
     key: str
     texel: tuple[int, ...]
@@ -34,7 +34,7 @@ class Bad:
 
 @dataclass(frozen=True)
 class FitPlan:
-    """The settings that decide the result; `spp_grad` None leaves it to the solver."""
+    """The settings that determine the result; with `spp_grad` None the solver chooses."""
 
     iterations: int
     spp: int
@@ -48,7 +48,7 @@ class FitPlan:
 
 @dataclass(frozen=True)
 class SceneProblem:
-    """What stands still during the fit."""
+    """Constants of the fit."""
 
     scene: Any
     table: Any
@@ -61,18 +61,18 @@ class SceneProblem:
     free: dict[str, np.ndarray]
     scales: dict[str, float]
     plan: FitPlan
-    fast: Any = None  # scene_fast.DeferredRenderer, where its pictures are the scene's
+    fast: Any = None  # deferred.DeferredRenderer, if it matches the scene
     newton: bool = False  # Gauss–Newton instead of Adam
 
 
 @dataclass
 class FitState:
-    """What moves, and in `held` which numbers do so no more; all but `bad`, `lost`, `broken` goes into a checkpoint.
+    """The changing values, and in `held` the frozen numbers. A checkpoint stores all but `bad`, `lost`, `broken`.
 
     start   the values before the first step
     tail    sums of the values over the last steps (Adam on noisy gradients: their mean is the result)
-    course  means of every parameter (`scene_result.brief`) after each of the last steps
-    paces   mean changes in the same steps (`scene_result.pace`)
+    course  means of every parameter (`result.brief`) after each of the last steps
+    paces   mean changes in the same steps (`result.pace`)
     """
 
     iteration: int
@@ -92,7 +92,7 @@ class FitState:
 
 @dataclass(frozen=True)
 class Unknowns:
-    """The parameters to fit, by name, and masks of the numbers that may change (`only`, by name)."""
+    """The parameters to fit, by name, and masks of their free numbers (`only`, by name)."""
 
     keys: str | Sequence[str]
     only: Mapping[str, np.ndarray] | None = None
@@ -100,7 +100,7 @@ class Unknowns:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The pictures to fit to, with their sensors and masks; None: the scene's sensors, every pixel."""
+    """The reference pictures with their sensors and masks; None: the scene's sensors, every pixel."""
 
     references: Any
     sensors: Any = None
@@ -109,7 +109,7 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Objective:
-    """The loss (None: chosen by the way of drawing) and the regularizers that are added to it."""
+    """The loss (None: depends on the renderer) and the added regularizers."""
 
     loss: str | scene_grad.Loss | None = None
     regularizers: Sequence[Regularizer] = ()
@@ -124,7 +124,7 @@ def prepare(
     integrator: Any = None,
     fast: bool = True,
 ) -> tuple[SceneProblem, list[str]]:
-    """Check everything and put it together; returns the problem and notes."""
+    """Validate the inputs and assemble the problem; returns it with notes."""
     import mitsuba as mi
 
     keys, loss, regularizers = unknowns.keys, objective.loss, objective.regularizers
@@ -141,12 +141,12 @@ def prepare(
     notes = [*notes, *(f"{p.name}: {note}" for p in chosen for note in p.notes)]
     if len(views) < FEWEST_VIEWS:
         notes.append(
-            f"{len(views)} view{'s' * (len(views) > 1)} came: with fewer than {FEWEST_VIEWS} the fit is singular, "
-            "materials that differ look the same."
+            f"{len(views)} view{'s' * (len(views) > 1)} given: with fewer than {FEWEST_VIEWS} the fit is singular, "
+            "since different materials look alike."
         )
     table = mi.traverse(scene)
     table.properties = {p.key: table.properties[p.key] for p in chosen}
-    free = _free(chosen, unknowns.only or {})
+    free = _free_masks(chosen, unknowns.only or {})
     scales = {p.key: _scale(p, scene_grad.array(table[p.key], p)) for p in chosen}
     quick, why = _fast(scene, chosen, views, loss or "log_srgb_l1", engine) if fast else (None, "it was not requested.")
     if loss is None:
@@ -161,24 +161,22 @@ def prepare(
     notes.append(_way(quick, engine, why))
     if quick is None and loss == "log_srgb_l1":
         notes.append(
-            "The loss log_srgb_l1 is not linear in the picture: render noise shifts its minimum, by several percent at "
+            "The loss log_srgb_l1 is not linear in the picture: render noise shifts its minimum by several percent at "
             "16 samples a pixel. The loss 'relative' has no such bias."
         )
     losses = tuple(scene_grad.loss_of(loss, view) for view in views)
-    given = (scene, table, chosen, views, engine, loss, losses, tuple(regularizers), free, scales, plan)
-    return SceneProblem(*given, fast=quick, newton=newton), notes
+    constants = (scene, table, chosen, views, engine, loss, losses, tuple(regularizers), free, scales, plan)
+    return SceneProblem(*constants, fast=quick, newton=newton), notes
 
 
 def _way(quick: Any, engine: Any, why: str) -> str:
     if quick is not None:
-        return (
-            "Gradients came without Monte Carlo: direct light of points and directions on plain `principled` materials."
-        )
-    return f"Gradients came through {str(engine).partition('[')[0]}, not through the fast path: {why}"
+        return "Gradients were noise-free: direct light of points and directions on plain `principled` materials."
+    return f"Gradients came from {str(engine).partition('[')[0]}, not from the fast path: {why}"
 
 
-def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Which numbers may change."""
+def _free_masks(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Masks of the free numbers."""
     free = {p.key: np.ones(p.shape, bool) for p in chosen}
     for name, mask in only.items():
         for p in scene_keys.choose(chosen, [name]):
@@ -192,7 +190,7 @@ def _free(chosen: Sequence[Parameter], only: Mapping[str, np.ndarray]) -> dict[s
 
 
 def _fast(scene, chosen, views, loss, engine) -> tuple[Any, str]:
-    """The fast path, or why there is none."""
+    """The fast path, or the reason why it does not apply."""
     from mistyle.solver.scene.deferred import DeferredRenderer, Unsupported
 
     try:
@@ -211,10 +209,10 @@ def _views(scene: Any, sensors: Sequence[Any] | None, references: Sequence[np.nd
             chosen = own[chosen]
         cameras.append(chosen)
     if not cameras:
-        raise UsageError("the scene has no sensor; give one as `sensors`, or put it into the scene file.")
+        raise UsageError("the scene has no sensor; pass one as `sensors`, or add it to the scene file.")
     if len(references) != len(cameras) or (masks is not None and len(masks) != len(cameras)):
         counted = f"{len(references)} references" + (f" and {len(masks)} masks" if masks is not None else "")
-        raise UsageError(f"{counted} came for {len(cameras)} sensors; one of each is expected for every sensor.")
+        raise UsageError(f"found {counted} for {len(cameras)} sensors; expected one of each for every sensor.")
     return tuple(
         scene_grad.sight(camera, np.asarray(references[k]), masks[k] if masks is not None else None, _called(camera, k))
         for k, camera in enumerate(cameras)
@@ -227,7 +225,7 @@ def _called(camera: Any, k: int) -> str:
 
 
 def _scale(parameter: Parameter, values: np.ndarray) -> float:
-    """The rate's unit: 1 for what is limited to 0..1, else the size of the numbers."""
+    """The rate's unit: 1 for values limited to 0..1, else the magnitude of the numbers."""
     bounds = scene_keys.limits(parameter)
     if parameter.owner == "NormalMap" or (bounds is not None and np.isfinite(bounds[1])):
         return 1.0
@@ -250,7 +248,7 @@ def begun(job: SceneProblem) -> FitState:
 
 
 def _fingerprint(job: SceneProblem) -> str:
-    """What must be the same for a checkpoint to fit."""
+    """The identity of a fit that a checkpoint must match."""
     loss = job.loss if isinstance(job.loss, str) else getattr(job.loss, "__name__", type(job.loss).__name__)
     films = [list(view.reference.shape) for view in job.views]
     return json.dumps([[(p.name, p.shape) for p in job.chosen], films, loss, len(job.regularizers), asdict(job.plan)])
@@ -278,8 +276,8 @@ def checkpoint(state: FitState, job: SceneProblem) -> dict[str, np.ndarray]:
 def restored(saved: Mapping[str, np.ndarray], job: SceneProblem) -> FitState:
     if "job" not in saved or str(saved["job"]) != _fingerprint(job):
         raise UsageError(
-            "the checkpoint belongs to another fit: its keys, cameras or settings differ. Start without it, or give "
-            "the settings it was made with."
+            "the checkpoint belongs to another fit: its keys, cameras or settings differ. Start without it, or use "
+            "the settings of its fit."
         )
     moments = {}
     for p in job.chosen:

@@ -1,12 +1,12 @@
-"""The arrow-shaped normal equations of one texel per lane: seven unknowns, of which the albedo is eliminated.
+"""Arrow-shaped normal equations of one texel per lane: seven unknowns, of which the albedo is eliminated.
 
-Unknowns are (albedo r, g, b, tilt x, tilt y, roughness, metallic); an observation's channels share the last four, and
+Unknowns are (albedo r, g, b, tilt x, tilt y, roughness, metallic). An observation's channels share the last four, and
 each depends on its own albedo alone. Everything is unrolled over Dr.Jit arrays, in single precision.
 """
 
 from typing import Any, NamedTuple
 
-# Pivots below this share of the diagonal have no digits left in single precision.
+# Pivots below this share of the diagonal have no significant digits in single precision.
 DIGITS = 1e-6
 
 
@@ -61,7 +61,7 @@ def _reduced(sums: Sums, inverse: list, prior: list, grow: Any) -> list:
 
 
 def spread_of(sums: Sums, prior: list) -> tuple[list, list]:
-    """Square roots of the inverse's diagonal, and the normal matrix's own diagonal."""
+    """Square roots of the inverse's diagonal, and the diagonal of the normal matrix."""
     import drjit as dr
 
     inverse = [1 / dr.maximum(h + p, 1e-12) for h, p in zip(sums.aa, prior[:3], strict=True)]
@@ -76,13 +76,13 @@ def spread_of(sums: Sums, prior: list) -> tuple[list, list]:
                 variance = variance + inverse[c] ** 2 * sums.aq[4 * c + q] * sums.aq[4 * c + p] * columns[q][p]
         spread.append(dr.sqrt(dr.maximum(variance, 0)))
     spread += [dr.sqrt(dr.maximum(columns[q][q], 0)) for q in range(4)]
-    # What is left open can never be more than the prior leaves open; rounding knows no such thing.
+    # The posterior variance cannot exceed the prior's; rounding may violate that.
     spread = [dr.minimum(s, dr.rsqrt(dr.maximum(p, 1e-12))) for s, p in zip(spread, prior, strict=True)]
     return spread, [*sums.aa, *(sums.qq[triangle(q, q)] for q in range(4))]
 
 
 def _least(sums: Sums, prior: list) -> list:
-    """What the pivots cannot be below: in single precision the Schur complement has no digits left there."""
+    """Lower bound of the pivots: below it the Schur complement has no significant digits in single precision."""
     import drjit as dr
 
     return [dr.maximum(DIGITS * sums.qq[triangle(q, q)], dr.maximum(prior[3 + q], 1e-10)) for q in range(4)]

@@ -1,4 +1,4 @@
-"""What pixel centres see and which lights reach it: how a texel learns in which pictures it appears, and how lit."""
+"""G-buffers of pictures: visible surface points and the lights that reach them."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ class GBuffer:
 
 
 def trace_gbuffer(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> GBuffer:
-    """One exact ray through every pixel centre, and from where it ends one shadow ray to every delta light.
+    """One exact ray through every pixel centre, and one shadow ray from its hit to every delta light.
 
     Lights are Directional or Point; their frame "camera" is that of `camera`. Shadow rays start where Mitsuba's do.
     """
@@ -68,7 +68,7 @@ def trace_gbuffer(traced: Tracer, camera: Camera, lights: Sequence[Light]) -> GB
 
 
 def rig(cameras: Sequence[Camera], lights: Sequence[Lights]) -> Rig:
-    """The solver's record of pictures and their lights; soft ones, where there are any, in SKY_CELLS cells."""
+    """The solver's rig of pictures and their lights; soft lights are binned into SKY_CELLS cells."""
     vector, near, irradiance, width2 = [], [], [], []
     first, cells, known = [0], [], {}
     for camera, own in zip(cameras, lights, strict=True):
@@ -114,8 +114,8 @@ def open_sky(
     normal: Float[np.ndarray, "n 3"],
     directions: Float[np.ndarray, "k 3"] | None = None,
 ) -> UInt32[np.ndarray, "n w"]:
-    """Which of some directions, by default the SKY_CELLS even ones, nothing of the mesh hides from points just above
-    the surface: bit k % 32 of word k // 32."""
+    """Visibility of directions (default: the SKY_CELLS cells) from points just above the surface, as packed bits: bit
+    k % 32 of word k // 32."""
     import drjit as dr
     import mitsuba
 
@@ -134,7 +134,7 @@ def open_sky(
 def reaches(
     traced: Tracer, position: Float[np.ndarray, "n 3"], normal: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "3"]
 ) -> Bool[np.ndarray, " n"]:
-    """Whether straight lines from points just above the surface to the world point `target` meet no face."""
+    """Whether segments from points just above the surface to the world point `target` meet no face."""
     import drjit as dr
     import mitsuba
 

@@ -1,21 +1,21 @@
-"""Material of every texel by itself, by a batched Levenberg–Marquardt solver: texels are the lanes.
+"""Per-texel materials by a batched Levenberg–Marquardt solver: texels are the lanes.
 
-Where geometry, cameras and lights are known and light arrives from deltas, a texel's own observations determine its own
-unknowns x = (albedo r, g, b, tilt x, tilt y, roughness, metallic), and no picture has to be rendered. Soft light is
-taken for as many directional lights as the sky has cells, each of which widens the lobe by its own width. With the
-reflectance albedo · linear + constant of `render/deferred/bsdf.py` and irradiance E the model of an observation is, per
-channel c, with q = (tilt, roughness, metallic),
+With known geometry, cameras and delta lights, a texel's own observations determine its own unknowns
+x = (albedo r, g, b, tilt x, tilt y, roughness, metallic). No picture has to be rendered. Soft light is approximated by
+one directional light per cell of the sky; each cell widens the lobe by its own width. The reflectance is
+albedo · linear + constant of `render/deferred/bsdf.py`. With irradiance E and q = (tilt, roughness, metallic), the
+model of an observation is, per channel c,
 
     f_c(x) = sum over its lights of E_c (albedo_c linear(q) + constant(q))
 
 and the solver minimises  sum_c,k rho(w_k (f_ck - y_ck)) + sum_j prior_j (x_j - mean_j)²  with Huber's rho. The albedo
-enters linearly and its channels do not meet, so the normal matrix is an arrow: the albedo is eliminated by its Schur
-complement, and what remains is a 4 x 4 system, solved by Cholesky in each lane.
+enters linearly and its channels are independent, so the normal matrix is an arrow: the Schur complement eliminates the
+albedo, and Cholesky solves the remaining 4 x 4 system in each lane.
 
-All iterations are one kernel, a symbolic loop in a symbolic loop: it walks over a lane's observations, accumulates the
-normal matrix at the values to be tried, accepts or rejects them, and proposes the next. Lanes are sorted by their
-number of observations, and observation k of neighbouring lanes lies in neighbouring memory. Sums run within a lane in
-a fixed order, so the result has the same bytes in every run at any number of threads.
+All iterations are one kernel with nested symbolic loops. It loops over a lane's observations, accumulates the normal
+matrix at the trial values, accepts or rejects them, and proposes the next. Lanes are sorted by their number of
+observations, and observation k of neighbouring lanes lies in neighbouring memory. Sums run within a lane in a fixed
+order, so the bytes are equal in every run at any number of threads.
 """
 
 from collections.abc import Callable
@@ -33,11 +33,11 @@ from mistyle.solver.texels.response import derivatives, differences, terms
 __all__ = ["UNKNOWNS", "Observations", "Options", "Points", "Problem", "Rig", "Solution"]
 
 LANES = 1 << 16
-LIGHTER, HEAVIER = 0.25, 5.0  # factors of the damping after a step that helped, and after one that did not
+LIGHTER, HEAVIER = 0.25, 5.0  # factors of the damping after an accepted and after a rejected step
 
 
 class Problem:
-    """Observations on the device, ready to be solved again and again with other targets, priors and starts."""
+    """Observations on the device, for repeated solves with other targets, priors and starts."""
 
     def __init__(self, points: Points, rig: Rig, observations: Observations, options: Options) -> None:
         device.use()
@@ -64,7 +64,7 @@ class Problem:
             self.chunks.append(_chunk(points, observations, texel, count[texel]))
 
     def retarget(self, rgb: Float[np.ndarray, "o 3"]) -> None:
-        """Replace what was observed; rows in the order of the Observations."""
+        """Replace the observed radiance; rows in the order of the Observations."""
         for chunk in self.chunks:
             chunk["rgb"] = _columns(rgb[chunk["rows"]])
 
@@ -143,7 +143,7 @@ class Problem:
         free = 7 if self.options.metallic else 6
 
         def body(k, *state):
-            tried, kept, sums, best, damping = state[:7], state[7:14], unflat(state[14:47]), state[47], state[48]
+            tried, accepted, sums, best, damping = state[:7], state[7:14], unflat(state[14:47]), state[47], state[48]
             new = self._accumulate(chunk, list(tried))
             total = new.cost
             for v, m, p in zip(tried, mean, prior, strict=True):
@@ -151,22 +151,22 @@ class Problem:
             better = total < best
             damping = dr.clip(damping * dr.select(better, LIGHTER, HEAVIER), 1e-7, 1e6)
             best = dr.select(better, total, best)
-            kept = [dr.select(better, a, b) for a, b in zip(tried, kept, strict=True)]
+            accepted = [dr.select(better, a, b) for a, b in zip(tried, accepted, strict=True)]
             flat = [dr.select(better, a, b) for a, b in zip(flat_of(new), flat_of(sums), strict=True)]
-            change = step(unflat(flat), kept, mean, prior, damping)
-            tried = [v - s if j < free else v for j, (v, s) in enumerate(zip(kept, change, strict=True))]
-            return k + 1, *_project(tried, self.options), *kept, *flat, best, damping
+            change = step(unflat(flat), accepted, mean, prior, damping)
+            tried = [v - s if j < free else v for j, (v, s) in enumerate(zip(accepted, change, strict=True))]
+            return k + 1, *_project(tried, self.options), *accepted, *flat, best, damping
 
         state = [*first, *[kind(v) for v in first], *flat_of(nothing(kind, width))]
         state += [dr.full(kind, 1e30, width), dr.full(kind, 1e-2 / LIGHTER, width)]
-        # An opaque number of iterations: another number does not compile another kernel.
+        # The number of iterations is opaque: changing it does not compile another kernel.
         last = dr.opaque(type(chunk["count"]), iterations + 1)
         start_state = (dr.zeros(type(chunk["count"]), width), *state)
         done = dr.while_loop(start_state, lambda k, *rest: k < last, body, label="levenberg_marquardt")[1:]
-        kept, sums = list(done[7:14]), unflat(done[14:47])
+        accepted, sums = list(done[7:14]), unflat(done[14:47])
         spread, diagonal = spread_of(sums, prior)
-        dr.eval(kept, sums.cost, spread, diagonal)
-        return _rows(kept), np.array(sums.cost), _rows(spread), _rows(diagonal)
+        dr.eval(accepted, sums.cost, spread, diagonal)
+        return _rows(accepted), np.array(sums.cost), _rows(spread), _rows(diagonal)
 
     def _accumulate(self, chunk: dict, x: list) -> Sums:
         """Normal matrix, gradient and cost of every lane at x."""
@@ -186,7 +186,7 @@ class Problem:
                 y = dr.gather(kind, chunk["rgb"][c], index)
                 residual.append(weight * (dr.fma(x[c], linear[c], constant[c]) - y))
                 slope.append([weight * dr.fma(x[c], d_linear[c][q], d_constant[c][q]) for q in range(4)])
-            # One robust weight for the three channels: what spoils an observation spoils its colour.
+            # One robust weight for the three channels: outliers affect all of them.
             size = dr.sqrt(residual[0] ** 2 + residual[1] ** 2 + residual[2] ** 2)
             inside = size <= huber
             robust = dr.select(inside, 1, huber / dr.maximum(size, 1e-20))
@@ -308,7 +308,7 @@ def _rows(columns: list) -> Float[np.ndarray, "n c"]:
 
 
 def _light_rows(rig: Rig) -> Float[np.ndarray, "l 8"]:
-    """Of every light vector, near, irradiance (which `relight` fills in) and width2."""
+    """One row per light: vector, near, irradiance (filled in by `relight`) and width2."""
     rows = np.zeros((len(rig.vector), 8), np.float32)
     rows[:, :3], rows[:, 3] = rig.vector, rig.near
     rows[:, 7] = 0 if rig.width2 is None else rig.width2
@@ -316,7 +316,7 @@ def _light_rows(rig: Rig) -> Float[np.ndarray, "l 8"]:
 
 
 def _chunk(points: Points, seen: Observations, texel: Int[np.ndarray, " n"], count: Int[np.ndarray, " n"]) -> dict:
-    """One chunk's observations, k-th ones of all lanes together; `rows` says where they came from, `real` whether."""
+    """One chunk's observations, the k-th of all lanes together; `rows` are their indices, `real` marks valid slots."""
     import drjit as dr
     import mitsuba
 
@@ -324,7 +324,7 @@ def _chunk(points: Points, seen: Observations, texel: Int[np.ndarray, " n"], cou
     width, most = len(texel), int(count[0])
     slot = np.arange(most)[:, None]
     real = (slot < count).ravel()
-    # Half the memory of 64 bits, where they are not needed.
+    # 32 bits where they suffice: half the memory.
     index = np.int32 if seen.start[-1] <= np.iinfo(np.int32).max else np.int64
     rows = np.where(real, (seen.start[texel] + slot).ravel(), 0).astype(index)
     frame = points.frame[texel]

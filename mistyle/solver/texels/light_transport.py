@@ -1,4 +1,4 @@
-"""What every cell of the sky adds to every observation of the per-texel solver: the linear half of finding a light."""
+"""Light transport matrix: radiance that each cell of the sky contributes to each observation of the solver."""
 
 from typing import Any
 

@@ -1,9 +1,9 @@
-"""From pictures to what each texel was seen to reflect: the observations of the per-texel solver.
+"""Observations of the per-texel solver: radiance of each texel, sampled from the pictures.
 
-A texel's reference value is the picture, interpolated bilinearly where the texel's centre is seen, between those of
-the four pixels around that place which count. A pixel counts where its centre and its corners show the texel's own
-surface and are all lit or all in the shadow: pixels on the edge of a shadow or a silhouette are mixtures that no
-material explains.
+A texel's reference value is the picture at the projection of the texel's centre, interpolated bilinearly between those
+of the four nearest pixels that are valid. A pixel is valid where its centre and its corners show the texel's own
+surface and are all lit or all in shadow: pixels on the edge of a shadow or a silhouette are mixtures that no material
+explains.
 """
 
 from collections.abc import Callable, Sequence
@@ -24,15 +24,15 @@ from mistyle.render.mitsuba.draw import Tracer
 from mistyle.solver.texels.gbuffer import GBuffer, open_sky, rig, trace_gbuffer
 from mistyle.solver.texels.levenberg_marquardt import Observations, Points, Rig
 
-REACH = 2.5  # how many pixels' width on the surface the four pixels may lie from the texel
-LIFT = 0.5  # and how far, in the same unit, above or below its tangent plane
-MOVED = 4.0  # of a look-up that moved d pixels: its standard deviation grows by 1 + MOVED d²
-PERCENTILE = 95.0  # of the observed radiance: the unit of the noise
+REACH = 2.5  # largest distance of the four pixels from the texel, in pixel widths on the surface
+LIFT = 0.5  # largest distance from its tangent plane, in the same unit
+MOVED = 4.0  # a look-up that moved by d pixels has 1 + MOVED d² times the standard deviation
+PERCENTILE = 95.0  # percentile of the observed radiance, the unit of the noise
 
 
 @dataclass(frozen=True)
 class ImageSamples:
-    """The observations of one picture: rows of the Observations, top left pixel and place between the four, 0..1."""
+    """One picture's observations: rows of the Observations, top left pixel, and position between the four, 0..1."""
 
     rows: Int[np.ndarray, " n"]
     pixel: Int[np.ndarray, " n"]
@@ -42,11 +42,11 @@ class ImageSamples:
 
 @dataclass(frozen=True)
 class TexelObservations:
-    """Everything that the pictures say about t covered texels (those of all sets, one set after the other).
+    """All observations of t covered texels (of all sets, one set after the other).
 
     texel     flat index of each into the concatenated sets
     per_image per picture
-    views     how many different cameras observed each texel
+    views     number of different cameras that observed each texel
     """
 
     texel: Int[np.ndarray, " t"]
@@ -58,21 +58,22 @@ class TexelObservations:
 
     @property
     def seen(self) -> Int[np.ndarray, " t"]:
-        """How many pictures observed each texel in the light."""
+        """Number of pictures that observed each texel in the light."""
         return np.diff(self.observations.start)
 
 
 @dataclass(frozen=True)
 class ObservationOptions:
-    """How pictures are observed.
+    """Options of observing pictures.
 
     facing    least cosine between the texel's normal and the camera
-    noise     with `relative`: the standard deviation of an observation of radiance y is noise · (the brightest
-              radiance, robustly) + relative · y. It is larger where the surface turns away, and where the texel is
-              smaller than the pixel, which then says more about its neighbours.
-    skies     False leaves out what hides the sky from each texel, which only the solver needs
-    move      how many pixels a look-up may move at most, 0 where all four have to count. It then shows what is beside
-              the texel; only the rounds correct that.
+    noise     with `relative`: the standard deviation of an observation of radiance y is noise · (PERCENTILE of
+    radiance)
+              + relative · y. It is larger at grazing angles, and where the texel is smaller than the pixel, which then
+              constrains its neighbours more.
+    skies     False omits the sky's visibility per texel, which only the solver needs
+    move      most pixels that a look-up may move, 0 to require all four valid. A moved look-up shows a point beside the
+              texel; only the rounds correct that.
     """
 
     facing: float = 0.2
@@ -93,7 +94,7 @@ def collect_observations(
     options: ObservationOptions = DEFAULT_OPTIONS,
     progress: Callable[[float], None] = lambda done: None,
 ) -> TexelObservations:
-    """All observations of all pictures. ValueError for lights that only a scene file describes."""
+    """All observations of all pictures. Raises ValueError for lights that only a scene file describes."""
     texel = covered_rows(texels)
     position, normal, face = points_of(texels)
     size = np.concatenate([texel_sizes(t) for t in texels])[texel]
@@ -106,17 +107,17 @@ def collect_observations(
         camera = captures.cameras[group[0]]
         beams = [light for k in group for light in captures.lights[k] if isinstance(light, DELTA)]
         seen, corners = trace_gbuffer(traced, camera, beams), trace_gbuffer(traced, of_corners(camera), beams)
-        pure = _pure(camera, seen, corners)
+        pure = _unmixed_pixels(camera, seen, corners)
         visible = _visible(camera, seen, pure, (position, normal, size), options.facing)
         any_light, first = np.zeros(len(visible.texel), bool), 0
         for k in group:
             count = sum(isinstance(light, DELTA) for light in captures.lights[k])
-            lit = [_steady(seen.lit[j], corners.lit[j]) for j in range(first, first + count)]
+            lit = [_uniform_light(seen.lit[j], corners.lit[j]) for j in range(first, first + count)]
             first += count
             rgb, usable = captures.load(k)
             ids, values, bits, chosen, *place, share = _observe(rgb, usable, lit, soft[k], visible, options.move)
             any_light[chosen] = True
-            # These are most of a fit's memory: nothing here is larger than it has to be.
+            # These arrays are most of a fit's memory, so they have the smallest sufficient types.
             where = visible.pixel[chosen].astype(np.int32)
             parts.append((k, ids.astype(np.int32), values, bits, where, *place, visible.worth[chosen] * share))
         views[visible.texel[any_light]] += 1
@@ -130,7 +131,7 @@ def covered_rows(texels: Sequence[Texels]) -> Int[np.ndarray, " n"]:
 
 
 def points_of(texels: Sequence[Texels]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Their positions, normals and faces."""
+    """Positions, normals and faces of the covered texels."""
     position, normal, face = (
         np.concatenate([getattr(t, name)[t.covered] for t in texels]) for name in ("position", "normal", "face")
     )
@@ -138,24 +139,23 @@ def points_of(texels: Sequence[Texels]) -> tuple[np.ndarray, np.ndarray, np.ndar
 
 
 def sample_image(image: Float[np.ndarray, "h w 3"], at: ImageSamples) -> Float[np.ndarray, "n 3"]:
-    """Any picture of the camera, at the places of its observations."""
+    """An image of the observations' camera, sampled at the observations."""
     return _bilinear(image, at.pixel, at.x, at.y)
 
 
 def with_extra_std(weight: Float[np.ndarray, " n"], more: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Weights, one over a standard deviation, once `more` is added to it."""
+    """Weights (1 / standard deviation) after `more` is added to the standard deviation."""
     return weight / (1 + weight * more)
 
 
 def observation_std(level: Float[np.ndarray, " n"], noise: float, relative: float) -> Float[np.ndarray, " n"]:
-    """Standard deviations of what was observed with radiance `level`: noise · (the brightest, robustly) + relative ·
-    level."""
+    """Standard deviations of observations with radiance `level`: noise · (PERCENTILE of `level`) + relative · level."""
     unit = float(np.percentile(level, PERCENTILE)) if len(level) else 1.0
     return noise * max(unit, 1e-6) + relative * level
 
 
 def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
-    """The shorter side of every texel on the surface, from where its neighbours in the island lie; 0 without any."""
+    """The shorter side of every texel on the surface, from its neighbours in the island; 0 without any."""
     right, below = beside(texels.island)
     shortest = np.full(texels.island.shape, np.inf, np.float32)
     columns = shortest.T, texels.position.transpose(1, 0, 2), right.T
@@ -167,8 +167,8 @@ def texel_sizes(texels: Texels) -> Float[np.ndarray, " n"]:
     return np.where(np.isfinite(smallest), smallest, 0).astype(np.float32)
 
 
-def _pure(camera: Camera, seen: GBuffer, corners: GBuffer) -> Bool[np.ndarray, "h w"]:
-    """Pixels whose corners show the surface that their centre shows: no silhouette and no crease goes through them."""
+def _unmixed_pixels(camera: Camera, seen: GBuffer, corners: GBuffer) -> Bool[np.ndarray, "h w"]:
+    """Pixels whose corners show the same surface as their centre: no silhouette or crease crosses them."""
     p, n = seen.position, seen.normal
     away = camera.position.astype(np.float32) - p
     unit = away @ -camera.world_from_cam[:3, 2].astype(np.float32) / np.float32(camera.focal)
@@ -181,20 +181,20 @@ def _pure(camera: Camera, seen: GBuffer, corners: GBuffer) -> Bool[np.ndarray, "
 
 
 def _one_surface(p: np.ndarray, n: np.ndarray, width: np.ndarray, q: np.ndarray, m: np.ndarray) -> np.ndarray:
-    """Whether points q with normals m continue the surface at p with normals n; `width`: of a pixel on it."""
+    """Whether points q with normals m continue the surface at p with normals n; `width` is a pixel's on it."""
     d = q - p
     near = ((d * d).sum(axis=-1) <= (REACH * width) ** 2) & (np.abs((d * n).sum(axis=-1)) <= LIFT * width)
     return near & ((m * n).sum(axis=-1) > 0.5)
 
 
 def _corners(size: tuple[int, int]) -> list[tuple[slice, slice]]:
-    """Of a picture of the pixels' corners, those at each pixel's top left, top right, bottom left and bottom right."""
+    """Values at each pixel's top left, top right, bottom left and bottom right corner, from an image of all corners."""
     height, width = size
     return [np.s_[r : r + height, c : c + width] for r in (0, 1) for c in (0, 1)]
 
 
-def _steady(lit: Bool[np.ndarray, "h w"], corners: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, "h w"]:
-    """1 where a pixel's centre and corners are all lit, 0 where none is, -1 where the edge of a shadow goes through."""
+def _uniform_light(lit: Bool[np.ndarray, "h w"], corners: Bool[np.ndarray, "H W"]) -> Int[np.ndarray, "h w"]:
+    """1 where a pixel's centre and corners are all lit, 0 where none is, -1 where a shadow's edge crosses it."""
     count = lit.astype(np.int8)
     for corner in _corners(lit.shape):
         count += corners[corner]
@@ -202,7 +202,7 @@ def _steady(lit: Bool[np.ndarray, "h w"], corners: Bool[np.ndarray, "H W"]) -> I
 
 
 class VisibleTexels(NamedTuple):
-    """Texels of which a picture shows the own surface: index, top left of the four pixels around, place between them,
+    """Texels whose own surface a picture shows: index, top left of the four nearest pixels, position between them,
     which of the four show it, and the observation's weight, 0..1."""
 
     texel: Int[np.ndarray, " n"]
@@ -214,7 +214,7 @@ class VisibleTexels(NamedTuple):
 
 
 def _visible(camera: Camera, seen: GBuffer, pure, points: tuple[np.ndarray, ...], facing: float) -> VisibleTexels:
-    """Texels whose own surface one of the four pixels around them shows; `points`: positions, normals and sizes."""
+    """Texels whose own surface at least one of their four nearest pixels shows; `points`: positions, normals, sizes."""
     position, normal, size = points
     height, width = camera.size
     eye = camera.position.astype(np.float32)
@@ -234,8 +234,8 @@ def _visible(camera: Camera, seen: GBuffer, pure, points: tuple[np.ndarray, ...]
     own = np.zeros((4, len(near)), bool)
     hit, front = seen.position.reshape(-1, 3), seen.normal.reshape(-1, 3)
     for k, step in enumerate((0, 1, width, width + 1)):
-        there = hit.take(pixel + step, axis=0), front.take(pixel + step, axis=0)
-        own[k] = pure.ravel().take(pixel + step) & _one_surface(p, n, unit / cosine[near], *there)
+        surface = hit.take(pixel + step, axis=0), front.take(pixel + step, axis=0)
+        own[k] = pure.ravel().take(pixel + step) & _one_surface(p, n, unit / cosine[near], *surface)
     good = own.any(axis=0)
     chosen = near[good]
     worth = np.sqrt(cosine[chosen]) * np.minimum(size[chosen] / unit[good], 1)
@@ -243,11 +243,10 @@ def _visible(camera: Camera, seen: GBuffer, pure, points: tuple[np.ndarray, ...]
 
 
 def _observe(rgb, usable, lit, soft: bool, visible: VisibleTexels, move: float) -> tuple[np.ndarray, ...]:
-    """Texels that one picture observes in the light: index, radiance, light bits, which of `visible`, the place between
-    the pixels that was looked up, and what that makes of the observation's worth. Soft light, where the picture has it
-    too, is taken to reach them all.
+    """Texels that one picture observes in the light: index, radiance, light bits, rows of `visible`, position of the
+    look-up, and its factor of the weight. Soft light, if the picture has any, is taken to reach all of them.
 
-    Where not all four pixels count, the place moves to the nearest ones that do, and the observation counts for less.
+    Where not all four pixels are valid, the look-up moves to the nearest valid ones, with a smaller weight.
     """
     near, pixel, x, y, own, _ = visible
     usable = erode(usable & np.isfinite(rgb).all(axis=-1), 1)
@@ -257,10 +256,10 @@ def _observe(rgb, usable, lit, soft: bool, visible: VisibleTexels, move: float) 
     for j, corner in enumerate(corners):
         good[j] &= usable.ravel().take(corner)
         for k, state in enumerate(lit):
-            here = state.ravel().take(corner)
-            good[j] &= here >= 0
-            code[j] |= np.where(here == 1, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
-    bits, u, v = _moved(good, code, x, y)
+            lit_state = state.ravel().take(corner)
+            good[j] &= lit_state >= 0
+            code[j] |= np.where(lit_state == 1, np.uint32(1 << k), np.uint32(0)).astype(np.uint32)
+    bits, u, v = _nearest_valid(good, code, x, y)
     moved = (u - x) ** 2 + (v - y) ** 2
     share = 1 / (1 + np.float32(MOVED) * moved)
     chosen = np.flatnonzero(good.any(axis=0) & (moved <= move**2) & ((bits != 0) | soft))
@@ -269,9 +268,9 @@ def _observe(rgb, usable, lit, soft: bool, visible: VisibleTexels, move: float) 
     return near[chosen], values, bits[chosen], chosen, u, v, share[chosen]
 
 
-def _moved(good: Bool[np.ndarray, "4 n"], code: UInt[np.ndarray, "4 n"], x, y) -> tuple[np.ndarray, ...]:
-    """The light bits of the nearest of the four pixels that is `good`, and the place (u, v) nearest to (x, y) for which
-    only good ones in the same light are needed: all four, two beside or above each other, or the nearest alone."""
+def _nearest_valid(good: Bool[np.ndarray, "4 n"], code: UInt[np.ndarray, "4 n"], x, y) -> tuple[np.ndarray, ...]:
+    """The light bits of the nearest `good` pixel of the four, and the position (u, v) nearest to (x, y) that needs only
+    good pixels in the same light: all four, two side by side or stacked, or the nearest alone."""
     across, down = np.stack([x, 1 - x, x, 1 - x]), np.stack([y, y, 1 - y, 1 - y])
     nearest = np.where(good, across**2 + down**2, np.inf).argmin(axis=0)  # its lowest bit: right; the next: below
     every = np.arange(len(x))
@@ -293,7 +292,7 @@ def _bilinear(image: Float[np.ndarray, "h w 3"], pixel, x, y) -> Float[np.ndarra
 
 
 def _assemble(texel, points, captures: Captures, parts, views, options: ObservationOptions) -> TexelObservations:
-    """Sort the observations by texel; within a texel they follow the pictures' order. `parts` is empty afterwards."""
+    """Sort the observations by texel, then by picture. `parts` is empty afterwards."""
     parts.sort(key=lambda part: -part[0])
     count = np.zeros(len(texel), np.int64)
     for part in parts:

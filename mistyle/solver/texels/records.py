@@ -1,4 +1,4 @@
-"""What the per-texel solver (`texels/levenberg_marquardt.py`) is given, and what it answers."""
+"""Inputs and outputs of the per-texel solver (`texels/levenberg_marquardt.py`)."""
 
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ UNKNOWNS = ("albedo_r", "albedo_g", "albedo_b", "tilt_x", "tilt_y", "roughness",
 class Points:
     """Surface points of t texels: position and tangent frame (rows: tangent, bitangent, normal; unit), in the world.
 
-    open  bit k % 32 of word k // 32 is set where cell k of the sky reaches the point; None where there is no soft light
+    open  bit k % 32 of word k // 32 is set where cell k of the sky reaches the point; None without soft light
     """
 
     position: Float[np.ndarray, "t 3"]
@@ -22,14 +22,14 @@ class Points:
 
 @dataclass(frozen=True)
 class Rig:
-    """Where pictures were taken from and what lit them. Picture v has the lights first[v] : first[v + 1].
+    """Cameras and lights of pictures. Picture v has the lights first[v] : first[v + 1].
 
     eye         world position of the camera
-    vector      unit direction towards the light, or where `near` the light's position, in the world
+    vector      unit direction towards the light, or the light's position where `near`, in the world
     near        1 for a point light, whose irradiance is that at distance 1
     irradiance  linear Rec.709
-    cells       from which light on those of picture v are the cells of the sky, in their order; None: nowhere
-    width2      of such a cell, see `sky.EnvironmentCells`; 0 for other lights
+    cells       index of picture v's first light that is a cell of the sky; cells follow in order; None without soft
+    light width2      of such a cell, see `sky.EnvironmentCells`; 0 for other lights
     """
 
     eye: Float[np.ndarray, "v 3"]
@@ -42,18 +42,19 @@ class Rig:
 
     @property
     def single(self) -> bool:
-        """Whether every picture has exactly one light, and that is a delta."""
+        """Whether every picture has exactly one light, a delta light."""
         return self.cells is None and bool((np.diff(self.first) == 1).all())
 
 
 @dataclass(frozen=True)
 class Observations:
-    """What pictures say about t texels, by texel: those of texel i are start[i] : start[i + 1].
+    """Observations of t texels, sorted by texel: those of texel i are start[i] : start[i + 1].
 
-    rgb     linear radiance that left the texel towards the camera
-    weight  one over its standard deviation
-    lit     bit l is set where light l of the picture (counted within the picture) reaches the texel; of cells of the
-            sky the points' `open` says it
+    rgb     linear radiance from the texel towards the camera
+    weight  1 / its standard deviation
+    lit     bit l is set where light l of the picture (counted within the picture) reaches the texel; cells of the sky
+    use
+            the points' `open` instead
     """
 
     start: Int[np.ndarray, " t1"]
@@ -67,8 +68,8 @@ class Observations:
 class Solution:
     """`values` (t, 7) in the order of UNKNOWNS; `cost` without the prior; `spread` (t, 7), standard deviations.
 
-    spread² is the diagonal of the inverse of normal matrix + prior: what the observations leave open. `diagonal` is
-    that of the normal matrix alone, `prior` the weights that were asked for.
+    spread² is the diagonal of the inverse of normal matrix + prior: the posterior variance. `diagonal` is that of the
+    normal matrix alone, `prior` the given weights.
     """
 
     values: Float[np.ndarray, "t 7"]
@@ -80,9 +81,9 @@ class Solution:
 
 @dataclass(frozen=True)
 class Options:
-    """How to solve. `huber` is in standard deviations; `floor` the least roughness; `tilt` bounds |tilt|.
+    """Options of the solver. `huber` is in standard deviations; `floor` is the least roughness; `tilt` bounds |tilt|.
 
-    With `metallic` False metallic keeps its value. `differences` takes central differences instead of AD.
+    With `metallic` False metallic keeps its value. `differences` selects central differences instead of AD.
     """
 
     model: str = "principled"

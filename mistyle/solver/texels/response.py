@@ -12,7 +12,7 @@ MIN_Z2 = 1e-4
 def terms(options: Options, wi: Any, wo: Any, q: list, width2: Any = None) -> tuple[Any, Any, list, list]:
     """Albedo-linear and constant term; light from a cell of `width2` (`sky.EnvironmentCells`) widens the lobe.
 
-    GGX's α² is twice the variance of the slopes that mirror, and these turn half as much as the light does.
+    GGX's α² is twice the variance of the microfacet slopes, and normals turn half as much as the light does.
     """
     import drjit as dr
 
@@ -36,8 +36,8 @@ def derivatives(options: Options, wi: Any, wo: Any, q: list, width2: Any = None)
             d_linear.append(dr.zeros(type(v)))
             d_constant.append(dr.zeros(type(v)))
             continue
-        for other in moving:
-            dr.set_grad(other, 1.0 if other is v else 0.0)
+        for variable in moving:
+            dr.set_grad(variable, 1.0 if variable is v else 0.0)
         dr.enqueue(dr.ADMode.Forward, moving)
         dr.traverse(dr.ADMode.Forward, dr.ADFlag.ClearInterior)
         d_linear.append(dr.grad(linear))

@@ -1,11 +1,10 @@
 """Rounds of the per-texel solver, with priors from neighbours, and defect correction by rendered pictures.
 
-The solver takes a texel's radiance for that of the picture at one place, but a pixel is a mean over its area of
-interpolated texels. So after each solve the pictures are rendered as they are really made
-(`render/deferred/renderer.py`), and what they still differ by is added to what the texels should reach (defect
-correction): at the end the pictures agree. Where a texel's radiance is far from that of the picture drawn there, as
-where highlights are narrower than pixels and normals still vary, what is added is far off too, and the observation
-counts for less.
+The solver compares a texel's radiance with the picture at one point, but a pixel is an area mean of interpolated
+texels. After each solve the pictures are rendered exactly (`render/deferred/renderer.py`), and their residual is added
+to the texels' targets (defect correction): at the fixed point the renders agree with the pictures. Where a texel's
+radiance is far from its render, as with highlights narrower than a pixel on varying normals, the correction is
+unreliable and the observation's weight falls.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,8 +32,8 @@ from mistyle.solver.texels.levenberg_marquardt import Problem, Solution
 from mistyle.solver.texels.observations import TexelObservations, sample_image, with_extra_std
 
 STARTS = (0.08, 0.25, 0.7)  # roughness has local minima
-UNLIKE = 0.3  # of what a texel and the picture drawn there differ by: what it adds to an observation's deviation
-RESTARTS = 3  # rounds in which texels also try what their neighbours found
+UNLIKE = 0.3  # share of the correction that is added to an observation's standard deviation
+RESTARTS = 3  # rounds in which texels also start from their neighbours' values
 
 
 def first_solve(
@@ -53,12 +52,12 @@ def first_solve(
     tries = [(start, mean, prior)]
     for metal in (0.0, 1.0) if settings.metallic else (None,):
         for roughness in STARTS:
-            other, around, weight = mean.copy(), mean.copy(), prior
-            other[:, ROUGHNESS] = roughness
+            guess, around, weight = mean.copy(), mean.copy(), prior
+            guess[:, ROUGHNESS] = roughness
             if metal is not None:
-                other[:, METALLIC], around[:, METALLIC] = abs(metal - 0.1), metal
+                guess[:, METALLIC], around[:, METALLIC] = abs(metal - 0.1), metal
                 around, weight, _ = metal_f0_prior(around, prior, np.full(len(mean), metal, np.float32))
-            tries.append((other, around, weight))
+            tries.append((guess, around, weight))
     tries = tries if not np.array_equal(start, mean) else tries[1:]
     solved = []
     for k, (each, around, weight) in enumerate(tries):
@@ -78,10 +77,10 @@ def another_round(
     settings: RecoverSettings,
     number: int,
 ) -> Solution:
-    """Solve again for targets corrected by `residuals(k)`, reference minus render of picture k for `solution`; the
-    references, and how much they count, are `observed`'s observations.
+    """Solve again for targets corrected by `residuals(k)`, reference minus render of picture k for `solution`.
+    `observed` holds the references and their weights.
 
-    Each texel's prior is the mean of its neighbours, weighted by how sure they are, as firm as the surface is smooth.
+    Each texel's prior is the precision-weighted mean of its neighbours; its strength is estimated (`prior_precision`).
     """
     target = problem.predict(solution.values)
     if len(target) < len(observed.observations.rgb):
@@ -109,32 +108,32 @@ def another_round(
             solved.values, observed.seen
         )
 
-    solved = [tried(solution.values, 5, _nearest(solution.values))]
+    solved = [tried(solution.values, 5, _is_metal(solution.values))]
     if number < RESTARTS:
         for roughness in (None, 0.15, 0.4, 0.8):
-            other = mean.copy()
+            guess = mean.copy()
             if roughness is not None:
-                other[:, ROUGHNESS] = roughness
-            solved.append(tried(other, 8, _nearest(mean)))
+                guess[:, ROUGHNESS] = roughness
+            solved.append(tried(guess, 8, _is_metal(mean)))
     return best(solved)
 
 
 def best(solutions: Sequence[tuple[Solution, Float[np.ndarray, " t"]]]) -> Solution:
-    """Texel by texel the solution of least cost with its penalty; the first of equals."""
+    """Per texel the solution of least cost plus penalty; the first of equals."""
     result, least = solutions[0][0], solutions[0][0].cost + solutions[0][1]
-    for other, extra in solutions[1:]:
-        cost = other.cost + extra
+    for candidate, extra in solutions[1:]:
+        cost = candidate.cost + extra
         better = cost < least
         least = np.where(better, cost, least)
         names = [f.name for f in fields(Solution)]
-        result = Solution(**{n: _pick(better, getattr(other, n), getattr(result, n)) for n in names})
+        result = Solution(**{n: _select(better, getattr(candidate, n), getattr(result, n)) for n in names})
     return result
 
 
-def _pick(choice: Bool[np.ndarray, " t"], a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _select(choice: Bool[np.ndarray, " t"], a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.where(choice.reshape(-1, *[1] * (a.ndim - 1)), a, b)
 
 
-def _nearest(values: Values) -> Float[np.ndarray, " t"]:
-    """Metal or not."""
+def _is_metal(values: Values) -> Float[np.ndarray, " t"]:
+    """1 for metal, 0 for dielectric."""
     return (values[:, METALLIC] > 0.5).astype(np.float32)

@@ -1,4 +1,4 @@
-"""The texels' part of a recovery: observations, solver, rounds and indirect light, at a level that fits."""
+"""The texels' stage of a recovery: observations, solver, rounds and indirect light, at a feasible resolution."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -31,18 +31,18 @@ from mistyle.solver.texels.observations import (
 if TYPE_CHECKING:
     from mistyle.render.deferred.renderer import MaterialRenderer
 
-SOFT_COST = 64  # times as long as under one light a texel takes under a sky, nearly
+SOFT_COST = 64  # approximate run time of a texel under a sky, relative to one light
 INDIRECT_STD = 0.5  # standard deviation of an estimate of indirect light, relative to it
 
 
 @dataclass(frozen=True)
 class TexelEstimate:
-    """The per-texel solver's answer at the atlas's resolution; not `solved`: only the start.
+    """The per-texel solver's result at the atlas's resolution; not `solved`: only the start.
 
     std            standard deviations under observations and priors
-    data_weight    share of a texel's tilt, 0..1, that its own pictures decide and not its neighbours
-    unconstrained  standard deviations under the observations alone, `recover_prior.NOTHING` where there are none
-    seen, views    how many pictures, and how many cameras, observed each texel in the light
+    data_weight    the data's share in a texel's tilt against its neighbours', 0..1
+    unconstrained  standard deviations under the observations alone, `prior.NOTHING` without any
+    seen, views    number of pictures and of cameras that observed each texel in the light
     """
 
     table: Float[np.ndarray, "a 8"]
@@ -57,9 +57,9 @@ class TexelEstimate:
 def solve_level(
     context: FitContext, renderer: "MaterialRenderer", start: Sequence[Maps] | None, progress: StageProgress
 ) -> tuple[TexelEstimate, DirectCaptures]:
-    """`solve_texels` on the finest level with at most `solver_texels` texels, enlarged to the atlas.
+    """`solve_texels` on the finest level with at most `solver_texels` texels, upsampled to the atlas.
 
-    `renderer` draws tables of the atlas.
+    `renderer` renders tables of the atlas.
     """
     by, settings, sizes = 1, context.settings, context.atlas.sizes
     sides = [side for size in sizes for side in size]
@@ -76,12 +76,12 @@ def solve_level(
     if start is not None:
         start = [_shrunk(maps, size) for maps, size in zip(start, coarse.atlas.sizes, strict=True)]
     estimate, direct = solve_texels(coarse, coarse.renderer(), start, progress)
-    context.notes.append(f"Texels were solved one by one on a level {by} times coarser than the atlas.")
+    context.notes.append(f"The per-texel solver ran on a level {by} times coarser than the atlas.")
     return _upsampled(estimate, coarse.atlas, by), direct
 
 
 def _upsampled(estimate: TexelEstimate, atlas: Atlas, by: int) -> TexelEstimate:
-    """The estimate of `atlas` for one of `by` times as many rows and columns."""
+    """The estimate of `atlas`, upsampled to one with `by` times as many rows and columns."""
     e = estimate
     table, std, data_weight, unconstrained, seen, views = (
         np.concatenate(
@@ -98,7 +98,7 @@ def _upsampled(estimate: TexelEstimate, atlas: Atlas, by: int) -> TexelEstimate:
 
 
 def _enlarged(values: np.ndarray, by: int) -> np.ndarray:
-    """Interpolated where they are numbers, repeated where they count."""
+    """Upsampled values: floats are interpolated, counts are repeated."""
     if values.dtype.kind == "f":
         return resize(values, (values.shape[0] * by, values.shape[1] * by))
     return np.repeat(np.repeat(values, by, axis=0), by, axis=1)
@@ -114,8 +114,8 @@ def solve_texels(
 ) -> tuple[TexelEstimate, DirectCaptures]:
     """The per-texel solver and its rounds, and the captures with the last estimate of their indirect light.
 
-    With each estimate it begins anew: roughness and metallic that light between surfaces made look right would else
-    stay where they are, minima of another cost.
+    The solver restarts with each estimate: indirect light can shift roughness and metallic into a local minimum, where
+    they would stay otherwise.
     """
     from mistyle.render.deferred.material_table import pack
 
@@ -133,7 +133,7 @@ def solve_texels(
     )
     if settings.solver == "pictures" or not len(observed.observations.rgb):
         if settings.solver != "pictures":
-            context.notes.append("No texel was observed in the light: texels were not solved one by one.")
+            context.notes.append("No texel was observed in the light: the per-texel solver was skipped.")
         nothing = np.full(mean.shape, recover_prior.NOTHING, np.float32)
         return _on_atlas(observed, atlas, (first, std, np.ones(len(mean), np.float32), nothing), False), direct
     problem = Problem(
@@ -147,7 +147,7 @@ def solve_texels(
     solution, observed, direct = _rounds(context, renderer, problem, solved_anew, observed, progress)
     bad = ~np.isfinite(solution.values).all(axis=1, keepdims=True)
     if bad.any():
-        context.notes.append(f"{int(bad.sum())} texels ended as no numbers in the per-texel solver and were reset.")
+        context.notes.append(f"{int(bad.sum())} texels were not finite after the per-texel solver and were reset.")
     values = np.where(bad, mean, solution.values)
     std = np.where(bad, std, solution.spread * recover_prior.inflation(solution, observed))
     weight = recover_prior.data_weight(solution, observed)
@@ -163,36 +163,36 @@ def _rounds(
     observed: TexelObservations,
     progress: StageProgress,
 ) -> tuple[Solution, TexelObservations, DirectCaptures]:
-    """What all rounds end with, and observations and captures after the last estimate of indirect light.
+    """The solution after all rounds, and observations and captures after the last estimate of indirect light.
 
-    `solved_anew` solves from the start, at first and after each estimate.
+    `solved_anew` solves from the start, first and after each estimate.
     """
     settings, atlas, pictures = context.settings, context.atlas, len(context.captures)
     weight, samples = observed.observations.weight, estimates(settings, pictures)[0]
     direct = DirectCaptures(context.captures)
     total, solution = all_rounds(settings, pictures), solved_anew(progress.part(0.3, 0.5))
     for number in range(total):
-        here = progress.part(0.5 + 0.5 * number / total, 0.5 + 0.5 * (number + 1) / total)
+        part = progress.part(0.5 + 0.5 * number / total, 0.5 + 0.5 * (number + 1) / total)
         table = scatter_to_atlas(solution.values, observed, atlas)
         if 0 < number <= settings.rounds * len(samples) and number % settings.rounds == 0:
             sampling = samples[number // settings.rounds - 1], context.seed + number
-            for k, light, _ in estimate_indirect(context, renderer, table, sampling, here.part(0, 0.4)):
+            for k, light, _ in estimate_indirect(context, renderer, table, sampling, part.part(0, 0.4)):
                 direct = direct.with_indirect(k, light)
             observed = _observed_direct(observed, weight, direct)
             problem.reweight(observed.observations.weight)
             problem.retarget(observed.observations.rgb)
-            solution = solved_anew(here.part(0.4, 0.8))
+            solution = solved_anew(part.part(0.4, 0.8))
             table = scatter_to_atlas(solution.values, observed, atlas)
         residuals = RoundResiduals(direct, renderer, renderer.upload(table), [])
         solution = recover_solve.another_round(problem, observed, atlas, solution, residuals, settings, number)
         context.trace.setdefault("texels.rms", []).append(float(np.sqrt(np.mean(residuals.squares))))
-        here(1.0)
+        part(1.0)
     return solution, observed, direct
 
 
 @dataclass(frozen=True)
 class RoundResiduals:
-    """Called with k: reference minus render of picture k, 0 where it does not count; `squares` gets its mean square."""
+    """A function of k: reference minus render of picture k, 0 at invalid pixels; `squares` gets its mean square."""
 
     direct: DirectCaptures
     renderer: "MaterialRenderer"
@@ -210,7 +210,7 @@ class RoundResiduals:
 def _on_atlas(
     observed: TexelObservations, atlas: Atlas, of_texels: tuple[Values, Values, np.ndarray, Values], solved: bool
 ) -> TexelEstimate:
-    """What is known `of_texels` (values, std, data_weight, unconstrained) for the whole atlas."""
+    """The estimate (values, std, data_weight, unconstrained) `of_texels`, scattered to the whole atlas."""
     values, std, data_weight, unconstrained = of_texels
     return TexelEstimate(
         scatter_to_atlas(values, observed, atlas),
@@ -232,7 +232,7 @@ def estimate_indirect(
     vectors: bool = False,
 ) -> Iterator[tuple[int, Radiance, Float[np.ndarray, "h w 9"] | None]]:
     """Each picture's number, its indirect light under the maps of `table`, and with `vectors` its vector irradiance
-    (`Indirect.pictures_and_vectors`); camera by camera. `sampling`: samples a pixel, and the seed."""
+    (`Indirect.pictures_and_vectors`); camera by camera. `sampling`: samples a pixel and seed."""
     from mistyle.render.deferred.material_table import unpack
     from mistyle.solver.indirect import Indirect, in_proportion
 
@@ -241,9 +241,11 @@ def estimate_indirect(
     scene = Indirect(context.traced.mesh, maps, model=settings.model, frame=settings.frame)
     for group in by_camera(captures.cameras):
         many = [captures.lights[k] for k in group]
-        asked = captures.cameras[group[0]], many, samples, seed + len(captures) * group[0]
+        request = captures.cameras[group[0]], many, samples, seed + len(captures) * group[0]
         lights: list[tuple[np.ndarray, Any]]
-        lights = scene.pictures_and_vectors(*asked) if vectors else [(light, None) for light in scene.pictures(*asked)]
+        lights = (
+            scene.pictures_and_vectors(*request) if vectors else [(light, None) for light in scene.pictures(*request)]
+        )
         for k, (light, vector) in zip(group, lights, strict=True):
             rgb, mask = captures.load(k)
             counts = (mask & np.isfinite(rgb).all(axis=-1))[..., None]
@@ -255,9 +257,9 @@ def estimate_indirect(
 def _observed_direct(
     observed: TexelObservations, weight: Float[np.ndarray, " o"], direct: DirectCaptures
 ) -> TexelObservations:
-    """The same observations without the light between surfaces.
+    """The observations without indirect light.
 
-    Their weights are `weight`, those of pictures as they came, less by the uncertainty of that light.
+    `weight` are weights of the original pictures; the uncertainty of indirect light reduces them.
     """
     rgb, weight = observed.observations.rgb.copy(), weight.copy()
     for k, samples in enumerate(observed.per_image):

@@ -149,7 +149,7 @@ def test_gradient_of_each_map_equals_finite_differences(traced, rng, loss, model
         pictures = [ours.image(k) for k in (0, 1)]
         apart = [np.where(np.abs(r - p) < 0.05, p + 0.1, r) for p, r in zip(pictures, references(ours), strict=True)]
         ours.renderer.captures = in_memory(cameras, ours.renderer.captures.lights, apart)
-        ours.renderer._kept.clear()
+        ours.renderer._cache.clear()
     start = ours.table.astype(np.float64)
     gradient = np.array(ours.step([0, 1], loss)[1]).astype(np.float64)
     assert (gradient[:, 7] == 0).all()
@@ -282,7 +282,7 @@ def test_same_bytes_frozen_kept_recomputed_and_again(traced, lights, subsamples,
         adjoint = rng.normal(size=(40, 40, 3)).astype(np.float32)
         found = [value, gradient, ours.pull(1, adjoint), *ours.image_and_coverage(1)]
         results.append([np.array(v).tobytes() for v in found])
-        assert bool(ours.renderer._kept) == ("memory" not in options)
+        assert bool(ours.renderer._cache) == ("memory" not in options)
     assert all(result == results[0] for result in results[1:])
 
 

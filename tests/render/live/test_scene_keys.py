@@ -199,5 +199,5 @@ def test_where_direct_light_needs_no_monte_carlo(loaded):
     direct, deep = ({"type": "prb", "max_depth": depth} for depth in (2, 3))
     found = scene_keys.fast_shapes(mi.load_dict(scene | {"integrator": direct}))
     assert found["ball"] is None and "SmoothDiffuse" in found["plate"]
-    assert "surface to surface" in scene_keys.fast_shapes(mi.load_dict(scene | {"integrator": deep}))["ball"]
+    assert "renders indirect light" in scene_keys.fast_shapes(mi.load_dict(scene | {"integrator": deep}))["ball"]
     assert "EnvironmentMapEmitter" in scene_keys.fast_shapes(loaded.scene)["wall"]

@@ -108,7 +108,7 @@ def test_direct_has_gradients_of_a_mirrors_colour_and_of_no_mask():
     mirror = lit(integrator=engine, wall=wall({"type": "conductor", "specular_reflectance": GREY}))
     masked = lit(integrator=engine, wall=wall(MASK))
     assert offered(mirror, mirror.integrator())["wall.bsdf.specular_reflectance.value"] is None
-    assert "one lobe or another" in offered(masked, masked.integrator())["wall.bsdf.opacity.value"]
+    assert "probabilities of the lobes" in offered(masked, masked.integrator())["wall.bsdf.opacity.value"]
 
 
 def mesh(attribute, bsdf):
@@ -144,7 +144,7 @@ def test_attributes_are_offered_where_a_material_reads_them_and_keep_its_range()
 
 def test_what_nothing_uses_is_not_offered():
     scene = lit(wall=wall(DIFFUSE), spare={"type": "diffuse", "id": "spare", "reflectance": GREY})
-    assert offered(scene)["spare.reflectance.value"] == "no shape and no light uses it."
+    assert offered(scene)["spare.reflectance.value"] == "neither a shape nor a light uses it."
 
 
 def test_a_scene_without_a_gradient_ends_in_a_sentence(monkeypatch):
@@ -337,7 +337,7 @@ def test_the_picture_inside_aov_and_moment_gives_the_integrator():
     inner = {"type": "path", "max_depth": 4, "hide_emitters": True}
     for outer in ({"type": "aov", "aovs": "dd:depth", "image": inner}, {"type": "moment", "image": inner}):
         engine, notes = scene_grad.ad_integrator(lit(integrator=outer, wall=wall(DIFFUSE)))
-        assert "max_depth = 4" in str(engine) and engine.hide_emitters and "prb takes its place" in notes[0]
+        assert "max_depth = 4" in str(engine) and engine.hide_emitters and "prb replaces it" in notes[0]
     held = {"type": "aov", "aovs": "dd:depth", "image": {"type": "prb", "max_depth": 3}}
     engine, notes = scene_grad.ad_integrator(lit(integrator=held, wall=wall(DIFFUSE)))
     assert "PRB" in str(engine) and "PRB" not in "".join(notes)[:0] and len(notes) == 1

@@ -224,7 +224,7 @@ def test_the_slot_of_a_scene_file(tmp_path: Path) -> None:
         draw.picture(quad(), None, camera, Staging(path))
     with pytest.raises(InputRefused, match="no scene"):
         draw.picture(quad(), None, camera, Staging(tmp_path / "absent.xml"))
-    with pytest.raises(InputRefused, match="takes no environment map"):
+    with pytest.raises(InputRefused, match="accepts no environment map"):
         draw.picture(quad(), None, camera, Staging("phase1_directional", hdri=np.ones((4, 8, 3), np.float32)))
 
 
