@@ -88,7 +88,7 @@ def epsilon_loss(eps: Float[torch.Tensor, "b c h w"], noise: Float[torch.Tensor,
 
 
 def x0_loss(
-    said: Float[torch.Tensor, "b c h w"],
+    output: Float[torch.Tensor, "b c h w"],
     z0: Float[torch.Tensor, "b c h w"],
     zt: Float[torch.Tensor, "b c h w"],
     alpha_bar: Float[torch.Tensor, ""],
@@ -97,9 +97,9 @@ def x0_loss(
     """Mean squared error of the picture that follows from what the network said, unweighted; equals the noise's error
     times `weight`."""
     if prediction == "v_prediction":
-        predicted = alpha_bar.sqrt() * zt - (1 - alpha_bar).sqrt() * said.float()
+        predicted = alpha_bar.sqrt() * zt - (1 - alpha_bar).sqrt() * output.float()
     else:
-        predicted = (zt - (1 - alpha_bar).sqrt() * said.float()) / alpha_bar.sqrt()
+        predicted = (zt - (1 - alpha_bar).sqrt() * output.float()) / alpha_bar.sqrt()
     return torch.mean((predicted - z0) ** 2)
 
 
@@ -122,11 +122,11 @@ def half_names(unet: Any, name: str) -> dict[str, torch.nn.Parameter]:
     """
     tensors = {}
     for key, value in parameters(unet, name).items():
-        found = re.fullmatch(rf"(.*)\.{PROJECTIONS}\.lora_([AB])\.{re.escape(name)}\.weight", key)
-        assert found is not None
-        part = "down" if found[3] == "A" else "up"
-        projection = found[2].removesuffix(".0")
-        tensors[f"unet.{found[1]}.processor.{projection}_lora.{part}.weight"] = value
+        match = re.fullmatch(rf"(.*)\.{PROJECTIONS}\.lora_([AB])\.{re.escape(name)}\.weight", key)
+        assert match is not None
+        part = "down" if match[3] == "A" else "up"
+        projection = match[2].removesuffix(".0")
+        tensors[f"unet.{match[1]}.processor.{projection}_lora.{part}.weight"] = value
     return tensors
 
 

@@ -136,7 +136,7 @@ def denoiser(
             )
             if conditioning.picture:
                 more = more | {"image_embeds": list(conditioning.picture)}
-            said = unet(
+            output = unet(
                 both,
                 time,
                 encoder_hidden_states=conditioning.text,
@@ -145,7 +145,7 @@ def denoiser(
                 mid_block_additional_residual=middle,
                 return_dict=False,
             )[0].float()
-            nothing, something = said.chunk(2)
+            nothing, something = output.chunk(2)
             guided = nothing + conditioning.guidance * (something - nothing)
             if terms:
                 residuals = [d[1:] for d in down], middle[1:]
@@ -155,11 +155,11 @@ def denoiser(
     return denoise
 
 
-def clean(prediction: str, said: torch.Tensor, x: torch.Tensor, sigma: float) -> torch.Tensor:
+def clean(prediction: str, output: torch.Tensor, x: torch.Tensor, sigma: float) -> torch.Tensor:
     """The clean latent that follows from what the network says of `x`: its noise, or its velocity."""
     if prediction == "v_prediction":
-        return x / (sigma**2 + 1) - said * (sigma / (sigma**2 + 1) ** 0.5)
-    return x - sigma * said
+        return x / (sigma**2 + 1) - output * (sigma / (sigma**2 + 1) ** 0.5)
+    return x - sigma * output
 
 
 def activate(pipeline: Any, adapters: Mapping[str, float]) -> None:

@@ -40,7 +40,7 @@ class LoraPair:
     content: Path
     style: Path
 
-    def there(self, key: str) -> tuple[bool, bool]:
+    def finished(self, key: str) -> tuple[bool, bool]:
         """Which of the two files is finished under this key."""
         from mistyle.stylization.diffusion.consislora import notes_of
 
@@ -180,9 +180,9 @@ def make(
             errors += run_phase(pipeline, shown, phase, training, seed, Checkpoint(state, key + phase.name), note)
             consislora.save_half(pair.style, unet, "style", notes)
     finally:
-        there = [name for name in ("content", "style") if name in getattr(unet, "peft_config", {})]
-        if there:
-            unet.delete_adapters(there)
+        loaded = [name for name in ("content", "style") if name in getattr(unet, "peft_config", {})]
+        if loaded:
+            unet.delete_adapters(loaded)
     return errors
 
 

@@ -241,16 +241,16 @@ def _take_up(checkpoint: Checkpoint | None, named: dict, optimiser: Any, scaler:
     try:
         if consislora.notes_of(checkpoint.path).get("key") != checkpoint.key:
             return []
-        kept = load_file(checkpoint.path)
+        tensors = load_file(checkpoint.path)
     except (InputRefused, SafetensorError):
         return []
-    history = kept["history"].tolist()
-    if "scale" in kept:
-        scale, tracker = kept["scale"].tolist()
+    history = tensors["history"].tolist()
+    if "scale" in tensors:
+        scale, tracker = tensors["scale"].tolist()
         scaler.load_state_dict(scaler.state_dict() | {"scale": scale, "_growth_tracker": int(tracker)})
     for name, parameter in named.items():
-        parameter.data.copy_(kept[f"weight:{name}"])
-        moments = {m: kept[f"{m}:{name}"] for m in ("step", "exp_avg", "exp_avg_sq") if f"{m}:{name}" in kept}
+        parameter.data.copy_(tensors[f"weight:{name}"])
+        moments = {m: tensors[f"{m}:{name}"] for m in ("step", "exp_avg", "exp_avg_sq") if f"{m}:{name}" in tensors}
         if moments:
             optimiser.state[parameter] = {m: v if m == "step" else v.to(parameter.device) for m, v in moments.items()}
     return history

@@ -62,20 +62,20 @@ def grow(
     content: large holes look plain, and strokes run back from the rim.
     """
     result = albedo.copy()
-    given = texels.covered & ~hole
-    if not hole.any() or not given.any():
+    known = texels.covered & ~hole
+    if not hole.any() or not known.any():
         return result
     sigma = DETAIL * albedo.shape[1]
     for island, box in island_boxes(texels.island, np.unique(texels.island[hole & texels.covered])):
         own = texels.island[box] == island
-        gap, rim = own & hole[box], own & given[box]
+        gap, rim = own & hole[box], own & known[box]
         part = result[box]
         if rim.any():
             part[gap] = _grow_island(albedo[box], gap, rim, own, sigma)
         else:
             rows, columns = np.nonzero(gap)
-            wanted = (rows + box[0].start) * hole.shape[1] + columns + box[1].start
-            source = nearest_in_space(given.reshape(-1), texels.position.reshape(-1, 3), wanted)
+            flat = (rows + box[0].start) * hole.shape[1] + columns + box[1].start
+            source = nearest_in_space(known.reshape(-1), texels.position.reshape(-1, 3), flat)
             part[gap] = albedo.reshape(-1, 3)[source]
     return result
 
@@ -115,24 +115,24 @@ def _mirrored(gap: Bool[np.ndarray, "h w"], rim: Bool[np.ndarray, "h w"]) -> tup
 
 
 def _harmonic(
-    values: Float[np.ndarray, "h w 3"], given: Bool[np.ndarray, "h w"], own: Bool[np.ndarray, "h w"]
+    values: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], own: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
     """Values continued into own & ~given so that each is the mean of its neighbours: coarse to fine, Jacobi sweeps."""
-    height, width = given.shape
-    if max(height, width) <= 4 or (given | ~own).all():
-        start = np.where(given[..., None], values, values[given].mean(axis=0))
+    height, width = known.shape
+    if max(height, width) <= 4 or (known | ~own).all():
+        start = np.where(known[..., None], values, values[known].mean(axis=0))
     else:
         size = ((width + 1) // 2, (height + 1) // 2)
-        weight = cv2.resize(given.astype(np.float32), size, interpolation=cv2.INTER_AREA)
-        mean = cv2.resize(values * given[..., None], size, interpolation=cv2.INTER_AREA)
+        weight = cv2.resize(known.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+        mean = cv2.resize(values * known[..., None], size, interpolation=cv2.INTER_AREA)
         mean = (mean / np.maximum(weight, 1e-6)[..., None]).astype(np.float32)
         whole = cv2.resize(own.astype(np.float32), size, interpolation=cv2.INTER_AREA)
         coarse = _harmonic(mean, weight > 1e-3, whole > 1e-3)
-        start = np.where(given[..., None], values, cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR))
+        start = np.where(known[..., None], values, cv2.resize(coarse, (width, height), interpolation=cv2.INTER_LINEAR))
     share = own.astype(np.float32)[..., None]
     kernel = np.array([[0, 1, 0], [1, 0, 1], [0, 1, 0]], np.float32)
     count = cv2.filter2D(own.astype(np.float32), -1, kernel, borderType=cv2.BORDER_CONSTANT)[..., None]
-    free = (own & ~given & (count[..., 0] > 0))[..., None]
+    free = (own & ~known & (count[..., 0] > 0))[..., None]
     result = start.astype(np.float32)
     for _ in range(SWEEPS):
         total = cv2.filter2D(result * share, -1, kernel, borderType=cv2.BORDER_CONSTANT)

@@ -165,13 +165,13 @@ def paint_atlas(
     larger = max(hole.shape) > side
     size = (side, side) if larger else tuple(-(-n // grain) * grain for n in hole.shape)
     open_part = hole | ~texels.covered
-    given = plan.filled(encoded, hole, texels)
+    filled = plan.filled(encoded, hole, texels)
     mask = plan.shrink_mask(open_part, size)
-    painted = inpaint(brush, plan.shrink(given, size), mask, plan.sampled(where, size), 1.0, rng)
-    result = plan.spread_islands(painted, texels, hole, given)
+    painted = inpaint(brush, plan.shrink(filled, size), mask, plan.sampled(where, size), 1.0, rng)
+    result = plan.spread_islands(painted, texels, hole, filled)
     if not larger or brush.settings.detail == 0 or min(hole.shape) < side:
         return np.where(hole[..., None], result, encoded).astype(np.float32)
-    detailed = _detailed(brush, np.where(hole[..., None], result, given), hole, texels, where, side, rng)
+    detailed = _detailed(brush, np.where(hole[..., None], result, filled), hole, texels, where, side, rng)
     return np.where(hole[..., None], detailed, encoded)
 
 

@@ -42,16 +42,16 @@ def crops(hole: Bool[np.ndarray, "h w"], size: int, overlap: int) -> list[tuple[
         return [(0, 0)] if hole.any() else []
     margin = min(overlap, size - 1) // 2
     inner = size - 2 * margin
-    left, found = hole.copy(), []
+    left, corners = hole.copy(), []
     while left.any():
         top = int(np.argmax(left.any(axis=1)))
         band = left[top : top + inner].any(axis=0)
         first = int(np.argmax(band))
         r = int(np.clip(top - margin, 0, max(rows - size, 0)))
         c = int(np.clip(first - margin, 0, max(columns - size, 0)))
-        found.append((r, c))
+        corners.append((r, c))
         left[top : top + inner, first : first + inner] = False
-    return found
+    return corners
 
 
 def feather(size: int, overlap: int) -> Float[np.ndarray, "s s"]:
@@ -82,7 +82,7 @@ def spread_islands(
     labels = sampled(texels.island, (small.shape[0], small.shape[1]))
     fr, fc = (n / have for n, have in zip(small.shape[:2], hole.shape, strict=True))
     for island, box in island_boxes(texels.island, np.unique(texels.island[hole & texels.covered])):
-        wanted = hole[box] & (texels.island[box] == island)
+        target = hole[box] & (texels.island[box] == island)
         rows, columns = box
         # The same box in the smaller atlas, with a border for the interpolation.
         top, bottom = max(int(rows.start * fr) - 2, 0), min(int(np.ceil(rows.stop * fr)) + 2, small.shape[0])
@@ -92,10 +92,10 @@ def spread_islands(
             continue
         index = nearest(own)[0]
         pure = small[top:bottom, left:right].reshape(-1, 3)[index]
-        r, c = np.nonzero(wanted)
+        r, c = np.nonzero(target)
         y = (r + rows.start + 0.5) * fr - 0.5 - top
         x = (c + columns.start + 0.5) * fc - 0.5 - left
-        result[box][wanted] = _bilinear(pure, y, x)
+        result[box][target] = _bilinear(pure, y, x)
     return result
 
 

@@ -84,9 +84,9 @@ def cosines(
     """|cosine| between normals and the lines to the camera; 1 where a normal is zero."""
     ray = camera.position.astype(np.float32)[:, None] - points
     along = np.abs(ray[0] * normals[0] + ray[1] * normals[1] + ray[2] * normals[2])
-    found = along / np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
-    found[~normals.any(axis=0)] = 1
-    return found
+    cosine = along / np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+    cosine[~normals.any(axis=0)] = 1
+    return cosine
 
 
 def depth_tolerance(camera: Camera, depth: np.ndarray, settings: WarpSettings) -> Float[np.ndarray, "..."]:

@@ -32,19 +32,19 @@ def segmenter(path: Path) -> Masker:
     Raises EnvironmentMissing without onnxruntime, InputRefused for a file that is no such model.
     """
     session = opened(path)
-    given = session.get_inputs()
-    if len(given) != 1 or len(given[0].shape) != 4:
-        shapes = ", ".join(str(one.shape) for one in given)
+    inputs = session.get_inputs()
+    if len(inputs) != 1 or len(inputs[0].shape) != 4:
+        shapes = ", ".join(str(one.shape) for one in inputs)
         raise InputRefused(
             f"{path}: found inputs of shape {shapes}, expected one picture (1, 3, height, width);"
             " give the ONNX file of BiRefNet or of a segmenter like it"
         )
-    half = getattr(given[0], "type", "") == "tensor(float16)"
-    height, width = (n if isinstance(n, int) and n > 0 else SIDE for n in given[0].shape[2:])
+    half = getattr(inputs[0], "type", "") == "tensor(float16)"
+    height, width = (n if isinstance(n, int) and n > 0 else SIDE for n in inputs[0].shape[2:])
 
     def mask(view: View) -> np.ndarray:
         ready = prepared(srgb_from_linear(view.rgb), (height, width)).astype(np.float16 if half else np.float32)
-        return foreground(session.run(None, {given[0].name: ready})[-1], view.camera.size, path)
+        return foreground(session.run(None, {inputs[0].name: ready})[-1], view.camera.size, path)
 
     return mask
 

@@ -51,9 +51,9 @@ def displacement(was: Bool[np.ndarray, "h w"], now: Bool[np.ndarray, "h w"]) -> 
         for _ in range(ROUNDS):
             x, y = columns + field[..., 0], rows + field[..., 1]
             # cv2.remap rounds places to 1/32 pixel, which is nothing beside an outline's own pixels.
-            here = cv2.remap(old, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            warped = cv2.remap(old, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             uphill = cv2.remap(slope, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            gap = np.clip(new - here, -reach, reach)[..., None]
+            gap = np.clip(new - warped, -reach, reach)[..., None]
             step = gap * uphill / ((uphill**2).sum(axis=-1, keepdims=True) + 0.1)
             field += gaussian(weight[..., None] * step, sigma) / (share + FAR)
     return field
@@ -83,9 +83,9 @@ def follow(view: View, mask: Bool[np.ndarray, "h w"]) -> View:
     index = carried(inside, field).reshape(-1)
 
     def moved(values: np.ndarray, outside: float) -> np.ndarray:
-        found = values.reshape(height * width, -1)[index].reshape(values.shape)
+        gathered = values.reshape(height * width, -1)[index].reshape(values.shape)
         where = mask.reshape(height, width, *[1] * (values.ndim - 2))
-        return np.where(where, found, np.asarray(outside, values.dtype))
+        return np.where(where, gathered, np.asarray(outside, values.dtype))
 
     return replace(
         view,

@@ -111,14 +111,14 @@ def sweep(
     lifted: list[Lifted] = []
     for turn, k in enumerate(order):
         file = None if store is None else store.folder / f"view_{k:03d}.npz"
-        own = None if file is None else read_kept(file, key)
+        own = None if file is None else read_view(file, key)
         if own is None:
             prior = composite(lifted, views[k], chosen) if lifted else None
             anchor = (views[order[0]], done[order[0]]) if done else None
             rng = np.random.default_rng([seed, k])
             own = paint_view(views[k], prior, anchor, painter, settings, rng, follows)
             if file is not None:
-                write_kept(file, key, own)
+                write_view(file, key, own)
         done[k] = own
         shown = drawn(views[k], own) if follows else finished(views[k], own)
         lifted.append(lift(shown, chosen, own.mask))
@@ -205,7 +205,7 @@ def drawn(view: View, painted: PaintedView) -> View:
     return replace(follow(view, painted.seen), rgb=painted.rgb)
 
 
-def write_kept(file: Path, key: str, painted: PaintedView) -> None:
+def write_view(file: Path, key: str, painted: PaintedView) -> None:
     """One finished view on disk, whole or not at all."""
     numbers = np.array([painted.known, painted.drift])
 
@@ -215,7 +215,7 @@ def write_kept(file: Path, key: str, painted: PaintedView) -> None:
     atomic_write(file, write)
 
 
-def read_kept(file: Path, key: str) -> PaintedView | None:
+def read_view(file: Path, key: str) -> PaintedView | None:
     """A finished view that was kept under this key; None where there is none that can be read."""
     try:
         with np.load(file, allow_pickle=False) as arrays:

@@ -29,10 +29,10 @@ CHANCE, CERTAIN = 0.5, 0.65
 def share(views: Sequence[View], shading: Sequence[Float[np.ndarray, "h w"]], largest: float = 1.0) -> float:
     """The exponent of the shading that the views show, 0..`largest`; `shading` is the luminance of the bare shape under
     the views' light, multiplied by coverage as `view.rgb` is."""
-    found = [pair for pair in map(_together, views, shading) if pair is not None]
-    if not found:
+    fits = [pair for pair in map(_together, views, shading) if pair is not None]
+    if not fits:
         return 0.0
-    slope, correlation = np.median(found, axis=0)
+    slope, correlation = np.median(fits, axis=0)
     certain = np.clip((correlation - CHANCE) / (CERTAIN - CHANCE), 0, 1)
     return float(min(certain * np.clip(slope, 0, 1), largest))
 

@@ -64,8 +64,8 @@ def _drop_stretched(winner: np.ndarray, known: np.ndarray, view: View, source: L
     pixel = np.flatnonzero(known)
     point = winner.reshape(-1)[pixel]
     normals = np.ascontiguousarray(view.normal.reshape(-1, 3)[pixel].T)
-    here = cosines(view.camera, source.points.take(point, axis=1), normals)
-    known.reshape(-1)[pixel] = source.cosine[point] >= settings.sharpness * here
+    facing = cosines(view.camera, source.points.take(point, axis=1), normals)
+    known.reshape(-1)[pixel] = source.cosine[point] >= settings.sharpness * facing
 
 
 def warp(source: Lifted, view: View, settings: WarpSettings, inside: Bool[np.ndarray, "h w"] | None = None) -> Prior:
@@ -80,15 +80,15 @@ def composite(
     height, width = view.camera.size
     rgb, known = np.zeros((height * width, 3), np.float32), np.zeros((height, width), bool)
     nearest = sorted(sources, key=lambda s: angle(s.camera, view.camera))
-    found: list[tuple[np.ndarray, np.ndarray]] = [(np.empty(0), np.empty(0))] * len(nearest)
+    winners: list[tuple[np.ndarray, np.ndarray]] = [(np.empty(0), np.empty(0))] * len(nearest)
 
     def work(k: int) -> None:
         winner, counts = splat(nearest[k], view, settings, inside)
         at = np.flatnonzero(counts)
-        found[k] = at, winner.reshape(-1)[at]
+        winners[k] = at, winner.reshape(-1)[at]
 
     threaded(work, len(nearest))
-    for source, (at, winner) in zip(nearest, found, strict=True):
+    for source, (at, winner) in zip(nearest, winners, strict=True):
         new = ~known.reshape(-1)[at]
         rgb[at[new]] = _colours(source, view, at[new], winner[new], settings)
         known.reshape(-1)[at] = True
@@ -108,19 +108,22 @@ def _colours(
     result = source.colour.take(winner, axis=0)
     if not settings.look_up or not len(pixel):
         return result
-    camera, other = view.camera, source.camera
+    camera, source_camera = view.camera, source.camera
     rows, columns = np.divmod(pixel, camera.size[1])
     depth = view.depth.reshape(-1)[pixel].astype(np.float64)
     x, y = ((n + 0.5 - c) / camera.focal * depth for n, c in zip((columns, rows), camera.centre, strict=True))
-    x, y, z = transformed(other.cam_from_world @ camera.world_from_cam, np.stack([x, y, depth]))
-    there = np.stack([x / z * other.focal + other.centre[0], y / z * other.focal + other.centre[1]], axis=1)
+    x, y, z = transformed(source_camera.cam_from_world @ camera.world_from_cam, np.stack([x, y, depth]))
+    px = np.stack(
+        [x / z * source_camera.focal + source_camera.centre[0], y / z * source_camera.focal + source_camera.centre[1]],
+        axis=1,
+    )
     row, column = np.divmod(source.pixel[winner], source.camera.size[1])
-    beside = (np.abs(there[:, 0] - column - 0.5) < 2) & (np.abs(there[:, 1] - row - 0.5) < 2)
-    found = bilinear(source.picture, there[beside])
-    found[:, :4] /= np.maximum(found[:, 4:], 1e-6)
-    same = np.abs(found[:, 3] - z[beside]) <= depth_tolerance(source.camera, z[beside], settings)
-    good = same & (found[:, 4] > 0.5)
-    result[np.flatnonzero(beside)[good]] = found[good, :3]
+    beside = (np.abs(px[:, 0] - column - 0.5) < 2) & (np.abs(px[:, 1] - row - 0.5) < 2)
+    samples = bilinear(source.picture, px[beside])
+    samples[:, :4] /= np.maximum(samples[:, 4:], 1e-6)
+    same = np.abs(samples[:, 3] - z[beside]) <= depth_tolerance(source.camera, z[beside], settings)
+    good = same & (samples[:, 4] > 0.5)
+    result[np.flatnonzero(beside)[good]] = samples[good, :3]
     return result
 
 
@@ -157,10 +160,10 @@ def _scatter(
 
 def _fill(winner: Int[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], camera: Camera, settings: WarpSettings):
     """Give the holes near a painted pixel the nearest one of their own surface, in place."""
-    found = winner >= 0
+    covered = winner >= 0
     height, width = winner.shape
-    holes = np.flatnonzero(np.isfinite(depth) & ~found & dilate(found, settings.fill))
-    flat, depths, known = winner.reshape(-1), depth.reshape(-1), found.reshape(-1)
+    holes = np.flatnonzero(np.isfinite(depth) & ~covered & dilate(covered, settings.fill))
+    flat, depths, known = winner.reshape(-1), depth.reshape(-1), covered.reshape(-1)
     for dy, dx in _disc(settings.fill):
         if not len(holes):
             return

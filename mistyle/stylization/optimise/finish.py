@@ -231,13 +231,13 @@ class Finishing:
         import torch
 
         rng, seen = np.random.default_rng(JUDGE), np.zeros_like(self.seen)
-        found = []
+        losses = []
         for _ in range(JUDGED):
             crops = self.crops(rng, seen)
             with torch.no_grad():
                 leaf = torch.from_numpy(self.table.values["albedo"][crops.taps.texels])
-                found.append(float(self.losses(crops, leaf, rng)[0]))
-        return float(np.mean(found))
+                losses.append(float(self.losses(crops, leaf, rng)[0]))
+        return float(np.mean(losses))
 
     def restrain(self) -> None:
         """Take out of the change of the albedo its own mean over a few strokes, and directions of colour in which the
@@ -259,14 +259,14 @@ class Finishing:
         if after >= before:
             # What does not help on crops that no step used stays as the painter left it.
             self.table.values["albedo"][:] = self.table.start["albedo"]
-        made, squares, count = [], 0.0, 0
+        albedos, squares, count = [], 0.0, 0
         laid = fit_table.finished(self.table, self.encoded, self.painted.only)
         for new, old, where in zip(laid, self.encoded, self.painted.texels, strict=True):
             change = (new.albedo - old.albedo)[where.covered]
             squares, count = squares + float(np.square(change, dtype=np.float64).sum()), count + change.size
-            made.append(linear_from_srgb(new.albedo))
+            albedos.append(linear_from_srgb(new.albedo))
         moved = float(np.sqrt(squares / max(count, 1)))
-        return StyleFinish(tuple(made), tuple(self.trace), (before, after), moved)
+        return StyleFinish(tuple(albedos), tuple(self.trace), (before, after), moved)
 
 
 class Film:
@@ -334,10 +334,10 @@ def weights(surface: Any, cameras: Sequence[Camera]) -> Float[np.ndarray, " n"]:
     each = zip(np.split(surface.position, n), cameras, strict=True)
     depth = np.concatenate([(p - c.position) @ c.world_from_cam[:3, 2] for p, c in each])
     near = np.clip(2 - 2 * np.abs(depth / DISTANCE - 1) / FAR, 0, 1)
-    found = (angle * near * surface.mask).reshape(n, height, width).astype(np.float32)
+    weight = (angle * near * surface.mask).reshape(n, height, width).astype(np.float32)
     kernel = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
-    inside = [cv2.erode((one > 0).astype(np.uint8), kernel) for one in found]
-    return (found * np.stack(inside)).reshape(-1)
+    inside = [cv2.erode((one > 0).astype(np.uint8), kernel) for one in weight]
+    return (weight * np.stack(inside)).reshape(-1)
 
 
 def shape_edges(normals: Float[np.ndarray, "n h w 3"]) -> Float[np.ndarray, "n h w"]:

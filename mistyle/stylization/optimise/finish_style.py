@@ -56,7 +56,7 @@ def painting_features(solution: PaintedSurface, pixel: float, features: Features
     for turn in range(4):
         page = torch.from_numpy(np.ascontiguousarray(np.rot90(picture, turn).transpose(2, 0, 1)))[None]
         with torch.no_grad():
-            pages.append(tuple(_thin(found[0], rows * columns).half() for found in features(page)))
+            pages.append(tuple(_thin(maps[0], rows * columns).half() for maps in features(page)))
     tree = as_points(solution.positions, solution.normals, solution.spacing).tree
     return PaintingFeatures(solution, tree, (rows, columns), tuple(pages))
 
@@ -101,15 +101,15 @@ def target_features(painting: PaintingFeatures, where: Places, crops: int, size:
         middle = slice(by // 2, None, by)
         page = where.page.reshape(crops, size, size)[:, middle, middle]
         at = where.at.reshape(crops, size, size, 2)[:, middle, middle] / by
-        made = torch.empty(crops, painting.pages[0][level].shape[0], *page.shape[1:])
+        sampled = torch.empty(crops, painting.pages[0][level].shape[0], *page.shape[1:])
         for turn, pages in enumerate(painting.pages):
             rows, columns = pages[level].shape[1:]
             x, y = (np.clip(at[..., axis].astype(np.int64), 0, most - 1) for axis, most in ((0, columns), (1, rows)))
             chosen = torch.from_numpy(page == turn)
             values = pages[level].reshape(pages[level].shape[0], -1)
             flat = torch.from_numpy(y * columns + x)[chosen]
-            made.permute(1, 0, 2, 3)[:, chosen] = values[:, flat].float()
-        result.append(made)
+            sampled.permute(1, 0, 2, 3)[:, chosen] = values[:, flat].float()
+        result.append(sampled)
     return result
 
 

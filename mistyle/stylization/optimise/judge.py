@@ -73,9 +73,9 @@ def build_evaluation(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets:
         point = world_from_px(
             targets[k].camera, px, targets[k].depth[rows[middle], columns[middle]][None].astype(float)
         )
-        other = _nearest(targets, k)
+        neighbour = _nearest(targets, k)
         views.append(_window(targets[k], px[0], size))
-        neighbours.append(_window(targets[other], px_from_world(targets[other].camera, point)[0][0], size))
+        neighbours.append(_window(targets[neighbour], px_from_world(targets[neighbour].camera, point)[0][0], size))
     pairs = list(zip(views, neighbours, strict=True))
     surfaces = [tuple(deferred.trace(traced, [each.camera], tangents) for each in pair) for pair in pairs]
     masks = [view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1) for view in views]

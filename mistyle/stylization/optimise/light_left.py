@@ -23,12 +23,12 @@ def light_left(
         return None
     areas = face_areas(mesh).astype(np.float64)
     step = max(1, covered // most)
-    found = []
+    samples = []
     for texels, chosen in zip(sets, maps, strict=True):
         at = np.flatnonzero(texels.covered)
         weight = texel_areas(texels.face.reshape(-1)[at], areas)[::step]
         at = at[::step]
         flat = (values.reshape(-1, 3)[at] for values in (chosen.albedo, texels.position, texels.normal))
-        found.append((*flat, weight))
-    albedo, positions, normals, weight = (np.concatenate(columns) for columns in zip(*found, strict=True))
+        samples.append((*flat, weight))
+    albedo, positions, normals, weight = (np.concatenate(columns) for columns in zip(*samples, strict=True))
     return baked_light(albedo, normals, ambient_occlusion(mesh, positions, normals, seed=seed), weight)

@@ -128,12 +128,12 @@ def solve(
         metallic=settings.metallic == "fit", iterations=ITERATIONS, bounces=BOUNCES, bounce_samples=BOUNCE_SAMPLES,
         joint_subsamples=JOINT_SAMPLES,
     )  # fmt: skip
-    found = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
-    fitted = tuple(_where_seen(found, start, coarse, k) for k in range(len(start)))
+    recovered = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
+    fitted = tuple(_where_seen(recovered, start, coarse, k) for k in range(len(start)))
     residual, unlit = _explained(mesh, captures, (start, fitted), targets)
     progress(1.0)
-    trace = {f"phase1.{name}": values for name, values in found.trace.items()}
-    return Solved(tuple(start), fitted, tuple(unlit), residual, trace, found.notes)
+    trace = {f"phase1.{name}": values for name, values in recovered.trace.items()}
+    return Solved(tuple(start), fitted, tuple(unlit), residual, trace, recovered.notes)
 
 
 def laid(
@@ -165,14 +165,14 @@ def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
     return Maps(known=np.zeros(size, bool), **fields)
 
 
-def _where_seen(found: Recovered, start: Sequence[Maps], texels: Sequence[Texels], k: int) -> Maps:
+def _where_seen(recovered: Recovered, start: Sequence[Maps], texels: Sequence[Texels], k: int) -> Maps:
     """The solution but for texels that no view shows in the light: these keep the start."""
-    open_ = texels[k].covered & (found.seen[k] <= 0)
+    open_ = texels[k].covered & (recovered.seen[k] <= 0)
     fields: dict[str, np.ndarray] = {}
     for name in DESCRIBED:
-        solved, before = getattr(found.maps[k], name), getattr(start[k], name)
+        solved, before = getattr(recovered.maps[k], name), getattr(start[k], name)
         fields[name] = np.where(open_[..., None] if solved.ndim == 3 else open_, before, solved)
-    return replace(found.maps[k], **fields)
+    return replace(recovered.maps[k], **fields)
 
 
 def _explained(

@@ -177,15 +177,15 @@ def pairs(table: FitTable, texels: Int[np.ndarray, " n"]) -> Pairs:
     table.place[texels] = own
     following, preceding, count = [], [], []
     for joined, stride in ((table.right, None), (table.below, table.columns)):
-        here = np.flatnonzero(joined[texels])
-        at = texels[here]
-        there = table.place[at + (1 if stride is None else stride[at])]
-        here, there = here[there >= 0], there[there >= 0]
+        first = np.flatnonzero(joined[texels])
+        at = texels[first]
+        second = table.place[at + (1 if stride is None else stride[at])]
+        first, second = first[second >= 0], second[second >= 0]
         ahead, behind = own.copy(), own.copy()
-        ahead[here], behind[there] = there, here
+        ahead[first], behind[second] = second, first
         following.append(ahead)
         preceding.append(behind)
-        count.append(len(here))
+        count.append(len(first))
     table.place[texels] = -1
     return Pairs(texels, tuple(following), tuple(preceding), tuple(count))
 
@@ -244,8 +244,8 @@ def _laid(
         after = _apply(before, name, resized_rows(change, shape, rows, "repeat"))
         result[rows] = after
         if mask is not None:
-            kept = ~mask[rows]
-            result[rows][kept] = before[kept]
+            outside = ~mask[rows]
+            result[rows][outside] = before[outside]
     return result
 
 
@@ -255,9 +255,9 @@ def spread(table: FitTable, maps: Sequence[Maps], values: Float[np.ndarray, " t"
     for k, (material, part) in enumerate(zip(maps, table.parts, strict=True)):
         rows, columns = material.roughness.shape
         cells = values[part].reshape(table.sizes[k]).astype(np.float32)
-        by, made = rows // table.sizes[k][0], memory.empty((rows, columns))
-        made.reshape(rows // by, by, columns // by, by)[...] = cells[:, None, :, None]
-        result.append(made)
+        by, enlarged = rows // table.sizes[k][0], memory.empty((rows, columns))
+        enlarged.reshape(rows // by, by, columns // by, by)[...] = cells[:, None, :, None]
+        result.append(enlarged)
     return result
 
 
@@ -299,8 +299,8 @@ def _shrink(material: Maps, name: str, covered: Bool[np.ndarray, "h w"], by: int
     mean = np.empty((*weight.shape, channels), np.float32)
     for rows in bands(height // by, width * by):  # of cells
         texels = slice(rows.start * by, rows.stop * by)
-        here = _tilt(values[texels]) if name == "tilt" else values[texels]
-        cells = (here * counted[texels][..., None]).reshape(-1, by, width // by, by, channels)
+        block = _tilt(values[texels]) if name == "tilt" else values[texels]
+        cells = (block * counted[texels][..., None]).reshape(-1, by, width // by, by, channels)
         mean[rows] = cells.sum(axis=(1, 3), dtype=np.float32) / np.maximum(weight[rows], 1)[..., None]
     index, _ = nearest(weight > 0)
     return np.ascontiguousarray(mean.reshape(-1, channels)[index.ravel()].reshape(*weight.shape, channels))

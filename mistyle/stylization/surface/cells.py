@@ -142,12 +142,12 @@ def _fates(dj: ModuleType, grid: PointGrid, fate: Any, i: Any, limit: Any) -> An
     mine = number(own[3])
 
     def visit(j: Any, inside: Any, beaten: Any, gone: Any) -> tuple[Any, Any]:
-        other, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
-        step = [other[axis] - own[axis] for axis in range(3)]
+        neighbour, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
+        step = [neighbour[axis] - own[axis] for axis in range(3)]
         near = inside & (step[0] * step[0] + step[1] * step[1] + step[2] * step[2] <= limit) & (j != i)
         near &= facing[0] * normal[0] + facing[1] * normal[1] + facing[2] * normal[2] > 0
         its = dr.gather(dj.UInt, fate, j)
-        beaten |= near & (its == UNDECIDED) & (number(other[3]) > mine)
+        beaten |= near & (its == UNDECIDED) & (number(neighbour[3]) > mine)
         return beaten, gone | (near & (its == STAYS))
 
     beaten, gone = each_near(dj, grid, own, (dj.Bool(False), dj.Bool(False)), visit)
@@ -174,8 +174,8 @@ def near(
     listed = whole(dj, np.repeat(np.arange(count, dtype=np.uint32), most))
 
     def visit(j: Any, inside: Any, held: Any) -> tuple[Any]:
-        other, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
-        away = dr.square(other[0] - own[0]) + dr.square(other[1] - own[1]) + dr.square(other[2] - own[2])
+        neighbour, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
+        away = dr.square(neighbour[0] - own[0]) + dr.square(neighbour[1] - own[1]) + dr.square(neighbour[2] - own[2])
         turn = [dr.square(facing[axis] - normal[axis]) for axis in range(3)]
         away += weight * (turn[0] + turn[1] + turn[2])
         take = inside & (away < limit) & (held < most)

@@ -374,19 +374,19 @@ def _cost(
         total = variety * dr.gather(dj.Float, prices.use, dr.gather(dj.UInt, exemplar.origin, pixel))
         own = _descriptor(dj, exemplar.descriptor, pixel, SEEN)
         for k in range(WIDTH // 4):
-            here = own[k] if k < len(own) else dr.gather(dj.Array4f, exemplar.descriptor, pixel * (WIDTH // 4) + k)
-            gap = target[k] - here
+            entries = own[k] if k < len(own) else dr.gather(dj.Array4f, exemplar.descriptor, pixel * (WIDTH // 4) + k)
+            gap = target[k] - entries
             if k < LINEAR // 4:
                 total += dr.squared_norm(gap)
             else:
                 total += dr.square(gap[0]) + band_weight * dr.square(gap[1])
-        for k, (other, u, v) in enumerate(beside):
+        for k, (neighbour_page, u, v) in enumerate(beside):
             away = dr.square(u - x) + dr.square(v - y)
             apart = sum((dr.squared_norm(a - b) for a, b in zip(own, shown[k], strict=True)), start=dj.Float(0))
             visible = HIDDEN_SEAM + (1 - HIDDEN_SEAM) * dr.minimum(apart * seam, 1)
-            price = coherence * visible * dr.select(other == page, dr.minimum(away, 4) / 4, 1)
+            price = coherence * visible * dr.select(neighbour_page == page, dr.minimum(away, 4) / 4, 1)
             if around is not None:
-                near = dr.select(other == page, dr.maximum(1 - away / around, 0), 0)
+                near = dr.select(neighbour_page == page, dr.maximum(1 - away / around, 0), 0)
                 price = dr.select(closed[k] > 0, STAY * near, price)
             total += price
         return total

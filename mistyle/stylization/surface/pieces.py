@@ -21,14 +21,14 @@ def labels(level: Level, exemplar: Exemplar, field: NearestNeighbourField) -> In
     """Which piece each sample belongs to, given its place."""
     page, x, y = field.page, field.x, field.y
     count, beside = len(page), np.array(BESIDE)
-    other, turned = level.neighbours[:, beside], level.turned[:, beside]
-    goes_on = np.stack([x[other], y[other]], axis=-1) + level.offsets[:, beside]
-    height, width = exemplar.shapes[page[other]].astype(np.float32).transpose(2, 0, 1)
+    neighbour, turned = level.neighbours[:, beside], level.turned[:, beside]
+    goes_on = np.stack([x[neighbour], y[neighbour]], axis=-1) + level.offsets[:, beside]
+    height, width = exemplar.shapes[page[neighbour]].astype(np.float32).transpose(2, 0, 1)
     goes_on = np.where(turned[..., None], np.stack([width - 1, height - 1], axis=-1) - goes_on, goes_on)
-    same = np.where(turned, (page[other] + 2) % 4, page[other]) == page[:, None]
+    same = np.where(turned, (page[neighbour] + 2) % 4, page[neighbour]) == page[:, None]
     jump = ((goes_on - np.stack([x, y], axis=-1)[:, None]) ** 2).sum(axis=-1)
-    here, there = np.nonzero(same & (jump < SAME**2))
-    joined = coo_matrix((np.ones(len(here), bool), (here, other[here, there])), shape=(count, count))
+    sample, slot = np.nonzero(same & (jump < SAME**2))
+    joined = coo_matrix((np.ones(len(sample), bool), (sample, neighbour[sample, slot])), shape=(count, count))
     return connected_components(joined, directed=False)[1]
 
 

@@ -114,15 +114,15 @@ def spread(
     order = in_order(positions)
     positions, normals = positions[order], normals[order]
     radius = SPACING * float(np.sqrt(area / count))
-    kept = thin(positions, normals, radius, rng, dj)
+    selected = thin(positions, normals, radius, rng, dj)
     # Layers that coincide count several times in the area but hold the points of one: draw nearer until enough stay.
     for _ in range(COINCIDENT_ROUNDS):
-        if len(kept) > count / 2:
+        if len(selected) > count / 2:
             break
-        radius *= max(0.25, float(np.sqrt(len(kept) / (YIELD * count))))
-        kept = thin(positions, normals, radius, rng, dj)
-    own_area = radius**2 / SPACING**2 * len(kept) / YIELD
-    return as_points(positions[kept], normals[kept], float(np.sqrt(min(area, 1.1 * own_area) / len(kept))))
+        radius *= max(0.25, float(np.sqrt(len(selected) / (YIELD * count))))
+        selected = thin(positions, normals, radius, rng, dj)
+    own_area = radius**2 / SPACING**2 * len(selected) / YIELD
+    return as_points(positions[selected], normals[selected], float(np.sqrt(min(area, 1.1 * own_area) / len(selected))))
 
 
 def combined(
@@ -173,9 +173,9 @@ def first_per_cell(
     cell = np.floor(positions / size).astype(np.int64)
     octant = (normals > 0) @ np.array([1, 2, 4])
     key = np.concatenate([cell, octant[:, None]], axis=1)
-    kept = np.zeros(len(positions), bool)
-    kept[distinct(key)[0]] = True
-    return kept
+    mask = np.zeros(len(positions), bool)
+    mask[distinct(key)[0]] = True
+    return mask
 
 
 def morton(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:

@@ -277,11 +277,11 @@ def paint_level(
             extra = settings.variety * usage(exemplar, on_host(field))[exemplar.origin]
             also = on_device(dj, exhaustive(asked, band_weight, described, extra, exemplar))
         for _ in range(SWEEPS):
-            here = on_host(field)
-            use = kernels.floats(dj, usage(exemplar, here))
+            current = on_host(field)
+            use = kernels.floats(dj, usage(exemplar, current))
             # Only where all places are tried is there a way out of a piece; finer levels redraw what these decided.
             bound = settings.largest_piece < 1 and complete > 0
-            limit = patch_size_limit(level, exemplar, here, settings.largest_piece, dj) if bound else None
+            limit = patch_size_limit(level, exemplar, current, settings.largest_piece, dj) if bound else None
             field = kernels.search(dj, table, arrays, field, targets, kernels.Prices(prices, use, limit), also)[1]
     return on_host(field)
 

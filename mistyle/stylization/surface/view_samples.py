@@ -193,11 +193,11 @@ def flat_level(
             step = share * points.spacing * (dx * tangent[left, :2] + dy * across[left, :2])
             column, row = np.floor((place[left] + step - middle) / points.spacing + 0.5).astype(np.int64).T
             inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-            other = number[np.where(inside, row * columns + column, 0)]
+            candidate = number[np.where(inside, row * columns + column, 0)]
             reach = STEEP * points.spacing * np.hypot(dx, dy) * depth[left] / focal
-            near = np.abs(depth[other] - depth[left]) <= np.maximum(LEAST_STEP, reach)
-            good = inside & (other >= 0) & near
-            neighbours[left[good], k] = other[good]
+            near = np.abs(depth[candidate] - depth[left]) <= np.maximum(LEAST_STEP, reach)
+            good = inside & (candidate >= 0) & near
+            neighbours[left[good], k] = candidate[good]
     offsets = np.empty((*neighbours.shape, 2), np.float32)
     way = (place[:, None] - place[neighbours]) / np.float32(points.spacing)
     offsets[..., 0] = (way * tangent[neighbours][..., :2]).sum(axis=2)

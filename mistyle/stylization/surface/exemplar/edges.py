@@ -52,9 +52,9 @@ def hard_pixels(lab: Float[np.ndarray, "h w 3"]) -> bool:
     hard, all_steps = 0, 0
     for axis in (0, 1):
         d = np.moveaxis(np.diff(lab[..., 0], axis=axis), axis, 0)
-        before, here, after = d[:-2], d[1:-1], d[2:]
-        big = np.abs(here) > 0.1
-        ramp = (before * here > 0.15 * here**2) | (after * here > 0.15 * here**2)
+        before, centre, after = d[:-2], d[1:-1], d[2:]
+        big = np.abs(centre) > 0.1
+        ramp = (before * centre > 0.15 * centre**2) | (after * centre > 0.15 * centre**2)
         hard, all_steps = hard + int((big & ~ramp).sum()), all_steps + int(big.sum())
     return all_steps > 0 and hard >= HARD * all_steps
 
@@ -83,6 +83,6 @@ def margin(lab: Float[np.ndarray, "h w 3"]) -> float:
     """How far from the first row on rows are of the first rows' colour, in shares of the height; 0 where none is."""
     colour = np.median(lab[:2].reshape(-1, 3), axis=0)
     alike = (np.abs(lab - colour).sum(axis=2) < ALIKE).mean(axis=1)
-    other = np.flatnonzero(alike < EVEN)
-    depth = int(other[0]) if len(other) else len(lab)
+    uneven = np.flatnonzero(alike < EVEN)
+    depth = int(uneven[0]) if len(uneven) else len(lab)
     return depth / len(lab) if 1 <= depth <= DEEPEST * len(lab) else 0.0

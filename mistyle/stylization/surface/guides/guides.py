@@ -67,14 +67,14 @@ def level_guides(
     if settings.form > 0:
         tone = mixed(tone, lit, settings.form)
         details = mixed(details, detail(levels, lit, cavity), settings.form)
-    kept = 0.0
+    content_share = 0.0
     if content is not None and settings.keep_content > 0:
         lightness = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
-        kept = settings.keep_content * min(float(lightness[-1].std()) / LEAST_CONTENT, 1.0)
-        tone, details = with_content(levels, tone, details, lightness, kept)
+        content_share = settings.keep_content * min(float(lightness[-1].std()) / LEAST_CONTENT, 1.0)
+        tone, details = with_content(levels, tone, details, lightness, content_share)
     shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
     colour = colour_field(tone[middle], fields, shown, palette, rng)
-    typical, spread = palette[:, 0].mean(), CALM + (1 - CALM) * max(settings.form, kept)
+    typical, spread = palette[:, 0].mean(), CALM + (1 - CALM) * max(settings.form, content_share)
     colour[:, 0] = typical + spread * (colour[:, 0] - typical)
     return [
         Guide(carry(base, colour, level.points), own, level.directed)

@@ -42,13 +42,13 @@ def vibrations(level: Level, count: int) -> Float[np.ndarray, "n k"]:
     size = len(level.directed)
     count = min(count, max(size // 8, 1))
     positions, normals = level.points.positions.astype(np.float64), level.points.normals.astype(np.float64)
-    other = level.neighbours
-    away = positions[other] - positions[:, None]
+    neighbour = level.neighbours
+    away = positions[neighbour] - positions[:, None]
     length = np.maximum(np.linalg.norm(away, axis=2), 1e-12)
-    bend = ((normals[other] - normals[:, None]) * away).sum(axis=2) / length
-    weight = np.exp(-CONCAVE * np.maximum(-bend, 0)) * (other != np.arange(size)[:, None])
-    rows = np.repeat(np.arange(size), other.shape[1])
-    bound = csr_matrix((weight.reshape(-1), (rows, other.reshape(-1))), shape=(size, size))
+    bend = ((normals[neighbour] - normals[:, None]) * away).sum(axis=2) / length
+    weight = np.exp(-CONCAVE * np.maximum(-bend, 0)) * (neighbour != np.arange(size)[:, None])
+    rows = np.repeat(np.arange(size), neighbour.shape[1])
+    bound = csr_matrix((weight.reshape(-1), (rows, neighbour.reshape(-1))), shape=(size, size))
     # Pieces of the mesh that do not touch are bound as loosely as can be, so that each vibrates as a whole first.
     bound = (bound + bound.T) / 2 + loose(positions)
     degree = np.asarray(bound.sum(axis=1))[:, 0]
