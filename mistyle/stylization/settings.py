@@ -158,7 +158,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "diffusion": {"content": "per-view"},
     },
 }
-# The demo has three minutes: the draft with finer strokes and a larger texture.
+# The demo should take three minutes: the draft with finer strokes and a larger texture.
 PRESETS["demo"] = PRESETS["draft"] | {"surface": {"samples": 150_000}, "atlas": {"size": 2048}}
 
 

@@ -1,6 +1,6 @@
-"""The weight-free inpainter: the surface solution's own colours where there is one, else what surrounds the hole.
+"""Weight-free texture inpainter: colours of the surface solution if available, else continued from the hole's rim.
 
-Stands in for the paper's 4.3 (Stable Diffusion inpainting with ControlNet and IP-Adapter), which needs weights.
+It replaces the paper's 4.3 (Stable Diffusion inpainting with ControlNet and IP-Adapter), which needs weights.
 """
 
 from collections.abc import Callable
@@ -14,19 +14,19 @@ from mistyle.core.image import gaussian, nearest
 from mistyle.core.maps import Texels
 from mistyle.stylization.inpaint.repair import Inpainter
 
-# Standard deviation, as a share of the atlas's side, that parts the colour which flows into a hole from the detail
-# which is mirrored into it: about the width of a brush stroke.
+# Standard deviation, as a share of the atlas's side, of the blur that separates smooth colour (continued harmonically)
+# from detail (mirrored): about the width of a brush stroke.
 DETAIL = 0.01
-# Where to look for detail, as factors of the step from a texel to the nearest rim, taken on from there.
+# Offsets of the mirrored detail beyond the nearest rim texel, as factors of the step from the texel to it.
 TURNS = (1, 0.7 + 0.7j, 0.7 - 0.7j, 1j, -1j, 0.5, 0.25, 0.125)
-SWEEPS = 12  # smoothing sweeps on every level of the pyramid; the coarse ones carry the colour across
+SWEEPS = 12  # Jacobi sweeps on every pyramid level; coarse levels carry colour across holes
 
 # positions (n 3), normals (n 3) in working space -> linear rgb (n 3); not finite where it has no answer
 Colours = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 def inpainter(colours: Colours | None = None) -> Inpainter:
-    """An Inpainter that asks `colours` first and grows inside the islands whatever that leaves open."""
+    """An Inpainter that takes `colours` where finite and grows the other texels inside their islands."""
 
     def paint(albedo: np.ndarray, hole: np.ndarray, texels: Texels, rng: np.random.Generator) -> np.ndarray:
         hole = hole & texels.covered
@@ -43,7 +43,7 @@ def inpainter(colours: Colours | None = None) -> Inpainter:
 
 
 def from_paint(painted: Float[np.ndarray, "h w 3"]) -> Inpainter:
-    """An Inpainter that knows what the whole surface looks like (linear, finite wherever texels are covered)."""
+    """An Inpainter that copies a painting of the whole surface (linear, finite on covered texels)."""
 
     def paint(albedo: np.ndarray, hole: np.ndarray, texels: Texels, rng: np.random.Generator) -> np.ndarray:
         return np.where((hole & texels.covered)[..., None], painted, albedo)
@@ -57,9 +57,9 @@ def grow(
     """Continue every island into its own holes; no colour crosses from one island to another.
 
     The smooth part of the surrounding colour is continued harmonically (Laplace's equation with no flow through the
-    island's border), and the detail around the hole is mirrored into it at the nearest rim texel. An island that is all
-    hole takes the colours nearest on the surface. What lies under the hole is not looked at. It knows nothing of
-    content: large holes look plain, and strokes run back from the rim.
+    island's border). The detail around the hole is mirrored at the nearest rim texel. An island without known texels
+    takes the nearest colours on the surface. Values under the hole are ignored. Content is not modelled: large holes
+    look plain, and strokes run back from the rim.
     """
     result = albedo.copy()
     known = texels.covered & ~hole
@@ -97,8 +97,11 @@ def _grow_island(
 
 
 def _mirrored(gap: Bool[np.ndarray, "h w"], rim: Bool[np.ndarray, "h w"]) -> tuple[np.ndarray, np.ndarray]:
-    """For each gap texel the rim texel opposite to it across the nearest rim texel; where the place opposite is no rim,
-    one beside it at the same distance, else one closer to the nearest. All of them meet the gap at its border."""
+    """For each gap texel the rim texel opposite to it across the nearest rim texel.
+
+    Where the opposite texel is not rim, one beside it at the same distance, else one closer to the nearest. All agree
+    with the gap at its border.
+    """
     rows, columns = np.nonzero(gap)
     near_row, near_column = np.unravel_index(nearest(rim)[0][gap], gap.shape)
     row, column = near_row.copy(), near_column.copy()
@@ -117,7 +120,7 @@ def _mirrored(gap: Bool[np.ndarray, "h w"], rim: Bool[np.ndarray, "h w"]) -> tup
 def _harmonic(
     values: Float[np.ndarray, "h w 3"], known: Bool[np.ndarray, "h w"], own: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """Values continued into own & ~given so that each is the mean of its neighbours: coarse to fine, Jacobi sweeps."""
+    """Values continued into own & ~known, each the mean of its neighbours: coarse to fine, Jacobi sweeps."""
     height, width = known.shape
     if max(height, width) <= 4 or (known | ~own).all():
         start = np.where(known[..., None], values, values[known].mean(axis=0))

@@ -6,7 +6,7 @@ of 3072², four views and 20,000 samples, the other an atlas of 2048². Memory f
 from a job with 20 sets of 512².
 
 TILED comes from single stages at 1024² and 2048², its report from 2048² and 4096²; it counts all sets alike. `finish`
-was measured on one draft of spot (two crops of 256²); its constant covers a painting of the largest size.
+was measured on one draft of spot (two crops of 256²); its estimate includes the features of the largest painting.
 """
 
 from collections.abc import Sequence
