@@ -1,4 +1,4 @@
-"""How much light a finished albedo holds, over all texture sets; the measure itself is in `measure/baked_light.py`."""
+"""Baked light left in a finished albedo, over all texture sets; the measure is in `measure/baked_light.py`."""
 
 from collections.abc import Sequence
 
@@ -8,14 +8,14 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
 
-LOOKED_AT = 40_000  # texels at most, evenly over the sets: enough for two digits
+LOOKED_AT = 40_000  # upper limit of texels, evenly over the sets: enough for two digits
 
 
 def light_left(
     mesh: Mesh, sets: Sequence[Texels], maps: Sequence[Maps], seed: int = 0, most: int = LOOKED_AT
 ) -> BakedLight | None:
-    """The albedo's dependence on the surface's direction and openness, from about `most` texels; None where nothing is
-    covered."""
+    """The albedo's dependence on surface direction and openness, from about `most` texels; None without covered
+    texels."""
     from mistyle.render.mitsuba.occlusion import ambient_occlusion
 
     covered = sum(int(texels.covered.sum()) for texels in sets)

@@ -43,14 +43,14 @@ def retouch(
     from mistyle.io.cameras.camera_files import read_cameras
     from mistyle.stylization.pipeline.painting import with_geometry
 
-    asked = [camera.size for camera in read_cameras(folder / "camera.json")]
+    sizes = [camera.size for camera in read_cameras(folder / "camera.json")]
     touched = {k: file for k, view in enumerate(views) if (file := _file(view, edited)) is not None}
     before = unlit_views(asset, baked.maps, views, lambda done: report(0.3 * done))
     traced = dict(zip(touched, with_geometry(asset, [views[k] for k in touched]), strict=True))
     brushes = []
     for k, file in touched.items():
         drawn = before[k] if file.endswith(".exr") else _as_written(folder, views[k], before[k])
-        lossy = file.lower().endswith((".jpg", ".jpeg", ".webp")) or views[k].camera.size != asked[k]
+        lossy = file.lower().endswith((".jpg", ".jpeg", ".webp")) or views[k].camera.size != sizes[k]
         new = differs(views[k], drawn, *(LOSSY if lossy else EXACT))
         brushes.append(_without_light(replace(traced[k], mask=traced[k].mask & new), baked.gains[k : k + 1]))
     painted, begun = [], []
@@ -69,7 +69,7 @@ def retouch(
         view
         if view.camera.size == size
         else unlit_views(asset, painted, _plain(asset, view, size), lambda done: None)[0]
-        for view, size in zip(shown, asked, strict=True)
+        for view, size in zip(shown, sizes, strict=True)
     ]
     return Retouched(replace(baked, maps=tuple(painted), begin=tuple(begun)), tuple(shown))
 

@@ -258,24 +258,26 @@ def paint_level(
     lab = kernels.floats(dj, exemplar.lab)
     patches = kernels.describe_pixels(dj, lab, exemplar.shapes, axes, mean).numpy().reshape(-1, kernels.PATCH)
     described[exemplar.allowed, : kernels.PATCH] = patches[exemplar.allowed]
-    asked, band_weight = described_guide(task.guide, exemplar, settings, guide_scale)
+    descriptors, band_weight = described_guide(task.guide, exemplar, settings, guide_scale)
     if start is None:
-        start = by_guides(asked, band_weight, described, exemplar, rng)
+        start = by_guides(descriptors, band_weight, described, exemplar, rng)
     table = kernels.tables(dj, level.neighbours, level.turned, level.offsets)
     arrays = exemplar_arrays(dj, exemplar, lab, described)
     weight = kernels.floats(dj, band_weight)
     typical = float(described[exemplar.allowed, : kernels.SEEN].var(axis=0).sum())
     prices = kernels.floats(dj, np.array([settings.stroke_coherence, settings.variety, 1 / max(typical, 1e-6)]))
     field = on_device(dj, start)
-    complete = min(task.rounds, int(ALL_PAIRS // (len(asked) * len(described))))
+    complete = min(task.rounds, int(ALL_PAIRS // (len(descriptors) * len(described))))
     for turn in range(task.rounds):
         colour = constrained(kernels.vote(dj, table, arrays, field), task.constraints, dj)
-        asked[:, : kernels.PATCH] = kernels.describe(dj, table, colour, axes, mean).numpy().reshape(-1, kernels.PATCH)
-        targets = kernels.TargetDescriptors(kernels.floats(dj, asked), weight)
+        descriptors[:, : kernels.PATCH] = (
+            kernels.describe(dj, table, colour, axes, mean).numpy().reshape(-1, kernels.PATCH)
+        )
+        targets = kernels.TargetDescriptors(kernels.floats(dj, descriptors), weight)
         also = None
         if turn < complete:
             extra = settings.variety * usage(exemplar, on_host(field))[exemplar.origin]
-            also = on_device(dj, exhaustive(asked, band_weight, described, extra, exemplar))
+            also = on_device(dj, exhaustive(descriptors, band_weight, described, extra, exemplar))
         for _ in range(SWEEPS):
             current = on_host(field)
             use = kernels.floats(dj, usage(exemplar, current))

@@ -41,8 +41,8 @@ def creases(levels: Sequence[Level]) -> list[Float[np.ndarray, " _"]]:
     relief = (narrow + bounded(broad, 99, LEAST_RELIEF, 1)) / 2
     around = smooth(coarse, drop(middle.points, smooth(middle, relief, 1), coarse.points), 1)
     line = relief - np.float32(NARROW) * carry(coarse.points, around, middle.points)
-    asked = CREASE * salient(np.maximum(line, 0)) + RIDGE * salient(np.maximum(-line, 0))
-    finest = carry(middle.points, asked.astype(np.float32), fine.points)
+    lines = CREASE * salient(np.maximum(line, 0)) + RIDGE * salient(np.maximum(-line, 0))
+    finest = carry(middle.points, lines.astype(np.float32), fine.points)
     softened = smooth(fine, finest, 1)
     return [drop(fine.points, softened, level.points) for level in levels[:-1]] + [finest]
 

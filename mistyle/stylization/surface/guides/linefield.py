@@ -45,7 +45,7 @@ def line_field(
     index = nearest(points, points, AROUND)[1]
     normals = points.normals.astype(np.float64)
     weight = ((normals[index] * normals[:, None]).sum(axis=2) > 0.1).astype(np.float64)
-    data = observed(points, normals, index, weight) if follow == "curvature" else asked(normals, follow)
+    data = observed(points, normals, index, weight) if follow == "curvature" else vertical_lines(normals, follow)
     if direction is not None:
         towards, share = direction(points.positions, points.normals)
         data = (1 - share)[:, None, None] * data + PAINTED_LINES * lines(towards.astype(np.float64), share)
@@ -58,7 +58,7 @@ def line_field(
     return LineField(points, tensors.astype(np.float32))
 
 
-def asked(normals: Float[np.ndarray, "n 3"], follow: str) -> Float[np.ndarray, "n 3 3"]:
+def vertical_lines(normals: Float[np.ndarray, "n 3"], follow: str) -> Float[np.ndarray, "n 3 3"]:
     """Lines along the vertical or around it, surer the steeper the surface stands."""
     level = np.cross(normals, UP)
     steep = (level**2).sum(axis=1)
