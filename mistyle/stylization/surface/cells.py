@@ -1,8 +1,8 @@
-"""Points in cubic cells, and what is near what: thinning to blue noise, and lists of neighbours.
+"""Spatial hash grid of points: blue-noise thinning and neighbour lists.
 
-A cell is found by a hash of its three whole numbers. Several cells may share a bucket: distances decide, so that a
-stranger in a bucket costs time and changes nothing. Everything runs in Dr.Jit; a thread reads what others wrote in the
-kernel before and writes only its own point.
+A cell's bucket is a hash of its three integer coordinates. Several cells may share a bucket: distance tests reject
+points of other cells, which cost time only. Everything runs in Dr.Jit; a thread reads only the previous kernel's values
+and writes only its own point.
 """
 
 from collections.abc import Callable
@@ -17,17 +17,17 @@ from mistyle.stylization.surface.kernels import floats, whole
 
 PRIMES = (73856093, 19349663, 83492791)
 UNDECIDED, STAYS, GONE = 0, 1, 2
-FEWEST = 12  # bits of a bucket's number: with few points too, cells that are near rarely share a bucket
+FEWEST = 12  # least bits of a bucket index, so that with few points, too, nearby cells rarely share a bucket
 
 
 @dataclass(frozen=True)
 class PointGrid:
-    """Points by bucket: those of bucket b stand in rows range[2 b] to range[2 b + 1] of the sorted arrays.
+    """Points by bucket: those of bucket b are rows range[2 b] to range[2 b + 1] of the sorted arrays.
 
-    at      flat (n 4): position, and a number of the point's own
-    facing  flat (n 4): normal, and its number in the order of before
-    row     where each point of before stands now
-    crowd   how many points a point meets in its own bucket, itself included, on average
+    at      flat (n 4): position, and the point's number
+    facing  flat (n 4): normal, and its index in the input order
+    row     row of each input point
+    crowd   mean number of points in a point's own bucket, itself included
     """
 
     size: float
@@ -46,7 +46,7 @@ def point_grid(
     size: float,
     number: Int[np.ndarray, " n"] | None = None,
 ) -> PointGrid:
-    """Points sorted into cubes of side `size`; `number` (under 2^32) goes along with them."""
+    """Points sorted into cubes of side `size`, with their `number` (under 2^32)."""
     count = len(positions)
     buckets = 1 << max(int(np.ceil(np.log2(max(count, 2)))), FEWEST)
     # The same float32 arithmetic as in the kernels, so that both agree on a point's cell.
@@ -80,7 +80,7 @@ def each_near(
 ) -> tuple[Any, ...]:
     """Fold `visit(row, inside, *state)` over the rows of the 27 cells about `point`.
 
-    Where `inside` is false the row means nothing; some rows belong to strangers, and with few points some come twice.
+    Where `inside` is false the row is invalid. Some rows belong to other cells; with few points some repeat.
     """
     import drjit as dr
 
@@ -109,10 +109,10 @@ def each_near(
 
 
 def thin(dj: ModuleType, grid: PointGrid, radius: float) -> Bool[np.ndarray, " n"]:
-    """Which points stay when a point removes all others of its side within `radius`, taken by falling number.
+    """Mask of the points that stay when, by falling number, each removes all others of its side within `radius`.
 
-    Found in parallel rounds: a point that outranks all its undecided neighbours stays, and who is near one that stays
-    is gone. `radius` is at most the cells' size. The answer is in the points' order of before.
+    Parallel rounds: a point that outranks all undecided neighbours stays, and its neighbours are removed. `radius` is
+    at most the cells' size. The mask is in the input order.
     """
     import drjit as dr
 
@@ -162,7 +162,7 @@ def near(
     turning: float,
     most: int,
 ) -> Int[np.ndarray, "n k"]:
-    """Up to `most` points j with |p_j - p_i|^2 + (turning |n_j - n_i|)^2 < reach^2, own index in the places left."""
+    """Up to `most` points j with |p_j - p_i|^2 + (turning |n_j - n_i|)^2 < reach^2, padded with the own index."""
     import drjit as dr
 
     count = len(positions)
