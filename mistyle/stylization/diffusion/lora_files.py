@@ -84,7 +84,7 @@ def refuse_unknown(every: Sequence[LoraPair]) -> None:
 
 def steps_left(kind: Kind, pair: LoraPair, key: str, training: TrainSettings) -> int:
     """Remaining training steps of a picture; ignores checkpoints within a phase."""
-    content, style = pair.there(key)
+    content, style = pair.finished(key)
     if kind == "content":
         return 0 if content and style else training.steps
     return (0 if content else training.steps) + (0 if style and content else training.style_steps)
@@ -151,7 +151,7 @@ def make(
 
     kind, rgb, word = image.kind, image.rgb, image.word
     notes = {"mistyle_key": key, "mistyle_kind": kind, "prompt_word": word, "base_model": "SDXL", "seed": str(seed)}
-    content, style = pair.there(key)
+    content, style = pair.finished(key)
     unet, left = pipeline.unet, steps_left(kind, pair, key, training)
     state = pair.content.with_name(f"{pair.content.name.removesuffix('.content.safetensors')}.training.safetensors")
     done, errors = 0, []

@@ -348,7 +348,7 @@ def urgency(detail: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 
 def exhaustive(
-    asked: Float[np.ndarray, "n 24"],
+    descriptors: Float[np.ndarray, "n 24"],
     band_weight: Float[np.ndarray, " n"],
     described: Float[np.ndarray, "m 24"],
     extra: Float[np.ndarray, " m"],
@@ -367,11 +367,11 @@ def exhaustive(
         [linear, band[:, None], (band**2)[:, None], ((linear**2).sum(axis=1) + extra[pixels])[:, None]], axis=1
     ).T
     weight = band_weight[:, None]
-    vector, level = asked[:, first : kernels.LINEAR], asked[:, kernels.LINEAR, None]
+    vector, level = descriptors[:, first : kernels.LINEAR], descriptors[:, kernels.LINEAR, None]
     left = np.concatenate([-2 * vector, -2 * weight * level, weight, np.ones_like(weight)], axis=1)
     rows = max(1, CHUNK_PAIRS // len(pixels))
-    best = np.empty(len(asked), np.int64)
-    for low in range(0, len(asked), rows):
+    best = np.empty(len(descriptors), np.int64)
+    for low in range(0, len(descriptors), rows):
         costs = left[low : low + rows] @ right
         if jitter is not None:
             costs += jitter(costs.shape)
@@ -380,7 +380,7 @@ def exhaustive(
 
 
 def by_guides(
-    asked: Float[np.ndarray, "n 24"],
+    descriptors: Float[np.ndarray, "n 24"],
     band_weight: Float[np.ndarray, " n"],
     described: Float[np.ndarray, "m 24"],
     exemplar: style.Exemplar,
@@ -392,4 +392,4 @@ def by_guides(
     def jitter(shape: tuple[int, int]) -> np.ndarray:
         return INITIAL_JITTER * rng.random(shape, dtype=np.float32)
 
-    return exhaustive(asked, band_weight, described, nothing, exemplar, kernels.PATCH, jitter)
+    return exhaustive(descriptors, band_weight, described, nothing, exemplar, kernels.PATCH, jitter)
