@@ -186,7 +186,7 @@ def finish_step(result: Any) -> Step:
     (before, after), moved = result.finishing.style, f"{result.finishing.moved:.3f} (sRGB, root mean square)"
     return Step(
         "Finish",
-        "VGG-19 style losses on many rendered crops, each compared with its source region in the painting.",
+        "Style losses of VGG-19 on many rendered crops, each compared with its source region in the painting.",
         pairs=(finish_pair(result.asset, result.finishing, close_up(result.job.settings)),),
         facts=(("style loss", f"{before:.4g} → {after:.4g}"), ("albedo change", moved)),
     )

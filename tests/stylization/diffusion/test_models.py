@@ -380,7 +380,7 @@ def test_single_files_are_found_by_their_models_names(tmp_path, monkeypatch, cap
     # Torchvision's own file is known by eight digits of its hash, BiRefNet's by all of them.
     (tmp_path / "vgg19").mkdir()
     shutil.copy(folder / "vgg19" / "vgg19-dcbb9e9d.pth", tmp_path / "vgg19")
-    with pytest.raises(EnvironmentMissing, match=r"expected dcbb9e9d, as in torchvision.*models adopt vgg19"):
+    with pytest.raises(EnvironmentMissing, match=r"expected dcbb9e9d as in torchvision.*models adopt vgg19"):
         models.file("vgg19", tmp_path)
     digits = hashlib.sha256((tmp_path / "vgg19" / "vgg19-dcbb9e9d.pth").read_bytes()).hexdigest()[:8]
     known = replace(models.MODELS["vgg19"], sha256={"vgg19-dcbb9e9d.pth": digits})
