@@ -162,10 +162,10 @@ def make(
     try:
         if not content or (kind == "content" and not style):
             phase = joint_phase(word, training)
-            shown = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
+            example = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
             for half in phase.trained:
                 consislora.add_half(unet, half, training.rank, seed + (half == "style"))
-            errors += run_phase(pipeline, shown, phase, training, seed, Checkpoint(state, key + phase.name), note)
+            errors += run_phase(pipeline, example, phase, training, seed, Checkpoint(state, key + phase.name), note)
             if kind == "content":
                 consislora.save_half(pair.style, unet, "style", notes)
             consislora.save_half(pair.content, unet, "content", notes)
@@ -174,10 +174,10 @@ def make(
             style = kind == "content"
         if not style:
             phase = style_phase(word, training)
-            shown = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
+            example = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
             consislora.put_half(unet, "content", pair.content)
             consislora.add_half(unet, "style", training.rank, seed + 2)
-            errors += run_phase(pipeline, shown, phase, training, seed, Checkpoint(state, key + phase.name), note)
+            errors += run_phase(pipeline, example, phase, training, seed, Checkpoint(state, key + phase.name), note)
             consislora.save_half(pair.style, unet, "style", notes)
     finally:
         loaded = [name for name in ("content", "style") if name in getattr(unet, "peft_config", {})]

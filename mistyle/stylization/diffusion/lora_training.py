@@ -126,24 +126,24 @@ class NoisyStep:
 
 
 def step_loss(
-    unet: Any, shown: TrainingExample, phase: LoraPhase, mode: str, at: NoisyStep
+    unet: Any, example: TrainingExample, phase: LoraPhase, mode: str, at: NoisyStep
 ) -> tuple[torch.Tensor, float]:
     """The loss of one step, and the unweighted prediction error (loss / weight), which is comparable between steps."""
     noise, alpha_bar = at.noise, at.alpha_bar
-    zt = consislora.noisy(shown.z0, noise, alpha_bar)
+    zt = consislora.noisy(example.z0, noise, alpha_bar)
     with consislora.below_without_gradients(unet):
         predicted = unet(
             zt.to(unet.dtype),
             torch.tensor([at.level], device=zt.device),
-            encoder_hidden_states=shown.text,
-            added_cond_kwargs={"text_embeds": shown.pooled, "time_ids": shown.sizes.to(shown.text.dtype)},
+            encoder_hidden_states=example.text,
+            added_cond_kwargs={"text_embeds": example.pooled, "time_ids": example.sizes.to(example.text.dtype)},
             return_dict=False,
         )[0]
-    target = consislora.velocity(shown.z0, noise, alpha_bar) if shown.prediction == "v_prediction" else noise
+    target = consislora.velocity(example.z0, noise, alpha_bar) if example.prediction == "v_prediction" else noise
     error = consislora.epsilon_loss(predicted, target)
     if at.step < phase.switch:
         return error, float(error.detach())
-    picture = consislora.x0_loss(predicted, shown.z0, zt, alpha_bar, shown.prediction)
+    picture = consislora.x0_loss(predicted, example.z0, zt, alpha_bar, example.prediction)
     return (picture + error if mode == "sum" else picture), float(error.detach())
 
 
@@ -157,7 +157,7 @@ class Checkpoint:
 
 def run_phase(
     pipeline: Any,
-    shown: TrainingExample,
+    example: TrainingExample,
     phase: LoraPhase,
     settings: TrainSettings,
     seed: int,
@@ -175,16 +175,16 @@ def run_phase(
     optimiser = torch.optim.AdamW(
         named.values(), lr=phase.rate, betas=(0.9, 0.999), eps=1e-8, weight_decay=settings.weight_decay
     )
-    scaler = torch.amp.GradScaler(shown.z0.device.type, enabled=unet.dtype == torch.float16)
-    alphas = pipeline.scheduler.alphas_cumprod.to(shown.z0.device)
+    scaler = torch.amp.GradScaler(example.z0.device.type, enabled=unet.dtype == torch.float16)
+    alphas = pipeline.scheduler.alphas_cumprod.to(example.z0.device)
     history = _take_up(checkpoint, named, optimiser, scaler)
     between = True
     try:
         for step in range(len(history), phase.steps):
-            level, noise = step_noise(phase, shown.z0.shape, seed, step, len(alphas))
-            noise = noise.to(shown.z0.device)
+            level, noise = step_noise(phase, example.z0.shape, seed, step, len(alphas))
+            noise = noise.to(example.z0.device)
             loss, error = step_loss(
-                unet, shown, phase, settings.loss_mode, NoisyStep(step, level, noise, alphas[level])
+                unet, example, phase, settings.loss_mode, NoisyStep(step, level, noise, alphas[level])
             )
             between = False
             for group in optimiser.param_groups:

@@ -4,9 +4,9 @@ Variance-exploding coordinates: a latent at level sigma is the clean one plus si
 not scaled for a network's input: a denoiser that needs x / sqrt(sigma^2 + 1) divides itself.
 
 The paper re-noises a block "before the final resample". With one re-noising in ten repeats, the other eight start from
-latents with less noise than sigma, and the variance of the result falls below half of the true one. Here, as in RePaint
-itself, every repeat but the first is re-noised. tests/stylization/diffusion/test_repaint.py compares both with a closed
-form.
+latents with less noise than sigma. The variance of the result then falls below half of the true one. Here, as in
+RePaint itself, every repeat but the first is re-noised. tests/stylization/diffusion/test_repaint.py compares both with
+a closed form.
 """
 
 from collections.abc import Callable, Sequence

@@ -106,9 +106,9 @@ def announcement(settings: ModelSettings, training: TrainSettings, chosen: Diffu
     """Upper cost of a job of `views` views, reported before it starts: training steps and network evaluations."""
     own = chosen.adapter == "lora" and settings.style_lora is None
     steps = (training.steps + training.style_steps) * own + training.steps * content_count(chosen, views)
-    looks = chosen.steps + (views - 1) * (chosen.steps * chosen.repeats + int(chosen.refinement * chosen.steps))
+    evaluations = chosen.steps + (views - 1) * (chosen.steps * chosen.repeats + int(chosen.refinement * chosen.steps))
     trained = f"at most {forecast(steps, training.resolution)}" if steps else "no LoRA is trained"
-    return f"diffusion: {trained}; then {looks:,} denoising steps over {views} views"
+    return f"diffusion: {trained}; then {evaluations:,} denoising steps over {views} views"
 
 
 def key(job: DiffusionJob, views: Sequence[View]) -> str:

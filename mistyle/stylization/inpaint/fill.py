@@ -34,9 +34,9 @@ def inpainter(colours: Colours | None = None) -> Inpainter:
             return grow(albedo, hole, texels)
         answer = np.asarray(colours(texels.position[hole], texels.normal[hole]), np.float32)
         result, left = albedo.copy(), hole.copy()
-        good = np.isfinite(answer).all(axis=1)
-        left[hole] = ~good
-        result[hole & ~left] = np.clip(answer[good], 0, 1)
+        finite = np.isfinite(answer).all(axis=1)
+        left[hole] = ~finite
+        result[hole & ~left] = np.clip(answer[finite], 0, 1)
         return grow(result, left, texels)
 
     return paint
@@ -105,15 +105,15 @@ def _mirrored(gap: Bool[np.ndarray, "h w"], rim: Bool[np.ndarray, "h w"]) -> tup
     rows, columns = np.nonzero(gap)
     near_row, near_column = np.unravel_index(nearest(rim)[0][gap], gap.shape)
     row, column = near_row.copy(), near_column.copy()
-    left = np.arange(len(rows))
+    pending = np.arange(len(rows))
     for turn in TURNS:
-        step = ((near_column - columns)[left] + 1j * (near_row - rows)[left]) * turn
-        r = near_row[left] + np.round(step.imag).astype(np.int64)
-        c = near_column[left] + np.round(step.real).astype(np.int64)
+        step = ((near_column - columns)[pending] + 1j * (near_row - rows)[pending]) * turn
+        r = near_row[pending] + np.round(step.imag).astype(np.int64)
+        c = near_column[pending] + np.round(step.real).astype(np.int64)
         inside = (r >= 0) & (c >= 0) & (r < gap.shape[0]) & (c < gap.shape[1])
-        good = inside & rim[np.where(inside, r, 0), np.where(inside, c, 0)]
-        row[left[good]], column[left[good]] = r[good], c[good]
-        left = left[~good]
+        valid = inside & rim[np.where(inside, r, 0), np.where(inside, c, 0)]
+        row[pending[valid]], column[pending[valid]] = r[valid], c[valid]
+        pending = pending[~valid]
     return row, column
 
 

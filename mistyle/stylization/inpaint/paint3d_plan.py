@@ -14,10 +14,10 @@ def position_map(
 ) -> Float[np.ndarray, "h w 3"]:
     """Paint3D's UV position map: each texel's position as a colour 0..1, black where no face covers it.
 
-    The mesh is centred on the mean of its vertices, scaled so that its farthest vertex has the radius `scale` (0.6),
-    and raised by `height` (0.25) along y. x, y, z of [-1, 1] become red, green, blue of [0, 1], truncated (not rounded)
-    to 8 bits. Row 0 is v = 1, axes are the mesh's own (y up). Scale and height come from a demo of Paint3D; its
-    training code was never published.
+    The mesh is centred on the mean of its vertices and scaled: its farthest vertex has the radius `scale` (0.6). It is
+    then raised by `height` (0.25) along y. x, y, z of [-1, 1] become red, green, blue of [0, 1], truncated (not
+    rounded) to 8 bits. Row 0 is v = 1, axes are the mesh's own (y up). Scale and height come from a demo of Paint3D;
+    its training code was never published.
     """
     placed = (texels.position - centre) / max(radius, 1e-12) * scale
     placed = placed + np.array([0.0, height, 0.0])

@@ -37,16 +37,16 @@ def struggle_mask(
 ) -> Bool[np.ndarray, "h w"]:
     """The texels to repaint: struggling ones, and those that no view sees; dilated by max-pooling inside islands.
 
-    A texel struggles where the mean |gradient| per sample exceeds mean + 0.5 std over sampled texels and
-    `settings.outlier` times their median, while its samples' gradients contradict one another.
+    A texel struggles where its samples' gradients contradict one another and their mean magnitude is large. It must
+    exceed mean + 0.5 std over sampled texels, and `settings.outlier` times their median.
 
     A large gradient alone also marks contrast and an unconverged fit: then it has the same sign in all views, and more
     steps would reduce it. `agreed` (`Fit.agreed`) separates the two cases; None skips this test.
 
     Gradients are smoothed by a Gaussian of `settings.smooth`: single texels' gradients are noise, and the dilation
     would join their scattered mask. `accumulated` is the sum of absolute albedo gradients over the last steps of phase
-    2, `looks` the number of samples per texel in these steps (`Fit.touched`), `seen` the number of views that see it.
-    The paper thresholds the sum, which without the division would show the number of samples. Rarely sampled texels
+    2; `looks` is the number of samples per texel in these steps (`Fit.touched`); `seen` is the number of views that see
+    it. The paper thresholds the sum, which without the division would show the number of samples. Rarely sampled texels
     count as sampled FEWEST times the median, or one chance pixel would decide; unsampled texels do not struggle.
     """
     struggling = texels.covered & (seen <= 0)

@@ -69,9 +69,9 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
     lock = models.read_lock(folder)
     lock[name] = {"repo": model.repo, "revision": revision, "files": entries}
     models.write_lock(folder, lock)
-    lost = models.lacking(model, place, model.loose)
-    if lost:
-        raise EnvironmentMissing(f"{place}: {model.repo} gave no {lost[0].relative_to(place).as_posix()}")
+    missing = models.lacking(model, place, model.loose)
+    if missing:
+        raise EnvironmentMissing(f"{place}: {model.repo} gave no {missing[0].relative_to(place).as_posix()}")
     return place
 
 
@@ -81,9 +81,9 @@ def adopt(name: str, folder: Path) -> Path:
     Meant for weights other than the published ones. Raises EnvironmentMissing where the folder is not complete.
     """
     model, place = models.get(name), folder / name
-    lost = models.lacking(model, place, model.loose) if place.is_dir() else [place]
-    if lost:
-        raise EnvironmentMissing(f"{lost[0]} is missing; {name} needs {', '.join(model.folders + model.loose)}")
+    missing = models.lacking(model, place, model.loose) if place.is_dir() else [place]
+    if missing:
+        raise EnvironmentMissing(f"{missing[0]} is missing; {name} needs {', '.join(model.folders + model.loose)}")
     lock = models.read_lock(folder)
     weights = [path for path in _files(place) if path.endswith(".safetensors") or path in model.loose]
     entries = {path: _checked(place / path, None) for path in weights}
@@ -210,7 +210,7 @@ def listing(folder: Path | None) -> list[dict[str, Any]]:
     lock = models.read_lock(folder) if folder else {}
     for model in models.MODELS.values():
         place = next((p for p in models.places(model, folder) if p.is_dir()), None)
-        lost = models.lacking(model, place, model.loose if model.url else ()) if place else []
+        missing = models.lacking(model, place, model.loose if model.url else ()) if place else []
         locked = lock.get(model.name, {}).get("files", {})
         hashes = {k: v["sha256"] for k, v in locked.items() if k.endswith(".safetensors")}
         rows.append(
@@ -224,7 +224,7 @@ def listing(folder: Path | None) -> list[dict[str, Any]]:
                 "purpose": model.purpose,
                 "url": model.url,
                 "folders": [f or "." for f in model.folders] + list(model.loose),
-                "found": str(place) if place and not lost else None,
+                "found": str(place) if place and not missing else None,
             }
         )
     return rows

@@ -26,10 +26,10 @@ PIECES, PIECE = 64, 65536
 
 def need_extra() -> None:
     """EnvironmentMissing, with the install command, where optional packages are missing."""
-    lost = [name for name in PACKAGES if find_spec(name) is None]
-    if lost:
+    missing = [name for name in PACKAGES if find_spec(name) is None]
+    if missing:
         raise EnvironmentMissing(
-            f"this needs the optional packages {', '.join(lost)}, which are not installed; "
+            f"this needs the optional packages {', '.join(missing)}, which are not installed; "
             "run: pip install 'mistyle[diffusion]'"
         )
 
@@ -69,11 +69,11 @@ def find(name: str, folder: Path | None, loose: Iterable[str] = (), weightless: 
     for place in looked:
         if not place.is_dir():
             continue
-        lost = lacking(model, place, loose, weightless)
-        if not lost:
+        missing = lacking(model, place, loose, weightless)
+        if not missing:
             verify(name, place, folder)
             return place
-        pickles = [p for p in lost if p.with_suffix(".bin").is_file()]
+        pickles = [p for p in missing if p.with_suffix(".bin").is_file()]
         if pickles:
             into = folder or Path("MODELS")
             raise EnvironmentMissing(
@@ -81,7 +81,7 @@ def find(name: str, folder: Path | None, loose: Iterable[str] = (), weightless: 
                 f"safetensors only. Convert it once: mistyle models convert {name} {place} --models {into}"
             )
         if place == looked[0] and folder:
-            raise EnvironmentMissing(f"{place} lacks {_relative(lost, place)}; {how_to_get(model, folder)}")
+            raise EnvironmentMissing(f"{place} lacks {_relative(missing, place)}; {how_to_get(model, folder)}")
     where = f"neither in {folder / name} nor in {cache()}" if folder else f"not in {cache()}"
     if model.url:
         where = f"not in {folder / name}" if folder else "nowhere, since no --models DIR was given"
@@ -102,7 +102,7 @@ def how_to_get(model: PublishedModel, folder: Path | None) -> str:
     into = folder or Path("models")
     if model.url:
         return f"download {model.url} and put it at {into / model.name / model.loose[0]} (--models {into})"
-    return f"run: mistyle models fetch {model.name} --models {into} --allow-download (or copy it there yourself)"
+    return f"run: mistyle models fetch {model.name} --models {into} --allow-download (or copy it yourself)"
 
 
 def _relative(paths: Iterable[Path], place: Path) -> str:
@@ -111,20 +111,20 @@ def _relative(paths: Iterable[Path], place: Path) -> str:
 
 def lacking(model: PublishedModel, place: Path, loose: Iterable[str], weightless: Iterable[str] = ()) -> list[Path]:
     """The missing files of a model's folder, by their expected paths."""
-    lost = [place / name for name in loose if not (place / name).is_file()]
+    missing = [place / name for name in loose if not (place / name).is_file()]
     for part in model.folders:
         folder = place / part
         if part.startswith("tokenizer"):
             complete = (folder / "vocab.json").is_file() or (folder / "tokenizer.json").is_file()
-            lost += [] if complete else [folder / "vocab.json"]
+            missing += [] if complete else [folder / "vocab.json"]
         elif part == "scheduler":
-            lost += [] if (folder / "scheduler_config.json").is_file() else [folder / "scheduler_config.json"]
+            missing += [] if (folder / "scheduler_config.json").is_file() else [folder / "scheduler_config.json"]
         else:
-            lost += [] if (folder / "config.json").is_file() else [folder / "config.json"]
+            missing += [] if (folder / "config.json").is_file() else [folder / "config.json"]
             if part not in weightless and not weights(folder):
                 stem = "model" if "encoder" in part else "diffusion_pytorch_model"
-                lost.append(folder / f"{stem}.safetensors")
-    return lost
+                missing.append(folder / f"{stem}.safetensors")
+    return missing
 
 
 def weights(folder: Path) -> list[Path]:

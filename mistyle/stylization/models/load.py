@@ -169,7 +169,7 @@ def add_ip_adapter(
 ) -> list[torch.Tensor]:
     """Load an IP-Adapter into a pipeline; returns the image embeddings [(2, 1, d)]: zeros first, the picture second.
 
-    The image encoder, 2.5 GB in full size, is not kept.
+    The image encoder, 2.5 GB in full size, is freed.
     """
     from transformers import CLIPVisionModelWithProjection
 

@@ -40,13 +40,13 @@ def _together(view: View, shading: Float[np.ndarray, "h w"]) -> tuple[float, flo
     """Slope and correlation of a view's log luminance with the shading's; None without enough pixels or contrast."""
     width = view.mask.shape[1]
     inside = erode(view.mask & (view.coverage > 0.99) & np.isfinite(view.rgb).all(axis=-1), 1)
-    seen = luminance(np.nan_to_num(view.rgb))
-    if inside.sum() < 16 or seen[inside].max() <= 0 or shading[inside].max() <= 0:
+    brightness = luminance(np.nan_to_num(view.rgb))
+    if inside.sum() < 16 or brightness[inside].max() <= 0 or shading[inside].max() <= 0:
         return None
-    planes = _log(shading, inside), _log(seen, inside), view.normal[..., 1]
-    bare, shown, upward = (blurred(p, inside, STROKE * width)[inside].astype(np.float64) for p in planes)
+    planes = _log(shading, inside), _log(brightness, inside), view.normal[..., 1]
+    bare, painted, upward = (blurred(p, inside, STROKE * width)[inside].astype(np.float64) for p in planes)
     form = np.stack([np.ones_like(upward), upward], axis=1)
-    x, y = (values - form @ np.linalg.lstsq(form, values, rcond=None)[0] for values in (bare, shown))
+    x, y = (values - form @ np.linalg.lstsq(form, values, rcond=None)[0] for values in (bare, painted))
     spread = float(x @ x)
     if min(spread, float(y @ y)) <= 1e-6 * len(x):
         return None

@@ -120,8 +120,8 @@ def _colours(
     samples = bilinear(source.picture, px[beside])
     samples[:, :4] /= np.maximum(samples[:, 4:], 1e-6)
     same = np.abs(samples[:, 3] - z[beside]) <= depth_tolerance(source.camera, z[beside], settings)
-    good = same & (samples[:, 4] > 0.5)
-    result[np.flatnonzero(beside)[good]] = samples[good, :3]
+    valid = same & (samples[:, 4] > 0.5)
+    result[np.flatnonzero(beside)[valid]] = samples[valid, :3]
     return result
 
 

@@ -176,9 +176,9 @@ class Finishing:
         maps = self.features(self.shown(crops, leaf, moving=True))
         style = content = leaf.new_zeros(())
         for k in range(n):
-            one, counts = slice(k, k + 1), crops.counts[k : k + 1]
-            mine, theirs = ([level[one] for level in levels] for levels in (maps, target))
-            distance = style_statistics(mine, theirs, counts, counts, kind=self.settings.statistic, rng=rng)
+            crop, counts = slice(k, k + 1), crops.counts[k : k + 1]
+            rendered, painted = ([level[crop] for level in levels] for levels in (maps, target))
+            distance = style_statistics(rendered, painted, counts, counts, kind=self.settings.statistic, rng=rng)
             # Root, times the weighted share: crops with few pixels or a large distance do not dominate.
             style = style + counts.mean() * (distance + LEAST).sqrt() / n
         # The content loss leaves out the finest features, those of single pixels.

@@ -87,8 +87,8 @@ def places(
     rows, columns = painting.size
     at = [np.choose(page, [x, y, columns - x, rows - y]), np.choose(page, [y, columns - x, rows - y, x])]
     inside = (x > 0) & (x < columns) & (y > 0) & (y < rows)
-    sure = inside & (np.abs(angle - 90 * quarter) < TURNED)
-    return Places(page, np.stack(at, axis=1).astype(np.float32), sure, sample)
+    valid = inside & (np.abs(angle - 90 * quarter) < TURNED)
+    return Places(page, np.stack(at, axis=1).astype(np.float32), valid, sample)
 
 
 def target_features(painting: PaintingFeatures, where: Places, crops: int, size: int) -> list[Any]:

@@ -1,10 +1,10 @@
 """Evaluation of a fit phase: does it improve the renders? A statistics loss can destroy good strokes.
 
-Windows of a few target views are rendered with the maps before and after the phase, under its own lights, and compared
-with the stylized views by three metrics. `detail` is the correlation of band-pass lightness (strokes); `style` the
-patch and Gram distance. `views` is the difference of a surface point between two neighbouring cameras under the same
-light, over the contrast of the picture's own detail, since a bolder picture differs more. No metric may get worse by
-more than TOLERANCE. A phase that exceeds HOPELESS times the tolerance at a check is stopped.
+Windows of a few target views are rendered with the maps before and after the phase, under its own lights. Three metrics
+compare them with the stylized views. `detail` is the correlation of band-pass lightness (strokes); `style` the patch
+and Gram distance. `views` is the difference of a surface point between two neighbouring cameras under the same light.
+It is relative to the contrast of the picture's own detail, since a bolder picture differs more. No metric may get worse
+by more than TOLERANCE. A phase that exceeds HOPELESS times the tolerance at a check is stopped.
 """
 
 from collections.abc import Sequence
@@ -39,9 +39,9 @@ HIGHER_IS_BETTER = {"detail": True, "style": False, "views": False}
 class EvaluationSet:
     """Evaluation windows, each with the window of a neighbouring view of the same surface.
 
-    Values independent of the maps are computed once: traced `surfaces` of the windows and their neighbours, `shared`
-    surface points of each pair, band-pass lightness (`details`) of each target within its mask, and statistics of all
-    targets (`style`).
+    Values independent of the maps are computed once. These are traced `surfaces` of the windows and their neighbours,
+    `shared` surface points of each pair, and statistics of all targets (`style`). `details` is the band-pass lightness
+    of each target within its mask.
     """
 
     traced: Any
@@ -103,12 +103,14 @@ def evaluate(where: EvaluationSet, maps: Sequence[Maps], lights: Lights, *, glos
         # Both windows use the lights of the first camera, or their shading would differ.
         fixed = _fixed(lights, view.camera)
         first, second = (_draw(where, table, surface, fixed, gloss) for surface in surfaces)
-        mine, theirs = srgb_from_linear(first), srgb_from_linear(second)
-        contrast = float(np.abs(metrics.detail(mine, view.mask))[view.mask].mean())
-        errors.append(metrics.shared_error(shared, mine, theirs) / max(contrast, 1e-3))
-        encoded.append(srgb_from_linear(_exposed(first, view)) if lit else mine)
+        rendered, target = srgb_from_linear(first), srgb_from_linear(second)
+        contrast = float(np.abs(metrics.detail(rendered, view.mask))[view.mask].mean())
+        errors.append(metrics.shared_error(shared, rendered, target) / max(contrast, 1e-3))
+        encoded.append(srgb_from_linear(_exposed(first, view)) if lit else rendered)
     compared = zip(encoded, where.details, where.masks, strict=True)
-    details = [metrics.band_correlation(metrics.detail(mine, mask), theirs, mask) for mine, theirs, mask in compared]
+    details = [
+        metrics.band_correlation(metrics.detail(rendered, mask), target, mask) for rendered, target, mask in compared
+    ]
     usable = [error for error in errors if np.isfinite(error)]
     return {
         "detail": float(np.mean([d for d in details if np.isfinite(d)] or [0.0])),

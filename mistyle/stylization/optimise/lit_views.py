@@ -189,17 +189,17 @@ def _explained(
     traced, sizes = tracer(mesh), [m.roughness.shape for m in both[0]]
     options = RenderOptions(subsamples=SUBSAMPLES, gradients=False)
     renderer = MaterialRenderer(traced, captures, sizes, options)
-    lost = np.zeros((2, 2))
+    squares = np.zeros((2, 2))
     plain = [rgb for rgb, _ in unlit(traced, both[1], captures.cameras)]
     result = []
     for j, maps in enumerate(both):
         table = renderer.upload(pack(maps))
         for k, view in enumerate(targets):
             mask, lit = captures.load(k)[1], renderer.image(table, k)
-            lost[j] += [float(((view.rgb - lit)[mask] ** 2).sum()), float((view.rgb[mask] ** 2).sum())]
+            squares[j] += [float(((view.rgb - lit)[mask] ** 2).sum()), float((view.rgb[mask] ** 2).sum())]
             if j == 1:
                 result.append(replace(view, rgb=without_light(view, lit, plain[k], mask)))
-    before, after = np.sqrt(lost[:, 0] / np.maximum(lost[:, 1], 1e-30))
+    before, after = np.sqrt(squares[:, 0] / np.maximum(squares[:, 1], 1e-30))
     return (float(before), float(after)), result
 
 

@@ -101,9 +101,9 @@ class PhaseRunner:
             value, slope = fit_table.variation(self.table, name, near)
             self._note(f"tv_{name}", weight * value)
             gradients[name] = gradients[name] + np.float32(weight) * slope * fit_table.nonzero(gradients[name])[:, None]
-        bad = self._not_a_number(texels, gradients)
-        if bad:
-            name, row = bad
+        invalid = self._not_a_number(texels, gradients)
+        if invalid:
+            name, row = invalid
             return self._stopped(iteration, name, int(texels[row]), crops[crop_of(row)])
         if "albedo" in gradients and self.phase.iterations - iteration <= self.settings.struggle_window:
             self.struggle[texels] += np.abs(pure["albedo"]) @ np.full(3, 1 / 3, np.float32)

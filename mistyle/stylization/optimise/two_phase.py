@@ -339,8 +339,8 @@ def _colour_loss(settings: FitSettings) -> Loss:
     def loss(batch: CropBatch, features, rng):
         colour = losses.srgb_from_linear(batch.render)
         chosen = batch.mask[:, 0] > 0
-        mine, theirs = colour.permute(0, 2, 3, 1)[chosen], batch.target.permute(0, 2, 3, 1)[chosen]
-        distance = losses.sliced_wasserstein(mine, theirs, rng, settings.projections, settings.colour_samples)
+        rendered, target = colour.permute(0, 2, 3, 1)[chosen], batch.target.permute(0, 2, 3, 1)[chosen]
+        distance = losses.sliced_wasserstein(rendered, target, rng, settings.projections, settings.colour_samples)
         maps, expected = losses.masked_features(features, colour, batch.target, batch.mask, batch.mask)
         result = {"style": settings.style2 * losses.style_aligned(maps, expected, batch.mask)}
         result["colour"] = settings.colour2 * distance

@@ -18,7 +18,7 @@ from mistyle.stylization.settings import Settings
 from mistyle.stylization.surface.layers import StyleLayers
 
 LEVELS = 3  # of VGG-19: relu1_1 to relu3_1
-WEIGHTS = "for example --vgg vgg19-normalised (see mistyle models), or --vgg vgg19.pth as torchvision has it"
+WEIGHTS = "for example --vgg vgg19-normalised (see mistyle models), or torchvision's --vgg vgg19.pth"
 
 
 @dataclass(frozen=True)

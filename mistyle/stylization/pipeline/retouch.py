@@ -49,9 +49,9 @@ def retouch(
     traced = dict(zip(touched, with_geometry(asset, [views[k] for k in touched]), strict=True))
     brushes = []
     for k, file in touched.items():
-        drawn = before[k] if file.endswith(".exr") else _as_written(folder, views[k], before[k])
+        rendered = before[k] if file.endswith(".exr") else _as_written(folder, views[k], before[k])
         lossy = file.lower().endswith((".jpg", ".jpeg", ".webp")) or views[k].camera.size != sizes[k]
-        new = differs(views[k], drawn, *(LOSSY if lossy else EXACT))
+        new = differs(views[k], rendered, *(LOSSY if lossy else EXACT))
         brushes.append(_without_light(replace(traced[k], mask=traced[k].mask & new), baked.gains[k : k + 1]))
     painted, begun = [], []
     for part, (texels, maps) in enumerate(zip(atlas.texels, baked.maps, strict=True)):
@@ -63,15 +63,15 @@ def retouch(
         report(0.3 + 0.4 * (part + 1) / len(atlas.texels))
     after = unlit_views(asset, painted, views, lambda done: report(0.7 + 0.3 * done))
     three = enumerate(zip(views, before, after, strict=True))
-    shown = [view if k in touched else _follow(view, old, new) for k, (view, old, new) in three]
+    views_after = [view if k in touched else _follow(view, old, new) for k, (view, old, new) in three]
     # The fit needs views of their original size: an edit of another size is redrawn from the texture.
-    shown = [
+    views_after = [
         view
         if view.camera.size == size
         else unlit_views(asset, painted, _plain(asset, view, size), lambda done: None)[0]
-        for view, size in zip(shown, sizes, strict=True)
+        for view, size in zip(views_after, sizes, strict=True)
     ]
-    return Retouched(replace(baked, maps=tuple(painted), begin=tuple(begun)), tuple(shown))
+    return Retouched(replace(baked, maps=tuple(painted), begin=tuple(begun)), tuple(views_after))
 
 
 def _without_light(view: View, gains: Sequence[np.ndarray]) -> View:
@@ -108,16 +108,16 @@ def _as_written(folder: Path, view: View, drawn: View) -> View:
 
 
 def differs(
-    view: View, drawn: View, steps: float, least: float, rim: int, together: int = 1
+    view: View, rendered: View, steps: float, least: float, rim: int, together: int = 1
 ) -> Bool[np.ndarray, "h w"]:
     """Where the straight sRGB colours of two pictures of a camera differ by more than `steps` of 255.
 
     Both must cover a pixel by more than `least`, and it must lie at least `rim` pixels inside. 8-connected groups of
     fewer than `together` pixels are left out.
     """
-    counts = np.minimum(view.coverage, drawn.coverage) > least
+    counts = np.minimum(view.coverage, rendered.coverage) > least
     first, second = (
-        srgb_from_linear(np.clip(v.rgb / np.maximum(v.coverage, 1e-3)[..., None], 0, 1)) for v in (view, drawn)
+        srgb_from_linear(np.clip(v.rgb / np.maximum(v.coverage, 1e-3)[..., None], 0, 1)) for v in (view, rendered)
     )
     changed = (np.abs(first - second).max(axis=-1) * 255 > steps) & (erode(counts, rim) if rim else counts)
     if together > 1:

@@ -206,7 +206,8 @@ def view_picture(view: View) -> np.ndarray:
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
     """Each phase: kept (with metrics that got worse within the tolerance) or undone, and its metrics."""
     phases = [
-        (phase, _judgement(fit, phase) if good else "undone: a metric got worse") for phase, good in fit.kept.items()
+        (phase, _judgement(fit, phase) if accepted else "undone: a metric got worse")
+        for phase, accepted in fit.kept.items()
     ]
     figures = []
     for name, (before, after) in fit.figures.items():

@@ -45,8 +45,8 @@ def style_looks(style: Picture, name: str, settings: Settings, progress: Progres
         if path.is_file():  # a slot without its picture is refused where slots are placed
             pictures[slot.rpartition("=")[0] + "=" + path.name] = read_file(path, settings.colour)
     looks = tuple(look(picture, called, settings) for called, picture in pictures.items())
-    for one in looks:
-        progress.say(f"{one.name}: {sentence(one)}")
+    for entry in looks:
+        progress.say(f"{entry.name}: {sentence(entry)}")
     return looks
 
 

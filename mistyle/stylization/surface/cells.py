@@ -139,16 +139,16 @@ def _fates(dj: ModuleType, grid: PointGrid, fate: Any, i: Any, limit: Any) -> An
 
     own: Any = dr.gather(dj.Array4f, grid.at, i)
     normal: Any = dr.gather(dj.Array4f, grid.facing, i)
-    mine = number(own[3])
+    own_number = number(own[3])
 
     def visit(j: Any, inside: Any, beaten: Any, gone: Any) -> tuple[Any, Any]:
         neighbour, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
         step = [neighbour[axis] - own[axis] for axis in range(3)]
         near = inside & (step[0] * step[0] + step[1] * step[1] + step[2] * step[2] <= limit) & (j != i)
         near &= facing[0] * normal[0] + facing[1] * normal[1] + facing[2] * normal[2] > 0
-        its = dr.gather(dj.UInt, fate, j)
-        beaten |= near & (its == UNDECIDED) & (number(neighbour[3]) > mine)
-        return beaten, gone | (near & (its == STAYS))
+        neighbour_fate = dr.gather(dj.UInt, fate, j)
+        beaten |= near & (neighbour_fate == UNDECIDED) & (number(neighbour[3]) > own_number)
+        return beaten, gone | (near & (neighbour_fate == STAYS))
 
     beaten, gone = each_near(dj, grid, own, (dj.Bool(False), dj.Bool(False)), visit)
     return dr.select(gone, dj.UInt(GONE), dr.select(beaten, dj.UInt(UNDECIDED), dj.UInt(STAYS)))

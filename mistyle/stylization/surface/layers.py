@@ -130,8 +130,10 @@ def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.nda
 def nearest_texels(
     texels: Sequence[Texels],
 ) -> tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], list[Int[np.ndarray, " n"]]]:
-    """About FEW_TEXELS covered texels, as flat indices of each set, and a function from surface points (positions,
-    normals) to the nearest of them on the same side, counted through all sets."""
+    """About FEW_TEXELS covered texels, as flat indices of each set, and a function to the nearest of them.
+
+    It takes surface points (positions, normals) and returns texels of the same side, counted through all sets.
+    """
     from scipy.spatial import KDTree
 
     counts = np.cumsum([0] + [int(t.covered.sum()) for t in texels])
@@ -216,10 +218,10 @@ def lay_relief(
     mesh: Mesh,
     tangents: Float[np.ndarray, "f 3 4"],
 ) -> None:
-    """Tilt the normals of `maps` by `height` times the painting's slope, and add `gloss` times its dullness to their
-    roughness, in place, for the texels of a band.
+    """Add the painting's relief to `maps`, in place, for the texels of a band.
 
-    The asset's own normal map is tilted, not overwritten. `tangents` are `corner_tangents` of the mesh.
+    Normals tilt by `height` times the painting's slope; roughness grows by `gloss` times its dullness. The asset's own
+    normal map is tilted, not overwritten. `tangents` are `corner_tangents` of the mesh.
     """
     texels, rows, at = band.texels, band.rows, band.at
     normal, roughness = maps.normal[rows], maps.roughness[rows]

@@ -171,8 +171,8 @@ def blended(
 ) -> tuple[Int[np.ndarray, "n j"], Float[np.ndarray, "n j"]]:
     """Selected nearest samples (distances in spacings, ascending) of a point, and their weights.
 
-    The samples around a point vote on its piece of the painting, so that a border between pieces is a smooth line and
-    not the zigzag of single samples; within a piece the nearest sample dominates.
+    The samples around a point vote on its piece of the painting. So a border between pieces is a smooth line, not the
+    zigzag of single samples; within a piece the nearest sample dominates.
     """
     keep = min(NEAREST, distance.shape[1])
     near = distance**2 - distance[:, :1] ** 2

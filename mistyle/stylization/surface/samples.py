@@ -1,7 +1,7 @@
 """Blue-noise surface samples, and tables of their 5x5 neighbourhoods, which replace a pixel grid.
 
-Distances between samples are six-dimensional, [position, 3 h normal]: two sides of a thin wall or of a crease are far
-apart although they touch in space, so paint on one side does not reach the other.
+Distances between samples are six-dimensional, [position, 3 h normal]. Two sides of a thin wall or of a crease are far
+apart although they touch in space. So paint on one side does not reach the other.
 """
 
 from dataclasses import dataclass

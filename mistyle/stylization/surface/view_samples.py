@@ -187,19 +187,19 @@ def flat_level(
         if k == CENTRE:
             continue
         for share in (1.0, 0.5):
-            left = np.flatnonzero(neighbours[:, k] == own)
-            step = share * points.spacing * (dx * tangent[left, :2] + dy * across[left, :2])
-            column, row = np.floor((place[left] + step - middle) / points.spacing + 0.5).astype(np.int64).T
+            pending = np.flatnonzero(neighbours[:, k] == own)
+            step = share * points.spacing * (dx * tangent[pending, :2] + dy * across[pending, :2])
+            column, row = np.floor((place[pending] + step - middle) / points.spacing + 0.5).astype(np.int64).T
             inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
             candidate = number[np.where(inside, row * columns + column, 0)]
-            reach = STEEP * points.spacing * np.hypot(dx, dy) * depth[left] / focal
-            near = np.abs(depth[candidate] - depth[left]) <= np.maximum(LEAST_STEP, reach)
-            good = inside & (candidate >= 0) & near
-            neighbours[left[good], k] = candidate[good]
+            reach = STEEP * points.spacing * np.hypot(dx, dy) * depth[pending] / focal
+            near = np.abs(depth[candidate] - depth[pending]) <= np.maximum(LEAST_STEP, reach)
+            valid = inside & (candidate >= 0) & near
+            neighbours[pending[valid], k] = candidate[valid]
     offsets = np.empty((*neighbours.shape, 2), np.float32)
-    way = (place[:, None] - place[neighbours]) / np.float32(points.spacing)
-    offsets[..., 0] = (way * tangent[neighbours][..., :2]).sum(axis=2)
-    offsets[..., 1] = (way * across[neighbours][..., :2]).sum(axis=2)
+    offset = (place[:, None] - place[neighbours]) / np.float32(points.spacing)
+    offsets[..., 0] = (offset * tangent[neighbours][..., :2]).sum(axis=2)
+    offsets[..., 1] = (offset * across[neighbours][..., :2]).sum(axis=2)
     turned = np.einsum("nc,nkc->nk", tangent, tangent[neighbours]) < 0
     return Level(points, tangent, across, directed, neighbours, turned, np.clip(offsets, -4, 4))
 

@@ -122,9 +122,9 @@ def tone_count(lightness: Float[np.ndarray, "h w"]) -> int:
 def structural_unit(lab: Float[np.ndarray, "h w 3"]) -> tuple[float, float]:
     """Width of the unit in long sides, and its clarity (0..1).
 
-    The scale (Lindeberg 1998) is the first maximum of the contrast between successive blurs. If the autocorrelation of
-    detail finer than a few such scales has a clear peak, its lag is the unit, along some direction or averaged over
-    all.
+    The scale (Lindeberg 1998) is the first maximum of the contrast between successive blurs. A clear peak in the
+    autocorrelation of detail finer than a few such scales overrides it: its lag is the unit. The autocorrelation is
+    along one direction or averaged over all.
     """
     long = max(lab.shape[:2])
     sigma, clarity = first_scale(lab)

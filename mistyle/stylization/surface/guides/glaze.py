@@ -35,8 +35,8 @@ def glaze(
         return np.zeros(len(fine.directed), np.float32)
     shown = band(levels, lightness)
     target = guide.detail * np.float32(settings.relief * exemplar.band.std())
-    sure = np.minimum(np.abs(guide.detail), 1).astype(np.float32)
-    missing = np.float32(strength) * sure * (target - shown)
+    certainty = np.minimum(np.abs(guide.detail), 1).astype(np.float32)
+    missing = np.float32(strength) * certainty * (target - shown)
     return smooth(fine, np.clip(missing, -THICKEST, THICKEST), 2)
 
 

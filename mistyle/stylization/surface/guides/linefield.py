@@ -130,5 +130,5 @@ def directions(field: LineField, points: SurfacePoints) -> tuple[Float[np.ndarra
     c = np.einsum("ni,nij,nj->n", second, tensors, second, optimize=True)
     angle = np.arctan2(2 * b, a - c) / 2
     tangent = unit(first * np.cos(angle)[:, None] + second * np.sin(angle)[:, None])
-    sure = np.hypot(a - c, 2 * b) / np.maximum(a + c, 1e-9)
-    return tangent.astype(np.float32), np.clip(sure, 0, 1).astype(np.float32)
+    certainty = np.hypot(a - c, 2 * b) / np.maximum(a + c, 1e-9)
+    return tangent.astype(np.float32), np.clip(certainty, 0, 1).astype(np.float32)

@@ -1,7 +1,7 @@
 """Place fields: smooth functions over the surface that follow its parts and assign colours without light.
 
-The lowest Laplacian eigenvectors change where the surface is narrow or creased and are nearly constant on its parts, so
-that an ear, a leg or a lid has its own colour. Their components explained by light (surface direction, openness) are
+The lowest Laplacian eigenvectors change where the surface is narrow or creased and are nearly constant on its parts. So
+an ear, a leg or a lid has its own colour. Their components explained by light (surface direction, openness) are
 removed, so that the albedo has no shading.
 """
 
