@@ -25,22 +25,22 @@ from mistyle.stylization.surface.lookup import PaintedSurface
 from mistyle.stylization.surface.settings import PaintSettings
 
 
-def paint_pictures(chosen: PaintSettings) -> list[Path]:
+def paint_pictures(settings: PaintSettings) -> list[Path]:
     """The required pictures of the paint settings."""
-    return [path for path in (chosen.style_mask, chosen.protect, chosen.direction_map) if path is not None]
+    return [path for path in (settings.style_mask, settings.protect, settings.direction_map) if path is not None]
 
 
-def check_paint(chosen: PaintSettings) -> None:
+def check_paint(settings: PaintSettings) -> None:
     """InputRefused for missing pictures, before anything is rendered."""
-    for path in paint_pictures(chosen):
+    for path in paint_pictures(settings):
         if not path.is_file():
             raise InputRefused(f"{path}: found nothing; expected a picture. Check the path")
 
 
-def paint_files(chosen: PaintSettings) -> list[Path]:
+def paint_files(settings: PaintSettings) -> list[Path]:
     """The files in the paint settings; cache keys use their contents, not their names."""
-    named = paint_pictures(chosen)
-    for slot in chosen.slots:
+    named = paint_pictures(settings)
+    for slot in settings.slots:
         name, _, picture = slot.rpartition("=")
         named += [Path(name), Path(picture)]
     return [path for path in named if path.is_file()]

@@ -207,10 +207,10 @@ def patch_basis(exemplar: Exemplar, rng: np.random.Generator) -> Basis:
     sample = []
     for k in range(kernels.PAGES):
         height, width = exemplar.shapes[k]
-        mine = (
+        pixel = (
             chosen[(chosen >= exemplar.starts[k]) & (chosen < exemplar.starts[k] + height * width)] - exemplar.starts[k]
         )
-        row, column = mine // width, mine % width
+        row, column = pixel // width, pixel % width
         lab = page(exemplar, exemplar.lab, k)
         sample.append(np.stack([lab[row + dy, column + dx] for dy in range(-2, 3) for dx in range(-2, 3)], axis=1))
     patches = np.concatenate(sample).reshape(-1, 75).astype(np.float64)
