@@ -244,7 +244,7 @@ def test_the_cache_serves_where_no_folder_is_given(tmp_path, monkeypatch):
 def test_files_copied_by_hand_are_compared_with_the_published_ones(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "models"
     shutil.copytree(tiny_models.folder() / "sdxl", folder / "sdxl")  # without the lock beside it
-    words = r"/vae/\w+.safetensors: sha256 is \w+, expected 1598f3d2\w+, .*mistyle models adopt sdxl"
+    words = r"/vae/\w+.safetensors: sha256 is \w+, expected 1598f3d2\w+ as in .*mistyle models adopt sdxl"
     with pytest.raises(EnvironmentMissing, match=words):
         models.find("sdxl", folder)
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "cache"))
