@@ -1,1 +1,1 @@
-"""`mistyle stylize`: the paper's method, section by section."""
+"""Stylization of a mesh's textures: the paper's method, section by section."""

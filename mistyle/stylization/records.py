@@ -1,4 +1,4 @@
-"""What the stages of a job hand on to one another."""
+"""Records that the stages of a stylization job exchange."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from mistyle.core.view import View
 
 @dataclass(frozen=True)
 class Atlas:
-    """Per texture set: where each texel lies and the material that the asset brought along."""
+    """Per texture set: the texels' surface points and the asset's own material."""
 
     texels: tuple[Texels, ...]
     start: tuple[Maps, ...]
@@ -20,9 +20,9 @@ class Atlas:
 class Baked:
     """Per texture set: the maps with the painted albedo, and by how many views each texel is seen.
 
-    `begin` are the same maps with the painting's relief, where the fit starts at them (else empty); `gains` are the
-    factors, per stylized view, that took the painted light out of it, where the stylizer paints lit objects, and
-    `taken` the share of the known shading that this was.
+    `begin` are the same maps with the painting's relief, if the fit starts from them, else empty. For a stylizer that
+    paints lit objects, `gains` are the factors per stylized view that removed the painted light; `taken` is the removed
+    share of the known shading.
     """
 
     maps: tuple[Maps, ...]
@@ -34,7 +34,7 @@ class Baked:
 
 @dataclass(frozen=True)
 class Retouched:
-    """The painted texture and the views after a person's edits of the views were laid into both."""
+    """The painted texture and the views, both with the user's edits of the views."""
 
     baked: Baked
     views: tuple[View, ...]
@@ -42,7 +42,7 @@ class Retouched:
 
 @dataclass(frozen=True)
 class Repaired:
-    """Per texture set: the final maps and which texels were repaired."""
+    """Per texture set: the final maps and the mask of repaired texels."""
 
     maps: tuple[Maps, ...]
     mask: tuple[np.ndarray, ...]

@@ -1,4 +1,4 @@
-"""The settings of `stylize`, `render` and `bake`: the root record lists one record per stage; and the presets."""
+"""Settings of `stylize`, `render` and `bake` (one record per stage), and the presets."""
 
 import os
 from collections.abc import Mapping
@@ -40,12 +40,12 @@ class DrawSettings(BaseModel):
     paper_files: bool = Field(default=False, description="also write the 8-bit depth maps and Canny edges of the paper")
 
     def samples(self, read: bool = True) -> int:
-        """Samples per pixel of views whose colours are `read` by what comes next, or are for people only."""
+        """Samples per pixel; more if a stylizer reads the views' colours (`read`)."""
         return self.spp or (READ_SAMPLES if read else 1)
 
 
 class Settings(BaseModel):
-    """One job: a mesh, a style, and how."""
+    """Settings of one job."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -57,8 +57,8 @@ class Settings(BaseModel):
         default=0,
         ge=0,
         le=100_000,
-        description="GB of main memory that the job may take (then large arrays lie in files of its work folder where "
-        "they must, with the same result; a job that cannot keep it is refused); 0: nine tenths of what there is",
+        description="GB of main memory that the job may use; 0: nine tenths of the available memory. Large arrays move "
+        "to files in its work folder if needed, with the same result; a job that still exceeds it is refused",
     )
     variant: Literal["auto", "llvm_ad_rgb", "cuda_ad_rgb", "metal_ad_rgb"] = "auto"
     stylizer: Literal["embedded", "embedded-view", "diffusion"] = Field(
@@ -67,7 +67,7 @@ class Settings(BaseModel):
         "diffusion does the same with SDXL (needs models)",
     )
     inpainter: Literal["fill", "paint3d"] = Field(
-        default="fill", description="fill takes the painting again; paint3d is Stable Diffusion (needs models)"
+        default="fill", description="fill reuses the painting; paint3d is Stable Diffusion (needs models)"
     )
     read: ReadSettings = ReadSettings()
     rig: RigSettings = RigSettings()
@@ -90,22 +90,24 @@ class Settings(BaseModel):
 
     @property
     def refined(self) -> Literal["off", "normal-roughness", "albedo", "all"]:
-        """Which maps the fit may change. Where the surface is painted once, `fit.refine_painted` says so, unless other
-        settings ask for the fit: its metallic, its own features, an inpainter."""
+        """Which maps the fit may change.
+
+        `fit.refine_painted` decides for the embedded stylizer, unless another setting needs the full fit: its metallic,
+        its own features, an inpainter.
+        """
         if self.fit.refine != "auto":
             return self.fit.refine
         features = self.fit.features is not None and self.finish.method == "off"
-        wanted = self.fit.metallic == "fit" or features or self.inpainter != "fill"
-        return "all" if wanted or self.stylizer != "embedded" else self.fit.refine_painted
+        refine = self.fit.metallic == "fit" or features or self.inpainter != "fill"
+        return "all" if refine or self.stylizer != "embedded" else self.fit.refine_painted
 
     @property
     def keeps_painting(self) -> bool:
-        """Whether nothing after the bake changes the maps: the fit is off, and a repair would take the painting
-        again."""
+        """Whether the baked maps are final: the fit is off, and the repair would reuse the painting."""
         return self.refined == "off" and self.stylizer == "embedded" and self.inpainter == "fill"
 
 
-# The ways to run a job; the defaults of the records are the standard ones.
+# Presets; the records' defaults are the standard ones.
 PRESETS: dict[str, dict[str, Any]] = {
     "draft": {
         "rig": {"resolution": 512},
@@ -123,8 +125,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "fit": {"refine": "all", "iterations1": 400, "iterations2": 600, "crops": 8, "lights": "together"},
         "diffusion": {"content": "per-view"},
     },
-    # To the letter, also where mistyle/stylization/README.md lists departures. The paper gives no step counts;
-    # these are those of `fine`.
+    # The paper's values, also where mistyle/stylization/README.md lists departures. The paper gives no step counts;
+    # these are from `fine`.
     "paper": {
         "stylizer": "diffusion",
         "inpainter": "paint3d",
@@ -156,7 +158,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "diffusion": {"content": "per-view"},
     },
 }
-# The demo has three minutes: the draft with finer strokes and a larger texture.
+# The demo should take three minutes: the draft with finer strokes and a larger texture.
 PRESETS["demo"] = PRESETS["draft"] | {"surface": {"samples": 150_000}, "atlas": {"size": 2048}}
 
 
@@ -166,5 +168,5 @@ def resolve(
     command_line: Mapping[str, Any],
     environment: Mapping[str, str] = os.environ,
 ) -> Settings:
-    """The settings of a job after every layer; see `resolve` of jobs/settings.py."""
+    """The settings of a job after all layers; see `resolve` of jobs/settings.py."""
     return settings.resolve(preset, config, command_line, environment, root=Settings, presets=PRESETS)

@@ -1,6 +1,6 @@
-"""ConsisLoRA's parts (paper 4.1.2; arXiv 2503.10614): which weights carry content and style, the two losses, the files.
+"""ConsisLoRA's adapters, losses and LoRA files (paper 4.1.2; arXiv 2503.10614).
 
-Only two blocks of SDXL's UNet are touched, through LoRAs on the projections of their attention:
+LoRAs on the attention projections adapt only two blocks of SDXL's UNet:
 up_blocks.0.attentions.0 holds content, up_blocks.0.attentions.1 style (B-LoRA's finding).
 """
 
@@ -24,7 +24,7 @@ PROJECTIONS = r"(to_q|to_k|to_v|to_out\.0)"
 
 
 def add_half(unet: Any, half: Half, rank: int, seed: int, name: str | None = None) -> None:
-    """A fresh LoRA on one block: A ~ N(0, 1/rank), B = 0, scale 1, float32 over the frozen network.
+    """Add a new LoRA on one block: A ~ N(0, 1/rank), B = 0, scale 1, float32 over the frozen network.
 
     peft leaves only the last added adapter active; see `activate`.
     """
@@ -36,7 +36,7 @@ def add_half(unet: Any, half: Half, rank: int, seed: int, name: str | None = Non
         lora_alpha=rank,
         lora_dropout=0.0,
         init_lora_weights="gaussian",
-        # A text is matched as a whole; a list would match endings and reach every block.
+        # peft matches a string as a whole; a list would match endings and reach every block.
         target_modules=rf"{block}\..*\.{PROJECTIONS}",
     )
     with torch.random.fork_rng():
@@ -47,12 +47,12 @@ def add_half(unet: Any, half: Half, rank: int, seed: int, name: str | None = Non
 
 
 def parameters(unet: Any, name: str) -> dict[str, torch.nn.Parameter]:
-    """The weights of an adapter by their names in the UNet."""
+    """An adapter's weights by their parameter names in the UNet."""
     return {n: p for n, p in unet.named_parameters() if ".lora_" in n and f".{name}.weight" in n}
 
 
 def activate(unet: Any, active: Mapping[str, float], trained: tuple[str, ...] = ()) -> None:
-    """Let these adapters speak at these scales; of all weights only those of `trained` get gradients."""
+    """Activate these adapters at these scales; only the weights of `trained` get gradients."""
     unet.set_adapters(list(active), list(active.values()))
     unet.requires_grad_(False)
     for name in trained:
@@ -62,7 +62,7 @@ def activate(unet: Any, active: Mapping[str, float], trained: tuple[str, ...] = 
 
 @contextmanager
 def below_without_gradients(unet: Any) -> Iterator[None]:
-    """While open, the UNet's down and middle blocks run without autograd: nothing there is trained or kept."""
+    """Context in which the UNet's down and middle blocks run without autograd: no trained weight is below them."""
     hooks = [
         unet.conv_in.register_forward_pre_hook(lambda *_: torch.set_grad_enabled(False) and None),
         unet.mid_block.register_forward_hook(lambda *_: torch.set_grad_enabled(True) and None),
@@ -88,45 +88,45 @@ def epsilon_loss(eps: Float[torch.Tensor, "b c h w"], noise: Float[torch.Tensor,
 
 
 def x0_loss(
-    said: Float[torch.Tensor, "b c h w"],
+    output: Float[torch.Tensor, "b c h w"],
     z0: Float[torch.Tensor, "b c h w"],
     zt: Float[torch.Tensor, "b c h w"],
     alpha_bar: Float[torch.Tensor, ""],
     prediction: str = "epsilon",
 ) -> Float[torch.Tensor, ""]:
-    """Mean squared error of the picture that follows from what the network said, unweighted; equals the noise's error
-    times `weight`."""
+    """Mean squared error of the x0 predicted by the network's `output`, unweighted; equals the noise error times
+    `weight`."""
     if prediction == "v_prediction":
-        predicted = alpha_bar.sqrt() * zt - (1 - alpha_bar).sqrt() * said.float()
+        predicted = alpha_bar.sqrt() * zt - (1 - alpha_bar).sqrt() * output.float()
     else:
-        predicted = (zt - (1 - alpha_bar).sqrt() * said.float()) / alpha_bar.sqrt()
+        predicted = (zt - (1 - alpha_bar).sqrt() * output.float()) / alpha_bar.sqrt()
     return torch.mean((predicted - z0) ** 2)
 
 
 def velocity(
     z0: Float[torch.Tensor, "b c h w"], noise: Float[torch.Tensor, "b c h w"], alpha_bar: Float[torch.Tensor, ""]
 ) -> Float[torch.Tensor, "b c h w"]:
-    """What networks of `v_prediction` say: sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z0."""
+    """The target of `v_prediction` networks: sqrt(alpha_bar) noise - sqrt(1 - alpha_bar) z0."""
     return alpha_bar.sqrt() * noise - (1 - alpha_bar).sqrt() * z0
 
 
 def weight(alpha_bar: Float[torch.Tensor, ""]) -> Float[torch.Tensor, ""]:
-    """(1 - alpha_bar) / alpha_bar: what the x0 loss makes of the noise's error, 0.001 to 214 over SDXL's levels."""
+    """(1 - alpha_bar) / alpha_bar: ratio of the x0 loss to the noise error, 0.001 to 214 over SDXL's levels."""
     return (1 - alpha_bar) / alpha_bar
 
 
 def half_names(unet: Any, name: str) -> dict[str, torch.nn.Parameter]:
-    """An adapter's weights under the names of its file.
+    """An adapter's weights by their names in its file.
 
-    The layout is the one of diffusers that ComfyUI knows too: unet.<attention>.processor.to_q_lora.down.weight.
+    The layout is diffusers', which ComfyUI also reads: unet.<attention>.processor.to_q_lora.down.weight.
     """
     tensors = {}
     for key, value in parameters(unet, name).items():
-        found = re.fullmatch(rf"(.*)\.{PROJECTIONS}\.lora_([AB])\.{re.escape(name)}\.weight", key)
-        assert found is not None
-        part = "down" if found[3] == "A" else "up"
-        projection = found[2].removesuffix(".0")
-        tensors[f"unet.{found[1]}.processor.{projection}_lora.{part}.weight"] = value
+        match = re.fullmatch(rf"(.*)\.{PROJECTIONS}\.lora_([AB])\.{re.escape(name)}\.weight", key)
+        assert match is not None
+        part = "down" if match[3] == "A" else "up"
+        projection = match[2].removesuffix(".0")
+        tensors[f"unet.{match[1]}.processor.{projection}_lora.{part}.weight"] = value
     return tensors
 
 
@@ -135,13 +135,13 @@ def save_half(path: Path, unet: Any, name: str, notes: Mapping[str, str]) -> Non
     from safetensors.torch import save_file
 
     tensors = {n: p.detach().cpu().clone().contiguous() for n, p in half_names(unet, name).items()}
-    # One entry: safetensors writes several in an order that differs from run to run.
+    # One entry: safetensors writes several entries in an order that varies between runs.
     note = {"mistyle": json.dumps(notes, sort_keys=True)}
     atomic_write(path, lambda place: save_file(tensors, place, note))
 
 
 def notes_of(path: Path) -> dict[str, str]:
-    """What `save_half` noted in a LoRA's header; empty for files of others."""
+    """The notes that `save_half` wrote into a LoRA's header; empty for foreign files."""
     try:
         notes = json.loads(header(path).get("__metadata__", {}).get("mistyle", "{}"))
     except (ValueError, RecursionError):
@@ -150,9 +150,9 @@ def notes_of(path: Path) -> dict[str, str]:
 
 
 def read_lora(path: Path, half: Half | None = None) -> dict[str, torch.Tensor]:
-    """A LoRA's tensors. Of files that only hold the two blocks, `half` keeps the wanted one.
+    """A LoRA's tensors. From a file of the two blocks only, `half` selects one block.
 
-    Doubled prefixes ('unet.unet.', in some published B-LoRAs) are mended.
+    Doubled prefixes ('unet.unet.', in some published B-LoRAs) are corrected.
     """
     from safetensors import SafetensorError
     from safetensors.torch import load_file
@@ -168,7 +168,7 @@ def read_lora(path: Path, half: Half | None = None) -> dict[str, torch.Tensor]:
 
 
 def put_half(unet: Any, half: Half, path: Path) -> None:
-    """An adapter under its half's own name with the float32 weights that `save_half` wrote."""
+    """Add an adapter named after its half, with the float32 weights that `save_half` wrote."""
     tensors = read_lora(path, half)
     rank = next(value.shape[0] for name, value in tensors.items() if name.endswith("down.weight"))
     add_half(unet, half, rank, 0)
@@ -177,7 +177,7 @@ def put_half(unet: Any, half: Half, path: Path) -> None:
 
 
 def load_half(pipeline: Any, path: Path, name: str, half: Half) -> None:
-    """Load a LoRA into a pipeline under an adapter's name, in the place of an earlier one of that name."""
+    """Load a LoRA into a pipeline under an adapter's name, replacing an earlier one of that name."""
     from mistyle.stylization.models.load import quiet
 
     if name in getattr(pipeline.unet, "peft_config", {}):
@@ -185,5 +185,5 @@ def load_half(pipeline: Any, path: Path, name: str, half: Half) -> None:
     with quiet():
         pipeline.load_lora_weights(read_lora(path, half), adapter_name=name)
     if not parameters(pipeline.unet, name):
-        raise InputRefused(f"{path}: none of its weights fits this model; expected a LoRA for SDXL's UNet")
+        raise InputRefused(f"{path}: none of its weights fit this model; expected a LoRA for SDXL's UNet")
     pipeline.unet.requires_grad_(False)

@@ -1,7 +1,7 @@
-"""SDXL with ControlNets as a denoiser in the sampler's coordinates, and pictures to latents and back.
+"""SDXL with ControlNets as a denoiser in the sampler's coordinates; encoding and decoding of pictures.
 
-The sampler (`stylization/diffusion/repaint.py`) works on unscaled latents, clean one plus sigma times noise; the
-network wants x / sqrt(sigma^2 + 1) and a time step.
+The sampler (`stylization/diffusion/repaint.py`) works on unscaled latents, the clean latent plus sigma times noise. The
+network takes x / sqrt(sigma^2 + 1) and a time step.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -16,18 +16,18 @@ from mistyle.core.image import canny, nearest_fill, resize, srgb_from_linear
 from mistyle.core.view import Prior, View
 from mistyle.io.cameras.views import paper_depth
 
-# Extra terms of the guidance: (weight, adapters that speak and prompt, the same for what is subtracted).
+# Extra guidance terms: (weight, positive adapters and prompt, negative adapters and prompt).
 Term = tuple[float, tuple[Mapping[str, float], str], tuple[Mapping[str, float], str]]
 
 
 @dataclass(frozen=True)
 class Conditioning:
-    """What the network is told for a view, besides its noisy latent; first the empty prompt, then the real one.
+    """The network's conditioning for a view; batch entry 0 is the empty prompt, entry 1 the real one.
 
     text, pooled   (2, n, d) and (2, p); `sizes` SDXL's (2, 6)
     conditions     depth and Canny pictures, each (2, 3, h, w) in 0..1, with `scales`
-    picture        what an IP-Adapter sees: [(2, 1, d)], or nothing
-    adapters       LoRAs that speak in the main pass
+    picture        image embeddings of an IP-Adapter: [(2, 1, d)], or empty
+    adapters       LoRAs active in the main pass, with their scales
     """
 
     text: torch.Tensor
@@ -41,20 +41,20 @@ class Conditioning:
 
 
 def noise_levels(scheduler: Any, steps: int) -> list[float]:
-    """The levels of a schedule of so many steps, falling to 0."""
+    """Noise levels of a schedule of `steps` steps, falling to 0."""
     scheduler.set_timesteps(steps)
     return [float(s) for s in scheduler.sigmas]
 
 
 def time_step(scheduler: Any, sigma: float) -> float:
-    """The time step whose noise level is sigma (between the trained ones: linear in sigma, as Euler's scheduler)."""
+    """The time step of noise level sigma; linear in sigma between trained levels, as in Euler's scheduler."""
     alphas = scheduler.alphas_cumprod.double().cpu().numpy()
     at = float(np.interp(sigma, np.sqrt((1 - alphas) / alphas), np.arange(len(alphas))))
     return float(round(at)) if abs(at - round(at)) < 1e-3 else at
 
 
 def grain(pipeline: Any) -> int:
-    """Pixels of which a picture's sides must be multiples."""
+    """Pixels; a picture's sides must be multiples of it."""
     return pipeline.vae_scale_factor * 2 ** (len(pipeline.unet.config.block_out_channels) - 1)
 
 
@@ -65,14 +65,14 @@ def fitting_size(size: tuple[int, int], multiple: int) -> tuple[int, int]:
 
 
 def conditions(view: View, size: tuple[int, int]) -> list[Float[np.ndarray, "h w 3"]]:
-    """Depth (near white, background black) and Canny edges of a rendered view, as the ControlNets were trained on."""
+    """Depth (near white, background black) and Canny edges of a rendered view, in the ControlNets' training format."""
     depth = paper_depth(view.depth)
     edges = canny(srgb_from_linear(view.rgb)).astype(np.float32)
     return [np.repeat(resize(np.asarray(p, np.float32), size)[..., None], 3, axis=-1) for p in (depth, edges)]
 
 
 def tensor_of(rgb: Float[np.ndarray, "h w c"]) -> Float[torch.Tensor, "1 c h w"]:
-    """A picture as the networks take it."""
+    """A picture as a network input."""
     return torch.from_numpy(np.ascontiguousarray(rgb, np.float32)).permute(2, 0, 1)[None]
 
 
@@ -92,10 +92,10 @@ def decode(vae: Any, latent: Float[torch.Tensor, "1 c h w"]) -> Float[np.ndarray
 def prior_latent(
     vae: Any, prior: Prior, size: tuple[int, int], factor: int
 ) -> tuple[Float[torch.Tensor, "1 c h w"], Float[torch.Tensor, "1 1 h w"]]:
-    """The prior's latent and which of its cells are known: those whose pixels all are (min-pooling).
+    """The prior's latent and the mask of its known cells: those whose pixels are all known (min-pooling).
 
-    The known colours are continued over the rest first: the encoder looks around each cell, and black there would leak
-    into the pinned border.
+    Known colours are first extended into the unknown area: the encoder's receptive field crosses cells, and black
+    there would leak into the pinned border.
     """
     filled = nearest_fill(prior.rgb, prior.known)
     latent = encode(vae, srgb_from_linear(resize(filled, size)))
@@ -104,7 +104,7 @@ def prior_latent(
 
 
 def pooled(known: Bool[np.ndarray, "h w"], factor: int) -> Bool[np.ndarray, "h2 w2"]:
-    """Cells of `factor` x `factor` pixels that are known throughout."""
+    """Cells of `factor` x `factor` pixels whose pixels are all known."""
     height, width = known.shape
     return np.asarray(known.reshape(height // factor, factor, width // factor, factor).all(axis=(1, 3)))
 
@@ -112,9 +112,9 @@ def pooled(known: Bool[np.ndarray, "h w"], factor: int) -> Bool[np.ndarray, "h2 
 def denoiser(
     pipeline: Any, conditioning: Conditioning, terms: Sequence[Term] = (), prompts: Mapping[str, Any] | None = None
 ) -> Callable[[torch.Tensor, float], torch.Tensor]:
-    """(latent, sigma) -> the clean latent that the network expects, with classifier-free guidance.
+    """(latent, sigma) -> the network's estimate of the clean latent, with classifier-free guidance.
 
-    `terms` add ConsisLoRA's guidance, each two more passes; `prompts` holds their texts' embeddings.
+    `terms` add ConsisLoRA's guidance, each with two more passes; `prompts` holds their prompts' embeddings.
     """
     unet, dtype = pipeline.unet, pipeline.unet.dtype
     activate(pipeline, conditioning.adapters)
@@ -136,7 +136,7 @@ def denoiser(
             )
             if conditioning.picture:
                 more = more | {"image_embeds": list(conditioning.picture)}
-            said = unet(
+            output = unet(
                 both,
                 time,
                 encoder_hidden_states=conditioning.text,
@@ -145,7 +145,7 @@ def denoiser(
                 mid_block_additional_residual=middle,
                 return_dict=False,
             )[0].float()
-            nothing, something = said.chunk(2)
+            nothing, something = output.chunk(2)
             guided = nothing + conditioning.guidance * (something - nothing)
             if terms:
                 residuals = [d[1:] for d in down], middle[1:]
@@ -155,15 +155,15 @@ def denoiser(
     return denoise
 
 
-def clean(prediction: str, said: torch.Tensor, x: torch.Tensor, sigma: float) -> torch.Tensor:
-    """The clean latent that follows from what the network says of `x`: its noise, or its velocity."""
+def clean(prediction: str, output: torch.Tensor, x: torch.Tensor, sigma: float) -> torch.Tensor:
+    """The clean latent from the network's `output` for `x`: its noise, or its velocity."""
     if prediction == "v_prediction":
-        return x / (sigma**2 + 1) - said * (sigma / (sigma**2 + 1) ** 0.5)
-    return x - sigma * said
+        return x / (sigma**2 + 1) - output * (sigma / (sigma**2 + 1) ** 0.5)
+    return x - sigma * output
 
 
 def activate(pipeline: Any, adapters: Mapping[str, float]) -> None:
-    """Let these LoRAs speak, and no others."""
+    """Activate only these LoRAs."""
     if adapters:
         pipeline.unet.enable_adapters()
         pipeline.unet.set_adapters(list(adapters), list(adapters.values()))
@@ -180,7 +180,7 @@ def _terms(
     conditioning: Conditioning,
     residuals: tuple[list[torch.Tensor], torch.Tensor],
 ) -> torch.Tensor:
-    """The sum of weight x (what one LoRA says - what its opposite says), under the same ControlNets."""
+    """The sum of weight x (output with one LoRA - output with its opposite), under the same ControlNets."""
     total = torch.zeros_like(scaled, dtype=torch.float32)
     for weight, *sides in terms:
         for sign, (adapters, prompt) in zip((1, -1), sides, strict=True):

@@ -1,4 +1,4 @@
-"""Making LoRAs and keeping them: each is trained once for its picture, word, settings, seed and base model."""
+"""Trained LoRA files: one training for each picture, prompt token, settings, seed and base model."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ Kind = Literal["content", "style"]
 
 @dataclass(frozen=True)
 class TrainingImage:
-    """A picture (sRGB) to train LoRAs on, the name of their files, and the word of the prompt that stands for it."""
+    """A training picture (sRGB), the name of its LoRA files, and its prompt token (`word`)."""
 
     kind: Kind
     name: str
@@ -35,13 +35,13 @@ class TrainingImage:
 
 @dataclass(frozen=True)
 class LoraPair:
-    """The two LoRAs of one picture; the half that is not its own serves ConsisLoRA's guidance only."""
+    """The two LoRAs of one picture; the half of the other kind is only for ConsisLoRA's guidance."""
 
     content: Path
     style: Path
 
-    def there(self, key: str) -> tuple[bool, bool]:
-        """Which of the two files is finished under this key."""
+    def finished(self, key: str) -> tuple[bool, bool]:
+        """Which of the two files (content, style) exists under this key."""
         from mistyle.stylization.diffusion.consislora import notes_of
 
         content, style = (p.is_file() and notes_of(p).get("mistyle_key") == key for p in (self.content, self.style))
@@ -49,7 +49,7 @@ class LoraPair:
 
 
 def identity(settings: ModelSettings) -> str:
-    """Which base model it is."""
+    """Fingerprint of the base model's weights."""
     if settings.checkpoint:
         return models.fingerprint([settings.checkpoint])
     place = models.find("sdxl", settings.folder)
@@ -57,21 +57,21 @@ def identity(settings: ModelSettings) -> str:
 
 
 def lora_key(image: TrainingImage, training: TrainSettings, settings: ModelSettings, seed: int) -> str:
-    """Everything that decides a LoRA's bits, but for the machine."""
-    # How often a checkpoint is written decides nothing.
+    """Key of all inputs that determine a LoRA's bits, except the machine."""
+    # The checkpoint interval does not matter.
     numbers = training.model_dump(exclude={"save_every"})
     own = settings.model_dump(include={"precision", "prediction"})
     return digest([image.kind, np.float32(image.rgb), image.word, numbers, identity(settings), own, seed])
 
 
 def paths(folder: Path, name: str, key: str) -> LoraPair:
-    """Where a picture's LoRAs are kept: readable, and different for different keys."""
+    """Paths of a picture's LoRAs: its name, and the start of the key."""
     stem = f"{cut(re.sub(r'[^A-Za-z0-9._+-]+', '_', name), ASSET)}-{key[:10]}"
     return LoraPair(folder / f"{stem}.content.safetensors", folder / f"{stem}.style.safetensors")
 
 
 def refuse_unknown(every: Sequence[LoraPair]) -> None:
-    """UsageError for a file at the place of a LoRA that no training of ours wrote."""
+    """UsageError for a file at a LoRA's path that mistyle did not train."""
     from mistyle.stylization.diffusion.consislora import notes_of
 
     for path in (p for pair in every for p in (pair.content, pair.style)):
@@ -83,24 +83,24 @@ def refuse_unknown(every: Sequence[LoraPair]) -> None:
 
 
 def steps_left(kind: Kind, pair: LoraPair, key: str, training: TrainSettings) -> int:
-    """Training steps that a picture still takes; checkpoints within a phase are not looked at."""
-    content, style = pair.there(key)
+    """Remaining training steps of a picture; ignores checkpoints within a phase."""
+    content, style = pair.finished(key)
     if kind == "content":
         return 0 if content and style else training.steps
     return (0 if content else training.steps) + (0 if style and content else training.style_steps)
 
 
 def forecast(steps: int, resolution: int) -> str:
-    """The sentence about training time that is said before it starts."""
+    """The estimate of training time, reported before it starts."""
     if steps == 0:
-        return "every LoRA is there, nothing is trained"
+        return "all LoRAs exist, nothing is trained"
     slow, fast = (steps / rate * (resolution / 1024) ** 2 / 3600 for rate in STEPS_A_SECOND)
     span = f"{fast:.1f} to {slow:.1f} hours" if slow >= 1 else f"{60 * fast:.0f} to {60 * slow:.0f} minutes"
     return f"{steps:,} training steps: about {span} on a recent GPU (estimate: 2 to 4 steps a second at 1024²)"
 
 
 def check(settings: ModelSettings, training: TrainSettings) -> None:
-    """Refuse, before anything is loaded, a training that could not run: packages, files, architecture, memory."""
+    """Refuse a training that cannot run, before anything is loaded: packages, files, architecture, memory."""
     models.need_extra()
     from mistyle.stylization.models.load import device_of, precision_of
 
@@ -116,7 +116,7 @@ def check(settings: ModelSettings, training: TrainSettings) -> None:
 
 
 def trainer(settings: ModelSettings) -> Any:
-    """SDXL as it is trained: a pipeline without ControlNets on its device, everything frozen."""
+    """SDXL for training: a pipeline without ControlNets on its device, all weights frozen."""
     from diffusers.pipelines.stable_diffusion_xl.pipeline_stable_diffusion_xl import StableDiffusionXLPipeline
 
     from mistyle.stylization.models.load import base_parts, device_of, precision_of
@@ -139,7 +139,7 @@ def make(
     seed: int,
     watch: Callable[[int, int, float], None] = lambda step, steps, loss: None,
 ) -> list[float]:
-    """Train what is missing of a picture's LoRAs and write them; returns the noise errors of the steps run."""
+    """Train and write a picture's missing LoRAs; returns the noise errors of the steps run."""
     from mistyle.stylization.diffusion import consislora
     from mistyle.stylization.diffusion.lora_training import (
         Checkpoint,
@@ -151,7 +151,7 @@ def make(
 
     kind, rgb, word = image.kind, image.rgb, image.word
     notes = {"mistyle_key": key, "mistyle_kind": kind, "prompt_word": word, "base_model": "SDXL", "seed": str(seed)}
-    content, style = pair.there(key)
+    content, style = pair.finished(key)
     unet, left = pipeline.unet, steps_left(kind, pair, key, training)
     state = pair.content.with_name(f"{pair.content.name.removesuffix('.content.safetensors')}.training.safetensors")
     done, errors = 0, []
@@ -162,10 +162,10 @@ def make(
     try:
         if not content or (kind == "content" and not style):
             phase = joint_phase(word, training)
-            shown = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
+            example = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
             for half in phase.trained:
                 consislora.add_half(unet, half, training.rank, seed + (half == "style"))
-            errors += run_phase(pipeline, shown, phase, training, seed, Checkpoint(state, key + phase.name), note)
+            errors += run_phase(pipeline, example, phase, training, seed, Checkpoint(state, key + phase.name), note)
             if kind == "content":
                 consislora.save_half(pair.style, unet, "style", notes)
             consislora.save_half(pair.content, unet, "content", notes)
@@ -174,21 +174,21 @@ def make(
             style = kind == "content"
         if not style:
             phase = style_phase(word, training)
-            shown = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
+            example = training_example(pipeline, rgb, phase.prompt, training.resolution, seed)
             consislora.put_half(unet, "content", pair.content)
             consislora.add_half(unet, "style", training.rank, seed + 2)
-            errors += run_phase(pipeline, shown, phase, training, seed, Checkpoint(state, key + phase.name), note)
+            errors += run_phase(pipeline, example, phase, training, seed, Checkpoint(state, key + phase.name), note)
             consislora.save_half(pair.style, unet, "style", notes)
     finally:
-        there = [name for name in ("content", "style") if name in getattr(unet, "peft_config", {})]
-        if there:
-            unet.delete_adapters(there)
+        loaded = [name for name in ("content", "style") if name in getattr(unet, "peft_config", {})]
+        if loaded:
+            unet.delete_adapters(loaded)
     return errors
 
 
 @dataclass(frozen=True)
 class LoraFolder:
-    """Where LoRAs are kept; without `overwrite` a file there that no training of ours wrote is refused."""
+    """A folder of LoRAs; without `overwrite`, files that mistyle did not train are refused."""
 
     path: Path
     overwrite: bool = False
@@ -203,9 +203,9 @@ def make_all(
     say: Callable[[str], None],
     watch: Callable[[int, int, float], None] = lambda step, steps, loss: None,
 ) -> list[LoraPair]:
-    """LoRAs of several pictures: what is missing is trained, in this order.
+    """LoRAs of several pictures; trains the missing ones in this order.
 
-    The time that it will take is said before anything is loaded; nothing is loaded when all is there.
+    Reports the estimated time before anything is loaded; loads nothing if all exist.
     """
     keys = [lora_key(image, training, settings, seed) for image in images]
     loras = [paths(folder.path, image.name, key) for image, key in zip(images, keys, strict=True)]

@@ -1,9 +1,9 @@
-"""Training of ConsisLoRA (paper 4.1.2): one picture, one latent, one prompt, fresh noise every step.
+"""Training of ConsisLoRA (paper 4.1.2): one picture, one latent, one prompt, new noise every step.
 
 A content picture trains both halves together with "A [c]"; only the content half is used. A style picture does the same
-with "A [v]" (stage 1), whose content half then stays, frozen, while a fresh style half learns "An image in the style of
-[v]" (stage 2). The noise of a step follows from seed, phase and step alone, so a training that is killed goes on from
-its last checkpoint to the same bits.
+with "A [v]" (stage 1). Stage 2 freezes that content half and trains a new style half on "An image in the style of [v]".
+A step's noise depends only on seed, phase and step, so a killed training resumes from its last checkpoint with the same
+bits.
 """
 
 import json
@@ -23,13 +23,13 @@ from mistyle.stylization.diffusion import consislora
 from mistyle.stylization.diffusion.consislora import Half
 from mistyle.stylization.diffusion.settings import TrainSettings
 
-# (step, steps, loss over its weight)
+# (step, steps, loss / weight)
 Watch = Callable[[int, int, float], None]
 
 
 @dataclass(frozen=True)
 class LoraPhase:
-    """One run of the optimiser: which halves learn, which only speak, and under which losses."""
+    """One run of the optimiser: trained halves, frozen active halves, prompt and loss schedule."""
 
     name: str
     prompt: str
@@ -44,7 +44,7 @@ class LoraPhase:
 
 @dataclass(frozen=True)
 class TrainingExample:
-    """What the network is shown, computed once: latent, text, pooled text and SDXL's sizes; and what it predicts."""
+    """The network's constant inputs: latent, text, pooled text and SDXL's sizes; and its prediction type."""
 
     z0: Float[torch.Tensor, "1 c h w"]
     text: Float[torch.Tensor, "1 n d"]
@@ -54,7 +54,7 @@ class TrainingExample:
 
 
 def joint_phase(word: str, settings: TrainSettings) -> LoraPhase:
-    """A content picture, or stage 1 of a style picture."""
+    """The phase of a content picture, or stage 1 of a style picture."""
     return LoraPhase(
         "joint",
         f"A {word}",
@@ -84,7 +84,7 @@ def style_phase(word: str, settings: TrainSettings) -> LoraPhase:
 def training_example(
     pipeline: Any, rgb: Float[np.ndarray, "h w 3"], prompt: str, resolution: int, seed: int
 ) -> TrainingExample:
-    """Encode an sRGB picture and a prompt: the short side becomes `resolution` pixels, nothing is cropped."""
+    """Encode an sRGB picture and a prompt; the short side becomes `resolution` pixels, without cropping."""
     height, width = rgb.shape[:2]
     grain = pipeline.vae_scale_factor * 2 ** (len(pipeline.unet.config.block_out_channels) - 1)
     scale = resolution / min(height, width)
@@ -117,7 +117,7 @@ def step_noise(
 
 @dataclass(frozen=True)
 class NoisyStep:
-    """One step's noise and its level: the index, and the product of alphas up to it."""
+    """One step's noise, its level's index, and alpha_bar, the product of alphas up to it."""
 
     step: int
     level: int
@@ -126,31 +126,30 @@ class NoisyStep:
 
 
 def step_loss(
-    unet: Any, shown: TrainingExample, phase: LoraPhase, mode: str, at: NoisyStep
+    unet: Any, example: TrainingExample, phase: LoraPhase, mode: str, at: NoisyStep
 ) -> tuple[torch.Tensor, float]:
-    """The loss of one step, and the error of what the network predicts alone: the loss over its weight, which can be
-    compared over steps."""
+    """The loss of one step, and the unweighted prediction error (loss / weight), which is comparable between steps."""
     noise, alpha_bar = at.noise, at.alpha_bar
-    zt = consislora.noisy(shown.z0, noise, alpha_bar)
+    zt = consislora.noisy(example.z0, noise, alpha_bar)
     with consislora.below_without_gradients(unet):
         predicted = unet(
             zt.to(unet.dtype),
             torch.tensor([at.level], device=zt.device),
-            encoder_hidden_states=shown.text,
-            added_cond_kwargs={"text_embeds": shown.pooled, "time_ids": shown.sizes.to(shown.text.dtype)},
+            encoder_hidden_states=example.text,
+            added_cond_kwargs={"text_embeds": example.pooled, "time_ids": example.sizes.to(example.text.dtype)},
             return_dict=False,
         )[0]
-    target = consislora.velocity(shown.z0, noise, alpha_bar) if shown.prediction == "v_prediction" else noise
+    target = consislora.velocity(example.z0, noise, alpha_bar) if example.prediction == "v_prediction" else noise
     error = consislora.epsilon_loss(predicted, target)
     if at.step < phase.switch:
         return error, float(error.detach())
-    picture = consislora.x0_loss(predicted, shown.z0, zt, alpha_bar, shown.prediction)
+    picture = consislora.x0_loss(predicted, example.z0, zt, alpha_bar, example.prediction)
     return (picture + error if mode == "sum" else picture), float(error.detach())
 
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """The file of a training under way, and the key of what decides its bits."""
+    """The checkpoint file of a training, and the key of the inputs that determine its bits."""
 
     path: Path
     key: str
@@ -158,17 +157,17 @@ class Checkpoint:
 
 def run_phase(
     pipeline: Any,
-    shown: TrainingExample,
+    example: TrainingExample,
     phase: LoraPhase,
     settings: TrainSettings,
     seed: int,
     checkpoint: Checkpoint | None = None,
     watch: Watch = lambda step, steps, loss: None,
 ) -> list[float]:
-    """Train the phase's halves, which must be there as adapters of these names; returns each step's noise error.
+    """Train the phase's halves, which must exist as adapters of these names; returns each step's noise error.
 
-    The checkpoint is written every `settings.save_every` steps and when the run is asked to stop, taken up when the
-    file's key is the same, and removed at the end.
+    The checkpoint is written every `settings.save_every` steps and on a stop signal, resumed if its key matches, and
+    removed at the end.
     """
     unet = pipeline.unet
     consislora.activate(unet, {half: 1.0 for half in (*phase.frozen, *phase.trained)}, phase.trained)
@@ -176,16 +175,16 @@ def run_phase(
     optimiser = torch.optim.AdamW(
         named.values(), lr=phase.rate, betas=(0.9, 0.999), eps=1e-8, weight_decay=settings.weight_decay
     )
-    scaler = torch.amp.GradScaler(shown.z0.device.type, enabled=unet.dtype == torch.float16)
-    alphas = pipeline.scheduler.alphas_cumprod.to(shown.z0.device)
+    scaler = torch.amp.GradScaler(example.z0.device.type, enabled=unet.dtype == torch.float16)
+    alphas = pipeline.scheduler.alphas_cumprod.to(example.z0.device)
     history = _take_up(checkpoint, named, optimiser, scaler)
     between = True
     try:
         for step in range(len(history), phase.steps):
-            level, noise = step_noise(phase, shown.z0.shape, seed, step, len(alphas))
-            noise = noise.to(shown.z0.device)
+            level, noise = step_noise(phase, example.z0.shape, seed, step, len(alphas))
+            noise = noise.to(example.z0.device)
             loss, error = step_loss(
-                unet, shown, phase, settings.loss_mode, NoisyStep(step, level, noise, alphas[level])
+                unet, example, phase, settings.loss_mode, NoisyStep(step, level, noise, alphas[level])
             )
             between = False
             for group in optimiser.param_groups:
@@ -225,14 +224,14 @@ def _keep(checkpoint: Checkpoint, named: dict, optimiser: Any, scaler: Any, hist
         tensors["scale"] = torch.tensor([scaler.get_scale(), scaler.state_dict()["_growth_tracker"]])
     for name, parameter in named.items():
         tensors[f"weight:{name}"] = parameter.detach().cpu().contiguous()
-        for moment, value in optimiser.state[parameter].items():  # none yet while float16 steps are skipped
+        for moment, value in optimiser.state[parameter].items():  # empty while float16 steps are skipped
             tensors[f"{moment}:{name}"] = value.cpu().contiguous()
     about = {"mistyle": json.dumps({"key": checkpoint.key})}
     atomic_write(checkpoint.path, lambda path: save_file(tensors, path, about))
 
 
 def _take_up(checkpoint: Checkpoint | None, named: dict, optimiser: Any, scaler: Any) -> list[float]:
-    """Put the checkpoint's values in place and return the losses of the steps done; empty where there is none."""
+    """Restore the checkpoint and return the losses of its steps; empty without a valid checkpoint."""
     from safetensors import SafetensorError
     from safetensors.torch import load_file
 
@@ -241,16 +240,16 @@ def _take_up(checkpoint: Checkpoint | None, named: dict, optimiser: Any, scaler:
     try:
         if consislora.notes_of(checkpoint.path).get("key") != checkpoint.key:
             return []
-        kept = load_file(checkpoint.path)
+        tensors = load_file(checkpoint.path)
     except (InputRefused, SafetensorError):
         return []
-    history = kept["history"].tolist()
-    if "scale" in kept:
-        scale, tracker = kept["scale"].tolist()
+    history = tensors["history"].tolist()
+    if "scale" in tensors:
+        scale, tracker = tensors["scale"].tolist()
         scaler.load_state_dict(scaler.state_dict() | {"scale": scale, "_growth_tracker": int(tracker)})
     for name, parameter in named.items():
-        parameter.data.copy_(kept[f"weight:{name}"])
-        moments = {m: kept[f"{m}:{name}"] for m in ("step", "exp_avg", "exp_avg_sq") if f"{m}:{name}" in kept}
+        parameter.data.copy_(tensors[f"weight:{name}"])
+        moments = {m: tensors[f"{m}:{name}"] for m in ("step", "exp_avg", "exp_avg_sq") if f"{m}:{name}" in tensors}
         if moments:
             optimiser.state[parameter] = {m: v if m == "step" else v.to(parameter.device) for m, v in moments.items()}
     return history

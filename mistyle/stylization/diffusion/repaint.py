@@ -1,11 +1,11 @@
-"""RePaint as a sampler over any denoiser (paper 4.1.3, equations 1 to 3); it knows of no network.
+"""RePaint as a sampler over any denoiser (paper 4.1.3, equations 1 to 3), independent of the network.
 
-Variance-exploding coordinates: a latent at level sigma is the clean one plus sigma times standard normal noise, not
-scaled for a network's input (a denoiser that wants x / sqrt(sigma^2 + 1) divides for itself).
+Variance-exploding coordinates: a latent at level sigma is the clean one plus sigma times standard normal noise. It is
+not scaled for a network's input: a denoiser that needs x / sqrt(sigma^2 + 1) divides itself.
 
-The paper re-noises a block "before the final resample". With one re-noising in ten repeats the other eight start from
-latents quieter than the denoiser is told, and the variance of the result falls under half of the true one; here, as in
-RePaint itself, every repeat but the first is re-noised. tests/stylization/diffusion/test_repaint.py holds both against
+The paper re-noises a block "before the final resample". With one re-noising in ten repeats, the other eight start from
+latents with less noise than sigma. The variance of the result then falls below half of the true one. Here, as in
+RePaint itself, every repeat but the first is re-noised. tests/stylization/diffusion/test_repaint.py compares both with
 a closed form.
 """
 
@@ -16,13 +16,12 @@ from typing import Any
 import numpy as np
 
 Array = Any  # a NumPy array, or a torch tensor; then `rng` is a torch.Generator
-Denoiser = Callable[[Array, float], Array]  # (latent, sigma) -> the clean latent it expects
+Denoiser = Callable[[Array, float], Array]  # (latent, sigma) -> estimate of the clean latent
 
 
 @dataclass(frozen=True)
 class Resampling:
-    """How a latent is resampled: blocks of `L` steps, each `r` times over, and the share of steps that are passed once
-    more at the end without the prior."""
+    """Resampling: blocks of `L` steps, each `r` times, and the share of steps repeated at the end without the prior."""
 
     L: int = 10
     r: int = 10
@@ -39,14 +38,16 @@ def sample(
     rng: Any,
     like: Array | None = None,
 ) -> Array:
-    """A latent whose part under `mask` (1: known) is `prior` and whose rest goes with it.
+    """A latent that equals `prior` under `mask` (1: known) and is sampled consistently with it elsewhere.
 
-    `sigmas` falls from the noisiest level to 0, one step between neighbours. Steps go in blocks of `L`, each block `r`
-    times over: after every step the known part is set to the prior at the next level (eq. 1 and 2), before every
-    repeat the block's noise is put back (eq. 3). With `prior` None (the first view) nothing is pinned, L and r count
-    as 1, and `like` gives the latent's shape and kind. The result then passes the last int(refine * steps) steps once
-    more without the prior, which smooths the border; refine = 0 leaves that out, and the known part is the prior
-    exactly. Calls `denoise` steps * r + int(refine * steps) times. The same generator state gives the same result.
+    `sigmas` falls from the noisiest level to 0, one step between neighbours. Steps run in blocks of `L`, each block `r`
+    times. After every step the known part is set to the prior at the next level (eq. 1 and 2); before every repeat the
+    block's noise is added again (eq. 3). With `prior` None (the first view) nothing is pinned, L and r count as 1, and
+    `like` gives the latent's shape and type.
+
+    The result then passes the last int(refine * steps) steps again without the prior, which smooths the border. With
+    refine = 0 the known part is the prior exactly. Calls `denoise` steps * r + int(refine * steps) times. The same
+    generator state gives the same result.
     """
     L, r, refine = resampling.L, resampling.r, resampling.refine
     levels = [float(s) for s in sigmas]
@@ -56,7 +57,7 @@ def sample(
         raise ValueError(f"L = {L} and r = {r} must be at least 1, refine = {refine} within 0..1")
     template = like if prior is None else prior
     if template is None or (prior is not None and mask is None):
-        raise ValueError("a first view needs `like` for the shape of the latent, a later one a prior and its mask")
+        raise ValueError("a first view needs `like` for the shape of the latent, a later view a prior and its mask")
     block, repeats = (L, r) if prior is not None else (1, 1)
     x = levels[0] * normal(rng, template)
     for first in range(0, len(levels) - 1, block):
@@ -72,7 +73,7 @@ def sample(
 
 
 def refined(denoise: Denoiser, x: Array, levels: Sequence[float], strength: float, rng: Any) -> Array:
-    """The last int(strength * steps) steps once more, from the finished latent with their noise added."""
+    """Repeat the last int(strength * steps) steps from the finished latent with their noise added."""
     steps = len(levels) - 1
     first = steps - int(strength * steps + 1e-9)
     if first == steps:
@@ -89,7 +90,7 @@ def step(denoise: Denoiser, x: Array, sigma: float, following: float) -> Array:
 
 
 def normal(rng: Any, like: Array) -> Array:
-    """Standard normal noise of the shape, type and place of `like`."""
+    """Standard normal noise of the shape, dtype and device of `like`."""
     if isinstance(like, np.ndarray):
         return rng.standard_normal(like.shape).astype(like.dtype, copy=False)
     import torch

@@ -1,4 +1,4 @@
-"""Settings of the generative stages: where models are, how LoRAs are trained, how views and texels are painted."""
+"""Settings of the generative stages: models, LoRA training, view stylizer and texture inpainter."""
 
 from pathlib import Path
 from typing import Literal
@@ -7,12 +7,12 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class ModelSettings(BaseModel):
-    """Where the models are and what they run on."""
+    """Model files, device, precision and memory."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     folder: Path | None = Field(
-        default=None, description="folder of models as `mistyle models` lays it out; else the Hugging Face cache"
+        default=None, description="folder of models as `mistyle models` writes it; else the Hugging Face cache"
     )
     checkpoint: Path | None = Field(
         default=None, description="SDXL or a finetune of it as one .safetensors file, in place of the folder's weights"
@@ -24,7 +24,7 @@ class ModelSettings(BaseModel):
     )
     precision: Literal["auto", "float32", "bfloat16", "float16"] = Field(
         default="auto",
-        description="of frozen networks; auto: bfloat16 on a GPU that computes it, float16 on others, float32 on a "
+        description="of frozen networks; auto: bfloat16 on a GPU that supports it, float16 on others, float32 on a "
         "CPU. VAEs stay float32",
     )
     prediction: Literal["auto", "epsilon", "v_prediction"] = Field(
@@ -32,7 +32,7 @@ class ModelSettings(BaseModel):
     )
     offload: bool = Field(
         default=False,
-        description="keep on the GPU only the network that runs: slower, the same pictures",
+        description="keep only the running network on the GPU: slower, the same pictures",
     )
     memory: float = Field(default=0, ge=0, description="GB that may be used; 0: the device's free memory")
 
@@ -56,8 +56,8 @@ class TrainSettings(BaseModel):
     clip: float = Field(
         default=0,
         ge=0,
-        description="largest norm of a step's gradient; 0: unlimited, as ConsisLoRA's script in effect has it, whose "
-        "clipping is handed a list that is used up",
+        description="largest norm of a step's gradient; 0: unlimited, as in ConsisLoRA's script, whose clipping gets "
+        "an exhausted iterator and has no effect",
     )
     resolution: int = Field(default=1024, ge=16, le=4096, description="pixels of the picture's short side")
     save_every: int = Field(default=100, ge=1, description="steps between checkpoints")
@@ -100,13 +100,15 @@ class Paint3dSettings(BaseModel):
 
     recipe: Literal["inpaint", "paint3d"] = Field(
         default="inpaint",
-        description="inpainting UNet (the paper), or SD 1.5 with an inpaint ControlNet (Paint3D)",
+        description="the paper's inpainting UNet, or Paint3D's SD 1.5 with an inpaint ControlNet",
     )
     prompt: str = Field(
         default="UV map, texture of an object, even flat lighting, high quality", description="text prompt"
     )
-    negative: str = Field(default=LIGHTING, description="negative prompt: light and shadow belong to the renderer")
-    size: int = Field(default=1024, ge=16, le=2048, description="pixels of a side that the model paints at once")
+    negative: str = Field(
+        default=LIGHTING, description="negative prompt: excludes light and shadow, which the renderer adds"
+    )
+    size: int = Field(default=1024, ge=16, le=2048, description="pixels along a side of the model's input")
     overlap: int = Field(default=128, ge=0, description="pixels that crops share, and context around holes")
     detail: float = Field(
         default=0.5, ge=0, le=1, description="strength of the pass over crops; 0 leaves it out (low frequencies only)"

@@ -1,6 +1,6 @@
 """The paper's stylizer (4.1.2, 4.1.3): SDXL with depth and Canny ControlNets, content and style LoRAs, RePaint.
 
-It paints one view at a time for the sweep of `stylization/mvst/sweep.py`. Weights are never downloaded here. Full-size
+It paints one view at a time for the sweep of `stylization/mvst/sweep.py`. It never downloads weights. Full-size
 networks have not been run yet; the tests run every path on tiny random ones of the same architecture.
 """
 
@@ -34,7 +34,7 @@ from mistyle.stylization.models.catalogue import ENCODER, LOOSE_NEEDED
 
 @dataclass(frozen=True)
 class DiffusionJob:
-    """What the stylizer is asked for: settings, the style picture, where LoRAs are kept."""
+    """The stylizer's inputs: settings, the style picture (sRGB) and its name, the LoRA folder, the seed."""
 
     models: ModelSettings
     training: TrainSettings
@@ -46,7 +46,7 @@ class DiffusionJob:
 
 
 def check(settings: ModelSettings, chosen: DiffusionSettings, side: int) -> None:
-    """Refuse, before anything is rendered, what could not be painted: packages, files, architectures, memory."""
+    """Refuse a job that cannot run, before anything is rendered: packages, files, architectures, memory."""
     models.need_extra()
     from mistyle.stylization.models.load import device_of, precision_of
 
@@ -80,7 +80,7 @@ def _places(settings: ModelSettings, chosen: DiffusionSettings) -> tuple[Path, l
 
 
 def training_set(job: DiffusionJob, views: Sequence[View]) -> list[TrainingImage]:
-    """The pictures that LoRAs are trained on: the style first, then the first view or every one."""
+    """The pictures to train LoRAs on: the style first, then the first view or all views."""
     images: list[TrainingImage] = []
     if job.diffusion.adapter == "lora" and job.models.style_lora is None:
         images.append(TrainingImage("style", job.style_name, job.style, job.diffusion.look))
@@ -91,28 +91,28 @@ def training_set(job: DiffusionJob, views: Sequence[View]) -> list[TrainingImage
 
 
 def content_of(chosen: DiffusionSettings) -> str:
-    """Which content LoRAs there are."""
+    """The kind of content LoRAs: none, shared or per-view."""
     if chosen.content != "auto":
         return chosen.content
     return "none" if chosen.adapter == "ip" else "shared"
 
 
 def content_count(chosen: DiffusionSettings, views: int) -> int:
-    """How many content LoRAs a job of so many views has."""
+    """Number of content LoRAs for a job of `views` views."""
     return {"none": 0, "shared": min(1, views), "per-view": views}[content_of(chosen)]
 
 
 def announcement(settings: ModelSettings, training: TrainSettings, chosen: DiffusionSettings, views: int) -> str:
-    """What a job of so many views costs at most, said before it starts: training steps, and looks of the network."""
+    """Upper cost of a job of `views` views, reported before it starts: training steps and network evaluations."""
     own = chosen.adapter == "lora" and settings.style_lora is None
     steps = (training.steps + training.style_steps) * own + training.steps * content_count(chosen, views)
-    looks = chosen.steps + (views - 1) * (chosen.steps * chosen.repeats + int(chosen.refinement * chosen.steps))
+    evaluations = chosen.steps + (views - 1) * (chosen.steps * chosen.repeats + int(chosen.refinement * chosen.steps))
     trained = f"at most {forecast(steps, training.resolution)}" if steps else "no LoRA is trained"
-    return f"diffusion: {trained}; then {looks:,} denoising steps over {views} views"
+    return f"diffusion: {trained}; then {evaluations:,} denoising steps over {views} views"
 
 
 def key(job: DiffusionJob, views: Sequence[View]) -> str:
-    """What a painted view hangs on besides the sweep's settings, the seed and the rig."""
+    """Cache key of painted views, besides the sweep's settings, the seed and the rig."""
     loras = [lora_key(image, job.training, job.models, job.seed) for image in training_set(job, views)]
     _, controls = _places(job.models, job.diffusion)
     files = [file for place in controls for file in models.weights(place)]
@@ -126,7 +126,7 @@ def key(job: DiffusionJob, views: Sequence[View]) -> str:
 
 
 def prompt_of(chosen: DiffusionSettings) -> str:
-    """ "a [c] in the style of [v]"; without LoRAs, for which the bracketed words mean nothing, plainer ones."""
+    """ "a [c] in the style of [v]"; without LoRAs, which define the bracketed tokens, a prompt of plain text."""
     named = content_of(chosen) != "none" or chosen.subject != "[c]"
     subject = f"a {chosen.subject}" if named else "an object"
     if chosen.adapter == "ip" and chosen.look == "[v]":
@@ -140,10 +140,10 @@ def stylizer(
     say: Callable[[str], None] = lambda text: None,
     watch: Callable[[int, int, float], None] = lambda step, steps, loss: None,
 ) -> Callable[[View, Prior | None, np.random.Generator], np.ndarray]:
-    """Train the LoRAs that are missing, load SDXL, and return the function that paints a view.
+    """Train the missing LoRAs, load SDXL, and return the function that paints a view.
 
-    `view.rgb` and the answer are linear; all randomness comes from the generator. Views are told apart by their
-    cameras' names. Sides are enlarged to multiples of 32 pixels and reduced again.
+    `view.rgb` and the result are linear; all randomness comes from the generator. Camera names identify views. Sides
+    are enlarged to multiples of 32 pixels and reduced again.
     """
     side = max(max(view.camera.size) for view in views)
     check(job.models, job.diffusion, side)
@@ -175,7 +175,7 @@ def _load(pipeline: Any, path: Path, half: Any, name: str | None = None) -> None
 
 
 def _pipeline(job: DiffusionJob) -> tuple[Any, list[Any]]:
-    """SDXL with its ControlNets on the device, and what the IP-Adapter says of the style picture, if it is used."""
+    """SDXL with its ControlNets on the device, and the style picture's IP-Adapter embedding, if used."""
     from diffusers.pipelines.controlnet.pipeline_controlnet_sd_xl import StableDiffusionXLControlNetPipeline
 
     from mistyle.stylization.models.load import add_ip_adapter, base_parts, controlnets, device_of, precision_of, settle
@@ -190,14 +190,14 @@ def _pipeline(job: DiffusionJob) -> tuple[Any, list[Any]]:
     picture: list[Any] = []
     if job.diffusion.adapter == "ip":
         ip, name = models.find("ip-adapter", job.models.folder), LOOSE_NEEDED["sdxl"]
-        # InstantStyle's block of SDXL, the one that the style LoRA sits in.
+        # InstantStyle's block of SDXL, also the style LoRA's.
         scale = {"up": {"block_0": [0.0, job.diffusion.adapter_scale, 0.0]}}
         picture = [e.to(device) for e in add_ip_adapter(pipeline, ip, name, job.style, scale, device)]
     return settle(pipeline, job.models, device), picture
 
 
 def _guidance(pipeline: Any, chosen: DiffusionSettings, style: LoraPair | None, content: LoraPair | None) -> list[Any]:
-    """ConsisLoRA's extra terms (its section 4.3), where on: each half against its twin of the other picture."""
+    """ConsisLoRA's guidance terms (its section 4.3), if enabled: each half against the other picture's same half."""
     terms: list[Any] = []
     if style is None or content is None or not (chosen.content_guidance or chosen.style_guidance):
         return terms
@@ -237,7 +237,7 @@ def paint_view(
     generator = torch.Generator("cpu").manual_seed(int(rng.integers(2**63)))
     if prior is None or not prior.known.any():
         shape = (1, pipeline.unet.config.in_channels, size[0] // factor, size[1] // factor)
-        # Nothing to harmonise with: the refinement is for the border between known and new.
+        # The refinement smooths the border between known and new pixels; a first view has none.
         like = torch.zeros(shape, device=device)
         latent = sample(denoise, None, None, levels, Resampling(refine=0.0), rng=generator, like=like)
     else:
@@ -250,7 +250,7 @@ def paint_view(
 
 
 def _text(pipeline: Any, prompt: str, negative: bool = False) -> tuple[Any, Any]:
-    """Embeddings of a prompt; with `negative` the empty prompt's first."""
+    """Embeddings of a prompt; with `negative` the empty prompt's come first."""
     import torch
 
     text, empty, pooled, pooled_empty = pipeline.encode_prompt(prompt, do_classifier_free_guidance=negative)

@@ -1,8 +1,8 @@
 """The paper's texture inpainter (4.3): Stable Diffusion 1.5 with Paint3D's UV-position ControlNet and an IP-Adapter.
 
-Behind the Inpainter signature of `stylization/inpaint/repair.py`, which cuts the mask and blends its edge. Two recipes:
-the inpainting UNet (the paper), and Paint3D's own, plain SD 1.5 with a second ControlNet for the inpainting. Weights
-are never downloaded here. Full-size networks have not been run yet; the tests run every path on tiny random ones.
+It has the Inpainter signature of `stylization/inpaint/repair.py`, which applies the mask and blends its edge. Two
+recipes: the inpainting UNet (the paper), and Paint3D's own, plain SD 1.5 with a second ControlNet for inpainting. It
+never downloads weights. Full-size networks have not been run yet; the tests run every path on tiny random ones.
 """
 
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ from mistyle.stylization.models.catalogue import ENCODER, LOOSE_NEEDED
 
 @dataclass(frozen=True)
 class Recipe:
-    """What distinguishes the two ways; zero (or -1) in the settings takes these."""
+    """Networks and default values of a recipe; a setting of 0 (or -1) takes the default."""
 
     base: str
     channels: int
@@ -40,7 +40,7 @@ class Recipe:
 
 
 RECIPES = {
-    # Latents go far beyond the -1..1 that DDIM clips its pictures to unless its configuration says otherwise.
+    # Latents exceed the -1..1 to which DDIM clips samples by default.
     "inpaint": Recipe("inpaint", 9, ("position",), (1.0,), 30, 4.0, 0.6, "DDIMScheduler", {"clip_sample": False}),
     "paint3d": Recipe(
         "sd15", 4, ("position", "inpaint-control"), (1.0, 0.5), 20, 3.0, 1.0, "EulerAncestralDiscreteScheduler"
@@ -52,7 +52,7 @@ TELEA = 3  # pixels; the radius of OpenCV's fill, Paint3D's start inside the mas
 
 @dataclass(frozen=True)
 class Brush:
-    """The loaded pipeline with what does not change from crop to crop."""
+    """The loaded pipeline with the inputs that all crops share."""
 
     pipeline: Any
     picture: list[Any]
@@ -63,7 +63,7 @@ class Brush:
 
 
 def check(settings: ModelSettings, chosen: Paint3dSettings) -> None:
-    """Refuse, before anything is rendered, what could not be inpainted: packages, files, architectures, memory."""
+    """Refuse an inpainting that cannot run, before anything is rendered: packages, files, architectures, memory."""
     models.need_extra()
     from mistyle.stylization.models.load import device_of, precision_of
 
@@ -93,7 +93,7 @@ def own(settings: ModelSettings, chosen: Paint3dSettings) -> ModelSettings:
 
 
 def identity(settings: ModelSettings, chosen: Paint3dSettings) -> list[str]:
-    """Which networks the recipe's are, and in which precision: where they lie and run decides nothing."""
+    """Fingerprints of the recipe's networks, and their precision; paths and device do not matter."""
     place, controls, ip = _places(settings, RECIPES[chosen.recipe])
     folders = [*(place / n for n in ("unet", "vae", "text_encoder")), *controls, ip / ENCODER]
     files = [file for folder in folders for file in models.weights(folder)]
@@ -105,7 +105,7 @@ def inpainter(
 ) -> Inpainter:
     """Load the networks and return the function that paints an atlas's holes; `style` is sRGB.
 
-    Albedo in and out is linear. What it answers outside the hole is the albedo that it was given, bit for bit.
+    Albedo in and out is linear. Outside the hole the output equals the input, bit for bit.
     """
     check(settings, chosen)
     brush = load(settings, chosen, style)
@@ -157,21 +157,23 @@ def paint_atlas(
     where: Float[np.ndarray, "h w 3"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "h w 3"]:
-    """The atlas (sRGB) with the hole painted: the whole at the model's size first, then, where the atlas is larger,
-    overlapping crops at full resolution that start from it. Only the hole's texels change.
+    """The atlas (sRGB) with the hole painted; only the hole's texels change.
+
+    The first pass paints the whole at the model's size. For a larger atlas, a second pass repaints overlapping crops at
+    full resolution, starting from the first.
     """
     grain = brush.pipeline.vae_scale_factor * 2 ** (len(brush.pipeline.unet.config.block_out_channels) - 1)
     side = brush.settings.size // grain * grain
     larger = max(hole.shape) > side
     size = (side, side) if larger else tuple(-(-n // grain) * grain for n in hole.shape)
     open_part = hole | ~texels.covered
-    given = plan.filled(encoded, hole, texels)
+    filled = plan.filled(encoded, hole, texels)
     mask = plan.shrink_mask(open_part, size)
-    painted = inpaint(brush, plan.shrink(given, size), mask, plan.sampled(where, size), 1.0, rng)
-    result = plan.spread_islands(painted, texels, hole, given)
+    painted = inpaint(brush, plan.shrink(filled, size), mask, plan.sampled(where, size), 1.0, rng)
+    result = plan.spread_islands(painted, texels, hole, filled)
     if not larger or brush.settings.detail == 0 or min(hole.shape) < side:
         return np.where(hole[..., None], result, encoded).astype(np.float32)
-    detailed = _detailed(brush, np.where(hole[..., None], result, given), hole, texels, where, side, rng)
+    detailed = _detailed(brush, np.where(hole[..., None], result, filled), hole, texels, where, side, rng)
     return np.where(hole[..., None], detailed, encoded)
 
 
@@ -184,7 +186,7 @@ def _detailed(
     side: int,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "h w 3"]:
-    """The second pass: crops of `side` texels, each begun with the first pass's colours, feathered where they meet."""
+    """The second pass: crops of `side` texels that start from the first pass's colours, feathered at overlaps."""
     total = np.zeros((*hole.shape, 3), np.float32)
     share = np.zeros(hole.shape, np.float32)
     ramp = plan.feather(side, brush.settings.overlap)
@@ -205,7 +207,7 @@ def inpaint(
     strength: float,
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "h w 3"]:
-    """One call of the model on a picture of its size (sRGB); all pixels of the answer come out of its decoder."""
+    """One call of the model on a picture of its size (sRGB); all pixels of the result come from its decoder."""
     import torch
 
     from mistyle.stylization.diffusion.denoiser import tensor_of
@@ -239,7 +241,7 @@ def inpaint(
 
 
 def telea(encoded: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 3"]:
-    """Paint3D's start: the mask filled by OpenCV's inpainting after Telea."""
+    """Paint3D's initial picture: the mask filled by OpenCV's Telea inpainting."""
     import cv2
 
     if mask.all():

@@ -1,4 +1,4 @@
-"""What the texture inpainter shows its model: position maps, crops of an atlas, and colours kept to their islands."""
+"""Inputs of the texture inpainter's model: position maps, atlas crops, resampling within UV islands."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
@@ -12,12 +12,12 @@ from mistyle.core.mesh import Mesh
 def position_map(
     texels: Texels, centre: Float[np.ndarray, "3"], radius: float, scale: float = 0.6, height: float = 0.25
 ) -> Float[np.ndarray, "h w 3"]:
-    """Paint3D's UV position map: where each texel lies, as a colour 0..1, black where no face covers it.
+    """Paint3D's UV position map: each texel's position as a colour 0..1, black where no face covers it.
 
-    The mesh is centred on the mean of its vertices, its farthest vertex comes to lie at `scale` (0.6), then it is
-    raised by `height` (0.25) along y; x, y, z of [-1, 1] become red, green, blue of [0, 1], cut off (not rounded) to
-    8 bits. Row 0 is v = 1, axes are the mesh's own (y up). Scale and height come from a demo of Paint3D; its training
-    code was never published.
+    The mesh is centred on the mean of its vertices and scaled: its farthest vertex has the radius `scale` (0.6). It is
+    then raised by `height` (0.25) along y. x, y, z of [-1, 1] become red, green, blue of [0, 1], truncated (not
+    rounded) to 8 bits. Row 0 is v = 1, axes are the mesh's own (y up). Scale and height come from a demo of Paint3D;
+    its training code was never published.
     """
     placed = (texels.position - centre) / max(radius, 1e-12) * scale
     placed = placed + np.array([0.0, height, 0.0])
@@ -32,37 +32,37 @@ def centre_and_radius(mesh: Mesh) -> tuple[Float[np.ndarray, "3"], float]:
 
 
 def crops(hole: Bool[np.ndarray, "h w"], size: int, overlap: int) -> list[tuple[int, int]]:
-    """Top left corners of square crops of side `size` that together see every hole texel.
+    """Top left corners of square crops of side `size` that together cover every hole texel.
 
-    Where the atlas has room, a hole texel lies at least half of `overlap` inside some crop, so that crops share
-    `overlap` texels and each hole comes with what surrounds it. Holes are taken from the top, left to right.
+    Where the atlas has room, a hole texel lies at least half of `overlap` inside some crop. So crops share `overlap`
+    texels, and each hole has context. Holes are visited from the top, left to right.
     """
     rows, columns = hole.shape
     if rows <= size and columns <= size:
         return [(0, 0)] if hole.any() else []
     margin = min(overlap, size - 1) // 2
     inner = size - 2 * margin
-    left, found = hole.copy(), []
+    left, corners = hole.copy(), []
     while left.any():
         top = int(np.argmax(left.any(axis=1)))
         band = left[top : top + inner].any(axis=0)
         first = int(np.argmax(band))
         r = int(np.clip(top - margin, 0, max(rows - size, 0)))
         c = int(np.clip(first - margin, 0, max(columns - size, 0)))
-        found.append((r, c))
+        corners.append((r, c))
         left[top : top + inner, first : first + inner] = False
-    return found
+    return corners
 
 
 def feather(size: int, overlap: int) -> Float[np.ndarray, "s s"]:
-    """How much a crop counts where crops overlap: 1 inside, falling to nearly 0 at its border."""
+    """Weight of a crop where crops overlap: 1 inside, falling to nearly 0 at its border."""
     distance = np.minimum(np.arange(size) + 0.5, size - np.arange(size) - 0.5)
     ramp = np.clip(distance / max(overlap / 2, 1), 1e-3, 1)
     return np.minimum.outer(ramp, ramp).astype(np.float32)
 
 
 def sampled(values: Shaped[np.ndarray, "h w *c"], size: tuple[int, int]) -> Shaped[np.ndarray, "h2 w2 *c"]:
-    """What lies at the centre of each pixel of a smaller (or larger) atlas; labels and positions must not be mixed."""
+    """Nearest samples at the pixel centres of a smaller (or larger) atlas: labels and positions must not be blended."""
     rows, columns = (((np.arange(n) + 0.5) * have / n).astype(int) for n, have in zip(size, values.shape, strict=False))
     return values[rows[:, None], columns[None, :]]
 
@@ -82,7 +82,7 @@ def spread_islands(
     labels = sampled(texels.island, (small.shape[0], small.shape[1]))
     fr, fc = (n / have for n, have in zip(small.shape[:2], hole.shape, strict=True))
     for island, box in island_boxes(texels.island, np.unique(texels.island[hole & texels.covered])):
-        wanted = hole[box] & (texels.island[box] == island)
+        target = hole[box] & (texels.island[box] == island)
         rows, columns = box
         # The same box in the smaller atlas, with a border for the interpolation.
         top, bottom = max(int(rows.start * fr) - 2, 0), min(int(np.ceil(rows.stop * fr)) + 2, small.shape[0])
@@ -92,10 +92,10 @@ def spread_islands(
             continue
         index = nearest(own)[0]
         pure = small[top:bottom, left:right].reshape(-1, 3)[index]
-        r, c = np.nonzero(wanted)
+        r, c = np.nonzero(target)
         y = (r + rows.start + 0.5) * fr - 0.5 - top
         x = (c + columns.start + 0.5) * fc - 0.5 - left
-        result[box][wanted] = _bilinear(pure, y, x)
+        result[box][target] = _bilinear(pure, y, x)
     return result
 
 
@@ -108,7 +108,7 @@ def _bilinear(image: Float[np.ndarray, "h w 3"], y: np.ndarray, x: np.ndarray) -
 def filled(
     encoded: Float[np.ndarray, "h w 3"], hole: Bool[np.ndarray, "h w"], texels: Texels
 ) -> Float[np.ndarray, "h w 3"]:
-    """The atlas with holes and background continued from the known texels: the encoder should not see black there."""
+    """The atlas with holes and background filled from known texels, so that the encoder sees no black there."""
     known = texels.covered & ~hole
     if not known.any():
         return np.full_like(encoded, 0.5)
@@ -122,5 +122,5 @@ def shrink(encoded: Float[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float[
 
 
 def shrink_mask(mask: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> Bool[np.ndarray, "h2 w2"]:
-    """A mask at the model's size: a pixel counts where any of its texels does."""
+    """A mask at the model's size: true where any texel of a pixel is."""
     return resize(mask.astype(np.float32), size) > 1e-6

@@ -1,7 +1,7 @@
-"""Repair (paper 4.3): where the fit could not settle, what to put there, and how to join it to what was there.
+"""Texture repair (paper 4.3): struggle mask, inpainting of masked texels, blending at the mask's boundary.
 
-The paper gives no sizes for its dilations and its blending boundary; here they are shares of the atlas's side. It fills
-with a diffusion model; any function of the Inpainter signature does, and `stylization/inpaint/fill.py` needs no
+The paper gives no sizes for its dilations and its blending boundary; here they are shares of the atlas's side. It
+inpaints with a diffusion model. Any function of the Inpainter signature works; `stylization/inpaint/fill.py` needs no
 weights.
 """
 
@@ -16,10 +16,10 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.process import memory
 from mistyle.stylization.inpaint.settings import RepairSettings
 
-# (albedo (h w 3) linear, hole (h w), texels, generator) -> albedo (h w 3); only what it answers inside the hole counts.
+# (albedo (h w 3) linear, hole (h w), texels, generator) -> albedo (h w 3); only values inside the hole are used.
 Inpainter = Callable[[np.ndarray, np.ndarray, Texels, np.random.Generator], np.ndarray]
 
-FEWEST = 0.25  # share of the median number of looks below which a texel's mean gradient is chance
+FEWEST = 0.25  # share of the median number of samples below which a texel's mean gradient is noise
 
 
 def radius(share: float, size: int) -> int:
@@ -35,19 +35,19 @@ def struggle_mask(
     settings: RepairSettings,
     agreed: Float[np.ndarray, "h w"] | None = None,
 ) -> Bool[np.ndarray, "h w"]:
-    """The texels to paint again: those around which the mean |gradient| of a look exceeds mean + 0.5 std over the
-    texels that were looked at, and `settings.outlier` times their median, while its looks contradict one another; and
-    those that no view sees. Dilated by max-pooling inside their islands.
+    """The texels to repaint: struggling ones, and those that no view sees; dilated by max-pooling inside islands.
 
-    A large gradient alone is the mark of contrast and of a fit that was not run to its end: it pulls the same way in
-    all views, and more steps would mend it. `agreed` (`Fit.agreed`) tells the two apart; None leaves it out.
+    A texel struggles where its samples' gradients contradict one another and their mean magnitude is large. It must
+    exceed mean + 0.5 std over sampled texels, and `settings.outlier` times their median.
 
-    "Around" is a Gaussian of `settings.smooth`: single texels' gradients are noise, and thresholded one by one they lie
-    scattered over everything, which the dilation then joins. `accumulated` is the sum of absolute albedo gradients over
-    the last steps of phase 2, `looks` how often these steps looked at a texel (`Fit.touched`), `seen` how many views
-    see it. The paper thresholds the sum; without the division the mask would show how often a texel was looked at. What
-    was hardly looked at counts as looked at FEWEST times the median, or one chance pixel would decide; what was not
-    looked at at all says nothing.
+    A large gradient alone also marks contrast and an unconverged fit: then it has the same sign in all views, and more
+    steps would reduce it. `agreed` (`Fit.agreed`) separates the two cases; None skips this test.
+
+    Gradients are smoothed by a Gaussian of `settings.smooth`: single texels' gradients are noise, and the dilation
+    would join their scattered mask. `accumulated` is the sum of absolute albedo gradients over the last steps of phase
+    2; `looks` is the number of samples per texel in these steps (`Fit.touched`); `seen` is the number of views that see
+    it. The paper thresholds the sum, which without the division would show the number of samples. Rarely sampled texels
+    count as sampled FEWEST times the median, or one chance pixel would decide; unsampled texels do not struggle.
     """
     struggling = texels.covered & (seen <= 0)
     looked = texels.covered & (seen > 0) & (looks > 0)
@@ -67,16 +67,17 @@ def struggle_mask(
 def blend_weights(
     mask: Bool[np.ndarray, "h w"], known: Bool[np.ndarray, "h w"], texels: Texels, settings: RepairSettings
 ) -> Float[np.ndarray, "h w"]:
-    """How much of the new colour each texel takes: 1 inside the eroded mask, 0 outside the dilated one, a smooth step
-    over the difference of the two. Both stay inside islands, and an island's own border does not erode the mask: there
-    is nothing behind it to blend with. A masked texel that nobody saw has nothing worth keeping and takes all.
+    """Weight of the new colour per texel: 1 inside the eroded mask, 0 outside the dilated one, a smooth step between.
+
+    Both stay inside islands. An island's own border does not erode the mask, since nothing lies behind it to blend
+    with. Masked texels that no view saw have weight 1.
     """
     side = radius(settings.blend, mask.shape[1])
     mask = mask & texels.covered
     outer = dilate_within(mask, texels.island, side)
     rest = texels.covered & ~mask
     inner = mask & ~dilate_within(rest, texels.island, side)
-    # Signed distance to the mask's boundary, which runs half way between texel centres.
+    # Signed distance to the mask's boundary, half way between texel centres.
     signed = np.where(mask, distance_to(rest) - 0.5, 0.5 - distance_to(mask))
     t = np.clip((signed + side) / max(2 * side, 1), 0, 1)
     weights = np.where(outer, t * t * (3 - 2 * t), 0)
@@ -91,10 +92,10 @@ def repair(
     settings: RepairSettings,
     rng: np.random.Generator | None = None,
 ) -> Maps:
-    """The maps with the albedo under `mask` painted anew and joined by `blend_weights`; the rest stays as it is.
+    """The maps with the albedo under `mask` repainted and blended by `blend_weights`.
 
-    Texels outside the dilated mask (by `settings.blend`) keep their bits. Normal, roughness, metallic and `known` are
-    not touched: they follow by a short fit against renders of the repaired albedo. Padding is not redone.
+    Texels outside the dilated mask (by `settings.blend`) keep their bits. Normal, roughness, metallic and `known` stay:
+    a later short fit adapts them to renders of the repaired albedo. Padding is not redone.
     """
     weights = blend_weights(mask, maps.known, texels, settings)
     hole = weights > 0
@@ -104,7 +105,7 @@ def repair(
     if painted.shape != maps.albedo.shape:
         raise ValueError(f"the inpainter returned {painted.shape}, not the albedo's {maps.albedo.shape}")
     if not np.isfinite(painted[hole]).all():
-        raise ValueError("the inpainter returned numbers that are not finite; it must answer every texel of the hole")
+        raise ValueError("the inpainter returned non-finite values; it must fill every texel of the hole")
     albedo = memory.copied(maps.albedo)
     w = weights[hole][:, None]
     albedo[hole] = np.where(w == 1, painted[hole], albedo[hole] + w * (painted[hole] - albedo[hole]))

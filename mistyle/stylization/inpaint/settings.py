@@ -1,10 +1,10 @@
-"""What a user may choose about the repair."""
+"""Settings of the texture repair."""
 
 from pydantic import BaseModel, ConfigDict, Field
 
 
 class RepairSettings(BaseModel):
-    """Which texels are painted again and how they are joined (paper 4.3)."""
+    """Struggle mask and blending of the repair (paper 4.3)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -18,15 +18,15 @@ class RepairSettings(BaseModel):
         default=4.0,
         ge=0,
         le=100,
-        description="and above this many times the median: of views that agree, mean and deviation alone mark a third; "
-        "0: no such limit (the paper)",
+        description="and above this many times the median: for consistent views, mean and deviation alone mark a "
+        "third; 0: no such limit (the paper)",
     )
     agreement: float = Field(
         default=0.7,
         ge=0,
         le=1,
-        description="and only where the views contradict one another: |sum| of the gradients at most this share of "
-        "the sum of |gradients|; 1: wherever the gradients are large (the paper)",
+        description="and only where views contradict one another: |sum| of the gradients is at most this share of "
+        "the sum of |gradients|; 1: wherever gradients are large (the paper)",
     )
     dilation: float = Field(
         default=0.004, ge=0, le=0.1, description="radius of the mask's max-pooling as a share of the atlas's side"
@@ -35,7 +35,7 @@ class RepairSettings(BaseModel):
         default=0.004,
         ge=0,
         le=0.1,
-        description="share of the atlas's side over which gradients are averaged: a lone texel does not struggle",
+        description="share of the atlas's side over which gradients are averaged: single texels do not struggle",
     )
     blend: float = Field(
         default=0.003, ge=0, le=0.1, description="half the width of the blended boundary as a share of the atlas's side"

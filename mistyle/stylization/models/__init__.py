@@ -1,1 +1,1 @@
-"""Model files of the generative stages: where they lie, checks, fetching, loading."""
+"""Model files of the generative stages: search, checks, download, loading."""

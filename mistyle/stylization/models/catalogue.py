@@ -1,8 +1,7 @@
-"""The models that the generative stages use: their names here, where they are published, licences, what they are for.
+"""Catalogue of the generative stages' models: names, repositories, revisions, hashes, licences, purposes.
 
-Revisions and hashes are those that other projects' published lock files give, several of them alike for every hash of
-SDXL and its ControlNets; they were not compared with the hub itself. Where a model has none, nobody was found to have
-published one.
+Revisions and hashes come from other projects' published lock files; several of these agree on every hash of SDXL and
+its ControlNets. They were not compared with the hub itself. Models without a hash: no published one was found.
 """
 
 from collections.abc import Mapping
@@ -13,9 +12,12 @@ BASE = ("tokenizer", "text_encoder", "unet", "vae", "scheduler")  # folders of a
 
 @dataclass(frozen=True)
 class PublishedModel:
-    """One model that mistyle can use. `folders` hold networks or tokenizers ('' is the model's own folder), `loose`
-    are single weight files; `patterns` are fetched. `sha256` may hold the first digits only, where no more is known.
-    What has a `url` is one file outside the hub, to be put in its place by hand."""
+    """One model that mistyle can use.
+
+    `folders` hold networks or tokenizers ('' is the model's own folder), `loose` are single weight files, `patterns`
+    are fetched. `sha256` may hold only the first digits. A model with a `url` is one file outside the hub, which the
+    user downloads.
+    """
 
     name: str
     repo: str

@@ -1,5 +1,4 @@
-"""Whether found models fit together and fit into memory, from their configurations and headers alone: before any
-rendering, and before torch is loaded."""
+"""Checks of model architectures and memory needs, from configurations and headers alone; without torch."""
 
 import gc
 import math
@@ -12,76 +11,77 @@ from typing import Any
 from mistyle.core.errors import EnvironmentMissing, InputRefused
 from mistyle.stylization.models import folder as models
 
-# Layers' working memory per megapixel of picture, GB at 2 bytes a number; an estimate, not measured here.
+# Activation memory per megapixel of picture, GB at 2 bytes a number; an estimate, not measured here.
 WORKING = {"sdxl": 4.0, "sd15": 3.0}
 PREDICTIONS = ("epsilon", "v_prediction")
-# Tensors by whose names finetunes in one file say that they predict velocities, and that their last level is all noise.
+# Tensor names that mark a single-file finetune: it predicts velocities; its terminal SNR is zero.
 MARKS = {"v_pred": ("prediction_type", "v_prediction"), "ztsnr": ("rescale_betas_zero_snr", True)}
 STYLE_BLOCK, CONTENT_BLOCK = "up_blocks.0.attentions.1", "up_blocks.0.attentions.0"
 
 
-def expect(path: Path, what: str, fix: str, **wanted: Any) -> dict[str, Any]:
-    """The configuration at `path`, refused where one of its values is not the wanted one."""
+def expect(path: Path, label: str, fix: str, **expected: Any) -> dict[str, Any]:
+    """The configuration at `path`; EnvironmentMissing where a value differs from `expected`."""
     config = models.read_json(path)
-    for key, value in wanted.items():
+    for key, value in expected.items():
         found = config.get(key)
         if found != value:
-            raise EnvironmentMissing(f"{path}: {key} is {found!r}, expected {value!r}: this is not {what}; {fix}")
+            raise EnvironmentMissing(f"{path}: {key} is {found!r}, expected {value!r}: this is not {label}; {fix}")
     return config
 
 
 def base(place: Path, kind: str, channels: int) -> dict[str, Any]:
-    """The UNet's configuration of a base model of kind 'sdxl' or 'sd15' with so many input channels."""
-    what = {
+    """The UNet's configuration of a base model of kind 'sdxl' or 'sd15' with `channels` input channels, checked."""
+    label = {
         ("sdxl", 4): "an SDXL base model",
         ("sd15", 9): "an inpainting model of Stable Diffusion 1.5",
         ("sd15", 4): "a Stable Diffusion 1.5 base model",
     }[kind, channels]
-    fix = f"put {what} there (mistyle models lists the one that is meant)"
-    expect(place / "vae" / "config.json", what, fix, _class_name="AutoencoderKL", latent_channels=4)
-    wanted: dict[str, Any] = {"_class_name": "UNet2DConditionModel", "in_channels": channels, "out_channels": 4}
-    wanted["addition_embed_type"] = "text_time" if kind == "sdxl" else None
-    config = expect(place / "unet" / "config.json", what, fix, **wanted)
+    fix = f"replace it with {label} (see mistyle models)"
+    expect(place / "vae" / "config.json", label, fix, _class_name="AutoencoderKL", latent_channels=4)
+    expected: dict[str, Any] = {"_class_name": "UNet2DConditionModel", "in_channels": channels, "out_channels": 4}
+    expected["addition_embed_type"] = "text_time" if kind == "sdxl" else None
+    config = expect(place / "unet" / "config.json", label, fix, **expected)
     text = models.read_json(place / "text_encoder" / "config.json")["hidden_size"]
     schedule = place / "scheduler" / "scheduler_config.json"
-    found = models.read_json(schedule).get("prediction_type", "epsilon")
-    if found not in PREDICTIONS:
+    prediction = models.read_json(schedule).get("prediction_type", "epsilon")
+    if prediction not in PREDICTIONS:
         raise EnvironmentMissing(
-            f"{schedule}: prediction_type is {found!r}, expected {' or '.join(PREDICTIONS)}; {fix}"
+            f"{schedule}: prediction_type is {prediction!r}, expected {' or '.join(PREDICTIONS)}; {fix}"
         )
     if kind == "sdxl":
         text += models.read_json(place / "text_encoder_2" / "config.json")["hidden_size"]
     if config["cross_attention_dim"] != text:
         raise EnvironmentMissing(
-            f"{place}: the UNet takes text of {config['cross_attention_dim']} numbers a token, the text encoders give "
-            f"{text}; the folders come from different models"
+            f"{place}: the UNet expects text embeddings of {config['cross_attention_dim']} channels, the text encoders "
+            f"give {text}; the folders come from different models"
         )
     return config
 
 
 def controlnet(place: Path, unet: Mapping[str, Any], base_name: str) -> None:
-    """A ControlNet must be of the base model's own shape."""
-    what = f"a ControlNet for {base_name}"
-    fix = "put one trained for that base model there (unions of several conditions are not supported)"
-    wanted = {k: unet.get(k) for k in ("cross_attention_dim", "block_out_channels", "addition_embed_type")}
-    expect(place / "config.json", what, fix, _class_name="ControlNetModel", **wanted)
+    """EnvironmentMissing unless a ControlNet has the base model's architecture."""
+    label = f"a ControlNet for {base_name}"
+    fix = "replace it with one trained for that base model (unions of several conditions are not supported)"
+    expected = {k: unet.get(k) for k in ("cross_attention_dim", "block_out_channels", "addition_embed_type")}
+    expect(place / "config.json", label, fix, _class_name="ControlNetModel", **expected)
 
 
 def ip_adapter(path: Path, encoder: Path, unet: Mapping[str, Any], base_name: str) -> None:
-    """A plain IP-Adapter (four tokens of the pooled picture) for this base model and this image encoder."""
+    """EnvironmentMissing unless a file is a plain IP-Adapter (four tokens of the pooled embedding) for this base model
+    and image encoder."""
     shapes = models.shapes([path])
-    found = shapes.get("image_proj.proj.weight")
+    shape = shapes.get("image_proj.proj.weight")
     gives = models.read_json(encoder / "config.json").get("projection_dim")
-    wanted = [4 * unet["cross_attention_dim"], gives]
-    if found != wanted:
+    expected = [4 * unet["cross_attention_dim"], gives]
+    if shape != expected:
         raise EnvironmentMissing(
-            f"{path}: image_proj.proj.weight is {found}, expected {wanted}: this is not a plain IP-Adapter for "
+            f"{path}: image_proj.proj.weight is {shape}, expected {expected}: this is not a plain IP-Adapter for "
             f"{base_name} with the image encoder in {encoder}; fetch the model 'ip-adapter' again"
         )
 
 
 def lora(path: Path, unet: Mapping[str, Any]) -> None:
-    """A LoRA that reaches the style block of this SDXL model."""
+    """EnvironmentMissing unless a LoRA has weights for the style block of this SDXL model."""
     if not path.is_file():
         raise InputRefused(f"{path}: found nothing, expected a LoRA (.safetensors); check the path")
     shapes = models.shapes([path])
@@ -96,13 +96,14 @@ def lora(path: Path, unet: Mapping[str, Any]) -> None:
     width = unet["block_out_channels"][-1]
     if any(shape[1] != width for shape in downs):
         raise EnvironmentMissing(
-            f"{path}: its weights take {downs[0][1]} numbers, the base model has {width}: trained for another model"
+            f"{path}: its weights take {downs[0][1]} channels, expected {width}; it was trained for another base model"
         )
 
 
 def checkpoint(path: Path, place: Path) -> None:
-    """A single file must be SDXL in its original layout, not an inpainting or a refiner model; the configurations that
-    go with it come from the folder of the model 'sdxl'.
+    """Refuse a single file unless it is SDXL in its original layout, not an inpainting or a refiner model.
+
+    Its configurations come from the folder of the model 'sdxl'.
     """
     if not (place / "model_index.json").is_file():
         raise EnvironmentMissing(
@@ -124,22 +125,22 @@ def checkpoint(path: Path, place: Path) -> None:
 
 
 def marks(checkpoint: Path) -> dict[str, Any]:
-    """What a single file says of its noise levels, as its scheduler's configuration."""
+    """Scheduler configuration that a single file's marker tensors imply."""
     names = models.header(checkpoint)
     return {key: value for mark, (key, value) in MARKS.items() if mark in names}
 
 
 def numbers(paths: Iterable[Path]) -> int:
-    """How many numbers weight files hold."""
+    """Number of parameters in weight files."""
     return sum(math.prod(shape) for shape in models.shapes(paths).values())
 
 
 def need(
     kind: str, folders: Sequence[Path], pixels: int, width: int, offload: bool, checkpoint: Path | None = None
 ) -> float:
-    """GB that networks of `width` bytes a number need for one picture of `pixels`, weights and layers' working memory.
+    """GB for weights and activations of networks at `width` bytes a number, for one picture of `pixels`.
 
-    With offloading text and image encoders, whose folders say so, leave before the rest comes.
+    With offloading, text and image encoders (by their folders' names) are unloaded before the rest is loaded.
     """
     counted = {folder: numbers(models.weights(folder)) * width / 1e9 for folder in folders}
     gone = {f: n for f, n in counted.items() if offload and "encoder" in f.name}
@@ -148,7 +149,7 @@ def need(
 
 
 def room(device: str) -> float:
-    """GB that are free on a device, networks that nobody holds any more counted as gone."""
+    """Free memory of a device, GB, after unreferenced networks are released."""
     empty(device)
     if device == "cuda":
         import torch
@@ -166,7 +167,7 @@ def room(device: str) -> float:
 
 
 def empty(device: str) -> None:
-    """Give back what networks left on a device: those that nobody holds any more, and memory kept for later ones."""
+    """Release unreferenced networks and cached memory of a device."""
     import torch
 
     gc.collect()
@@ -178,14 +179,14 @@ def empty(device: str) -> None:
         getattr(torch, device).empty_cache()
 
 
-def memory(what: str, needed: float, allowed: float, device: str, offload: bool) -> None:
-    """Refuse a stage that will not fit."""
+def memory(stage: str, needed: float, allowed: float, device: str, offload: bool) -> None:
+    """EnvironmentMissing for a stage that needs more memory (GB) than it may use."""
     free = room(device)
     limit = min(allowed, free) if allowed else free
     if needed <= limit:
         return
     less = "" if offload or device == "cpu" else "; --set models.offload=true needs less"
     raise EnvironmentMissing(
-        f"{what} needs about {needed:.1f} GB on the {'CPU' if device == 'cpu' else 'GPU'}, {limit:.1f} GB may be used"
+        f"{stage} needs about {needed:.1f} GB on the {'CPU' if device == 'cpu' else 'GPU'}, {limit:.1f} GB may be used"
         f"{less}; or use a smaller --resolution, or free some memory"
     )

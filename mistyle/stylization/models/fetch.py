@@ -1,4 +1,4 @@
-"""Fetching models on request, through huggingface_hub, and the one conversion of a pickle into safetensors."""
+"""Model downloads through huggingface_hub, and conversion of a pickled state dict into safetensors."""
 
 import errno
 import hashlib
@@ -20,15 +20,15 @@ PARTIAL = ".partial"
 
 
 def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) -> Path:
-    """Download a model into `folder/name`, check its hashes, note them in the folder's lock; goes on where it stopped.
+    """Download a model into `folder/name`, check its hashes and record them in the folder's lock; resumes.
 
-    A file's sha256 must be the pinned one, else the one that the hub states for it. UsageError for a file of the
-    folder's own that differs, unless `overwrite`. `HF_ENDPOINT`, `HF_TOKEN` and the
-    proxies are huggingface_hub's. Raises UsageError unless downloading was allowed.
+    A file's sha256 must be the pinned one, else the one that the hub states for it. `HF_ENDPOINT`, `HF_TOKEN` and the
+    proxies are huggingface_hub's. Raises UsageError unless downloading is allowed, and for a differing file that
+    mistyle did not fetch, unless `overwrite`.
     """
     model = models.get(name)
     if model.url:
-        raise UsageError(f"'{name}' does not lie on the hub: {models.how_to_get(model, folder)}")
+        raise UsageError(f"'{name}' is not on the hub: {models.how_to_get(model, folder)}")
     if not allowed:
         raise UsageError(
             f"fetching '{name}' downloads about {model.gigabytes} GB from {model.repo} under its licence "
@@ -37,15 +37,15 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
     models.need_extra()
     from huggingface_hub.errors import HfHubHTTPError
 
-    # huggingface_hub has changed its HTTP library more than once; its error's base is that library's own.
+    # huggingface_hub has changed its HTTP library more than once; its errors derive from that library's own class.
     transport: Any = next(base for base in HfHubHTTPError.__mro__ if base.__name__ == "HTTPError")
     place = folder / name
     try:
         noted = models.read_lock(folder).get(name, {})
         known = noted.get("files", {})
-        own = set(_files(place)) - set(known)  # put there by hand: never removed
+        own = set(_files(place)) - set(known)  # copied by the user: never removed
         revision = _commit(model, noted.get("revision", ""))
-        wanted = _download(model, revision, place, None if overwrite else known) | dict(model.sha256)
+        hashes = _download(model, revision, place, None if overwrite else known) | dict(model.sha256)
     except (transport, OSError) as error:
         if isinstance(error, OSError) and error.errno in (
             *disk_errors.FULL,
@@ -60,7 +60,7 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
             f"{model.repo} could not be fetched: {str(error).splitlines()[0]}; check the network (HF_ENDPOINT, proxy, "
             "HF_HUB_OFFLINE; HF_TOKEN where the licence must be accepted) and rerun to resume"
         ) from None
-    entries = {path: _checked(place / path, wanted.get(path), fetched=path not in own) for path in _files(place)}
+    entries = {path: _checked(place / path, hashes.get(path), fetched=path not in own) for path in _files(place)}
     if not entries:
         raise EnvironmentMissing(f"{model.repo} at {model.revision} holds none of {', '.join(model.patterns)}")
     if list(place.glob("*.bin")) and not models.weights(place):
@@ -69,21 +69,21 @@ def fetch(name: str, folder: Path, allowed: bool, *, overwrite: bool = False) ->
     lock = models.read_lock(folder)
     lock[name] = {"repo": model.repo, "revision": revision, "files": entries}
     models.write_lock(folder, lock)
-    lost = models.lacking(model, place, model.loose)
-    if lost:
-        raise EnvironmentMissing(f"{place}: {model.repo} gave no {lost[0].relative_to(place).as_posix()}")
+    missing = models.lacking(model, place, model.loose)
+    if missing:
+        raise EnvironmentMissing(f"{place}: {model.repo} gave no {missing[0].relative_to(place).as_posix()}")
     return place
 
 
 def adopt(name: str, folder: Path) -> Path:
-    """Take a folder of weights as it lies there for the model `name`: their hashes go into the folder's lock.
+    """Accept a folder's present weights as the model `name`: their hashes go into the folder's lock.
 
-    For weights that are not the published ones, on purpose. Raises EnvironmentMissing where the folder is not complete.
+    Meant for weights other than the published ones. Raises EnvironmentMissing where the folder is not complete.
     """
     model, place = models.get(name), folder / name
-    lost = models.lacking(model, place, model.loose) if place.is_dir() else [place]
-    if lost:
-        raise EnvironmentMissing(f"{lost[0]} is not there; {name} needs {', '.join(model.folders + model.loose)}")
+    missing = models.lacking(model, place, model.loose) if place.is_dir() else [place]
+    if missing:
+        raise EnvironmentMissing(f"{missing[0]} is missing; {name} needs {', '.join(model.folders + model.loose)}")
     lock = models.read_lock(folder)
     weights = [path for path in _files(place) if path.endswith(".safetensors") or path in model.loose]
     entries = {path: _checked(place / path, None) for path in weights}
@@ -98,8 +98,8 @@ def _files(place: Path) -> list[str]:
 
 
 def _commit(model: models.PublishedModel, noted: str) -> str:
-    """The commit to fetch. Where nobody is known to have published one, that of the first fetching stays: what the hub
-    calls `main` may change meanwhile."""
+    """The commit to fetch. A model without a pinned revision keeps the commit of its first download, because the hub's
+    `main` may change."""
     from huggingface_hub import HfApi
 
     if model.revision != "main":
@@ -110,11 +110,11 @@ def _commit(model: models.PublishedModel, noted: str) -> str:
 def _download(
     model: models.PublishedModel, revision: str, place: Path, known: Mapping[str, Any] | None
 ) -> dict[str, str]:
-    """Fetch what is not there; returns the sha256 that the hub states for its large files.
+    """Fetch the missing files; returns the sha256 that the hub states for its large files.
 
-    A file of another size is replaced if it is `known`, noted in the folder's lock (None: all are). UsageError else.
+    A file of another size is replaced if it is `known`, i.e. in the folder's lock (None: all are). UsageError else.
 
-    Parts of files stay in `place/.partial` when the connection breaks (huggingface_hub's own downloads begin anew in
+    Partial files stay in `place/.partial` when the connection breaks (huggingface_hub's own downloads restart in
     every process).
     """
     from huggingface_hub import HfApi, get_hf_file_metadata, hf_hub_url
@@ -126,26 +126,26 @@ def _download(
     for path in filter_repo_objects(every, allow_patterns=list(model.patterns)):
         target = _inside(place, path)
         url = hf_hub_url(model.repo, path, revision=revision)
-        found = get_hf_file_metadata(url)
-        tag = found.etag or ""
+        remote = get_hf_file_metadata(url)
+        tag = remote.etag or ""
         if re.fullmatch("[0-9a-f]{64}", tag):
             stated[path] = tag
-        if target.is_file() and target.stat().st_size == found.size:
+        if target.is_file() and target.stat().st_size == remote.size:
             continue
         if target.exists() and known is not None and path not in known:
             raise UsageError(
-                f"{target}: found {target.stat().st_size} bytes that mistyle did not fetch, {model.repo} has "
-                f"{found.size}. Move the file away, take it with `mistyle models adopt`, or replace it with --overwrite"
+                f"{target}: found {target.stat().st_size} bytes that mistyle did not fetch, expected {remote.size} of "
+                f"{model.repo}. Move the file away, keep it with `mistyle models adopt`, or replace it with --overwrite"
             )
         headers = build_hf_headers()
-        if urlparse(found.location).netloc != urlparse(url).netloc:
-            url = found.location  # a signed address elsewhere, to which the token must not go
+        if urlparse(remote.location).netloc != urlparse(url).netloc:
+            url = remote.location  # a signed address on another host, which must not receive the token
             headers.pop("authorization", None)
         part = partial / hashlib.sha256(f"{path}\n{tag}".encode()).hexdigest()[:24]
         part.parent.mkdir(parents=True, exist_ok=True)
         with open(part, "r+b" if part.is_file() else "wb") as file:
             have = file.seek(0, os.SEEK_END)
-            http_get(url, file, resume_size=have, headers=headers, expected_size=found.size)
+            http_get(url, file, resume_size=have, headers=headers, expected_size=remote.size)
         target.parent.mkdir(parents=True, exist_ok=True)
         os.replace(part, target)
     shutil.rmtree(partial, ignore_errors=True)
@@ -153,33 +153,33 @@ def _download(
 
 
 def _inside(place: Path, path: str) -> Path:
-    """Where a file of a repository goes; names that lead elsewhere are refused."""
+    """The local path of a repository's file; EnvironmentMissing for paths outside the folder."""
     target = place / path
     if not target.resolve().is_relative_to(place.resolve()):
         raise EnvironmentMissing(f"the repository names a file '{path}' outside its own folder; it was not fetched")
     return target
 
 
-def _checked(path: Path, wanted: str | None, fetched: bool = False) -> dict[str, Any]:
-    """What the lock notes of a file. One of another hash is refused, and removed if it was `fetched`."""
-    found = sha256_file(path)
-    if wanted is not None and found != wanted:
+def _checked(path: Path, expected: str | None, fetched: bool = False) -> dict[str, Any]:
+    """A file's entry for the lock. A file of another hash is refused, and removed if it was `fetched`."""
+    digest = sha256_file(path)
+    if expected is not None and digest != expected:
         if fetched:
             path.unlink()
-        what = "the file was removed. Run" if fetched else "this file was put there by hand. Move it away and run"
+        action = "the file was removed. Rerun" if fetched else "the file was copied by hand. Move it away and rerun"
         raise EnvironmentMissing(
-            f"{path}: sha256 is {found}, expected {wanted}; {what} the same command again; if it stays so, the file at "
-            "its source is not the one that mistyle knows"
+            f"{path}: sha256 is {digest}, expected {expected}; {action} the same command. If the hash stays wrong, the "
+            "published file has changed"
         )
     stat = path.stat()
-    return {"sha256": found, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
+    return {"sha256": digest, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
 
 
 def convert(pickle: Path, into: Path, *, overwrite: bool = False) -> Path:
-    """A pickled state dict as safetensors in the folder `into`, beside a copy of its config.json.
+    """Write a pickled state dict as safetensors into the folder `into`, with a copy of its config.json.
 
-    The pickle is opened in a child process with `weights_only=True`: tensors and nothing that could run. Anything else
-    is refused. UsageError where another file would be replaced, unless `overwrite`.
+    A child process opens the pickle with `weights_only=True`: only tensors, no code. Anything else is refused.
+    UsageError where another file would be replaced, unless `overwrite`.
     """
     from safetensors.torch import save_file
 
@@ -197,20 +197,20 @@ def convert(pickle: Path, into: Path, *, overwrite: bool = False) -> Path:
 
 
 def _refuse_others(pickle: Path, target: Path) -> None:
-    """UsageError for weights, or a configuration that differs, at the place of what a conversion writes."""
-    config, there = pickle.with_name("config.json"), target.with_name("config.json")
-    differs = config.is_file() and there.is_file() and config.read_bytes() != there.read_bytes()
-    for path in (target,) * target.exists() + (there,) * differs:
-        raise UsageError(f"{path}: this file is there and would be replaced. Move it away, or add --overwrite")
+    """UsageError for existing weights, or a differing configuration, at a conversion's output paths."""
+    config, written = pickle.with_name("config.json"), target.with_name("config.json")
+    differs = config.is_file() and written.is_file() and config.read_bytes() != written.read_bytes()
+    for path in (target,) * target.exists() + (written,) * differs:
+        raise UsageError(f"{path}: this file exists and would be replaced. Move it away, or add --overwrite")
 
 
 def listing(folder: Path | None) -> list[dict[str, Any]]:
-    """Every model with what `mistyle models` prints of it."""
+    """One row per model, as `mistyle models` prints it."""
     rows = []
     lock = models.read_lock(folder) if folder else {}
     for model in models.MODELS.values():
-        there = next((p for p in models.places(model, folder) if p.is_dir()), None)
-        lost = models.lacking(model, there, model.loose if model.url else ()) if there else []
+        place = next((p for p in models.places(model, folder) if p.is_dir()), None)
+        missing = models.lacking(model, place, model.loose if model.url else ()) if place else []
         locked = lock.get(model.name, {}).get("files", {})
         hashes = {k: v["sha256"] for k, v in locked.items() if k.endswith(".safetensors")}
         rows.append(
@@ -224,7 +224,7 @@ def listing(folder: Path | None) -> list[dict[str, Any]]:
                 "purpose": model.purpose,
                 "url": model.url,
                 "folders": [f or "." for f in model.folders] + list(model.loose),
-                "found": str(there) if there and not lost else None,
+                "found": str(place) if place and not missing else None,
             }
         )
     return rows

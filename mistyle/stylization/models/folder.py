@@ -1,4 +1,4 @@
-"""Where models are found and whether they are what they should be; nothing here loads weights or imports torch.
+"""Model folders: search, completeness and hashes, without loading weights or importing torch.
 
 Only safetensors are accepted: a pickle can run code when it is opened.
 """
@@ -25,11 +25,11 @@ PIECES, PIECE = 64, 65536
 
 
 def need_extra() -> None:
-    """Refuse with the command that installs them where the optional packages are missing."""
-    lost = [name for name in PACKAGES if find_spec(name) is None]
-    if lost:
+    """EnvironmentMissing, with the install command, where optional packages are missing."""
+    missing = [name for name in PACKAGES if find_spec(name) is None]
+    if missing:
         raise EnvironmentMissing(
-            f"this needs the optional packages {', '.join(lost)}, which are not installed; "
+            f"this needs the optional packages {', '.join(missing)}, which are not installed; "
             "run: pip install 'mistyle[diffusion]'"
         )
 
@@ -48,32 +48,32 @@ def cache() -> Path:
 
 
 def places(model: PublishedModel, folder: Path | None) -> list[Path]:
-    """Where a model is looked for: the models' folder, then the cache (the pinned revision, then `main`)."""
-    found = [folder / model.name] if folder else []
+    """Search path of a model: the models' folder, then the cache (the pinned revision, then `main`)."""
+    candidates = [folder / model.name] if folder else []
     if model.url:
-        return found
+        return candidates
     cached = cache() / f"models--{model.repo.replace('/', '--')}"
     main = cached / "refs" / "main"
     revisions = [model.revision, *([main.read_text().strip()] if main.is_file() else [])]
-    return found + [cached / "snapshots" / revision for revision in revisions]
+    return candidates + [cached / "snapshots" / revision for revision in revisions]
 
 
 def find(name: str, folder: Path | None, loose: Iterable[str] = (), weightless: Iterable[str] = ()) -> Path:
-    """The folder of a complete model; EnvironmentMissing says where it was looked for and how to get it.
+    """The folder of a complete model; EnvironmentMissing names the searched folders and the way to get it.
 
-    `loose` are the single files that are needed; `weightless` the folders of which only the configuration is needed,
-    since their weights come from elsewhere.
+    `loose` are the single files that are needed; `weightless` the folders that need only a configuration, since their
+    weights come from another file.
     """
     model = get(name)
     looked = places(model, folder)
     for place in looked:
         if not place.is_dir():
             continue
-        lost = lacking(model, place, loose, weightless)
-        if not lost:
+        missing = lacking(model, place, loose, weightless)
+        if not missing:
             verify(name, place, folder)
             return place
-        pickles = [p for p in lost if p.with_suffix(".bin").is_file()]
+        pickles = [p for p in missing if p.with_suffix(".bin").is_file()]
         if pickles:
             into = folder or Path("MODELS")
             raise EnvironmentMissing(
@@ -81,7 +81,7 @@ def find(name: str, folder: Path | None, loose: Iterable[str] = (), weightless: 
                 f"safetensors only. Convert it once: mistyle models convert {name} {place} --models {into}"
             )
         if place == looked[0] and folder:
-            raise EnvironmentMissing(f"{place} lacks {_relative(lost, place)}; {how_to_get(model, folder)}")
+            raise EnvironmentMissing(f"{place} lacks {_relative(missing, place)}; {how_to_get(model, folder)}")
     where = f"neither in {folder / name} nor in {cache()}" if folder else f"not in {cache()}"
     if model.url:
         where = f"not in {folder / name}" if folder else "nowhere, since no --models DIR was given"
@@ -92,17 +92,17 @@ def find(name: str, folder: Path | None, loose: Iterable[str] = (), weightless: 
 
 
 def file(name: str, folder: Path | None) -> Path:
-    """The one file of a model that is one (VGG-19, BiRefNet)."""
+    """The file of a single-file model (VGG-19, BiRefNet)."""
     loose = get(name).loose
     return find(name, folder, loose) / loose[0]
 
 
 def how_to_get(model: PublishedModel, folder: Path | None) -> str:
-    """The sentence that fixes a missing model."""
+    """The instruction that gets a missing model."""
     into = folder or Path("models")
     if model.url:
         return f"download {model.url} and put it at {into / model.name / model.loose[0]} (--models {into})"
-    return f"run: mistyle models fetch {model.name} --models {into} --allow-download (or copy it there yourself)"
+    return f"run: mistyle models fetch {model.name} --models {into} --allow-download (or copy it yourself)"
 
 
 def _relative(paths: Iterable[Path], place: Path) -> str:
@@ -110,25 +110,25 @@ def _relative(paths: Iterable[Path], place: Path) -> str:
 
 
 def lacking(model: PublishedModel, place: Path, loose: Iterable[str], weightless: Iterable[str] = ()) -> list[Path]:
-    """The files that a model's folder lacks, by the names they should have."""
-    lost = [place / name for name in loose if not (place / name).is_file()]
+    """The missing files of a model's folder, by their expected paths."""
+    missing = [place / name for name in loose if not (place / name).is_file()]
     for part in model.folders:
         folder = place / part
         if part.startswith("tokenizer"):
-            there = (folder / "vocab.json").is_file() or (folder / "tokenizer.json").is_file()
-            lost += [] if there else [folder / "vocab.json"]
+            complete = (folder / "vocab.json").is_file() or (folder / "tokenizer.json").is_file()
+            missing += [] if complete else [folder / "vocab.json"]
         elif part == "scheduler":
-            lost += [] if (folder / "scheduler_config.json").is_file() else [folder / "scheduler_config.json"]
+            missing += [] if (folder / "scheduler_config.json").is_file() else [folder / "scheduler_config.json"]
         else:
-            lost += [] if (folder / "config.json").is_file() else [folder / "config.json"]
+            missing += [] if (folder / "config.json").is_file() else [folder / "config.json"]
             if part not in weightless and not weights(folder):
                 stem = "model" if "encoder" in part else "diffusion_pytorch_model"
-                lost.append(folder / f"{stem}.safetensors")
-    return lost
+                missing.append(folder / f"{stem}.safetensors")
+    return missing
 
 
 def weights(folder: Path) -> list[Path]:
-    """The weight files of a network: full precision before half, shards where it is cut; empty where there are none."""
+    """The weight files of a network: full precision before half, shards where split; empty where none exist."""
     for variant in ("", ".fp16"):
         for stem in WEIGHTS:
             whole = folder / f"{stem}{variant}.safetensors"
@@ -142,9 +142,9 @@ def weights(folder: Path) -> list[Path]:
 
 
 def variant(folder: Path) -> str | None:
-    """What diffusers calls the files that `weights` chose."""
-    found = weights(folder)
-    return "fp16" if found and ".fp16" in found[0].name else None
+    """diffusers' variant name of the files that `weights` chose."""
+    files = weights(folder)
+    return "fp16" if files and ".fp16" in files[0].name else None
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -169,7 +169,7 @@ def shapes(paths: Iterable[Path]) -> dict[str, list[int]]:
 
 
 def fingerprint(files: Iterable[Path]) -> str:
-    """What weight files are, from their sizes and pieces spread over each: reading gigabytes whole takes too long."""
+    """Hash of weight files by their sizes and sampled pieces: reading gigabytes whole takes too long."""
     total = hashlib.sha256()
     for path in files:
         size = path.stat().st_size
@@ -182,16 +182,16 @@ def fingerprint(files: Iterable[Path]) -> str:
 
 
 def read_lock(folder: Path) -> dict[str, Any]:
-    """What was fetched into a models' folder: per model its revision and its files' hashes."""
+    """The lock of a models' folder: per model its revision and its files' hashes."""
     path = folder / LOCK
     return read_json(path) if path.is_file() else {}
 
 
 def verify(name: str, place: Path, folder: Path | None) -> None:
-    """Compare a model's files with the hashes of their fetching or adopting, else with those that its publisher's are
-    known by. A file in the models' folder is read once and noted in the lock; in the cache, once a process.
+    """Compare a model's files with the lock's hashes, else with the published ones.
 
-    Files that nobody has named a hash for (see `PublishedModel.sha256`) are taken as they are.
+    A file in the models' folder is hashed once and recorded in the lock; in the cache, once a process. Files without a
+    known hash (see `PublishedModel.sha256`) are accepted. EnvironmentMissing for a mismatch.
     """
     model = MODELS[name]
     ours = folder is not None and place == folder / name
@@ -201,34 +201,34 @@ def verify(name: str, place: Path, folder: Path | None) -> None:
     for relative in dict.fromkeys([*noted, *model.sha256]):
         path = place / relative
         if not path.is_file():
-            continue  # what is needed was checked; the rest may be removed
+            continue  # `lacking` has checked the needed files; others may be absent
         stat = path.stat()
         entry = noted.get(relative)
         if entry is not None and (stat.st_size, stat.st_mtime_ns) == (entry["bytes"], entry["mtime_ns"]):
             continue
-        found = _sha256(path, stat.st_size, stat.st_mtime_ns)
-        if entry is not None and found != entry["sha256"]:
+        digest = _sha256(path, stat.st_size, stat.st_mtime_ns)
+        if entry is not None and digest != entry["sha256"]:
             raise EnvironmentMissing(
-                f"{path}: sha256 is {found}, expected {entry['sha256']} as it was when it was taken in; the file "
-                f"changed or broke. Remove it and {how_to_get(model, folder)}"
+                f"{path}: sha256 is {digest}, expected {entry['sha256']}, recorded when the file was added; the file "
+                f"has changed since. Remove it and {how_to_get(model, folder)}"
             )
-        if entry is None and not found.startswith(model.sha256[relative]):
+        if entry is None and not digest.startswith(model.sha256[relative]):
             raise EnvironmentMissing(
-                f"{path}: sha256 is {found}, expected {model.sha256[relative]}, which is the file of {model.repo}. "
+                f"{path}: sha256 is {digest}, expected {model.sha256[relative]} as in {model.repo}. "
                 f"Remove it and {how_to_get(model, folder)}; to use these weights anyway, put them into a folder of "
                 f"models and run: mistyle models adopt {name} --models {folder or Path('models')}"
             )
-        noted[relative] = {"sha256": found, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
+        noted[relative] = {"sha256": digest, "bytes": stat.st_size, "mtime_ns": stat.st_mtime_ns}
         changed = True
     if folder is not None and ours and changed:
         lock[name] = {"repo": model.repo, "revision": "copied by hand"} | lock.get(name, {}) | {"files": noted}
-        with suppress(MistyleError):  # a folder that cannot be written is read anew by the next run
+        with suppress(MistyleError):  # the next run hashes the files of a read-only folder again
             write_lock(folder, lock)
 
 
 @functools.lru_cache(maxsize=256)
 def _sha256(path: Path, size: int, modified: int) -> str:
-    """The hash of a file as it was of that size at that time."""
+    """The sha256 of a file; size and modification time are part of the cache key."""
     return sha256_file(path)
 
 

@@ -1,4 +1,4 @@
-"""From folders to networks: every weight is a safetensors file on disk, no code of a model's author is run."""
+"""Loading of networks from safetensors files; no code of a model's author is run."""
 
 import warnings
 from collections.abc import Mapping
@@ -21,28 +21,28 @@ CLIP_MEAN, CLIP_STD = (0.48145466, 0.4578275, 0.40821073), (0.26862954, 0.261302
 
 def device_of(settings: ModelSettings) -> str:
     """The device that the networks run on."""
-    there = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
+    available = {"cpu": True, "cuda": torch.cuda.is_available(), "mps": torch.backends.mps.is_available()}
     if settings.device == "auto":
-        return next(name for name in ("cuda", "mps", "cpu") if there[name])
-    if not there[settings.device]:
-        raise EnvironmentMissing(f"models.device={settings.device}: torch sees no such device here; use cpu or auto")
+        return next(name for name in ("cuda", "mps", "cpu") if available[name])
+    if not available[settings.device]:
+        raise EnvironmentMissing(f"models.device={settings.device}: torch finds no such device; use cpu or auto")
     return settings.device
 
 
 def precision_of(settings: ModelSettings, device: str) -> torch.dtype:
-    """The type of the frozen networks' numbers; auto takes bfloat16 where a card computes it itself, else float16."""
+    """The frozen networks' dtype; auto: float32 on a CPU, bfloat16 on a device that supports it, else float16."""
     chosen = settings.precision
     if chosen == "auto":
         chosen = "float32" if device == "cpu" else "bfloat16" if computes_bfloat16(device) else "float16"
     elif chosen == "bfloat16" and not computes_bfloat16(device):
         raise EnvironmentMissing(
-            "models.precision=bfloat16: this card does not compute it; use auto, float16 or float32"
+            "models.precision=bfloat16: this device does not support it; use auto, float16 or float32"
         )
     return getattr(torch, chosen)
 
 
 def computes_bfloat16(device: str) -> bool:
-    """Whether a device has bfloat16 of its own: CPUs always, CUDA cards from Ampere on, MPS not counted on."""
+    """Whether a device supports bfloat16 natively: CPUs do, CUDA cards from Ampere on, MPS is assumed not to."""
     if device == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return device != "mps"
@@ -50,7 +50,7 @@ def computes_bfloat16(device: str) -> bool:
 
 @contextmanager
 def quiet():
-    """diffusers and transformers without their bars and remarks."""
+    """Silence the progress bars and warnings of diffusers and transformers."""
     from diffusers.utils import logging as of_diffusers
     from transformers.utils import logging as of_transformers
 
@@ -63,15 +63,15 @@ def quiet():
 
 
 def network(kind: Any, folder: Path, dtype: torch.dtype) -> Any:
-    """One network of a class of diffusers or transformers, frozen."""
+    """A frozen network of a diffusers or transformers class."""
     from diffusers.models.modeling_utils import ModelMixin
 
     key = "torch_dtype" if issubclass(kind, ModelMixin) else "dtype"
     with quiet():
-        made = kind.from_pretrained(
+        loaded = kind.from_pretrained(
             folder, use_safetensors=True, local_files_only=True, variant=models.variant(folder), **{key: dtype}
         )
-    return made.requires_grad_(False).eval()
+    return loaded.requires_grad_(False).eval()
 
 
 def base_parts(
@@ -99,8 +99,11 @@ def base_parts(
 
 
 def schedule(place: Path, checkpoint: Path | None, prediction: str) -> Any:
-    """SDXL's noise levels, Euler's with trailing spacing (ConsisLoRA's choice; the paper's equations (1)-(3) need its
-    unscaled levels), and what the network predicts: as set, else as a single file's marks or the configuration say."""
+    """SDXL's Euler scheduler with trailing spacing (ConsisLoRA's choice) and the network's prediction type.
+
+    The paper's equations (1)-(3) need its unscaled levels. The prediction type is the setting, else that of a single
+    file's marker tensors, else the configuration's.
+    """
     from diffusers.schedulers.scheduling_euler_discrete import EulerDiscreteScheduler
 
     more: dict[str, Any] = {} if checkpoint is None else models_check.marks(checkpoint)
@@ -137,7 +140,7 @@ def controlnets(places: list[Path], dtype: torch.dtype) -> list[Any]:
 
 
 def settle(pipeline: Any, settings: ModelSettings, device: str) -> Any:
-    """Put a pipeline where it runs: whole on the device, or network by network, which changes no number."""
+    """Move a pipeline to its device, whole or network by network (offloading); both give the same numbers."""
     pipeline.set_progress_bar_config(disable=True)
     if settings.offload and device not in ("cpu", "mps"):
         pipeline.enable_model_cpu_offload(device=device)
@@ -146,7 +149,7 @@ def settle(pipeline: Any, settings: ModelSettings, device: str) -> Any:
 
 
 def image_embedding(encoder: Any, rgb: Float[np.ndarray, "h w 3"]) -> torch.Tensor:
-    """The pooled CLIP embedding (1, d) of an sRGB picture, drawn out to a square: a crop would lose borders."""
+    """The pooled CLIP embedding (1, d) of an sRGB picture, stretched to a square: a crop would lose borders."""
     from mistyle.core.image import resize
 
     size = encoder.config.image_size
@@ -164,9 +167,9 @@ def add_ip_adapter(
     scale: float | Mapping[str, Any],
     device: str,
 ) -> list[torch.Tensor]:
-    """Give a pipeline an IP-Adapter and return what its picture says: [(2, 1, d)], nothing first, the picture second.
+    """Load an IP-Adapter into a pipeline; returns the image embeddings [(2, 1, d)]: zeros first, the picture second.
 
-    The image encoder, 2.5 GB in full size, is not kept.
+    The image encoder, 2.5 GB in full size, is freed.
     """
     from transformers import CLIPVisionModelWithProjection
 

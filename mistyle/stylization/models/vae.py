@@ -1,4 +1,4 @@
-"""SDXL's and Stable Diffusion's VAE, in float32 beside networks of half precision."""
+"""The float32 VAE of SDXL and Stable Diffusion, for pipelines of half-precision networks."""
 
 from typing import Any
 
@@ -7,10 +7,10 @@ from diffusers.models.autoencoders.autoencoder_kl import AutoencoderKL
 
 
 class ExactVae(AutoencoderKL):
-    """An AutoencoderKL that takes pictures and latents of any type from any device.
+    """An AutoencoderKL that takes pictures and latents of any dtype from any device.
 
-    They go to its own type and to the device that it runs on, which is not where it lies while it is offloaded.
-    Latents come back in the picture's type, as a network beside it wants them; pictures come out in its own.
+    It converts them to its own dtype and moves them to its execution device, which differs from its storage device
+    while it is offloaded. Latents come back in the input's dtype for the UNet; pictures come out in its own.
     """
 
     def encode(self, x: torch.Tensor, return_dict: bool = True) -> Any:
@@ -25,7 +25,7 @@ class ExactVae(AutoencoderKL):
         return AutoencoderKLOutput(latent_dist=answer)
 
     def decode(self, z: torch.Tensor, return_dict: bool = True, generator: torch.Generator | None = None) -> Any:
-        """Pictures of latents (n, 4, h, w), the scale of training taken off."""
+        """Pictures of unscaled latents (n, 4, h, w)."""
         return super().decode(self._brought(z), return_dict=return_dict, generator=generator)
 
     def _brought(self, x: torch.Tensor) -> Any:

@@ -1,4 +1,4 @@
-"""Finished views as coloured points of the surface; `stylization/mvst/warp.py` carries them into other views."""
+"""Lifting of finished views to coloured surface points, which `stylization/mvst/warp.py` warps into other views."""
 
 from dataclasses import dataclass
 
@@ -17,14 +17,14 @@ PURE = 0.995  # coverage from which a pixel shows one surface only
 
 @dataclass(frozen=True)
 class Lifted:
-    """The pixels of one view that may be carried elsewhere, lifted to the surface.
+    """The pixels of one view that may be warped, lifted to the surface.
 
     points     world positions, one column a pixel
     colour     linear Rec.709
     near_edge  whether a depth discontinuity of the view is within a few pixels
-    cosine     between the surface and the line to the camera, 1 where the view has no normals
-    pixel      which pixel of the view each point is, flat
-    picture    the view's colour and depth where its pixels are among these, zero elsewhere; last whether they are
+    cosine     between the normal and the line to the camera, 1 where the view has no normals
+    pixel      flat pixel index of each point in the view
+    picture    colour, depth and validity (0 or 1) of the view's lifted pixels, zero elsewhere
     """
 
     camera: Camera
@@ -39,9 +39,9 @@ class Lifted:
 def lift(view: View, settings: WarpSettings, mask: Bool[np.ndarray, "h w"] | None = None) -> Lifted:
     """The foreground of a finished view as coloured points.
 
-    Left out are pixels off `mask` (default: the view's), pixels of mixed colour (partly covered, or beside a depth
-    step) and those seen at a cosine under `settings.facing`. The view needs its depth; where it has no normals the
-    angle is not looked at.
+    Excluded are pixels off `mask` (default: the view's), pixels of mixed colour (partly covered, or beside a depth
+    step) and those with a cosine under `settings.facing`. The view needs its depth; without normals the angle is
+    ignored.
     """
     usable = view.mask & np.isfinite(view.depth) & (view.depth > 0) & (view.coverage > PURE)
     if mask is not None:
@@ -71,7 +71,7 @@ def lift(view: View, settings: WarpSettings, mask: Bool[np.ndarray, "h w"] | Non
 def transformed(matrix: Float[np.ndarray, "r 4"], points: Float[np.ndarray, "3 n"]) -> Float[np.ndarray, "3 n"]:
     """The first three rows of an affine or projective map, applied to points.
 
-    Written out: a matrix product shares its rows out to threads, and who else computes then decides the last bit.
+    Written out: a threaded matrix product would make the last bit depend on the machine's load.
     """
     m = matrix.astype(points.dtype)
     x, y, z = points
@@ -84,23 +84,23 @@ def cosines(
     """|cosine| between normals and the lines to the camera; 1 where a normal is zero."""
     ray = camera.position.astype(np.float32)[:, None] - points
     along = np.abs(ray[0] * normals[0] + ray[1] * normals[1] + ray[2] * normals[2])
-    found = along / np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
-    found[~normals.any(axis=0)] = 1
-    return found
+    cosine = along / np.sqrt(ray[0] * ray[0] + ray[1] * ray[1] + ray[2] * ray[2])
+    cosine[~normals.any(axis=0)] = 1
+    return cosine
 
 
 def depth_tolerance(camera: Camera, depth: np.ndarray, settings: WarpSettings) -> Float[np.ndarray, "..."]:
-    """How far two depths of one surface may lie apart within a pixel: the setting, or a steep surface's change."""
+    """Largest depth difference of one surface within a pixel: the setting, or a steep surface's change."""
     return np.maximum(np.float32(settings.depth_tolerance), depth * np.float32(STEEP / camera.focal))
 
 
 def discontinuities(view: View, settings: WarpSettings) -> Bool[np.ndarray, "h w"]:
-    """Pixels of the mesh with another surface, or none, right beside them (four neighbours)."""
+    """Pixels of the mesh with a depth step, or background, at one of their four neighbours."""
     depth = np.where(view.mask, view.depth, np.inf).astype(np.float32)
     result = np.zeros(depth.shape, bool)
     for marks, values in ((result, depth), (result.T, depth.T)):
         low, high = np.minimum(values[1:], values[:-1]), np.maximum(values[1:], values[:-1])
-        with np.errstate(invalid="ignore"):  # infinity minus infinity: nothing on either side
+        with np.errstate(invalid="ignore"):  # infinity minus infinity: background on both sides
             step = high - low > depth_tolerance(view.camera, low, settings)
         marks[1:] |= step
         marks[:-1] |= step

@@ -1,7 +1,7 @@
-"""Who says what is foreground in a stylized view: the rendered coverage, or a segmenter from an ONNX file.
+"""Foreground masks of stylized views: the rendered coverage, or a segmenter from an ONNX file.
 
-BiRefNet (the paper's choice) is read as ONNX, so no code is downloaded with its weights. Its logits go through a plain
-sigmoid and a threshold of 0.5. Stretching a mask to 0..1 first, as common wrappers do, would turn a picture without any
+BiRefNet (the paper's choice) is read as ONNX, so no code is downloaded with its weights. Its logits pass a plain
+sigmoid and a threshold of 0.5. Common wrappers stretch the mask to 0..1 first, which would turn a picture without
 foreground into foreground everywhere.
 """
 
@@ -28,29 +28,29 @@ def coverage(view: View) -> Bool[np.ndarray, "h w"]:
 def segmenter(path: Path) -> Masker:
     """A Masker from an ONNX file with one picture (1 3 s s) in and logits (1 1 s s) out, the last of its outputs.
 
-    The picture is what BiRefNet was trained on: sRGB, resized to a square, ImageNet's mean and deviation taken off.
-    Raises EnvironmentMissing without onnxruntime, InputRefused for a file that is no such model.
+    The input is as in BiRefNet's training: sRGB, resized to a square, normalised by ImageNet's mean and deviation.
+    Raises EnvironmentMissing without onnxruntime, InputRefused for a file that is not such a model.
     """
     session = opened(path)
-    given = session.get_inputs()
-    if len(given) != 1 or len(given[0].shape) != 4:
-        shapes = ", ".join(str(one.shape) for one in given)
+    inputs = session.get_inputs()
+    if len(inputs) != 1 or len(inputs[0].shape) != 4:
+        shapes = ", ".join(str(one.shape) for one in inputs)
         raise InputRefused(
             f"{path}: found inputs of shape {shapes}, expected one picture (1, 3, height, width);"
-            " give the ONNX file of BiRefNet or of a segmenter like it"
+            " use the ONNX file of BiRefNet or of a similar segmenter"
         )
-    half = getattr(given[0], "type", "") == "tensor(float16)"
-    height, width = (n if isinstance(n, int) and n > 0 else SIDE for n in given[0].shape[2:])
+    half = getattr(inputs[0], "type", "") == "tensor(float16)"
+    height, width = (n if isinstance(n, int) and n > 0 else SIDE for n in inputs[0].shape[2:])
 
     def mask(view: View) -> np.ndarray:
         ready = prepared(srgb_from_linear(view.rgb), (height, width)).astype(np.float16 if half else np.float32)
-        return foreground(session.run(None, {given[0].name: ready})[-1], view.camera.size, path)
+        return foreground(session.run(None, {inputs[0].name: ready})[-1], view.camera.size, path)
 
     return mask
 
 
 def opened(path: Path) -> Any:
-    """The file's inference session on the CPU."""
+    """The inference session of a file on the CPU."""
     try:
         import onnxruntime
     except ImportError:
@@ -62,12 +62,12 @@ def opened(path: Path) -> Any:
         raise InputRefused(f"{path}: found nothing, expected the ONNX file of a segmenter; check the path")
     try:
         return onnxruntime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
-    except Exception as error:  # its errors are bare C++ exceptions without a common type
+    except Exception as error:  # onnxruntime's errors have no common base class
         raise InputRefused(f"{path}: onnxruntime cannot open it ({error}); is it a whole ONNX model?") from error
 
 
 def prepared(encoded: Float[np.ndarray, "h w 3"], size: tuple[int, int]) -> Float[np.ndarray, "1 3 a b"]:
-    """A picture (sRGB 0..1) as the network wants it."""
+    """A picture (sRGB 0..1) as the network's input."""
     scaled = (np.clip(resize(encoded, size), 0, 1) - MEAN) / SPREAD
     return np.ascontiguousarray(scaled.transpose(2, 0, 1)[None], np.float32)
 
@@ -77,8 +77,8 @@ def foreground(logits: np.ndarray, size: tuple[int, int], path: Path) -> Bool[np
     plane = np.squeeze(np.asarray(logits, np.float32))
     if plane.ndim != 2 or not np.isfinite(plane).all():
         raise InputRefused(
-            f"{path}: its answer has the shape {np.shape(logits)} or is not finite, expected finite logits"
-            " (1, 1, height, width); give a segmenter of one class"
+            f"{path}: its output has the shape {np.shape(logits)} or is not finite, expected finite logits"
+            " (1, 1, height, width); use a segmenter of one class"
         )
     probability = 0.5 * (1 + np.tanh(plane / 2))  # the sigmoid, without overflow
     return resize(probability.astype(np.float32), size) > 0.5

@@ -1,9 +1,8 @@
-"""Depth that follows the silhouette (paper 6.1.2, where landmark features failed).
+"""Registration of depth to a moved silhouette (paper 6.1.2, where landmark features failed).
 
-A stylizer may move the outline of what it paints. Depth belongs to the old outline; here it is moved to the new one by
-a smooth displacement found from the two masks alone: their signed distance fields are laid onto each other near the
-outline, coarse to fine, and the inside follows. No features are compared, so the style does not matter; what moved
-inside the silhouette without moving the outline is not seen.
+A stylizer may move an object's outline, while depth belongs to the rendered one. A smooth displacement warps the depth
+to the new outline. It registers the two masks' signed distance fields near the outline, coarse to fine, and extends
+into the inside. It compares no features, so the style does not matter; motion inside the silhouette is not detected.
 """
 
 from dataclasses import replace
@@ -15,16 +14,16 @@ from jaxtyping import Bool, Float, Shaped
 from mistyle.core.image import distance_to, gaussian, nearest
 from mistyle.core.view import View
 
-SCALES = (1 / 24, 1 / 48, 1 / 96, 1 / 192)  # widths of the smoothing, in sides of the picture
-ROUNDS = 12  # steps at each
-LEAST_SIGMA = 3.0  # pixels; with less, concave corners tear
-FAR = 1e-3  # weight under which a place is too far from the outline to be moved with it
+SCALES = (1 / 24, 1 / 48, 1 / 96, 1 / 192)  # smoothing widths, in sides of the picture
+ROUNDS = 12  # steps at each width
+LEAST_SIGMA = 3.0  # pixels; below it, concave corners tear
+FAR = 1e-3  # weight under which a pixel is too far from the outline to move with it
 
 
 def signed(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
-    """Distance to the outline in pixels, positive inside; the outline runs half way between pixel centres.
+    """Signed distance to the outline in pixels, positive inside; the outline is half way between pixel centres.
 
-    Where there is no outline (an empty or a full mask) it lies at an infinite distance.
+    For an empty or a full mask the distance is infinite.
     """
     return np.where(mask, distance_to(~mask) - 0.5, 0.5 - distance_to(mask)).astype(np.float32)
 
@@ -32,9 +31,9 @@ def signed(mask: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w"]:
 def displacement(was: Bool[np.ndarray, "h w"], now: Bool[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
     """A smooth field u (x, y in pixels) with was(p + u(p)) = now(p): where each pixel of the new outline came from.
 
-    Gradient steps on the difference of the signed distances, weighted by nearness to the new outline and smoothed, with
-    ever less smoothing. It fades out away from the outline; zero where a mask is empty or full. Parts thinner than
-    about the shift may be taken for others.
+    Gradient steps on the difference of the signed distances, weighted by nearness to the new outline, with decreasing
+    smoothing. The field fades out away from the outline and is zero where a mask is empty or full. Parts thinner than
+    about the shift may be matched wrongly.
     """
     field = np.zeros((*was.shape, 2), np.float32)
     if was.all() or now.all() or not was.any() or not now.any():
@@ -50,17 +49,17 @@ def displacement(was: Bool[np.ndarray, "h w"], now: Bool[np.ndarray, "h w"]) -> 
         reach = np.float32(2 * sigma + 2)
         for _ in range(ROUNDS):
             x, y = columns + field[..., 0], rows + field[..., 1]
-            # cv2.remap rounds places to 1/32 pixel, which is nothing beside an outline's own pixels.
-            here = cv2.remap(old, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+            # cv2.remap rounds coordinates to 1/32 pixel, which is negligible for an outline.
+            warped = cv2.remap(old, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
             uphill = cv2.remap(slope, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            gap = np.clip(new - here, -reach, reach)[..., None]
+            gap = np.clip(new - warped, -reach, reach)[..., None]
             step = gap * uphill / ((uphill**2).sum(axis=-1, keepdims=True) + 0.1)
             field += gaussian(weight[..., None] * step, sigma) / (share + FAR)
     return field
 
 
 def carried(values: Shaped[np.ndarray, "h w *c"], field: Float[np.ndarray, "h w 2"]) -> Shaped[np.ndarray, "h w *c"]:
-    """values(p + u(p)), the nearest pixel's: nothing is mixed across a depth step."""
+    """values(p + u(p)) of the nearest pixel, so that nothing is blended across a depth step."""
     height, width = field.shape[:2]
     rows, columns = np.indices((height, width))
     row = np.clip(np.rint(rows + field[..., 1]).astype(np.int64), 0, height - 1)
@@ -69,10 +68,10 @@ def carried(values: Shaped[np.ndarray, "h w *c"], field: Float[np.ndarray, "h w 
 
 
 def follow(view: View, mask: Bool[np.ndarray, "h w"]) -> View:
-    """The view with its geometry (depth, normal, uv, part) moved to the outline of `mask`, which becomes its mask.
+    """The view with its geometry (depth, normal, uv, part) warped to the outline of `mask`, which becomes its mask.
 
-    The colours stay. Pixels whose place was off the mesh take the geometry of the nearest pixel on it. A view or mask
-    without any foreground is given back with the part that both have.
+    The colours stay. Pixels whose source is off the mesh take the geometry of the nearest pixel on it. A view or mask
+    without any foreground is returned with the intersection of both masks.
     """
     if not view.mask.any() or not mask.any():
         both = view.mask & mask
@@ -83,9 +82,9 @@ def follow(view: View, mask: Bool[np.ndarray, "h w"]) -> View:
     index = carried(inside, field).reshape(-1)
 
     def moved(values: np.ndarray, outside: float) -> np.ndarray:
-        found = values.reshape(height * width, -1)[index].reshape(values.shape)
+        gathered = values.reshape(height * width, -1)[index].reshape(values.shape)
         where = mask.reshape(height, width, *[1] * (values.ndim - 2))
-        return np.where(where, found, np.asarray(outside, values.dtype))
+        return np.where(where, gathered, np.asarray(outside, values.dtype))
 
     return replace(
         view,

@@ -1,7 +1,7 @@
-"""Views that agree: the sweep over any stylizer that paints one view at a time (paper 4.1.3).
+"""Multiview-consistent sweep over any stylizer that paints one view at a time (paper 4.1.3).
 
-Views are painted one after another. The first is the anchor; every later one is given, as its prior, what the finished
-views show of its surface (`stylization/mvst/warp.py`), and its colours are drawn towards the anchor's.
+Views are painted one after another. The first is the anchor. Every later view has a prior, the finished views warped
+into it (`stylization/mvst/warp.py`), and its colours are matched to the anchor's.
 """
 
 import zipfile
@@ -31,7 +31,7 @@ from mistyle.stylization.mvst.warp import composite
 Stylizer = Callable[[View, Prior | None, np.random.Generator], np.ndarray]
 Masker = Callable[[View], np.ndarray]
 STILL_EROSION = 2  # pixels (at 1024 across), for a stylizer that keeps outlines
-FEATHER = 8.0  # pixels from the prior over which the histogram match sets in
+FEATHER = 8.0  # pixels beside the prior over which the histogram match ramps up
 
 
 @dataclass(frozen=True)
@@ -39,9 +39,9 @@ class PaintedView:
     """One finished view.
 
     rgb     linear Rec.709, not multiplied by coverage
-    mask    which pixels are foreground and may be carried into other views
-    seen    the foreground before it was eroded: the segmenter's, or the rendered one
-    known   share of the foreground that earlier views had shown
+    mask    foreground pixels that may be warped into other views
+    seen    the foreground before erosion: the segmenter's, or the rendered one
+    known   share of the foreground known from earlier views
     drift   intersection over union of the segmenter's mask and the rendered one (1 without a segmenter)
     """
 
@@ -54,7 +54,7 @@ class PaintedView:
 
 @dataclass(frozen=True)
 class Swept:
-    """The finished views in the order in which they came; `order` is that in which they were painted."""
+    """The finished views in input order; `order` is the painting order."""
 
     views: tuple[View, ...]
     painted: tuple[PaintedView, ...]
@@ -63,12 +63,12 @@ class Swept:
 
 @dataclass(frozen=True)
 class ViewPainter:
-    """What paints a view.
+    """A stylizer of views with its masker.
 
-    stylizer        (view, prior, rng) -> rgb, linear; the prior is None for the first view. The view comes with the
-                    rendered colours and geometry; colours off the mesh are not used
-    masker          says what is foreground in a stylized view; None: the rendered coverage
-    keeps_outlines  the stylizer cannot move silhouettes: little need be cut off beside them, and depth need not follow
+    stylizer        (view, prior, rng) -> rgb, linear; the prior is None for the first view. The view has the rendered
+                    colours and geometry; colours off the mesh are not used
+    masker          foreground mask of a stylized view; None: the rendered coverage
+    keeps_outlines  the stylizer cannot move silhouettes: erosion beside them is small, and depth is not registered to
                     them (`stylization/mvst/outline.py`)
     """
 
@@ -79,7 +79,7 @@ class ViewPainter:
 
 @dataclass(frozen=True)
 class ViewStore:
-    """A folder for finished views, under a key: all that the result hangs on besides settings, seed and rig."""
+    """A folder of finished views, and the key of their inputs besides settings, seed and rig."""
 
     folder: Path
     key: str
@@ -93,11 +93,11 @@ def sweep(
     progress: Callable[[float], None] = lambda done: None,
     store: ViewStore | None = None,
 ) -> Swept:
-    """Paint every view from what the views before show.
+    """Paint every view with the earlier views as its prior.
 
-    With a store a sweep that was killed goes on in the view it was in, and ends with the same pictures.
+    With a store, a killed sweep resumes at its unfinished view and gives the same pictures.
 
-    Raises ValueError where the stylizer's answer has the wrong shape or is not finite on the mesh.
+    Raises ValueError where the stylizer's output has the wrong shape or is not finite on the mesh.
     """
     if not views:
         raise ValueError("there are no views to paint; pass at least one")
@@ -111,14 +111,14 @@ def sweep(
     lifted: list[Lifted] = []
     for turn, k in enumerate(order):
         file = None if store is None else store.folder / f"view_{k:03d}.npz"
-        own = None if file is None else read_kept(file, key)
+        own = None if file is None else read_view(file, key)
         if own is None:
             prior = composite(lifted, views[k], chosen) if lifted else None
             anchor = (views[order[0]], done[order[0]]) if done else None
             rng = np.random.default_rng([seed, k])
             own = paint_view(views[k], prior, anchor, painter, settings, rng, follows)
             if file is not None:
-                write_kept(file, key, own)
+                write_view(file, key, own)
         done[k] = own
         shown = drawn(views[k], own) if follows else finished(views[k], own)
         lifted.append(lift(shown, chosen, own.mask))
@@ -128,9 +128,9 @@ def sweep(
 
 
 def visiting(cameras: Sequence[Camera], kind: str) -> list[int]:
-    """Indices in the order of painting. Cameras that have no azimuth and elevation are in the paper's order as given.
+    """Indices in the order of painting. The paper's order keeps the rig's for cameras without azimuth and elevation.
 
-    The angular order starts from the view that the paper starts from.
+    The angular order starts from the paper's first view.
     """
     named = np.array([abs(c.azimuth) + abs(c.elevation) for c in cameras])
     paper = list(range(len(cameras)))
@@ -150,14 +150,14 @@ def paint_view(
     rng: np.random.Generator,
     follows: bool = False,
 ) -> PaintedView:
-    """One view: stylize, find its foreground, draw its colours towards the anchor's.
+    """One view: stylize it, segment its foreground, match its colours to the anchor's.
 
-    What lies off the mesh is kept where depth is to follow the outline, and only where the segmenter sees foreground.
+    Pixels off the mesh are kept only if depth follows the outline and the segmenter marks them as foreground.
     """
     rgb = np.asarray(painter.stylizer(view, prior, rng))
     if rgb.shape != view.rgb.shape or not np.isfinite(rgb[view.mask]).all():
         raise ValueError(
-            f"view '{view.camera.name}': the stylizer gave an array of shape {rgb.shape}, or values that are not"
+            f"view '{view.camera.name}': the stylizer returned shape {rgb.shape}, or values that are not"
             f" finite; expected finite colours of shape {view.rgb.shape}"
         )
     seen, drift = view.mask, 1.0
@@ -182,10 +182,10 @@ def towards(
     anchor: PaintedView,
     strength: float,
 ) -> Float[np.ndarray, "h w 3"]:
-    """Colours matched (in sRGB) to the anchor's, foreground against foreground; what came from the prior stays.
+    """Colours matched (in sRGB) to the anchor's, foreground against foreground; the prior's pixels stay.
 
-    Pinned pixels were matched when they were first painted; moving them again would pull the views apart, so the match
-    sets in over a few pixels beside them.
+    Pinned pixels were matched when first painted; another match would make views inconsistent. So the match ramps up
+    over a few pixels beside them.
     """
     encoded = srgb_from_linear(rgb)
     target = srgb_from_linear(anchor.rgb[anchor.mask])
@@ -196,17 +196,17 @@ def towards(
 
 
 def finished(view: View, painted: PaintedView) -> View:
-    """The view with its painted colours, premultiplied by coverage as rendered ones are."""
+    """The view with its painted colours, premultiplied by coverage like rendered ones."""
     return replace(view, rgb=painted.rgb * view.coverage[..., None])
 
 
 def drawn(view: View, painted: PaintedView) -> View:
-    """The view as its stylizer drew it: the geometry moved to the outline of what is seen there."""
+    """The painted view with its geometry warped to the painted outline."""
     return replace(follow(view, painted.seen), rgb=painted.rgb)
 
 
-def write_kept(file: Path, key: str, painted: PaintedView) -> None:
-    """One finished view on disk, whole or not at all."""
+def write_view(file: Path, key: str, painted: PaintedView) -> None:
+    """Write one finished view atomically."""
     numbers = np.array([painted.known, painted.drift])
 
     def write(path: Path) -> None:
@@ -215,8 +215,8 @@ def write_kept(file: Path, key: str, painted: PaintedView) -> None:
     atomic_write(file, write)
 
 
-def read_kept(file: Path, key: str) -> PaintedView | None:
-    """A finished view that was kept under this key; None where there is none that can be read."""
+def read_view(file: Path, key: str) -> PaintedView | None:
+    """The finished view stored under this key; None if missing or unreadable."""
     try:
         with np.load(file, allow_pickle=False) as arrays:
             if str(arrays["key"]) != key:

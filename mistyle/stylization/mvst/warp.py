@@ -1,20 +1,19 @@
-"""From finished views to a colour prior for the next one (paper 4.1.3, "cumulative view warping").
+"""Warping of finished views into a colour prior for the next view (paper 4.1.3, "cumulative view warping").
 
 Every finished view is lifted to the surface by its metric depth and scattered into the next view, nearer points over
-farther ones; of several views the one whose camera stands nearest in angle is believed. What the paper leaves open, or
-takes from 8-bit depth and integer pixels, is read here as follows (`stylization/mvst/lift.py` says what of a view is
-carried):
+farther ones; among several views the one with the smallest camera angle wins. Where the paper is ambiguous, or uses
+8-bit depth and integer pixels, this module does the following (`stylization/mvst/lift.py` selects the source pixels):
 
-- pixel centres lie at +0.5, depth is float32: a point lands where the renderer sees it;
-- a point counts only where it agrees with the depth of the pixel it lands on, so nothing shows through the gaps that
-  scattering leaves, and a hole takes the nearest colour of its own surface only;
-- what landed says which source pixel is seen; the colour is then looked up where the pixel's own surface point lies;
-- a surface that the source saw much more flatly than the view does is left to be painted anew;
+- pixel centres lie at +0.5, depth is float32: a point lands on the pixel where the renderer sees it;
+- a point counts only where it agrees with the depth of its target pixel: nothing shows through gaps of the scattering,
+  and a hole takes the nearest colour of its own surface only;
+- the scattered point selects the source pixel; the colour is then sampled at the projection of the target's own point;
+- a surface that the source saw at a much smaller cosine than the view is repainted;
 - exp(-angle) falls with the angle: nearest-view-wins is the smallest angle between camera positions;
 - the directional erosion cuts from both rims of an occlusion shadow (the region behind a near surface that the source
-  does not see), along the line away from the projected source camera, and only where the source itself has a depth
-  discontinuity: there a stylized outline may lie beside the true one. Edges that come from grazing angles or from the
-  frame of the source stay.
+  does not see), along the line away from the projected source camera. It acts only where the source has a depth
+  discontinuity, since a stylized outline may differ from the true one there. Edges from grazing angles or from the
+  source's frame stay.
 """
 
 from collections.abc import Sequence
@@ -32,18 +31,18 @@ from mistyle.stylization.mvst.settings import WarpSettings
 
 __all__ = ["Lifted", "angle", "composite", "lift", "splat", "warp"]
 
-EROSION = 20  # the paper's, where `erosion` is not set
-EROSION_AT = 1024  # the width of view for which `erosion` is meant
+EROSION = 20  # the paper's, for `erosion` unset
+EROSION_AT = 1024  # view width to which `erosion` refers
 EMPTY = np.uint64(2**64 - 1)
 
 
 def splat(
     source: Lifted, view: View, settings: WarpSettings, inside: Bool[np.ndarray, "h w"] | None = None
 ) -> tuple[Int[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Which point of `source` each pixel of `view` shows (-1: none), and where that counts after fill and erosion.
+    """Index of the `source` point at each pixel of `view` (-1: none), and the valid ones after fill and erosion.
 
-    `inside` (default: the view's mask) bounds the answer. Points that do not agree with the view's depth are hidden
-    there, or off the mesh: they never count.
+    `inside` (default: the view's mask) bounds the result. Points that disagree with the view's depth are hidden there
+    or off the mesh, and never count.
     """
     depth = np.where(view.mask if inside is None else inside & view.mask, view.depth, np.inf).astype(np.float32)
     winner = _scatter(source, view.camera, depth, settings)
@@ -58,14 +57,14 @@ def splat(
 
 
 def _drop_stretched(winner: np.ndarray, known: np.ndarray, view: View, source: Lifted, settings: WarpSettings) -> None:
-    """Take out of `known`, in place, the pixels whose surface the source saw much more flatly than the view does."""
+    """Clear in `known`, in place, the pixels that the source saw at a much smaller cosine than the view does."""
     if settings.sharpness == 0:
         return
     pixel = np.flatnonzero(known)
     point = winner.reshape(-1)[pixel]
     normals = np.ascontiguousarray(view.normal.reshape(-1, 3)[pixel].T)
-    here = cosines(view.camera, source.points.take(point, axis=1), normals)
-    known.reshape(-1)[pixel] = source.cosine[point] >= settings.sharpness * here
+    facing = cosines(view.camera, source.points.take(point, axis=1), normals)
+    known.reshape(-1)[pixel] = source.cosine[point] >= settings.sharpness * facing
 
 
 def warp(source: Lifted, view: View, settings: WarpSettings, inside: Bool[np.ndarray, "h w"] | None = None) -> Prior:
@@ -80,15 +79,15 @@ def composite(
     height, width = view.camera.size
     rgb, known = np.zeros((height * width, 3), np.float32), np.zeros((height, width), bool)
     nearest = sorted(sources, key=lambda s: angle(s.camera, view.camera))
-    found: list[tuple[np.ndarray, np.ndarray]] = [(np.empty(0), np.empty(0))] * len(nearest)
+    winners: list[tuple[np.ndarray, np.ndarray]] = [(np.empty(0), np.empty(0))] * len(nearest)
 
     def work(k: int) -> None:
         winner, counts = splat(nearest[k], view, settings, inside)
         at = np.flatnonzero(counts)
-        found[k] = at, winner.reshape(-1)[at]
+        winners[k] = at, winner.reshape(-1)[at]
 
     threaded(work, len(nearest))
-    for source, (at, winner) in zip(nearest, found, strict=True):
+    for source, (at, winner) in zip(nearest, winners, strict=True):
         new = ~known.reshape(-1)[at]
         rgb[at[new]] = _colours(source, view, at[new], winner[new], settings)
         known.reshape(-1)[at] = True
@@ -98,34 +97,36 @@ def composite(
 def _colours(
     source: Lifted, view: View, pixel: Int[np.ndarray, " n"], winner: Int[np.ndarray, " n"], settings: WarpSettings
 ) -> Float[np.ndarray, "n 3"]:
-    """The colours of the view's pixels: those of the points that landed there or, looked up, what the source shows
-    where the pixel's own surface point lies in it.
+    """The colours of the view's pixels: those of the scattered points or, with `look_up`, samples of the source at the
+    projections of the pixels' own surface points.
 
-    A point lands up to half a pixel beside the middle; passed on from view to view as it is, the picture would fray.
-    Looked up is only beside the winner, among pixels that were lifted and at the point's own depth: the same surface,
-    no mixed colours.
+    A scattered point is up to half a pixel off centre; repeated warps of its colour would fray the picture. A look-up
+    stays next to the winner, within lifted pixels and at the point's own depth: the same surface, no mixed colours.
     """
     result = source.colour.take(winner, axis=0)
     if not settings.look_up or not len(pixel):
         return result
-    camera, other = view.camera, source.camera
+    camera, source_camera = view.camera, source.camera
     rows, columns = np.divmod(pixel, camera.size[1])
     depth = view.depth.reshape(-1)[pixel].astype(np.float64)
     x, y = ((n + 0.5 - c) / camera.focal * depth for n, c in zip((columns, rows), camera.centre, strict=True))
-    x, y, z = transformed(other.cam_from_world @ camera.world_from_cam, np.stack([x, y, depth]))
-    there = np.stack([x / z * other.focal + other.centre[0], y / z * other.focal + other.centre[1]], axis=1)
+    x, y, z = transformed(source_camera.cam_from_world @ camera.world_from_cam, np.stack([x, y, depth]))
+    px = np.stack(
+        [x / z * source_camera.focal + source_camera.centre[0], y / z * source_camera.focal + source_camera.centre[1]],
+        axis=1,
+    )
     row, column = np.divmod(source.pixel[winner], source.camera.size[1])
-    beside = (np.abs(there[:, 0] - column - 0.5) < 2) & (np.abs(there[:, 1] - row - 0.5) < 2)
-    found = bilinear(source.picture, there[beside])
-    found[:, :4] /= np.maximum(found[:, 4:], 1e-6)
-    same = np.abs(found[:, 3] - z[beside]) <= depth_tolerance(source.camera, z[beside], settings)
-    good = same & (found[:, 4] > 0.5)
-    result[np.flatnonzero(beside)[good]] = found[good, :3]
+    beside = (np.abs(px[:, 0] - column - 0.5) < 2) & (np.abs(px[:, 1] - row - 0.5) < 2)
+    samples = bilinear(source.picture, px[beside])
+    samples[:, :4] /= np.maximum(samples[:, 4:], 1e-6)
+    same = np.abs(samples[:, 3] - z[beside]) <= depth_tolerance(source.camera, z[beside], settings)
+    valid = same & (samples[:, 4] > 0.5)
+    result[np.flatnonzero(beside)[valid]] = samples[valid, :3]
     return result
 
 
 def angle(a: Camera, b: Camera) -> float:
-    """Angle in radians between two camera positions seen from the origin, which the paper's rig looks at."""
+    """Angle in radians between two camera positions, seen from the origin (the paper rig's target)."""
     p, q = a.position / np.linalg.norm(a.position), b.position / np.linalg.norm(b.position)
     return float(np.arctan2(np.linalg.norm(np.cross(p, q)), p @ q))
 
@@ -133,7 +134,7 @@ def angle(a: Camera, b: Camera) -> float:
 def _scatter(
     source: Lifted, camera: Camera, depth: Float[np.ndarray, "h w"], settings: WarpSettings
 ) -> Int[np.ndarray, "h w"]:
-    """The nearest agreeing point in each pixel, the first of equals; -1 where there is none."""
+    """The nearest agreeing point in each pixel, the first of equals; -1 for none."""
     height, width = depth.shape
     k = np.array([[camera.focal, 0, camera.centre[0]], [0, camera.focal, camera.centre[1]], [0, 0, 1]])
     x, y, z = transformed(k @ camera.cam_from_world[:3], source.points)
@@ -156,11 +157,11 @@ def _scatter(
 
 
 def _fill(winner: Int[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], camera: Camera, settings: WarpSettings):
-    """Give the holes near a painted pixel the nearest one of their own surface, in place."""
-    found = winner >= 0
+    """Fill holes near a painted pixel, in place, with the nearest one of their own surface."""
+    covered = winner >= 0
     height, width = winner.shape
-    holes = np.flatnonzero(np.isfinite(depth) & ~found & dilate(found, settings.fill))
-    flat, depths, known = winner.reshape(-1), depth.reshape(-1), found.reshape(-1)
+    holes = np.flatnonzero(np.isfinite(depth) & ~covered & dilate(covered, settings.fill))
+    flat, depths, known = winner.reshape(-1), depth.reshape(-1), covered.reshape(-1)
     for dy, dx in _disc(settings.fill):
         if not len(holes):
             return
@@ -174,7 +175,7 @@ def _fill(winner: Int[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"], camer
 
 
 def _disc(radius: int) -> list[tuple[int, int]]:
-    """Steps (row, column) within a disc, nearest first."""
+    """Offsets (row, column) within a disc, nearest first."""
     around = range(-radius, radius + 1)
     steps = [(dy, dx) for dy in around for dx in around if 0 < dy * dy + dx * dx <= radius * radius]
     return sorted(steps, key=lambda s: (s[0] ** 2 + s[1] ** 2, s))
@@ -191,7 +192,7 @@ def _shadow_rims(
 ) -> Bool[np.ndarray, "h w"]:
     """Known pixels within `reach` of an occlusion shadow, counted along the line to the projected source camera.
 
-    From each rim pixel a march goes away from the shadow until it leaves the surface, the known pixels or the reach.
+    From each rim pixel it marches away from the shadow until it leaves the surface, the known pixels or the reach.
     """
     height, width = winner.shape
     rim = np.flatnonzero(known & ~erode(known, 1))
@@ -217,7 +218,7 @@ def _shadow_rims(
             points = points + step
             index, inside = at(points)
             with np.errstate(invalid="ignore"):
-                # A diagonal step is longer than a pixel's side; the allowance of a pixel covers it.
+                # A diagonal step is longer than a pixel's side; the tolerance of one pixel covers it.
                 go_on = inside & (np.abs(depths[index] - before) <= depth_tolerance(camera, before, settings))
             points, step, index = points[go_on], step[go_on], index[go_on]
             if not len(index):
@@ -228,10 +229,10 @@ def _shadow_rims(
 
 
 def _away_from(source: Camera, camera: Camera, px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Unit directions in the picture in which points move that go straight away from the source camera.
+    """Unit image directions of points that move straight away from the source camera.
 
-    With c the source's position in this camera, a point at z (u, v, 1) moves along c_z (u, v) - c_xy whatever its z;
-    zero where the source stands exactly behind or before the pixel.
+    With c the source's position in this camera, a point at z (u, v, 1) moves along c_z (u, v) - c_xy, independent of z;
+    zero where the source is exactly behind or before the pixel.
     """
     c = camera.cam_from_world[:3, :3] @ source.position + camera.cam_from_world[:3, 3]
     direction = (px - np.asarray(camera.centre)) / camera.focal * c[2] - c[:2]

@@ -1,1 +1,1 @@
-"""The two-phase optimisation of normal and roughness, then albedo (paper 4.2)."""
+"""Two-phase optimisation of normal and roughness, then albedo (paper 4.2)."""

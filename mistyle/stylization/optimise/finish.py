@@ -1,11 +1,11 @@
-"""Finishing a painted albedo by style losses of VGG-19 on many rendered crops (StyleMesh's line, Höllein et al. 2022).
+"""Finish of a painted albedo by VGG-19 style losses on many rendered crops (after StyleMesh, Höllein et al. 2022).
 
-Each step looks straight at a few places of the surface, at the scale at which the painting lies on it. Mitsuba renders
-the crops without light (`Film`), and the statistics of their features are compared with those of the unbroken painting
-at the same places (`finish_style.py`). Pixels count by the angle and the distance at which they are seen. The gradient
-moves a Laplacian pyramid of the texture (`render/deferred/pyramid.py`). The painter's own features hold the content,
-most along the edges of the shape; no shading appears anywhere. Changes broader than a stroke, and changes of colour
-that the painting does not have, are taken out at the end: neither do colours drift, nor is light painted in.
+Each step views a few surface points frontally, at the painting's own scale. Mitsuba renders the crops without light
+(`Film`). The statistics of their features are compared with those of the original painting at the same places
+(`finish_style.py`). Pixels are weighted by viewing angle and distance. The gradient moves a Laplacian pyramid of the
+texture (`render/deferred/pyramid.py`). The content loss uses the painted albedo's own features, with more weight along
+edges of the shape. Changes broader than a stroke, and colours outside the painting's palette, are removed: so neither
+colour drift nor light enters the albedo.
 """
 
 from collections.abc import Callable, Sequence
@@ -31,26 +31,26 @@ if TYPE_CHECKING:
 
     from mistyle.measure.features import Features
 
-DISTANCE = 4.0  # of a camera from the place it looks at, working units
-GRAZING, FRONTAL = 0.35, 0.8  # cosines at which a pixel begins to count, and counts fully
-FAR = 0.2  # relative difference of depth, and so of scale, at which a pixel stops counting
-RIM = 6  # pixels along silhouettes, whose features see the background
-TRIES = 16  # places drawn for a crop; the least seen is taken
-EDGE, EDGE_REACH = 0.3, 7  # turn of the normal between pixels that is an edge of the shape; pixels around it
-BROAD = 12.0  # standard deviation in texels of the table beyond which a change is taken out
-JUDGE = 0x5EED  # seed of the crops by which before and after are compared
+DISTANCE = 4.0  # of a camera from its target, working units
+GRAZING, FRONTAL = 0.35, 0.8  # cosines of weight 0 and 1
+FAR = 0.2  # relative difference of depth, and so of scale, of weight 0
+RIM = 6  # pixels along silhouettes, whose receptive field includes background
+TRIES = 16  # candidate points per crop; the least seen is used
+EDGE, EDGE_REACH = 0.3, 7  # change of the normal between pixels at an edge of the shape; pixels around it
+BROAD = 12.0  # standard deviation in texels of the table beyond which a change is removed
+JUDGE = 0x5EED  # seed of the crops that compare before and after
 OFF_PALETTE = 0.03  # standard deviation of the painting's colours (sRGB units) along which half of a change stays
-FURTHEST = 0.12  # a change of an encoded value comes near to this and never gets there
-LONGEST = 1024  # pixels of the painting along its long side, at most, as its features are taken
-LEAST = 1e-6  # of a squared distance, whose root has a slope at 0
-LAST_RATE = 0.1  # share of the rate at the end; a cosine leads there
+FURTHEST = 0.12  # asymptotic bound of an encoded value's change
+LONGEST = 1024  # largest long side of the painting, pixels, for its features
+LEAST = 1e-6  # lower bound of a squared distance: the root's slope is infinite at 0
+LAST_RATE = 0.1  # share of the rate at the end of the cosine schedule
 
 
 @dataclass(frozen=True)
 class PaintedAsset:
-    """The painter's result: maps and texels per texture set, and the solution that says what lies where.
+    """The painter's result: maps and texels per texture set, and the solution that maps surface to painting.
 
-    `only`, where given, masks the texels that may change.
+    `only` masks the texels that may change; None: all.
     """
 
     mesh: Mesh
@@ -62,10 +62,10 @@ class PaintedAsset:
 
 @dataclass(frozen=True)
 class StyleFinish:
-    """The finished albedo (linear, one per texture set), and how that went.
+    """The finished albedo (linear, one per texture set), and its losses.
 
-    trace   style loss of every step: the root of the statistic's distance, by the share of pixels that count
-    style   that loss before and after, on crops that no step used
+    trace   style loss of every step: the root of the statistic's distance, times the share of weighted pixels
+    style   that loss before and after, on held-out crops
     moved   root mean square change of the covered texels' albedo, sRGB units
     """
 
@@ -77,8 +77,10 @@ class StyleFinish:
 
 @dataclass(frozen=True)
 class Crops:
-    """Rendered crops of one step: n squares of one size, where their pixels lie in texture and painting, and how much
-    each counts (n, 1, s, s), torch; `held` are the content's weights."""
+    """Rendered crops of one step: n squares of one size, with their pixels' texels and places in the painting.
+
+    `counts` are pixel weights (n, 1, s, s), torch; `held` are the content's weights.
+    """
 
     lit: Any
     taps: Any
@@ -97,7 +99,7 @@ def finish(
     *,
     bridge: Any = "frozen",
 ) -> StyleFinish:
-    """Move the albedo of `painted` for `settings.steps` steps, and keep that if the style loss fell.
+    """Optimise the albedo of `painted` for `settings.steps` steps, and keep it if the style loss fell.
 
     The same inputs, settings, seed and thread count give the same bytes.
     """
@@ -111,7 +113,7 @@ def finish(
 
 
 class Finishing:
-    """A finish under way; a class because texture, moments and the count of what was seen change step by step."""
+    """State of a running finish: texture, Adam's moments and sample counts, which change every step."""
 
     def __init__(
         self, painted: PaintedAsset, features: "Features", settings: FinishSettings, seed: int, bridge: Any = "frozen"
@@ -133,7 +135,7 @@ class Finishing:
         self.trace: list[float] = []
 
     def step(self, number: int) -> None:
-        """One step against the gradient of style and content."""
+        """One gradient step on style and content."""
         import torch
 
         from mistyle.render.deferred import pyramid
@@ -159,7 +161,7 @@ class Finishing:
     def losses(
         self, crops: Crops, leaf: "torch.Tensor", rng: np.random.Generator
     ) -> "tuple[torch.Tensor, torch.Tensor]":
-        """Style and content of crops whose texels, encoded, are `leaf`."""
+        """Style and content losses of crops with encoded texels `leaf`."""
         import torch
         import torch.nn.functional as functional
 
@@ -167,26 +169,26 @@ class Finishing:
 
         n, size = self.settings.crops, self.settings.crop_size
         target = finish_style.target_features(self.painting, crops.places, n, size)
-        # The painter's own first: the film holds one picture at a time until its gradient is taken.
+        # The original albedo first: the film holds one picture at a time until its gradient is computed.
         with torch.no_grad():
             start = torch.from_numpy(self.table.start["albedo"][crops.taps.texels])
             own = self.features(self.shown(crops, start)) if self.settings.content else []
         maps = self.features(self.shown(crops, leaf, moving=True))
         style = content = leaf.new_zeros(())
         for k in range(n):
-            one, counts = slice(k, k + 1), crops.counts[k : k + 1]
-            mine, theirs = ([level[one] for level in levels] for levels in (maps, target))
-            distance = style_statistics(mine, theirs, counts, counts, kind=self.settings.statistic, rng=rng)
-            # By the root and the share that counts: a crop with few pixels, or far off, does not outweigh the others.
+            crop, counts = slice(k, k + 1), crops.counts[k : k + 1]
+            rendered, painted = ([level[crop] for level in levels] for levels in (maps, target))
+            distance = style_statistics(rendered, painted, counts, counts, kind=self.settings.statistic, rng=rng)
+            # Root, times the weighted share: crops with few pixels or a large distance do not dominate.
             style = style + counts.mean() * (distance + LEAST).sqrt() / n
-        # The finest features are those of single pixels, which the style is free to move.
+        # The content loss leaves out the finest features, those of single pixels.
         for a, b in zip(maps[-2:], own[-2:], strict=False):
             held = functional.interpolate(crops.held, size=a.shape[2:], mode="area")
             content = content + ((a - b).square() * held).mean() / b.square().mean().clamp_min(1e-8)
         return style, content
 
     def shown(self, crops: Crops, texels: "torch.Tensor", moving: bool = False) -> "torch.Tensor":
-        """The crops' pictures (n, 3, s, s), encoded; the painting's mean colour off the mesh."""
+        """Encoded pictures of the crops (n, 3, s, s); the painting's mean colour off the mesh."""
         import torch
 
         from mistyle.measure.losses import linear_from_srgb as linear
@@ -198,7 +200,7 @@ class Finishing:
         return encoded(picture) * crops.on + mean * (1 - crops.on)
 
     def crops(self, rng: np.random.Generator, seen: Float[np.ndarray, " n"]) -> Crops:
-        """Crops of the least seen of places drawn at random; `seen` counts the painter's samples."""
+        """Crops at the least seen of random surface points; `seen` counts views of the painter's samples."""
         import torch
 
         from mistyle.render.deferred import integrator as deferred
@@ -227,21 +229,21 @@ class Finishing:
         return Crops(lit, torch_bridge.taps(surface, self.table.sizes), places, image(counts), on, held)
 
     def judged(self) -> float:
-        """The style loss as the texture is, on crops of a generator of their own."""
+        """The style loss of the current texture on held-out crops (seed JUDGE)."""
         import torch
 
         rng, seen = np.random.default_rng(JUDGE), np.zeros_like(self.seen)
-        found = []
+        losses = []
         for _ in range(JUDGED):
             crops = self.crops(rng, seen)
             with torch.no_grad():
                 leaf = torch.from_numpy(self.table.values["albedo"][crops.taps.texels])
-                found.append(float(self.losses(crops, leaf, rng)[0]))
-        return float(np.mean(found))
+                losses.append(float(self.losses(crops, leaf, rng)[0]))
+        return float(np.mean(losses))
 
     def restrain(self) -> None:
-        """Take out of the change of the albedo its own mean over a few strokes, and directions of colour in which the
-        painting does not vary (a woodcut stays black and white); and bound what is left."""
+        """Restrict the albedo's change: remove its mean over a few strokes and colour directions in which the painting
+        does not vary (a woodcut stays black and white), then bound it."""
         palette = own_directions(self.painted.solution.painting)
         values, start = self.table.values["albedo"], self.table.start["albedo"]
         for rows, size, where in zip(self.table.parts, self.table.sizes, self.painted.texels, strict=True):
@@ -255,23 +257,25 @@ class Finishing:
             values[rows] = np.clip(start[rows] + finer.reshape(-1, 3), 0, 1)
 
     def result(self, before: float, after: float) -> StyleFinish:
-        """The albedo with what was changed laid upon it."""
+        """The finish with the original albedo plus its change, or unchanged if the loss did not fall."""
         if after >= before:
-            # What does not help on crops that no step used stays as the painter left it.
+            # Without a gain on held-out crops the albedo stays unchanged.
             self.table.values["albedo"][:] = self.table.start["albedo"]
-        made, squares, count = [], 0.0, 0
+        albedos, squares, count = [], 0.0, 0
         laid = fit_table.finished(self.table, self.encoded, self.painted.only)
         for new, old, where in zip(laid, self.encoded, self.painted.texels, strict=True):
             change = (new.albedo - old.albedo)[where.covered]
             squares, count = squares + float(np.square(change, dtype=np.float64).sum()), count + change.size
-            made.append(linear_from_srgb(new.albedo))
+            albedos.append(linear_from_srgb(new.albedo))
         moved = float(np.sqrt(squares / max(count, 1)))
-        return StyleFinish(tuple(made), tuple(self.trace), (before, after), moved)
+        return StyleFinish(tuple(albedos), tuple(self.trace), (before, after), moved)
 
 
 class Film:
-    """Pictures of the albedo alone through the house's renderer: what a matt surface sends back under uniform light,
-    over what a white one does. A class because the renderer behind it is built once."""
+    """Differentiable unlit pictures: radiance of a matt surface under uniform light over that of a white one.
+
+    A class because its renderer is built once.
+    """
 
     def __init__(self, crops: int, size: int, bridge: Any) -> None:
         from mistyle.render.deferred.torch_bridge import Shader
@@ -280,7 +284,7 @@ class Film:
         self.shader = Shader((crops * size, size), gloss=False, bridge=bridge)
 
     def __call__(self, lit: Any, albedo: "torch.Tensor", moving: bool = False) -> "torch.Tensor":
-        """Linear (n, 3, s, s) from the pixels' albedo (n s s, 3), with its gradient where that is `moving`."""
+        """Linear (n, 3, s, s) from the pixels' albedo (n s s, 3); differentiable if `moving`."""
         import torch
 
         n, size = self.shape
@@ -291,7 +295,7 @@ class Film:
 
 
 def texels_per_pixel(painted: PaintedAsset, settings: FinishSettings) -> int:
-    """As the settings say, and more where the painting would be longer than LONGEST pixels at that scale."""
+    """Texels per pixel from the settings, or more where the painting would exceed LONGEST pixels at that scale."""
     solution, shrink = painted.solution, settings.texels_per_pixel
     long = max(solution.painting.shape[:2]) * solution.spacing / max(solution.scale)
     while long > LONGEST * shrink * texel_side(painted):
@@ -306,7 +310,7 @@ def texel_side(painted: PaintedAsset) -> float:
 
 
 def own_directions(painting: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "3 3"]:
-    """A symmetric matrix that keeps differences of colour along which the painting varies, and shrinks others to 0."""
+    """A symmetric matrix that keeps colour differences along which the painting varies, and shrinks others to 0."""
     spread = np.cov(painting.reshape(-1, 3).T.astype(np.float64))
     return (spread @ np.linalg.inv(spread + OFF_PALETTE**2 * np.eye(3))).astype(np.float32)
 
@@ -318,7 +322,7 @@ def frontal(
     pixel: float,
     size: int,
 ) -> Camera:
-    """A camera that looks along the normal at a place, `tangent` to the right, with `pixel` units a pixel there."""
+    """A camera that looks at a surface point along its normal, `tangent` to the right, `pixel` units a pixel there."""
     across = tangent - (tangent @ normal) * normal
     across = across / max(float(np.linalg.norm(across)), 1e-9)
     world = np.eye(4)
@@ -328,20 +332,20 @@ def frontal(
 
 
 def weights(surface: Any, cameras: Sequence[Camera]) -> Float[np.ndarray, " n"]:
-    """How much each pixel counts: by the angle and the distance at which it is seen, and not along silhouettes."""
+    """Weight of each pixel by viewing angle and distance; zero along silhouettes."""
     n, (height, width) = len(cameras), cameras[0].size
     angle = np.clip((surface.facing - GRAZING) / (FRONTAL - GRAZING), 0, 1)
     each = zip(np.split(surface.position, n), cameras, strict=True)
     depth = np.concatenate([(p - c.position) @ c.world_from_cam[:3, 2] for p, c in each])
     near = np.clip(2 - 2 * np.abs(depth / DISTANCE - 1) / FAR, 0, 1)
-    found = (angle * near * surface.mask).reshape(n, height, width).astype(np.float32)
+    weight = (angle * near * surface.mask).reshape(n, height, width).astype(np.float32)
     kernel = np.ones((2 * RIM + 1, 2 * RIM + 1), np.uint8)
-    inside = [cv2.erode((one > 0).astype(np.uint8), kernel) for one in found]
-    return (found * np.stack(inside)).reshape(-1)
+    inside = [cv2.erode((one > 0).astype(np.uint8), kernel) for one in weight]
+    return (weight * np.stack(inside)).reshape(-1)
 
 
 def shape_edges(normals: Float[np.ndarray, "n h w 3"]) -> Float[np.ndarray, "n h w"]:
-    """0..1: how much of an edge the shape has around a pixel, by the turn of its normal between neighbours."""
+    """Edge strength 0..1 of the shape around a pixel, by the change of its normal between neighbours."""
     turn = np.zeros(normals.shape[:3], np.float32)
     turn[:, :, 1:] += np.linalg.norm(np.diff(normals, axis=2), axis=3)
     turn[:, 1:] += np.linalg.norm(np.diff(normals, axis=1), axis=3)

@@ -1,15 +1,15 @@
-"""What a user may choose about finishing the painting."""
+"""Settings of the finish of a painted albedo."""
 
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-JUDGED = 3  # batches of crops, never stepped on, by which before and after are compared
+JUDGED = 3  # batches of held-out crops that compare before and after
 
 
 class FinishSettings(BaseModel):
-    """Style losses of VGG-19 on many rendered crops, after the painting and before the fit."""
+    """VGG-19 style losses on many rendered crops, after the painting and before the fit."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -41,5 +41,5 @@ class FinishSettings(BaseModel):
         default=3.0,
         ge=0,
         le=100,
-        description="0: Adam's steps, alike for every texel; higher: texels that fit already hardly move",
+        description="0: Adam's steps, equal for every texel; higher: texels with small gradients hardly move",
     )

@@ -1,8 +1,8 @@
-"""The painting as the features that a finished surface should have: each pixel knows the place it was painted from.
+"""Target features of the finish, sampled from the painting at each surface pixel's source place.
 
-A patch of the surface shows pieces of the painting, turned along the strokes. Its features are compared with those
-of the whole, unbroken painting at the same places, turned alike, and not with the painting's overall statistics: those
-would pull every patch towards the mean of all colours.
+A patch of the surface shows pieces of the painting, rotated along the strokes. Its features are compared with those of
+the original painting at the same places and rotation. The painting's global statistics would pull every patch towards
+the mean of all colours.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from mistyle.measure.features import Features
 from mistyle.stylization.surface.lookup import PaintedSurface
 from mistyle.stylization.surface.samples import as_points, lifted, workers
 
-TURNED = 35.0  # degrees between a piece of the painting and the page that stands for it, beyond which it does not count
+TURNED = 35.0  # largest angle in degrees between a piece of the painting and its nearest quarter-turn page
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,8 @@ class PaintingFeatures:
 
 @dataclass(frozen=True)
 class Places:
-    """Where n pixels lie in the painting: the page, the place on it in pixels (x, y), whether that can be said, and the
-    painter's nearest sample."""
+    """Places of n pixels in the painting: page, position on it in pixels (x, y), validity, and the painter's nearest
+    sample."""
 
     page: Int[np.ndarray, " n"]
     at: Float[np.ndarray, "n 2"]
@@ -56,7 +56,7 @@ def painting_features(solution: PaintedSurface, pixel: float, features: Features
     for turn in range(4):
         page = torch.from_numpy(np.ascontiguousarray(np.rot90(picture, turn).transpose(2, 0, 1)))[None]
         with torch.no_grad():
-            pages.append(tuple(_thin(found[0], rows * columns).half() for found in features(page)))
+            pages.append(tuple(_thin(maps[0], rows * columns).half() for maps in features(page)))
     tree = as_points(solution.positions, solution.normals, solution.spacing).tree
     return PaintingFeatures(solution, tree, (rows, columns), tuple(pages))
 
@@ -68,7 +68,7 @@ def places(
     right: Float[np.ndarray, "n 3"],
     down: Float[np.ndarray, "n 3"],
 ) -> Places:
-    """The painting's places at surface points; `right` and `down` are the axes of the camera that sees each."""
+    """The painting's places at surface points; `right` and `down` are the axes of each point's camera."""
     solution = painting.solution
     sample = painting.tree.query(lifted(positions, normals, solution.spacing), workers=workers())[1]
     tangent, turn = solution.tangent[sample], solution.turn[sample]
@@ -80,15 +80,15 @@ def places(
     per_unit = np.array(solution.scale, np.float32) / np.float32(solution.spacing)
     shrink = np.array(painting.size[::-1]) / np.array(solution.painting.shape[1::-1])
     x, y = ((solution.centre[sample] + own * per_unit) * shrink).T
-    # The page stands on the screen as its x axis does there; what is left after quarter turns may not be much.
+    # The page's x axis on the screen selects the quarter turn; the remaining angle is at most TURNED.
     angle = np.degrees(np.arctan2((tangent * down).sum(axis=1), (tangent * right).sum(axis=1)))
     quarter = np.round(angle / 90)
     page = (turn - quarter.astype(np.int64)) % 4
     rows, columns = painting.size
     at = [np.choose(page, [x, y, columns - x, rows - y]), np.choose(page, [y, columns - x, rows - y, x])]
     inside = (x > 0) & (x < columns) & (y > 0) & (y < rows)
-    sure = inside & (np.abs(angle - 90 * quarter) < TURNED)
-    return Places(page, np.stack(at, axis=1).astype(np.float32), sure, sample)
+    valid = inside & (np.abs(angle - 90 * quarter) < TURNED)
+    return Places(page, np.stack(at, axis=1).astype(np.float32), valid, sample)
 
 
 def target_features(painting: PaintingFeatures, where: Places, crops: int, size: int) -> list[Any]:
@@ -101,18 +101,18 @@ def target_features(painting: PaintingFeatures, where: Places, crops: int, size:
         middle = slice(by // 2, None, by)
         page = where.page.reshape(crops, size, size)[:, middle, middle]
         at = where.at.reshape(crops, size, size, 2)[:, middle, middle] / by
-        made = torch.empty(crops, painting.pages[0][level].shape[0], *page.shape[1:])
+        sampled = torch.empty(crops, painting.pages[0][level].shape[0], *page.shape[1:])
         for turn, pages in enumerate(painting.pages):
             rows, columns = pages[level].shape[1:]
             x, y = (np.clip(at[..., axis].astype(np.int64), 0, most - 1) for axis, most in ((0, columns), (1, rows)))
             chosen = torch.from_numpy(page == turn)
             values = pages[level].reshape(pages[level].shape[0], -1)
             flat = torch.from_numpy(y * columns + x)[chosen]
-            made.permute(1, 0, 2, 3)[:, chosen] = values[:, flat].float()
-        result.append(made)
+            sampled.permute(1, 0, 2, 3)[:, chosen] = values[:, flat].float()
+        result.append(sampled)
     return result
 
 
 def _thin(maps: Any, pixels: int) -> Any:
-    """Every second row and column of maps as large as the picture: statistics need no more, and they are the most."""
+    """Every second row and column of full-size maps: enough for statistics, and these maps take the most memory."""
     return maps[:, ::2, ::2] if maps[0].numel() == pixels else maps

@@ -1,10 +1,10 @@
-"""Did a phase of the fit make the pictures better? A statistics loss can undo good strokes, so each phase is judged.
+"""Evaluation of a fit phase: does it improve the renders? A statistics loss can destroy good strokes.
 
-Windows of a few target views are rendered with the maps before and after the phase, under its own lights, and compared
-with the stylized views in three figures: `detail` (correlation of band-pass lightness: are the strokes still there),
-`style` (patch and Gram distance) and `views` (difference of a surface point seen from two neighbouring cameras under
-the same light, over the contrast of the picture's own detail, for a bolder picture differs more). None of them may get
-worse by more than TOLERANCE. A phase that is worse by HOPELESS times as much on its way is stopped there.
+Windows of a few target views are rendered with the maps before and after the phase, under its own lights. Three metrics
+compare them with the stylized views. `detail` is the correlation of band-pass lightness (strokes); `style` the patch
+and Gram distance. `views` is the difference of a surface point between two neighbouring cameras under the same light.
+It is relative to the contrast of the picture's own detail, since a bolder picture differs more. No metric may get worse
+by more than TOLERANCE. A phase that exceeds HOPELESS times the tolerance at a check is stopped.
 """
 
 from collections.abc import Sequence
@@ -25,23 +25,23 @@ from mistyle.process import memory
 
 VIEWS = 6
 WINDOW = 256
-# (share of the value, absolute) by which a figure may get worse. A relief adds flanks and highlights of its own to the
-# strokes: a good one costs up to 0.04 of the correlation and, on a bold flat style, 0.07 of the agreement; noise and
-# lost strokes cost more. The rest is what another seed of the crops changes.
+# (share of the value, absolute) by which a metric may get worse. A relief adds its own shading and highlights to the
+# strokes: a good one costs up to 0.04 of `detail` and, on a bold flat style, 0.07 of `views`; noise and lost strokes
+# cost more. The rest covers the variation between seeds of the crops.
 TOLERANCE = {"detail": (0.0, 0.06), "style": (0.05, 0.0), "views": (0.05, 0.1)}
 HOPELESS = 2.0
-CHECKS = (0.25, 0.5)  # shares of a phase's steps after which it is judged on its way
-FEWEST = 10  # steps before the first such judgement: it takes as long as one or two steps
+CHECKS = (0.25, 0.5)  # shares of a phase's steps after which it is checked
+FEWEST = 10  # steps before the first check, which takes as long as one or two steps
 HIGHER_IS_BETTER = {"detail": True, "style": False, "views": False}
 
 
 @dataclass(frozen=True)
 class EvaluationSet:
-    """Windows of views to judge by, each with the window of a neighbouring view that shows the same place.
+    """Evaluation windows, each with the window of a neighbouring view of the same surface.
 
-    What does not hang on the maps is found once: the windows' `surfaces` and those of the neighbours (traced), which
-    places a window shares with its neighbour, the band-pass lightness (`details`) of the target within its mask, and
-    the statistics of all targets (`style`).
+    Values independent of the maps are computed once. These are traced `surfaces` of the windows and their neighbours,
+    `shared` surface points of each pair, and statistics of all targets (`style`). `details` is the band-pass lightness
+    of each target within its mask.
     """
 
     traced: Any
@@ -55,7 +55,7 @@ class EvaluationSet:
 
 
 def build_evaluation(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets: Sequence[View]) -> EvaluationSet:
-    """Windows of up to VIEWS evenly chosen targets, about the middle of what they see; WINDOW pixels at most."""
+    """Windows of up to VIEWS evenly chosen targets, around the centre of their foreground; WINDOW pixels at most."""
     from mistyle.measure import metrics
     from mistyle.measure.overlap import overlap
     from mistyle.render.deferred import integrator as deferred
@@ -73,9 +73,9 @@ def build_evaluation(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets:
         point = world_from_px(
             targets[k].camera, px, targets[k].depth[rows[middle], columns[middle]][None].astype(float)
         )
-        other = _nearest(targets, k)
+        neighbour = _nearest(targets, k)
         views.append(_window(targets[k], px[0], size))
-        neighbours.append(_window(targets[other], px_from_world(targets[other].camera, point)[0][0], size))
+        neighbours.append(_window(targets[neighbour], px_from_world(targets[neighbour].camera, point)[0][0], size))
     pairs = list(zip(views, neighbours, strict=True))
     surfaces = [tuple(deferred.trace(traced, [each.camera], tangents) for each in pair) for pair in pairs]
     masks = [view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1) for view in views]
@@ -93,22 +93,24 @@ def build_evaluation(traced: Any, tangents: Float[np.ndarray, "f 3 4"], targets:
 
 
 def evaluate(where: EvaluationSet, maps: Sequence[Maps], lights: Lights, *, gloss: bool = True) -> dict[str, float]:
-    """detail, style and views of `maps` under `lights`, with or without the reflection at dielectric surfaces."""
+    """The metrics detail, style and views of `maps` under `lights`, with or without dielectric reflection."""
     from mistyle.measure import metrics
 
     lit = any(isinstance(light, Directional) for light in lights)
     table = _tables(maps)
     encoded, errors = [], []
     for view, surfaces, shared in zip(where.views, where.surfaces, where.shared, strict=True):
-        # Both under the lights of the first camera, or their shading would differ.
+        # Both windows use the lights of the first camera, or their shading would differ.
         fixed = _fixed(lights, view.camera)
         first, second = (_draw(where, table, surface, fixed, gloss) for surface in surfaces)
-        mine, theirs = srgb_from_linear(first), srgb_from_linear(second)
-        contrast = float(np.abs(metrics.detail(mine, view.mask))[view.mask].mean())
-        errors.append(metrics.shared_error(shared, mine, theirs) / max(contrast, 1e-3))
-        encoded.append(srgb_from_linear(_exposed(first, view)) if lit else mine)
+        rendered, target = srgb_from_linear(first), srgb_from_linear(second)
+        contrast = float(np.abs(metrics.detail(rendered, view.mask))[view.mask].mean())
+        errors.append(metrics.shared_error(shared, rendered, target) / max(contrast, 1e-3))
+        encoded.append(srgb_from_linear(_exposed(first, view)) if lit else rendered)
     compared = zip(encoded, where.details, where.masks, strict=True)
-    details = [metrics.band_correlation(metrics.detail(mine, mask), theirs, mask) for mine, theirs, mask in compared]
+    details = [
+        metrics.band_correlation(metrics.detail(rendered, mask), target, mask) for rendered, target, mask in compared
+    ]
     usable = [error for error in errors if np.isfinite(error)]
     return {
         "detail": float(np.mean([d for d in details if np.isfinite(d)] or [0.0])),
@@ -118,13 +120,13 @@ def evaluate(where: EvaluationSet, maps: Sequence[Maps], lights: Lights, *, glos
 
 
 def checks(iterations: int) -> tuple[int, ...]:
-    """After how many of a phase's steps it is judged on its way."""
+    """Numbers of steps after which a phase is checked."""
     steps = (round(share * iterations) for share in CHECKS)
     return tuple(step for step in steps if FEWEST <= step < iterations)
 
 
 def regressed(before: dict[str, float], after: dict[str, float], times: float = 1.0) -> list[str]:
-    """The figures that got worse by more than so many times their tolerance."""
+    """The metrics that got worse by more than `times` their tolerance."""
     result = []
     for name, (share, absolute) in TOLERANCE.items():
         loss = before[name] - after[name] if HIGHER_IS_BETTER[name] else after[name] - before[name]
@@ -134,7 +136,7 @@ def regressed(before: dict[str, float], after: dict[str, float], times: float = 
 
 
 def undone_where() -> str:
-    """When a phase is undone, in words, with the tolerances."""
+    """Report sentence on when a phase is undone, with the tolerances."""
     parts = []
     for name, (share, absolute) in TOLERANCE.items():
         by = " and ".join(text for text in (f"{share:.0%}" * (share > 0), f"{absolute:g}" * (absolute > 0)) if text)
@@ -143,7 +145,7 @@ def undone_where() -> str:
 
 
 def _nearest(targets: Sequence[View], k: int) -> int:
-    """The other view whose camera stands at the smallest angle to view k's; the view itself if it is the only one."""
+    """The other view with the smallest camera angle to view k; k itself if it is the only view."""
     directions = np.stack([view.camera.position / np.linalg.norm(view.camera.position) for view in targets])
     closeness = directions @ directions[k]
     closeness[k] = -2
@@ -151,7 +153,7 @@ def _nearest(targets: Sequence[View], k: int) -> int:
 
 
 def _window(view: View, centre: Float[np.ndarray, "2"], size: int) -> View:
-    """The square of `size` pixels of a view about `centre`, moved inside the view."""
+    """The square window of `size` pixels around `centre`, moved inside the view."""
     height, width = view.camera.size
     x = int(np.clip(round(float(centre[0]) - size / 2), 0, width - size))
     y = int(np.clip(round(float(centre[1]) - size / 2), 0, height - size))
@@ -187,7 +189,7 @@ def _draw(where: EvaluationSet, table: tuple, surface: Any, lights: Lights, glos
 
 
 def _exposed(picture: Float[np.ndarray, "h w 3"], view: View) -> Float[np.ndarray, "h w 3"]:
-    """Scaled to the mean luminance of the target: its exposure is no fault of the maps."""
+    """Scale to the mean luminance of the target: exposure does not depend on the maps."""
     mean = float(luminance(picture)[view.mask].mean())
     return picture * np.float32(float(luminance(np.nan_to_num(view.rgb))[view.mask].mean()) / max(mean, 1e-6))
 

@@ -1,4 +1,4 @@
-"""How much light a finished albedo holds, over all texture sets; the measure itself is in `measure/baked_light.py`."""
+"""Baked light left in a finished albedo, over all texture sets; the measure is in `measure/baked_light.py`."""
 
 from collections.abc import Sequence
 
@@ -8,14 +8,14 @@ from mistyle.core.maps import Maps, Texels
 from mistyle.core.mesh import Mesh, face_areas
 from mistyle.measure.baked_light import BakedLight, baked_light, texel_areas
 
-LOOKED_AT = 40_000  # texels at most, evenly over the sets: enough for two digits
+LOOKED_AT = 40_000  # upper limit of texels, evenly over the sets: enough for two digits
 
 
 def light_left(
     mesh: Mesh, sets: Sequence[Texels], maps: Sequence[Maps], seed: int = 0, most: int = LOOKED_AT
 ) -> BakedLight | None:
-    """The albedo's dependence on the surface's direction and openness, from about `most` texels; None where nothing is
-    covered."""
+    """The albedo's dependence on surface direction and openness, from about `most` texels; None without covered
+    texels."""
     from mistyle.render.mitsuba.occlusion import ambient_occlusion
 
     covered = sum(int(texels.covered.sum()) for texels in sets)
@@ -23,12 +23,12 @@ def light_left(
         return None
     areas = face_areas(mesh).astype(np.float64)
     step = max(1, covered // most)
-    found = []
+    samples = []
     for texels, chosen in zip(sets, maps, strict=True):
         at = np.flatnonzero(texels.covered)
         weight = texel_areas(texels.face.reshape(-1)[at], areas)[::step]
         at = at[::step]
         flat = (values.reshape(-1, 3)[at] for values in (chosen.albedo, texels.position, texels.normal))
-        found.append((*flat, weight))
-    albedo, positions, normals, weight = (np.concatenate(columns) for columns in zip(*found, strict=True))
+        samples.append((*flat, weight))
+    albedo, positions, normals, weight = (np.concatenate(columns) for columns in zip(*samples, strict=True))
     return baked_light(albedo, normals, ambient_occlusion(mesh, positions, normals, seed=seed), weight)

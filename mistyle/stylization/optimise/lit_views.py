@@ -1,11 +1,11 @@
-"""The two phases for views that show lit objects and whose light is known (paper 4.2).
+"""Two-phase fit for stylized views of lit objects under known light (paper 4.2).
 
-Such a view says what each texel reflects under known light, so normal, roughness and albedo are solved for: texel by
+Such views measure each texel's reflectance under known light, so the solver estimates normal, roughness and albedo: per
 texel, then on whole pictures, and under delta lights jointly (`recover.py`). Phase 1 takes normal and roughness from
-that solution, with its smoothness priors in the place of the paper's total variation. Phase 2 starts at the solution's
-albedo and minimises the paper's loss (style, total variation, sliced Wasserstein distance) against the views without
-their light: the solution drawn without light, and what it does not explain of a view, unless that is as broad as
-shading is. Where the solution explains the views worse than the maps as they came, both phases start at these.
+this solution; its smoothness priors replace the paper's total variation. Phase 2 starts at the solution's albedo and
+minimises the paper's loss (style, total variation, sliced Wasserstein distance) against unlit views. An unlit view is
+the solution rendered without light plus the view's residual, except residuals as broad as shading. If the solution
+explains the views worse than the baked maps, both phases start at the baked maps.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,10 +28,10 @@ from mistyle.stylization.optimise.settings import FitSettings
 from mistyle.stylization.optimise.table import ROUGHNESS_FLOOR
 from mistyle.stylization.optimise.two_phase import Fit, FitStart, FitTargets, shrinkage, two_phase, view_mask
 
-# A stylized view is not a measurement: fewer steps and samples than for photographs.
+# Stylized views are not measurements: fewer steps and samples than for photographs.
 ITERATIONS, BOUNCES, BOUNCE_SAMPLES, JOINT_SAMPLES, SUBSAMPLES = 640, 2, 32, 9, 4
-SOLVED_SHARE = 0.8  # of the whole progress
-LEAST_Z = 0.3  # of a normal: 72 degrees off
+SOLVED_SHARE = 0.8  # share of the total progress
+LEAST_Z = 0.3  # of a normal: 72 degrees from the surface normal
 DESCRIBED = ("normal", "roughness", "albedo", "metallic")
 
 
@@ -43,7 +43,7 @@ class LitViews:
     lights: Lights
 
     def captures(self) -> Captures:
-        """The same as references of a recovery."""
+        """The views as captures for `recover`."""
         return in_memory(
             [view.camera for view in self.views],
             [self.lights] * len(self.views),
@@ -56,8 +56,8 @@ class LitViews:
 class Solved:
     """The solution at the fit's resolution, one set of maps per texture set, and the views without their light.
 
-    start     the maps as they came, at that resolution
-    residual  root mean square of view - render, relative to the views': the maps as they came, the solution
+    start     the baked maps at that resolution
+    residual  root mean square of view - render, relative to the views: (baked maps, solution)
     """
 
     start: tuple[Maps, ...]
@@ -117,30 +117,32 @@ def solve(
     seed: int,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Solved:
-    """Normal, roughness and albedo from the views, as fine as the views can tell texels apart."""
+    """Normal, roughness and albedo from the views, at the resolution that the views resolve."""
     by = shrinkage(mesh, texels, lit.views, settings.texels_per_pixel)
     coarse = [t if by == 1 else rasterise(mesh, k, len(t.covered) // by) for k, t in enumerate(texels)]
     start = [_shrunk(m, t.covered.shape) for m, t in zip(maps, coarse, strict=True)]
     targets, captures = lit.views, lit.captures()
-    # Under soft light steps on whole pictures took as long as the texels and were undone.
+    # Under soft light, steps on whole pictures took as long as the texels and were undone.
     chosen = RecoverSettings(
         solver="texels" if has_soft(captures.lights) else "both",
         metallic=settings.metallic == "fit", iterations=ITERATIONS, bounces=BOUNCES, bounce_samples=BOUNCE_SAMPLES,
         joint_subsamples=JOINT_SAMPLES,
     )  # fmt: skip
-    found = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
-    fitted = tuple(_where_seen(found, start, coarse, k) for k in range(len(start)))
+    recovered = recover(mesh, coarse, captures, chosen, seed, lambda done: progress(0.9 * done), start=start)
+    fitted = tuple(_where_seen(recovered, start, coarse, k) for k in range(len(start)))
     residual, unlit = _explained(mesh, captures, (start, fitted), targets)
     progress(1.0)
-    trace = {f"phase1.{name}": values for name, values in found.trace.items()}
-    return Solved(tuple(start), fitted, tuple(unlit), residual, trace, found.notes)
+    trace = {f"phase1.{name}": values for name, values in recovered.trace.items()}
+    return Solved(tuple(start), fitted, tuple(unlit), residual, trace, recovered.notes)
 
 
 def laid(
     maps: Sequence[Maps], start: Sequence[Maps], solved: Sequence[Maps], names: Sequence[str] = DESCRIBED
 ) -> list[Maps]:
-    """`maps` with what the solution changes of the maps `names`; `start` and `solved` are at its own, coarser
-    resolution, `start` the shrunk `maps`. Detail that is finer than it stays."""
+    """`maps` plus the change from `start` to `solved` in the fields `names`.
+
+    `start` and `solved` have the solution's coarser resolution; `start` is the shrunk `maps`. Finer detail stays.
+    """
     result = []
     for fine, before, after in zip(maps, start, solved, strict=True):
         size, fields = fine.roughness.shape, {}
@@ -165,20 +167,20 @@ def _shrunk(maps: Maps, size: tuple[int, int]) -> Maps:
     return Maps(known=np.zeros(size, bool), **fields)
 
 
-def _where_seen(found: Recovered, start: Sequence[Maps], texels: Sequence[Texels], k: int) -> Maps:
-    """The solution but for texels that no view shows in the light: these keep the start."""
-    open_ = texels[k].covered & (found.seen[k] <= 0)
+def _where_seen(recovered: Recovered, start: Sequence[Maps], texels: Sequence[Texels], k: int) -> Maps:
+    """The solution; texels that no view sees lit keep the start values."""
+    open_ = texels[k].covered & (recovered.seen[k] <= 0)
     fields: dict[str, np.ndarray] = {}
     for name in DESCRIBED:
-        solved, before = getattr(found.maps[k], name), getattr(start[k], name)
+        solved, before = getattr(recovered.maps[k], name), getattr(start[k], name)
         fields[name] = np.where(open_[..., None] if solved.ndim == 3 else open_, before, solved)
-    return replace(found.maps[k], **fields)
+    return replace(recovered.maps[k], **fields)
 
 
 def _explained(
     mesh: Mesh, captures: Captures, both: tuple[Sequence[Maps], Sequence[Maps]], targets: Sequence[View]
 ) -> tuple[tuple[float, float], list[View]]:
-    """The residuals of two solutions, and the views without their light by the second one."""
+    """The residuals of two solutions, and the unlit views by the second one."""
     from mistyle.render.deferred.material_table import pack
     from mistyle.render.deferred.renderer import MaterialRenderer, RenderOptions
     from mistyle.render.mitsuba.draw import tracer
@@ -187,25 +189,25 @@ def _explained(
     traced, sizes = tracer(mesh), [m.roughness.shape for m in both[0]]
     options = RenderOptions(subsamples=SUBSAMPLES, gradients=False)
     renderer = MaterialRenderer(traced, captures, sizes, options)
-    lost = np.zeros((2, 2))
+    squares = np.zeros((2, 2))
     plain = [rgb for rgb, _ in unlit(traced, both[1], captures.cameras)]
     result = []
     for j, maps in enumerate(both):
         table = renderer.upload(pack(maps))
         for k, view in enumerate(targets):
             mask, lit = captures.load(k)[1], renderer.image(table, k)
-            lost[j] += [float(((view.rgb - lit)[mask] ** 2).sum()), float((view.rgb[mask] ** 2).sum())]
+            squares[j] += [float(((view.rgb - lit)[mask] ** 2).sum()), float((view.rgb[mask] ** 2).sum())]
             if j == 1:
                 result.append(replace(view, rgb=without_light(view, lit, plain[k], mask)))
-    before, after = np.sqrt(lost[:, 0] / np.maximum(lost[:, 1], 1e-30))
+    before, after = np.sqrt(squares[:, 0] / np.maximum(squares[:, 1], 1e-30))
     return (float(before), float(after)), result
 
 
 def without_light(
     view: View, lit: Float[np.ndarray, "h w 3"], plain: Float[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """The view as it would be without light: `plain`, the solution without light, and what the solution under the light
-    (`lit`) leaves of the view in detail, brought to plain's brightness by BOUND at most."""
+    """An unlit view: `plain`, the solution without light, plus the view's fine residual to `lit`, the solution under
+    light, scaled to plain's brightness by BOUND at most."""
     bright = luminance(lit)
     gain = luminance(plain) / np.maximum(bright, LEAST * max(float(bright.max()), 1e-6))
     rest = np.where(mask[..., None], np.nan_to_num(view.rgb) - lit, 0).astype(np.float32)

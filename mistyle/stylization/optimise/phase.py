@@ -1,4 +1,4 @@
-"""One phase of the fit under way: crops, render, loss, gradient, step."""
+"""Optimisation loop of one fit phase: crops, render, loss, gradient, Adam step."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,19 +20,19 @@ if TYPE_CHECKING:
 
     from mistyle.measure.losses import Crop
 
-CLAY = 0.25  # albedo of the clay of phase 1: dark enough for highlights to count
-GRAZING = 0.2  # pixels whose surface is seen at a smaller cosine are left out
-LAST_RATE = 0.1  # share of the learning rate at the end of a phase; a cosine leads there
+CLAY = 0.25  # constant albedo of phase 1's clay render: dark enough for visible highlights
+GRAZING = 0.2  # pixels with a smaller cosine are left out
+LAST_RATE = 0.1  # share of the learning rate at the end of a phase's cosine schedule
 
 
 @dataclass(frozen=True)
 class CropBatch:
-    """One step's crops, rendered, beside their targets: n crops of s x s pixels (torch).
+    """One step's rendered crops and their targets: n crops of s x s pixels (torch).
 
-    render linear, target sRGB (n, 3, s, s); `plain` the same render with the normals and roughness of the unpainted
-    surface, where the phase asks for it; mask (n, 1, s, s) 0 or 1; world position and normal (n, 3, s, s); `light`
-    (n, 3) the direction to each crop's light, or to where the mean of its lights stands, None under ambient light;
-    `zoomed` crop pixels per pixel of the view.
+    `render` is linear, `target` sRGB, both (n, 3, s, s). `plain` is the render with the unpainted surface's normals and
+    roughness, if the phase needs it. `mask` is (n, 1, s, s), 0 or 1; world position and normal (n, 3, s, s). `light`
+    (n, 3) is the direction to each crop's light or to the mean of its lights, None under ambient light. `zoomed` is
+    crop pixels per pixel of the view.
     """
 
     render: Any
@@ -51,7 +51,7 @@ Loss = Callable[[CropBatch, Callable[[Any], list[Any]], np.random.Generator], "d
 
 @dataclass(frozen=True)
 class SceneContext:
-    """What stands still during the fit; `targets` are (4, h, w): sRGB and the mask of pixels that are wholly inside."""
+    """Constants of the fit; `targets` are (4, h, w): sRGB, and the mask of pixels wholly inside."""
 
     traced: Any
     tangents: Float[np.ndarray, "f 3 4"]
@@ -63,12 +63,12 @@ class SceneContext:
 
 @dataclass(frozen=True)
 class Phase:
-    """One of the two optimisations: under which lights, what moves how fast, and what is minimised."""
+    """Definition of an optimisation phase: lights, learning rates, total-variation weights, steps and loss."""
 
     name: str
     lights: Lights
-    one_by_one: bool  # each crop under one of the lights alone, in turn
-    clay: bool  # compared with a relief's shading under the crop's lights, so without shadows
+    one_by_one: bool  # each crop under one light, in turn
+    clay: bool  # render with constant albedo, for comparison with a relief's shading; so without shadows
     gloss: bool
     rates: Mapping[str, float]
     variation: Mapping[str, float]
@@ -77,7 +77,7 @@ class Phase:
 
 
 class PhaseRunner:
-    """A phase under way: its trace, and what the last steps say about where the albedo struggles."""
+    """State of a running phase: its losses, and the last steps' accumulated albedo gradients."""
 
     def __init__(
         self, scene: SceneContext, table: FitTable, phase: Phase, settings: FitSettings, rng: np.random.Generator
@@ -93,7 +93,7 @@ class PhaseRunner:
         table.forget()
 
     def step(self, iteration: int) -> str:
-        """One step of Adam; where something is not a number nothing moves, and the note says which texel."""
+        """One step of Adam; on a NaN or infinite value no texel moves, and the returned note names the texel."""
         crops = self._crops()
         texels, pure, looks, crop_of = self._gradients(crops)
         gradients, near = dict(pure), fit_table.pairs(self.table, texels)
@@ -101,9 +101,9 @@ class PhaseRunner:
             value, slope = fit_table.variation(self.table, name, near)
             self._note(f"tv_{name}", weight * value)
             gradients[name] = gradients[name] + np.float32(weight) * slope * fit_table.nonzero(gradients[name])[:, None]
-        bad = self._not_a_number(texels, gradients)
-        if bad:
-            name, row = bad
+        invalid = self._not_a_number(texels, gradients)
+        if invalid:
+            name, row = invalid
             return self._stopped(iteration, name, int(texels[row]), crops[crop_of(row)])
         if "albedo" in gradients and self.phase.iterations - iteration <= self.settings.struggle_window:
             self.struggle[texels] += np.abs(pure["albedo"]) @ np.full(3, 1 / 3, np.float32)
@@ -116,7 +116,7 @@ class PhaseRunner:
         return ""
 
     def _crops(self) -> "list[Crop]":
-        """Views in turn, in an order drawn anew after each round."""
+        """Crops of the views in turn, in a new random order each round."""
         from mistyle.measure.losses import sample_crops
 
         settings = self.settings
@@ -130,8 +130,8 @@ class PhaseRunner:
     def _gradients(
         self, crops: "Sequence[Crop]"
     ) -> tuple[Int[np.ndarray, " t"], dict[str, np.ndarray], Float[np.ndarray, " t"], Callable[[int], int]]:
-        """Touched texels; the gradient of the loss for each map that moves; how often each texel was looked at (sum of
-        bilinear weights of the pixels that count); and a function that says in which crop a texel was seen."""
+        """Touched texels; the loss's gradient for each optimised map; samples per texel (sum of the bilinear weights of
+        valid pixels); and a function from a texel to the crop that saw it."""
         import torch
 
         from mistyle.measure.losses import crop_picture
@@ -195,8 +195,10 @@ class PhaseRunner:
     def _not_a_number(
         self, texels: Int[np.ndarray, " t"], gradients: Mapping[str, np.ndarray]
     ) -> tuple[str, int] | None:
-        """The map and the row of the first texel that is, or would become, no number; Mitsuba gives such a texel itself
-        a gradient of zero, so the values are looked at too where the loss is no number."""
+        """The map and row of the first texel with a non-finite gradient or value, else None.
+
+        Mitsuba gives a non-finite texel a zero gradient, so a non-finite loss also checks the values.
+        """
         broken = not all(np.isfinite(values[-1]) for values in self.trace.values())
         looked_at = {name: self.table.values[name][texels] for name in self.table.values} if broken else {}
         for tables in (looked_at, gradients):
@@ -217,21 +219,21 @@ class PhaseRunner:
 
 
 def _mean_direction(beams: Sequence[Directional], camera: Camera) -> Float[np.ndarray, "3"]:
-    """Where one light would stand that shades a matt surface as all of these do, up to its strength."""
+    """Direction of the single light that shades a matt surface like all of these, up to intensity."""
     strength = luminance(np.array([beam.irradiance for beam in beams], np.float32))
     total = strength @ np.stack([direction_in_world(beam, camera) for beam in beams])
     return (total / np.linalg.norm(total)).astype(np.float32)
 
 
 def shader(settings: FitSettings, gloss: bool) -> Any:
-    """The film of one step's crops, one below the other."""
+    """The shader for one step's crops, stacked vertically."""
     from mistyle.render.deferred.torch_bridge import Shader
 
     return Shader((settings.crops * settings.crop_size, settings.crop_size), gloss=gloss, bridge=settings.bridge)
 
 
 def materials(leaves: "Mapping[str, torch.Tensor]", clay: bool = False) -> "torch.Tensor":
-    """Texel values side by side as the shader wants them: tilt becomes a unit normal, clay a constant albedo."""
+    """Texel values in the shader's column layout: tilt becomes a unit normal, clay a constant albedo."""
     import torch
 
     tilt = leaves["tilt"]

@@ -1,4 +1,4 @@
-"""What a user may choose about the fit."""
+"""Settings of the two-phase fit."""
 
 from pathlib import Path
 from typing import Literal
@@ -7,18 +7,18 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class FitSettings(BaseModel):
-    """The fit's choices; the paper's numbers where it gives some (4.2), else what measuring on real data suggested."""
+    """Settings of the fit: the paper's values (4.2) where given, else values measured on real data."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     refine: Literal["auto", "off", "normal-roughness", "albedo", "all"] = Field(
         default="auto",
-        description="which maps may change: those of phase 1, of phase 2, or of both; auto: `refine_painted` where the "
-        "embedded stylizer paints the surface, and all elsewhere",
+        description="which maps may change: those of phase 1, of phase 2, or of both; auto: `refine_painted` for the "
+        "embedded stylizer, else all",
     )
     refine_painted: Literal["off", "normal-roughness", "albedo", "all"] = Field(
         default="albedo",
-        description="maps of a painted surface that auto refines (its views are drawn from these maps); drafts: off",
+        description="maps of a painted surface that auto refines (its views are rendered from these maps); drafts: off",
     )
     painted: Literal["auto", "without-light", "with-light"] = Field(
         default="auto",
@@ -29,19 +29,19 @@ class FitSettings(BaseModel):
         ge=0,
         le=1,
         description="largest share of the shading under the views' own lights that is divided out of views painted "
-        "with light, before the texture and phase 2 see them; 0: none (the paper)",
+        "with light, before the bake and phase 2; 0: none (the paper)",
     )
     solve: bool = Field(
         default=True,
-        description="of views painted with light, solve for normal, roughness and albedo under the views' own light, "
+        description="for views painted with light, solve for normal, roughness and albedo under the views' own light, "
         "before phase 2; false: both phases by Adam alone (the paper)",
     )
     lights: Literal["together", "one-per-view"] = Field(
         default="one-per-view",
-        description="phase 1's lights, without light in the views: all at once (the paper's), or one a crop, in turn",
+        description="phase 1's lights for views without light: all at once (the paper), or one per crop, in turn",
     )
     metallic: Literal["keep", "zero", "fit"] = Field(
-        default="keep", description="the asset's own metallic map (0 without one), 0, or moved by phase 1"
+        default="keep", description="the asset's own metallic map (0 without one), 0, or fitted by phase 1"
     )
     features: Path | None = Field(
         default=None,
@@ -62,36 +62,34 @@ class FitSettings(BaseModel):
     texels_per_pixel: float = Field(
         default=1.25,
         gt=0,
-        description="the fit works on the finest mip level with at most so many texels along a pixel's side",
+        description="largest number of texels along a pixel's side; selects the fit's mip level",
     )
     style1: float = Field(default=1.0, ge=0, description="weight of the style loss in phase 1")
     statistics: float = Field(
-        default=0.001, ge=0, description="weight of the features' statistics beside it, without light"
+        default=0.001, ge=0, description="weight of the features' statistics in phase 1, for views without light"
     )
     statistic: Literal["gram", "mean-std", "swd"] = Field(
-        default="gram", description="which: Gram matrices, mean and deviation, or sliced Wasserstein distance"
+        default="gram", description="statistics: Gram matrices, mean and deviation, or sliced Wasserstein distance"
     )
     relief: float = Field(
-        default=0.15, ge=0, le=1, description="slope of the strokes' flanks (root mean square), without light"
+        default=0.15, ge=0, le=1, description="slope of the strokes' relief (root mean square), for views without light"
     )
-    smooth: float = Field(
-        default=1.0, gt=0, description="pixels of a view by which strokes are smoothed before they have flanks"
-    )
+    smooth: float = Field(default=1.0, gt=0, description="smoothing of strokes before their relief, pixels of a view")
     sheen: float = Field(
         default=0.05, ge=0, le=1, description="share of the strokes' own contrast that roughness may explain"
     )
-    radius: float = Field(default=12.0, gt=0, description="pixels of a view over which mean and contrast are taken")
+    radius: float = Field(default=12.0, gt=0, description="radius of local mean and contrast, pixels of a view")
     tv_normal: float = Field(default=0.02, ge=0, description="weight of the normal's total variation")
     tv_roughness: float = Field(default=0.01, ge=0, description="weight of the roughness's total variation")
     style2: float = Field(default=15.0, ge=0, description="weight of the style loss in phase 2 (the paper's)")
     statistics2: float = Field(default=0.0, ge=0, description="weight of the features' statistics in phase 2")
     tv_albedo: float = Field(
-        default=0.05, ge=0, description="largest weight of the albedo's total variation, for a flat style"
+        default=0.05, ge=0, description="largest weight of the albedo's total variation, reached for a flat style"
     )
     tv_from: Literal["views", "style"] = Field(
         default="views",
-        description="whose mean gradient lowers it: the stylized views', which are at the fit's own scale, or the "
-        "style picture's (the paper)",
+        description="source of the mean gradient that lowers `tv_albedo`: the stylized views, at the fit's scale, or "
+        "the style picture (the paper)",
     )
     colour2: float = Field(
         default=5.0, ge=0, description="weight of the sliced Wasserstein distance in phase 2 (the paper's)"
@@ -102,7 +100,10 @@ class FitSettings(BaseModel):
     rate_roughness: float = Field(default=0.03, gt=0, description="Adam's rate for the roughness")
     rate_albedo: float = Field(default=0.005, gt=0, description="Adam's rate for the albedo")
     reduced: float = Field(
-        default=0.05, ge=0, le=1, description="share of their rates that normal and roughness keep in phase 2"
+        default=0.05,
+        ge=0,
+        le=1,
+        description="learning rate of normal and roughness in phase 2, as a share of phase 1's",
     )
     judge: bool = Field(
         default=True, description="undo a phase that makes detail, style or view-to-view agreement worse"

@@ -1,8 +1,8 @@
-"""The fit's texels: every texture set in one table, at the resolution that the views can tell apart, moved by Adam.
+"""Texel table of the fit: all texture sets at the views' resolution, optimised by Adam.
 
-An atlas is usually finer than the views: neighbouring texels then fall into one pixel, and fitted one by one they
-turn to noise. The fit therefore moves the maps of a coarser mip level, about one texel per pixel, and what it changed
-is laid, interpolated, upon the maps as they came; their own finer detail stays.
+An atlas is usually finer than the views: several texels fall into one pixel, and fitting them one by one gives noise.
+The fit therefore optimises a coarser mip level, about one texel per pixel. Its change is interpolated and added to the
+input maps, whose finer detail stays.
 """
 
 from collections.abc import Sequence
@@ -18,24 +18,23 @@ from mistyle.process import memory
 
 MAPS = ("albedo", "normal", "roughness", "metallic")
 CHANNELS = {"tilt": 2, "roughness": 1, "albedo": 3, "metallic": 1}
-TILT_LIMIT = 0.95  # a normal more than 72 degrees off faces away from most views, where its gradient is zero
+TILT_LIMIT = 0.95  # a normal tilted by more than 72 degrees faces away from most views, where its gradient is zero
 ROUGHNESS_FLOOR = 0.05  # below 0.0316 Mitsuba's roughness has no gradient
 BETA1, BETA2, EPSILON = 0.9, 0.99, 1e-8  # with 0.999 texels that few views see keep stale second moments
-# Share of a map's mean gradient that damps Adam's steps: plain Adam moves a texel with a tenth of the others' gradient
-# as fast as them, and the blank parts of a picture, where the gradient is noise, drift.
+# Share of a map's RMS gradient that damps Adam's steps. Plain Adam moves texels with a tenth of the gradient as fast as
+# others, so blank parts of a picture, where the gradient is noise, drift.
 DAMPING = 0.3
-SMOOTH = 0.7  # texels of the table; a change finer than that is the noise of single steps
-FILL = 6  # texels of the table by which a change is continued beyond the last texel that was seen
+SMOOTH = 0.7  # texels of the table; finer changes are noise of single steps
+FILL = 6  # texels of the table by which a change extends beyond the seen texels
 
 
 @dataclass
 class FitTable:
-    """All texels (t) of all texture sets at the fit's resolution, row by row, set after set; changes as the fit goes.
+    """All texels (t) of all texture sets at the fit's resolution, row by row, set after set; mutable.
 
-    tilt is the tangent-space normal's x and y. `start` keeps the values before the fit, `plain` those of an unpainted
-    surface. `right` and `below` say
-    whether a texel's neighbour in the same set belongs to the same UV island. `steps` counts Adam's steps per texel.
-    `place` is -1 everywhere, scratch of `pairs`.
+    tilt is the tangent-space normal's x and y. `start` holds the values before the fit, `plain` those of an unpainted
+    surface. `right` and `below`: whether a texel's neighbour in the same set belongs to the same UV island. `still`
+    texels do not move. `steps` counts Adam's steps per texel. `place` is -1 everywhere, scratch of `pairs`.
     """
 
     sizes: tuple[tuple[int, int], ...]
@@ -58,7 +57,7 @@ class FitTable:
         return rows_of(self.sizes)
 
     def forget(self) -> None:
-        """Drop Adam's moments: the next phase minimises something else."""
+        """Reset Adam's moments: the next phase has another objective."""
         self.first, self.second, self.steps, self.squares = {}, {}, {}, {}
 
 
@@ -70,7 +69,7 @@ def build(
 ) -> FitTable:
     """A table of `maps` shrunk by the factor `shrink`: means over covered texels; uncovered ones take the nearest.
 
-    With `only`, cells without a texel of these masks stand still.
+    With `only`, cells without a texel of these masks do not move.
     """
     sizes, rows = [], []
     right, below, columns, still = [], [], [], []
@@ -114,7 +113,7 @@ def project(name: str, values: Float[np.ndarray, "*t c"]) -> Float[np.ndarray, "
 def step(
     table: FitTable, name: str, texels: Int[np.ndarray, " n"], gradient: Float[np.ndarray, "n c"], rate: float
 ) -> None:
-    """One step of Adam for the given texels; those whose gradient is zero neither move nor forget (`mask_updates`).
+    """One step of Adam for `texels`; those of zero gradient keep their values and moments (`mask_updates`).
 
     The step is rate · m / (sqrt(v) + DAMPING · root mean square of all gradients of this map so far).
     """
@@ -125,7 +124,7 @@ def step(
         table.first[name], table.second[name] = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         table.steps[name] = np.zeros(shape[0], np.int32)
     moving = np.flatnonzero(nonzero(gradient) & ~table.still[texels])
-    # By torch, because it does such sums in place and on all cores.
+    # torch computes these sums in place and on all cores.
     slope = torch.from_numpy(np.ascontiguousarray(gradient)).index_select(0, torch.from_numpy(moving))
     rows, count = texels[moving], slope.numel()
     before = table.squares.get(name, (0.0, 0))
@@ -146,7 +145,7 @@ def step(
 
 
 def _unbiased(beta: float, age: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 1"]:
-    """1 / (1 - beta^age): what makes a running mean of `age` numbers, begun at zero, a mean."""
+    """1 / (1 - beta^age): bias correction of a moving average of `age` values that starts at zero."""
     powers = beta ** np.arange(int(age.max(initial=1)) + 1)
     powers[0] = 0
     return (1 / (1 - powers)).astype(np.float32)[age][:, None]
@@ -162,8 +161,11 @@ def nonzero(gradient: Float[np.ndarray, "n c"]) -> Bool[np.ndarray, " n"]:
 
 @dataclass(frozen=True)
 class Pairs:
-    """Neighbours among n texels of a step. Per direction (right, below): where each texel's next and previous one
-    stands among them, its own place where there is none in the same island; and how many pairs there are."""
+    """Neighbours among n texels of a step, per direction (right, below).
+
+    `next` and `previous` index each texel's neighbours among the n texels, or the texel itself if it has none in the
+    same island; `count` is the number of pairs.
+    """
 
     texels: Int[np.ndarray, " n"]
     next: tuple[Int[np.ndarray, " n"], ...]
@@ -172,20 +174,20 @@ class Pairs:
 
 
 def pairs(table: FitTable, texels: Int[np.ndarray, " n"]) -> Pairs:
-    """Which of the given texels (sorted) are neighbours in the same island."""
+    """The pairs of `texels` (sorted) that are neighbours in the same island."""
     own = np.arange(len(texels))
     table.place[texels] = own
     following, preceding, count = [], [], []
     for joined, stride in ((table.right, None), (table.below, table.columns)):
-        here = np.flatnonzero(joined[texels])
-        at = texels[here]
-        there = table.place[at + (1 if stride is None else stride[at])]
-        here, there = here[there >= 0], there[there >= 0]
+        first = np.flatnonzero(joined[texels])
+        at = texels[first]
+        second = table.place[at + (1 if stride is None else stride[at])]
+        first, second = first[second >= 0], second[second >= 0]
         ahead, behind = own.copy(), own.copy()
-        ahead[here], behind[there] = there, here
+        ahead[first], behind[second] = second, first
         following.append(ahead)
         preceding.append(behind)
-        count.append(len(here))
+        count.append(len(first))
     table.place[texels] = -1
     return Pairs(texels, tuple(following), tuple(preceding), tuple(count))
 
@@ -193,9 +195,9 @@ def pairs(table: FitTable, texels: Int[np.ndarray, " n"]) -> Pairs:
 def variation(table: FitTable, name: str, near: Pairs) -> tuple[float, Float[np.ndarray, "n c"]]:
     """Total variation among the texels of `near` and its gradient: means of |difference| to the right and below.
 
-    Of the albedo as it is (the paper's L_TV(A)); of the other maps what the fit changed, or an asset's own normal map
-    would be flattened. Only neighbours in the same island count. Written out instead of differentiated by torch, whose
-    gradient of an indexed read adds up in any order.
+    For the albedo its values (the paper's L_TV(A)); for other maps the fit's change, or an asset's own normal map would
+    be flattened. Only neighbours in the same island count. Written out, since torch's gradient of an indexed read sums
+    in any order.
     """
     import torch
 
@@ -218,7 +220,7 @@ def variation(table: FitTable, name: str, near: Pairs) -> tuple[float, Float[np.
 def finished(
     table: FitTable, maps: Sequence[Maps], only: Sequence[Bool[np.ndarray, "h w"]] | None = None
 ) -> list[Maps]:
-    """The maps as they came with what the fit changed laid upon them, at their own resolution (inside `only`)."""
+    """The input maps plus the fit's change, at their own resolution (inside `only`)."""
     result = []
     for k, material in enumerate(maps):
         fields = {}
@@ -237,35 +239,35 @@ def _laid(
     change: Float[np.ndarray, "H W c"],
     mask: Bool[np.ndarray, "h w"] | None,
 ) -> Float[np.ndarray, "h w *c"]:
-    """A map with a change, enlarged to it, laid upon it (inside the mask)."""
+    """A map plus an upsampled change (inside the mask)."""
     result, shape = memory.empty(values.shape), (values.shape[0], values.shape[1])
     for rows in bands(*shape):
         before = values[rows]
         after = _apply(before, name, resized_rows(change, shape, rows, "repeat"))
         result[rows] = after
         if mask is not None:
-            kept = ~mask[rows]
-            result[rows][kept] = before[kept]
+            outside = ~mask[rows]
+            result[rows][outside] = before[outside]
     return result
 
 
 def spread(table: FitTable, maps: Sequence[Maps], values: Float[np.ndarray, " t"]) -> list[Float[np.ndarray, "h w"]]:
-    """A figure per texel of the table at the maps' resolution (each texel takes that of the cell it lies in)."""
+    """Values per texel of the table at the maps' resolution (each texel takes its cell's value)."""
     result = []
     for k, (material, part) in enumerate(zip(maps, table.parts, strict=True)):
         rows, columns = material.roughness.shape
         cells = values[part].reshape(table.sizes[k]).astype(np.float32)
-        by, made = rows // table.sizes[k][0], memory.empty((rows, columns))
-        made.reshape(rows // by, by, columns // by, by)[...] = cells[:, None, :, None]
-        result.append(made)
+        by, enlarged = rows // table.sizes[k][0], memory.empty((rows, columns))
+        enlarged.reshape(rows // by, by, columns // by, by)[...] = cells[:, None, :, None]
+        result.append(enlarged)
     return result
 
 
 def _change(table: FitTable, k: int, name: str) -> Float[np.ndarray, "H W c"] | None:
-    """What the fit changed, at the table's resolution; None where nothing."""
+    """The fit's change of a map, at the table's resolution; None if unchanged."""
     part, size = table.parts[k], table.sizes[k]
     change = (table.values[name][part] - table.start[name][part]).reshape(*size, -1)
-    change = np.where(np.isfinite(change), change, 0)  # a texel that came as no number goes as it came
+    change = np.where(np.isfinite(change), change, 0)  # a texel that is non-finite in the input stays unchanged
     moved = change.any(axis=-1)
     if not moved.any():
         return None
@@ -299,8 +301,8 @@ def _shrink(material: Maps, name: str, covered: Bool[np.ndarray, "h w"], by: int
     mean = np.empty((*weight.shape, channels), np.float32)
     for rows in bands(height // by, width * by):  # of cells
         texels = slice(rows.start * by, rows.stop * by)
-        here = _tilt(values[texels]) if name == "tilt" else values[texels]
-        cells = (here * counted[texels][..., None]).reshape(-1, by, width // by, by, channels)
+        block = _tilt(values[texels]) if name == "tilt" else values[texels]
+        cells = (block * counted[texels][..., None]).reshape(-1, by, width // by, by, channels)
         mean[rows] = cells.sum(axis=(1, 3), dtype=np.float32) / np.maximum(weight[rows], 1)[..., None]
     index, _ = nearest(weight > 0)
     return np.ascontiguousarray(mean.reshape(-1, channels)[index.ravel()].reshape(*weight.shape, channels))

@@ -1,26 +1,24 @@
-"""Fitting normal, roughness and albedo to the stylized views (paper 4.2), by Adam through Mitsuba's gradients.
+"""Two-phase fit of normal, roughness and albedo to stylized views (paper 4.2), by Adam through Mitsuba's gradients.
 
 Phase 1 moves normal and roughness under the directional lights of `scenes/phase1_directional.xml`, in grey. Phase 2
 moves the albedo under the ambient light of `scenes/phase2_ambient.xml`, normal and roughness at a reduced rate. The
 target of both is the stylized view of the same camera, compared on random jittered crops.
 
-What phase 1 aims at depends on how the stylizer painted (`painted`):
+Phase 1's objective depends on the stylizer (`painted`):
 
-- "with-light": the view shows a lit object. Render with the baked albedo and view are compared as they are, feature
-  by feature (the paper's style loss).
-- "without-light": the view is as flat as an albedo. Compared as they are, the normals would learn to cancel the
-  light. So both lose what light does and what it does not: the object is rendered as clay and divided by its own
-  render without the fit (the shape's shading is gone), the view loses its mean and its contrast (the course of the
-  strokes is left). The strokes are taken to stand proud of the surface, bright ones most, with flanks of slope
-  `relief`; what that adds to the shading under the crop's light is what the clay is compared with, in features at
-  their places and in their statistics. Each crop has one light of the rig alone, in turn: only lights from several
-  sides tell a slope from a bright spot. With the key light on the other side the relief's shading turns around.
+- "with-light": the view shows a lit object. The render with the baked albedo is compared with the view, feature by
+  feature (the paper's style loss).
+- "without-light": the view is as flat as an albedo. A direct comparison would make the normals cancel the light. So the
+  object is rendered as clay and divided by its own render before the fit, which removes the shape's shading. The view
+  is normalised by its local mean and contrast, which leaves the strokes. Strokes are assumed to be raised, bright ones
+  most, with a relief of slope `relief`. The clay is compared with this relief's shading under the crop's light, by
+  features and by their statistics. Each crop uses one light of the rig, in turn: only lights from several sides
+  separate a slope from a bright spot. A key light from the opposite side inverts the relief's shading.
 
-Phase 2 likewise: a view painted without light shows the paint's own colour, so the reflection at the paint's surface
-is left out of the render. Were it in, an albedo below about 0.05 could not make up for it and dark strokes would end
-black.
+Phase 2 likewise: a view painted without light shows the paint's own colour, so its render has no specular reflection.
+With it, an albedo below about 0.05 could not compensate, and dark strokes would become black.
 
-Both phases are judged afterwards (`optimise/judge.py`), and undone where they made the pictures worse.
+Both phases are evaluated afterwards (`optimise/judge.py`), and undone where they made the renders worse.
 """
 
 from collections.abc import Callable, Sequence
@@ -43,23 +41,23 @@ from mistyle.stylization.optimise import table as fit_table
 from mistyle.stylization.optimise.phase import CropBatch, Loss, Phase, PhaseRunner, SceneContext
 from mistyle.stylization.optimise.settings import FitSettings
 
-DARK = 0.01  # radiance of the clay below which a ratio means nothing
+DARK = 0.01  # radiance of the clay below which a ratio is meaningless
 
 
 @dataclass(frozen=True)
 class Fit:
-    """What the fit made.
+    """Result of the fit.
 
     maps      the fitted maps, one per texture set
     struggle  sum over the last steps of phase 2 of |d loss / d albedo| (mean over rgb); zero where phase 2 did not run
-    touched   how often those steps looked at a texel: the sum of its bilinear weights over pixels and steps, at the
-              fit's resolution; struggle / touched is the gradient of one look
+    touched   samples of a texel in those steps: the sum of its bilinear weights over pixels and steps, at the fit's
+              resolution; struggle / touched is the mean gradient per sample
     trace     losses per step, by name ("phase1.style", …)
     kept      whether each phase that ran was kept
     figures   by "phase.figure": (before, after)
     notes     sentences for the report
-    agreed    |sum| of the same gradients with their signs (mean over rgb): as large as `struggle` where all steps pull
-              a texel one way, near 0 where they contradict one another
+    agreed    |sum| of the signed gradients (mean over rgb): equal to `struggle` where all steps have one sign, near 0
+              where they contradict one another
     """
 
     maps: tuple[Maps, ...]
@@ -76,8 +74,8 @@ class Fit:
 class FitStart:
     """The maps as baked, one per texture set.
 
-    begin  where the fit starts instead, empty for the baked maps: their detail finer than the views is kept, they are
-           returned where every phase is undone, and phase 1's clay is compared with clay of the baked maps all the same
+    begin  start of the fit; empty: the baked maps. Their detail finer than the views stays, and they are returned if
+           every phase is undone. Phase 1's clay is still compared with clay of the baked maps
     only   the texels that may change; all others keep their bytes
     """
 
@@ -88,11 +86,11 @@ class FitStart:
 
 @dataclass(frozen=True)
 class FitTargets:
-    """What renders shall look like.
+    """Targets of the fit.
 
     views   stylized (linear rgb)
     unlit   the same without light, for phase 2
-    style   the picture (sRGB) whose gradient lowers the albedo's total variation; None: that of the views
+    style   the picture (sRGB) whose gradient lowers the albedo's total-variation weight; None: that of the views
     lights  of phase 1; None: those of `scenes/phase1_directional.xml`
     """
 
@@ -111,10 +109,10 @@ def two_phase(
     seed: int,
     progress: Callable[[float], None] = lambda done: None,
 ) -> Fit:
-    """Fit maps (one per texture set) so that renders look like the targets.
+    """Fit maps (one per texture set) so that renders match the targets.
 
-    The same inputs, settings, seed and thread count give the same bytes. A gradient that is not a number ends its phase
-    at the last good state, and a note says where.
+    The same inputs, settings, seed and thread count give the same bytes. A non-finite gradient ends its phase at the
+    last good state, and a note names the texel.
     """
     maps, views = start.maps, targets.views
     first = tuple(start.begin or maps)
@@ -149,7 +147,7 @@ def two_phase(
 
 
 def _report(progress: Callable[[float], None], begin: float, length: float, done: float) -> None:
-    """Report progress within a part of the whole."""
+    """Report progress within an interval of the total."""
     progress(begin + length * done)
 
 
@@ -161,9 +159,9 @@ def _one_phase(
     evaluation: fit_judge.EvaluationSet | None,
     progress: Callable[[float], None],
 ) -> Fit:
-    """Run a phase and keep its result unless a figure got worse.
+    """Run a phase and keep its result unless a metric got worse.
 
-    At the steps of `fit_judge.checks` a phase that is far from keeping what it had is stopped: it would be undone.
+    At the steps of `judge.checks`, a phase far beyond the tolerances is stopped: it would be undone.
     """
     phase, table, notes = runner.phase, runner.table, list(fit.notes)
     saved = {name: table.values[name].copy() for name in phase.rates}
@@ -208,7 +206,7 @@ def _one_phase(
 
 
 def shrinkage(mesh: Mesh, texels: Sequence[Texels], views: Sequence[View], texels_per_pixel: float) -> int:
-    """The power of two by which the atlas is shrunk for the fit: as fine as the views can tell texels apart.
+    """The power of two by which the atlas is shrunk for the fit: the finest resolution that the views resolve.
 
     Compares texels per unit of surface (covered texels over area) with pixels per unit of surface that faces a camera.
     """
@@ -220,7 +218,7 @@ def shrinkage(mesh: Mesh, texels: Sequence[Texels], views: Sequence[View], texel
 
 
 def view_mask(view: View) -> Bool[np.ndarray, "h w"]:
-    """Pixels wholly on the mesh whose colour is a number."""
+    """Pixels wholly on the mesh with a finite colour."""
     return view.mask & (view.coverage > 0.999) & np.isfinite(view.rgb).all(axis=-1)
 
 
@@ -229,7 +227,7 @@ def _inside(view: View) -> Bool[np.ndarray, "h w"]:
 
 
 def _pictures(targets: Sequence[View]) -> tuple[Any, ...]:
-    """Targets as a SceneContext holds them."""
+    """Targets in a SceneContext's layout."""
     import torch
 
     pictures = []
@@ -297,7 +295,7 @@ def _albedo_variation(settings: FitSettings, targets: FitTargets) -> float:
 
 
 def _relief_loss(settings: FitSettings) -> Loss:
-    """Phase 1 for targets painted without light."""
+    """Phase 1's loss for targets painted without light."""
     from mistyle.measure import losses
 
     def loss(batch: CropBatch, features, rng):
@@ -322,7 +320,7 @@ def _relief_loss(settings: FitSettings) -> Loss:
 
 
 def _lit_loss(settings: FitSettings) -> Loss:
-    """Phase 1 for targets that show light: grey render and grey target as they are."""
+    """Phase 1's loss for targets that show light: grey render against grey target."""
     from mistyle.measure import losses
 
     def loss(batch: CropBatch, features, rng):
@@ -335,14 +333,14 @@ def _lit_loss(settings: FitSettings) -> Loss:
 
 
 def _colour_loss(settings: FitSettings) -> Loss:
-    """Phase 2: 15 style + 5 sliced Wasserstein in RGB (total variation is added by the table; statistics on demand)."""
+    """Phase 2's loss: 15 style + 5 sliced Wasserstein in RGB, statistics on demand (the table adds total variation)."""
     from mistyle.measure import losses
 
     def loss(batch: CropBatch, features, rng):
         colour = losses.srgb_from_linear(batch.render)
         chosen = batch.mask[:, 0] > 0
-        mine, theirs = colour.permute(0, 2, 3, 1)[chosen], batch.target.permute(0, 2, 3, 1)[chosen]
-        distance = losses.sliced_wasserstein(mine, theirs, rng, settings.projections, settings.colour_samples)
+        rendered, target = colour.permute(0, 2, 3, 1)[chosen], batch.target.permute(0, 2, 3, 1)[chosen]
+        distance = losses.sliced_wasserstein(rendered, target, rng, settings.projections, settings.colour_samples)
         maps, expected = losses.masked_features(features, colour, batch.target, batch.mask, batch.mask)
         result = {"style": settings.style2 * losses.style_aligned(maps, expected, batch.mask)}
         result["colour"] = settings.colour2 * distance

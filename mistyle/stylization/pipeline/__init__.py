@@ -1,1 +1,1 @@
-"""The stylization jobs, stage by stage."""
+"""Stylization jobs: their stages, plans and memory budgets."""

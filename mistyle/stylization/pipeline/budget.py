@@ -1,11 +1,12 @@
-"""How much memory `stylize`, `render` and `bake` need, stage by stage.
+"""Memory models of `stylize`, `render` and `bake`, stage by stage.
 
-The needs of PLAIN were solved from the peaks that `run.json` notes for every stage (`peaks_gb`) of five jobs:
-`draft_spot`, `views_64` and `atlas_4096` of `python -m benchmarks.memory --stages`, and the draft on spot with an atlas
-of 3072², four views and 20,000 samples, and of 2048². What only one texture set takes at a time (`one`) comes from a
-job with 20 sets of 512². Those of TILED come from stages run alone at 1024² and 2048², the report's from 2048² and
-4096²; they count all sets alike. The stage `finish` was read off one draft of spot (two crops of 256²), and its program
-counts the features of a painting of the largest size.
+The coefficients of PLAIN were fitted to the stages' peaks (`peaks_gb` in `run.json`) of five jobs: `draft_spot`,
+`views_64` and `atlas_4096` of `python -m benchmarks.memory --stages`, and two drafts of spot. One of these has an atlas
+of 3072², four views and 20,000 samples, the other an atlas of 2048². Memory for one texture set at a time (`one`) comes
+from a job with 20 sets of 512².
+
+TILED comes from single stages at 1024² and 2048², its report from 2048² and 4096²; it counts all sets alike. `finish`
+was measured on one draft of spot (two crops of 256²); its estimate includes the features of the largest painting.
 """
 
 from collections.abc import Sequence
@@ -29,7 +30,7 @@ PLAIN = {
     "report": Need(0.71, texel=39, one=124, viewed=60, view=114, drawn=72, frame=24),
 }
 PLAIN = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in PLAIN.items()}
-# With large arrays in files: what has to be in memory all the same.
+# With large arrays in files: the resident remainder.
 TILED = {
     "mesh": Need(0.39, face=5000),
     "texels": Need(0.42, texel=30),
@@ -45,8 +46,8 @@ TILED = {
     "report": Need(0.65, texel=5, view=4, drawn=78, frame=24),
 }
 TILED = {stage: need._replace(own=1 + (stage == "mesh")) for stage, need in TILED.items()}
-# Of `render` and `bake`, which have one texture set at a time or none: from runs with one material and with twenty,
-# with and without textures, at atlases of 512² to 2048² and views of 128² to 1024².
+# `render` and `bake` hold at most one texture set at a time. Fitted to runs with one and twenty materials, with and
+# without textures, at atlases of 512² to 2048² and views of 128² to 1024².
 RENDER = {
     "mesh": Need(0.38, face=5000, own=2),
     "views": Need(0.44, view=46.5, lane=25, own=3),
@@ -63,21 +64,21 @@ BAKE_TILED = {
     "mesh": Need(0.38, face=5000, own=2),
     "asset": Need(0.60, texel=60, view=10, own=1, packed=12),
 }
-# The settings whose half saves memory, of each verb.
+# Settings of each verb that save memory when halved.
 STYLED = ("atlas.size", "surface.samples", "fit.crop_size")
 DRAWN = ("rig.resolution", "draw.spp")
 BAKED = ("atlas.size",)
 
 
 def view_pixels(settings: Settings) -> int:
-    """Pixels of all views together; of a rig made for the mesh, which is not known yet, or of a file: of 16 at most."""
+    """Pixels of all views; an upper estimate of 16 views for rigs from a file or from next-best-view selection."""
     rig = settings.rig
     views = {"paper": 16, "turntable": rig.views, "nbv": min(16, rig.most_views)}.get(rig.kind, 16)
     return views * rig.resolution**2
 
 
 def counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> Counts:
-    """The counts of `stylize` for a mesh of so many faces, texture sets and bytes of own maps."""
+    """The counts of `stylize` for a mesh's faces, texture sets and bytes of its own maps."""
     crop = 0 if settings.refined == "off" else settings.fit.crops * settings.fit.crop_size**2
     return Counts(
         sets * settings.atlas.size**2,
@@ -94,7 +95,7 @@ def counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> C
 
 
 def rig_pixels(settings: Settings) -> list[int]:
-    """Pixels of each view of a rig, of which the file is read where it is one."""
+    """Pixels of each view of a rig; reads the camera file of a rig from a file."""
     if settings.rig.kind != "file" or settings.rig.file is None:
         side = settings.rig.resolution**2
         return [side] * (view_pixels(settings) // side)
@@ -104,7 +105,7 @@ def rig_pixels(settings: Settings) -> list[int]:
 
 
 def render_counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> Counts:
-    """The counts of `render`, which draws from the file's own maps however many sets they are."""
+    """The counts of `render`, which draws from the file's own maps; the number of sets does not matter."""
     from mistyle.render.mitsuba.scene import passes
 
     pictures = rig_pixels(settings)
@@ -113,8 +114,7 @@ def render_counts(settings: Settings, faces: int = 0, sets: int = 1, own: int = 
 
 
 def bake_counts(pictures: Sequence[int], settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> Counts:
-    """The counts of `bake` from pictures of so many pixels: it has one texture set at a time, and the PNG files of all
-    of them."""
+    """The counts of `bake` for `pictures` (pixels each): one texture set at a time, and the PNG files of all sets."""
     texels = settings.atlas.size**2
     return Counts(texels, sum(pictures), face=faces, own=own, packed=sets * texels)
 
@@ -125,5 +125,5 @@ def memory_gb(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -
 
 
 def tiles(settings: Settings, faces: int = 0, sets: int = 1, own: int = 0) -> bool:
-    """Whether the large arrays of `stylize` must lie in files for its budget. UsageError where that is not enough."""
+    """Whether `stylize` must move large arrays to files for its budget. UsageError where that is not enough."""
     return must_tile(settings, lambda s: counts(s, faces, sets, own), PLAIN, TILED, STYLED)

@@ -1,4 +1,4 @@
-"""The stage "finish" in a job: what it refuses, its record, and the painting before and after for the report."""
+"""The stage "finish" of a job: its checks, its record, and before/after pictures for the report."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,12 +18,12 @@ from mistyle.stylization.settings import Settings
 from mistyle.stylization.surface.layers import StyleLayers
 
 LEVELS = 3  # of VGG-19: relu1_1 to relu3_1
-WEIGHTS = "for example --vgg vgg19-normalised (see mistyle models), or --vgg vgg19.pth as torchvision has it"
+WEIGHTS = "for example --vgg vgg19-normalised (see mistyle models), or torchvision's --vgg vgg19.pth"
 
 
 @dataclass(frozen=True)
 class FinishRecord:
-    """How the painting was finished: its maps before and after, style loss before and after, and how far it moved."""
+    """Result of the finish: maps before and after, style loss (before, after), RMS change of the albedo (sRGB)."""
 
     before: tuple[Maps, ...]
     after: tuple[Maps, ...]
@@ -32,20 +32,20 @@ class FinishRecord:
 
 
 def weights_file(settings: Settings) -> Path | None:
-    """Where the finish has VGG-19 from: its own setting, or that of the fit (`--vgg`)."""
+    """The finish's VGG-19 weights: its own setting, else the fit's (`--vgg`)."""
     from mistyle.stylization.pipeline.generative import named
 
     return named(settings, settings.finish.features or settings.fit.features)
 
 
 def check_finish(settings: Settings) -> None:
-    """UsageError where the painting cannot be finished, InputRefused where the weights are no VGG-19."""
+    """UsageError where the painting cannot be finished, InputRefused where the weights are not VGG-19's."""
     if settings.finish.method == "off":
         return
     if settings.stylizer != "embedded":
         raise UsageError(
-            f"--finish vgg: --stylizer {settings.stylizer} paints views; expected the embedded stylizer, whose "
-            "painting knows which place of the picture lies where. Leave out --finish, or use --stylizer embedded"
+            f"--finish vgg: --stylizer {settings.stylizer} paints views; expected the embedded stylizer, which maps "
+            "surface points to places of the picture. Leave out --finish, or use --stylizer embedded"
         )
     if settings.paint.slots:
         raise UsageError(
@@ -53,7 +53,7 @@ def check_finish(settings: Settings) -> None:
             "SLOT=PICTURE or --finish"
         )
     if settings.surface.glaze > 0:
-        raise UsageError("--finish vgg would take the glaze off again; leave out surface.glaze or --finish")
+        raise UsageError("--finish vgg would remove the glaze; leave out surface.glaze or --finish")
     path = weights_file(settings)
     if path is None:
         raise UsageError(f"--finish vgg: found no weights of VGG-19; name them, {WEIGHTS}")
@@ -63,26 +63,26 @@ def check_finish(settings: Settings) -> None:
 
 
 def finish_stage(run: Run, asset: Asset, layers: StyleLayers, atlas: Atlas, baked: Baked) -> tuple[Baked, FinishRecord]:
-    """The stage "finish": the painted albedo moved by VGG-19's style losses; normal and roughness as they were."""
+    """The stage "finish": VGG-19 style losses move the painted albedo; normal and roughness stay."""
     s = run.job.settings
     protect = [s.paint.protect] if s.paint.protect is not None else []
-    # The weights by their bytes.
+    # The key covers the bytes of the weights.
     inputs = [s.finish, weights_file(s), s.fit.bridge, protect, s.seed]
-    made = run.record("finish", ["bake"], inputs, lambda r: finished(asset, layers, atlas, baked, s, r))
-    moved = f"the albedo moved by {made.moved:.3f} (sRGB, root mean square)"
-    kept = made.style[1] < made.style[0]
+    outcome = run.record("finish", ["bake"], inputs, lambda r: finished(asset, layers, atlas, baked, s, r))
+    moved = f"the albedo moved by {outcome.moved:.3f} (sRGB, root mean square)"
+    improved = outcome.style[1] < outcome.style[0]
     run.progress.note(
-        f"finish: the style loss on crops that no step used went from {made.style[0]:.4f} to {made.style[1]:.4f}; "
-        f"{moved if kept else 'the painting stays as it was'}."
+        f"finish: the style loss on held-out crops went from {outcome.style[0]:.4f} to {outcome.style[1]:.4f}; "
+        f"{moved if improved else 'the painting stays unchanged'}."
     )
-    after = laid(baked, made)
-    return after, FinishRecord(baked.maps, after.maps, made.style, made.moved)
+    after = laid(baked, outcome)
+    return after, FinishRecord(baked.maps, after.maps, outcome.style, outcome.moved)
 
 
 def finished(
     asset: Asset, layers: StyleLayers, atlas: Atlas, baked: Baked, settings: Settings, report: Report
 ) -> StyleFinish:
-    """The painted maps, finished; protected texels stay."""
+    """Run the finish on the painted maps; protected texels stay."""
     from mistyle.measure.features import load_features
     from mistyle.stylization.optimise.finish import PaintedAsset, finish
     from mistyle.stylization.surface.layers import painted_mask
@@ -94,16 +94,16 @@ def finished(
     return finish(painted, features, settings.finish, settings.seed, report, bridge=settings.fit.bridge)
 
 
-def laid(baked: Baked, made: StyleFinish) -> Baked:
-    """The painting with its finished albedo; what begins the fit has the same one."""
-    pairs = zip(baked.begin, made.albedo, strict=True) if baked.begin else ()
+def laid(baked: Baked, outcome: StyleFinish) -> Baked:
+    """The baked maps, and the fit's start maps, with the finished albedo."""
+    pairs = zip(baked.begin, outcome.albedo, strict=True) if baked.begin else ()
     begin = tuple(replace(maps, albedo=albedo) for maps, albedo in pairs)
-    maps = tuple(replace(m, albedo=albedo) for m, albedo in zip(baked.maps, made.albedo, strict=True))
+    maps = tuple(replace(m, albedo=albedo) for m, albedo in zip(baked.maps, outcome.albedo, strict=True))
     return replace(baked, maps=maps, begin=begin)
 
 
 def finish_pair(asset: Asset, finishing: FinishRecord, camera: Camera) -> BeforeAfter:
-    """The painting before and after, without light, for the report."""
+    """Unlit renders of the painting before and after, for the report."""
     from mistyle.jobs.report.draw import shown
     from mistyle.render.mitsuba.unlit import unlit
 

@@ -1,7 +1,7 @@
-"""The asset as soon as it is painted and baked: written and announced before fit and repair, which then replace it.
+"""First asset: the painted and baked maps, written before fit and repair, which then replace it.
 
-It stands where the finished asset will stand, whole, and says what it is: in `asset/done.json` ("first"), in its list
-of files and in the GLB (provenance), and in `run.json` ("finished": false).
+It is complete, and has the finished asset's path. It is marked as first in `asset/done.json` ("first"), its file list,
+the GLB's provenance, and `run.json` ("finished": false).
 """
 
 import time
@@ -23,7 +23,7 @@ STATE = "painted and baked; not fitted, not repaired"
 
 
 def write_first(run: Any, asset: Asset, atlas: Atlas, baked: Baked) -> None:
-    """Write and announce the first asset, unless the run folder has an asset of this painting already."""
+    """Write and announce the first asset, unless the run folder already has an asset of this painting."""
     job, painted = run.job, run.keys["bake"]
     key = digest([painted, "first", job.name])
     if painted == _painted(job.out / "asset"):
@@ -32,8 +32,8 @@ def write_first(run: Any, asset: Asset, atlas: Atlas, baked: Baked) -> None:
 
     def write(folder: Path, report: Report) -> None:
         sets = zip(atlas.texels, maps, strict=True)
-        given = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed, "state": STATE}
-        asset_files.write(folder, job, asset, sets, given, report, UNEDITED)
+        provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed, "state": STATE}
+        asset_files.write(folder, job, asset, sets, provenance, report, UNEDITED)
 
     run.early("asset", key, "write the first asset", write, {"painted": painted, "first": True})
     place = job.out / "asset" / f"{job.name}.glb"
@@ -52,7 +52,7 @@ def write_first(run: Any, asset: Asset, atlas: Atlas, baked: Baked) -> None:
 
 
 def _painted(folder: Path) -> str | None:
-    """The painting that a folder's asset, first or finished, was made of."""
+    """Key of the painting from which a folder's asset, first or finished, was written."""
     try:
         return str(read_own(folder / DONE)["painted"])
     except (OSError, ValueError, KeyError, TypeError):

@@ -1,4 +1,4 @@
-"""Where a job meets the generative backends: refusals before any rendering, the stylizer of views, the inpainter."""
+"""A job's generative backends: checks before rendering, the view stylizer, the texture inpainter."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,12 +17,12 @@ from mistyle.stylization.mvst.sweep import Stylizer
 from mistyle.stylization.optimise.settings import FitSettings
 from mistyle.stylization.settings import Settings
 
-LORAS = "loras"  # in work/: trained LoRAs outlive the stages that asked for them
-SPOKEN = 20.0  # seconds between two lines about a training
+LORAS = "loras"  # in work/: trained LoRAs outlive the stages that trained them
+SPOKEN = 20.0  # seconds between progress lines of a training
 
 
 def named(settings: Settings, path: Path | None) -> Path | None:
-    """A file that a setting names: the user's own, or that of a model of `mistyle models` by the model's name."""
+    """The file of a setting: the user's own path, or the file of the model with that name (`mistyle models`)."""
     from mistyle.stylization.models.folder import MODELS, file
 
     if path is None or path.exists() or str(path) not in MODELS:
@@ -31,7 +31,7 @@ def named(settings: Settings, path: Path | None) -> Path | None:
 
 
 def fit_settings(settings: Settings) -> FitSettings:
-    """The fit's settings with what the rest of the job decides: where the features lie, how the views are painted, and
+    """The fit's settings with values from the rest of the job: path of the features, whether views show light, and
     which maps may change."""
     chosen, painted = settings.fit, settings.fit.painted
     if painted == "auto":
@@ -48,12 +48,12 @@ def lights_of_views(settings: Settings) -> Lights | None:
     file = settings.draw.scene
     if file is not None and file.resolve().parent != scenes().resolve():
         return None
-    found = lights("paper_views" if file is None else file.stem)
-    return None if any(isinstance(light, SceneLights) for light in found) else found
+    view_lights = lights("paper_views" if file is None else file.stem)
+    return None if any(isinstance(light, SceneLights) for light in view_lights) else view_lights
 
 
 def check(settings: Settings, say: Callable[[str], None]) -> None:
-    """Refuse what the generative backends of a job lack, in one sentence, before anything is rendered; say what they
+    """EnvironmentMissing or UsageError for missing models or unsupported settings, before rendering; reports the
     cost."""
     try:
         _check(settings, say)
@@ -85,7 +85,7 @@ def _check(settings: Settings, say: Callable[[str], None]) -> None:
 
 
 def diffusion_job(settings: Settings, style: Picture, name: str, out: Path) -> Any:
-    """The stylizer's own job: the style picture without its transparent parts' colours."""
+    """The stylizer's own job; transparent parts of the style picture are white."""
     from mistyle.stylization.diffusion.stylizer import DiffusionJob
 
     loras = settings.models.loras or out / "work" / LORAS
@@ -93,7 +93,7 @@ def diffusion_job(settings: Settings, style: Picture, name: str, out: Path) -> A
 
 
 def opaque(style: Picture) -> np.ndarray:
-    """The style picture on white where it is transparent: the networks know no alpha."""
+    """The style picture composited over white: the networks have no alpha input."""
     if style.alpha is None:
         return style.rgb
     alpha = style.alpha[..., None]
@@ -101,7 +101,7 @@ def opaque(style: Picture) -> np.ndarray:
 
 
 def sweep_key(run: Run, style: Picture, views: Sequence[View]) -> str:
-    """What the views painted by diffusion hang on."""
+    """Cache key of the views painted by diffusion."""
     from mistyle.stylization.diffusion.stylizer import key
 
     job = diffusion_job(run.job.settings, style, run.job.style.stem, run.job.out)
@@ -109,7 +109,7 @@ def sweep_key(run: Run, style: Picture, views: Sequence[View]) -> str:
 
 
 def view_stylizer(run: Run, style: Picture, views: Sequence[View], report: Report) -> Stylizer:
-    """The diffusion stylizer, its LoRAs trained; `report` hears the training's share."""
+    """Train the missing LoRAs and return the diffusion stylizer; `report` receives the training's progress."""
     from mistyle.stylization.diffusion.stylizer import stylizer
 
     job = diffusion_job(run.job.settings, style, run.job.style.stem, run.job.out)
@@ -117,7 +117,7 @@ def view_stylizer(run: Run, style: Picture, views: Sequence[View], report: Repor
 
 
 def watcher(say: Callable[[str], None], report: Report) -> Callable[[int, int, float], None]:
-    """Tells of a training: its share, and now and then a line with the mean loss over its weight."""
+    """A callback that reports a training's progress, and every SPOKEN seconds its mean loss over weight."""
     import time
 
     losses: list[float] = []
@@ -139,7 +139,7 @@ def watcher(say: Callable[[str], None], report: Report) -> Callable[[int, int, f
 
 
 def inpainter_inputs(settings: Settings, style: Picture) -> list[Any]:
-    """What repaired maps hang on besides the fill's own settings; nothing for the weight-free inpainter."""
+    """Cache inputs of repaired maps besides the repair settings; empty for the weight-free inpainter."""
     if settings.inpainter == "fill":
         return []
     from mistyle.stylization.inpaint.paint3d import identity
@@ -149,7 +149,7 @@ def inpainter_inputs(settings: Settings, style: Picture) -> list[Any]:
 
 
 def release(settings: Settings) -> None:
-    """Free the device of networks whose stage is over: the next one asks how much is free."""
+    """Free the device memory of a finished stage, so that the next stage can measure it."""
     from mistyle.stylization.models.check import empty
     from mistyle.stylization.models.load import device_of
 
@@ -157,7 +157,7 @@ def release(settings: Settings) -> None:
 
 
 def texture_inpainter(settings: Settings, asset: Asset, style: Picture) -> Inpainter:
-    """Paint3D's inpainter, loaded."""
+    """Load Paint3D's inpainter."""
     from mistyle.stylization.inpaint.paint3d import inpainter
 
     return inpainter(asset.mesh, opaque(style), settings.models, settings.paint3d)

@@ -1,4 +1,4 @@
-"""A job of `stylize`: what it is given, and its stages by name."""
+"""The job record of `stylize`, and its stages with their descriptions."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +18,7 @@ STAGES = {
     "asset": "write the asset",
     "report": "write the report",
 }
-# Those that a job leaves out where nothing after the bake changes the maps.
+# Skipped when nothing after the bake changes the maps.
 REFINING = ("fit", "masks", "repair")
 # Before fit and repair, in the place of "asset".
 FIRST = {"first asset": "write the first asset"}
@@ -33,7 +33,7 @@ PREVIEW_STAGES = {name: STAGES[name] for name in ("mesh", "texels", "surface")} 
 
 @dataclass(frozen=True)
 class Job:
-    """What to do and where: one mesh, one style picture, one run folder."""
+    """One mesh, one style picture, settings and one run folder."""
 
     mesh: Path
     style: Path

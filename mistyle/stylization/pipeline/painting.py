@@ -1,4 +1,4 @@
-"""The embedded stylizer in a job: the surface painted once, laid into the texture, and drawn from every camera."""
+"""Stages of the embedded stylizer: paint the surface once, bake it into the texture, render it from every camera."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -25,22 +25,22 @@ from mistyle.stylization.surface.lookup import PaintedSurface
 from mistyle.stylization.surface.settings import PaintSettings
 
 
-def paint_pictures(chosen: PaintSettings) -> list[Path]:
-    """The pictures that the paint settings name and that must be there."""
-    return [path for path in (chosen.style_mask, chosen.protect, chosen.direction_map) if path is not None]
+def paint_pictures(settings: PaintSettings) -> list[Path]:
+    """The required pictures of the paint settings."""
+    return [path for path in (settings.style_mask, settings.protect, settings.direction_map) if path is not None]
 
 
-def check_paint(chosen: PaintSettings) -> None:
-    """Refuse pictures that are not there, before anything is rendered."""
-    for path in paint_pictures(chosen):
+def check_paint(settings: PaintSettings) -> None:
+    """InputRefused for missing pictures, before anything is rendered."""
+    for path in paint_pictures(settings):
         if not path.is_file():
             raise InputRefused(f"{path}: found nothing; expected a picture. Check the path")
 
 
-def paint_files(chosen: PaintSettings) -> list[Path]:
-    """The files that the paint settings name: their contents count, not their names."""
-    named = paint_pictures(chosen)
-    for slot in chosen.slots:
+def paint_files(settings: PaintSettings) -> list[Path]:
+    """The files in the paint settings; cache keys use their contents, not their names."""
+    named = paint_pictures(settings)
+    for slot in settings.slots:
         name, _, picture = slot.rpartition("=")
         named += [Path(name), Path(picture)]
     return [path for path in named if path.is_file()]
@@ -54,8 +54,7 @@ def paint(
     content: Content | None = None,
     direction: DirectionConstraint | None = None,
 ) -> PaintedSurface:
-    """The surface painted once with one picture; `content` is the lightness of a texture that it has already,
-    `direction` where strokes shall run."""
+    """Paint the surface with one picture; `content`: lightness of its own texture; `direction`: that of strokes."""
     from mistyle.stylization.surface.surface_painter import solve_surface
 
     return solve_surface(
@@ -64,7 +63,7 @@ def paint(
 
 
 def paint_layers(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> StyleLayers:
-    """The embedded stylizer: the whole surface painted once with every picture that has a place on it."""
+    """Paint the whole surface once with every picture of the style and slots."""
     from mistyle.deliver.colour import read_style
     from mistyle.stylization.surface.layers import content, masked_style, painted_direction, scaled, slot_masks
 
@@ -89,7 +88,7 @@ def paint_layers(asset: Asset, style: Picture, atlas: Atlas, settings: Settings,
 
 
 def texel_side(asset: Asset, part: int, texels: Texels) -> float:
-    """The mean side of a texel on the surface, working units: what the painting is averaged over."""
+    """Mean side of a texel on the surface, working units; the painting is averaged over it."""
     area = face_areas(asset.mesh)[asset.mesh.part == part].sum()
     return float(np.sqrt(area / max(int(texels.covered.sum()), 1)))
 
@@ -97,7 +96,7 @@ def texel_side(asset: Asset, part: int, texels: Texels) -> float:
 def bake(
     asset: Asset, layers: StyleLayers, atlas: Atlas, views: Sequence[View], settings: Settings, report: Report
 ) -> Baked:
-    """Section 4.1.4 for a painted surface: texels look the painting up directly; the views say who sees what."""
+    """Section 4.1.4 for a painted surface: texels sample the painting directly; views give visibility only."""
     from mistyle.atlas.bake import accepted
 
     maps, seen = painted(asset, layers, atlas, settings), []
@@ -110,15 +109,15 @@ def bake(
     return Baked(tuple(maps), tuple(seen), tuple(with_relief))
 
 
-PAINTERS = ("off", "albedo")  # what may be refined where normal and roughness stay the painter's
+PAINTERS = ("off", "albedo")  # values of `refined` that keep the painter's normal and roughness
 HEIGHT, GLOSS = 0.15, 1.0  # slope of the painting's relief in the normal map, and share of its gloss in the roughness
-LOOKED_UP = 2**20  # texels whose colour is looked up at one time
+LOOKED_UP = 2**20  # texels per look-up batch
 
 
 def painted(asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, settings: Settings) -> list[Maps]:
-    """The start maps with the painting's colours in place of the albedo, looked up for every covered texel.
+    """The start maps with the painting's colours as albedo, looked up for every covered texel.
 
-    A single solution paints everything.
+    A single solution covers all texture sets.
     """
     from mistyle.atlas.texels import pad_in_place, sharpen_in_place
     from mistyle.stylization.surface.layers import painted_mask, protected
@@ -129,9 +128,9 @@ def painted(asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, se
         side, albedo = texel_side(asset, part, texels), memory.zeros(start.albedo.shape)
         for solution, at in whose(layers, part, texels):
             for rows in pieces(at):
-                here = at[rows]
-                place = texels.position[rows][here], texels.normal[rows][here]
-                albedo[rows][here] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
+                mask = at[rows]
+                place = texels.position[rows][mask], texels.normal[rows][mask]
+                albedo[rows][mask] = linear_from_srgb(surface_colour(solution, *place, footprint=side))
         sharpen_in_place(albedo, texels)
         pad_in_place([albedo], texels, settings.atlas.padding)
         painted_maps = replace(start, albedo=albedo, known=texels.covered)
@@ -144,7 +143,7 @@ def painted(asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, se
 def raised(
     asset: Asset, layers: StyleLayers | PaintedSurface, atlas: Atlas, settings: Settings, maps: Sequence[Maps]
 ) -> list[Maps]:
-    """Painted maps with the painting's relief laid upon their normals, and its gloss upon their roughness."""
+    """Painted maps with the painting's relief added to their normals and its gloss to their roughness."""
     from mistyle.core.image import nearest_fill_in_place
     from mistyle.stylization.surface.layers import PaintRelief, TexelBand, lay_relief, painted_mask, protected
     from mistyle.stylization.surface.surface_painter import surface_relief
@@ -156,23 +155,23 @@ def raised(
     result = []
     for part, (texels, flat) in enumerate(zip(atlas.texels, maps, strict=True)):
         side, tangents = texel_side(asset, part, texels), corner_tangents(asset.mesh)
-        made = replace(flat, normal=memory.copied(flat.normal), roughness=memory.copied(flat.roughness))
+        bent = replace(flat, normal=memory.copied(flat.normal), roughness=memory.copied(flat.roughness))
         for solution, at in whose(layers, part, texels):
             for rows in pieces(at):
-                here = at[rows]
-                place = texels.position[rows][here], texels.normal[rows][here]
+                mask = at[rows]
+                place = texels.position[rows][mask], texels.normal[rows][mask]
                 relief = PaintRelief(*surface_relief(solution, *place, footprint=side))
-                lay_relief(made, TexelBand(texels, rows, here), relief, height, gloss, asset.mesh, tangents)
-        chosen = [values for values, used in ((made.normal, height), (made.roughness, gloss)) if used > 0]
+                lay_relief(bent, TexelBand(texels, rows, mask), relief, height, gloss, asset.mesh, tangents)
+        chosen = [values for values, used in ((bent.normal, height), (bent.roughness, gloss)) if used > 0]
         nearest_fill_in_place(chosen, texels.covered)
         if settings.paint.protect is not None:
-            made = protected(made, flat, painted_mask(settings.paint.protect, texels))
-        result.append(made)
+            bent = protected(bent, flat, painted_mask(settings.paint.protect, texels))
+        result.append(bent)
     return result
 
 
 def pieces(at: np.ndarray) -> Iterator[slice]:
-    """Bands of rows with about LOOKED_UP chosen texels each: what is looked up at one time."""
+    """Bands of rows with about LOOKED_UP chosen texels each."""
     from mistyle.atlas.texels import bands
 
     share = max(float(at.mean()), 1e-3)
@@ -180,22 +179,21 @@ def pieces(at: np.ndarray) -> Iterator[slice]:
 
 
 def whose(layers: StyleLayers | PaintedSurface, part: int, texels: Texels) -> list[tuple[PaintedSurface, np.ndarray]]:
-    """Each solution with the covered texels of a set that it paints."""
+    """Each solution with its mask of covered texels in a texture set."""
     if isinstance(layers, PaintedSurface):
         return [(layers, texels.covered)]
     return [(one, texels.covered & (layers.choice[part] == k)) for k, one in enumerate(layers.solutions)]
 
 
 def surface_stage(run: Run, asset: Asset, style: Picture, atlas: Atlas) -> StyleLayers:
-    """The stage "surface": the painting, before it is laid into a texture."""
+    """The stage "surface": the painting, before it is baked."""
     s, seed = run.job.settings, run.job.settings.seed
     inputs = [style.rgb, style.alpha, s.surface, s.paint, paint_files(s.paint), seed]
     return run.record("surface", ["texels"], inputs, lambda r: paint_layers(asset, style, atlas, s, r))
 
 
 def stylized_stage(run: Run, asset: Asset, baked: Baked, views: Sequence[View], after: str) -> list[View]:
-    """The stylized views, drawn from the painted texture so that all agree by construction;
-    `after` is the stage that made it."""
+    """The stylized views, rendered from the painted texture and so consistent; `after` is the stage that wrote it."""
     from mistyle.io.cameras.views import read_views, write_views
 
     def write(folder: Path, report: Report) -> None:
@@ -214,7 +212,7 @@ def unlit_views(asset: Asset, maps: Sequence[Maps], views: Sequence[View], repor
 
 
 def with_geometry(asset: Asset, views: Sequence[View]) -> list[View]:
-    """Pictures with the depth and normals of the mesh where the files brought none: the mesh itself is the truth."""
+    """Pictures with the mesh's own depth, normals, UVs and parts, and their mask cut to the mesh."""
     from mistyle.render.mitsuba.draw import gbuffer, tracer
 
     traced = tracer(asset.mesh)

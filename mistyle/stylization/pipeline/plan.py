@@ -1,4 +1,4 @@
-"""What `stylize`, `render` and `bake` will do and cost, before they do it (`--dry-run`); see jobs/plan.py."""
+"""Stages, time and disk estimates of `stylize`, `render` and `bake` (`--dry-run`); see jobs/plan.py."""
 
 from pathlib import Path
 from typing import Any
@@ -41,8 +41,10 @@ from mistyle.stylization.settings import Settings
 
 
 def plan(job: Job) -> dict[str, Any]:
-    """Stages with estimated seconds, and the disk they take; refuses a missing mesh or picture, and a folder with the
-    user's files in the way, as the job would."""
+    """Stages with estimated seconds, and the disk they take.
+
+    Refuses a missing mesh or picture, and a folder with the user's own files, as the job would.
+    """
     from mistyle.stylization.pipeline.stylize import inputs_of
 
     extent = extent_of(job.mesh, job.settings)
@@ -79,7 +81,7 @@ def plan(job: Job) -> dict[str, Any]:
 
 
 def fit_steps(settings: Settings) -> int:
-    """The steps of the phases that will run."""
+    """Steps of all phases that will run."""
     steps = {"normal-roughness": settings.fit.iterations1, "albedo": settings.fit.iterations2}
     return sum(count for name, count in steps.items() if settings.refined in (name, "all"))
 
@@ -133,7 +135,7 @@ def plan_bake(mesh: Path, views: Path, out: Path, settings: Settings, name: str)
 
 
 def _finishing(settings: Settings) -> dict[str, float]:
-    """Seconds of the stage 'finish', where it is wanted, with the crops that judge it before and after."""
+    """Seconds of the stage 'finish', if enabled, with its evaluation crops before and after."""
     from mistyle.stylization.optimise.finish_settings import JUDGED
 
     chosen = settings.finish

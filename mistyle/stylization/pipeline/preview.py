@@ -1,7 +1,7 @@
-"""`--preview`: the painting on the mesh in seconds, without fit and repair, on one sheet of four views and the maps.
+"""`--preview`: a sheet of four views and the maps, painted in seconds without fit and repair.
 
-It works in the job's own run folder, with the job's stages: what it keeps there (the mesh with its UVs and, where the
-job asks for no more than a preview takes, texture layout and painting) the full job takes over.
+It uses the job's own run folder and stages, so the full job reuses its cached results: the mesh with its UVs, and for
+jobs within the preview's limits also texture layout and painting.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,8 +28,8 @@ from mistyle.stylization.pipeline.start import lay_out, texels_stage
 from mistyle.stylization.records import Atlas
 from mistyle.stylization.settings import Settings
 
-SAMPLES, ATLAS = 80_000, 1024  # at most: those of the preset draft
-SIDE = 448  # pixels of a view, and of a map where there are few
+SAMPLES, ATLAS = 80_000, 1024  # upper limits, from the preset draft
+SIDE = 448  # pixels of a view, and of a map for few sets
 FEW_SETS = 4
 VIEWS = (30.0, 120.0, 210.0, 300.0)  # azimuths
 ELEVATION = 15.0
@@ -73,12 +73,12 @@ def preview(job: Job, progress: Progress) -> dict[str, Any]:
 
         inputs = [style.rgb, style.alpha, s.surface, s.paint, s.seed, s.atlas, s.fit.metallic]
         folder = run.stage("preview", after, inputs, lambda f, r: write(f / SHEET, asset, maps_of(r), s.seed))
-    told = {"preview": str(folder / SHEET), "seconds": {k: round(v, 3) for k, v in progress.seconds.items()}}
-    return {**told, "notes": list(progress.notes)}
+    summary = {"preview": str(folder / SHEET), "seconds": {k: round(v, 3) for k, v in progress.seconds.items()}}
+    return {**summary, "notes": list(progress.notes)}
 
 
 def reduced(settings: Settings) -> Settings:
-    """The settings with no more surface samples and texels than a preview takes."""
+    """The settings, limited to a preview's surface samples and texels."""
     samples, size = min(settings.surface.samples, SAMPLES), min(settings.atlas.size, ATLAS)
     return settings.model_copy(
         update={
@@ -89,21 +89,21 @@ def reduced(settings: Settings) -> Settings:
 
 
 def sentence(full: Settings, small: Settings) -> str:
-    """In what a preview differs from the job."""
+    """The note on a preview's lower resolution."""
     return (
         f"The preview was painted with {small.surface.samples:,} surface samples on {small.atlas.size}² texels; the "
-        f"job takes {full.surface.samples:,} on {full.atlas.size}², and its strokes are finer."
+        f"job uses {full.surface.samples:,} on {full.atlas.size}², and its strokes are finer."
     )
 
 
 def painted_maps(asset: Asset, style: Picture, atlas: Atlas, settings: Settings, report: Report) -> list[Maps]:
-    """The painting with its relief, laid into the texture; nothing of it is kept."""
+    """Paint the surface and bake it with its relief, uncached."""
     layers = paint_layers(asset, style, atlas, settings, report)
     return raised(asset, layers, atlas, settings, painted(asset, layers, atlas, settings))
 
 
 def write(path: Path, asset: Asset, maps: Sequence[Maps], seed: int) -> None:
-    """The sheet: four views in a row, and below them the maps of each texture set."""
+    """Write the sheet: four views in a row, and below them the maps of each texture set."""
     from mistyle.io.images.write import write_png
     from mistyle.jobs.report.parts import map_shots
 
@@ -117,8 +117,10 @@ def write(path: Path, asset: Asset, maps: Sequence[Maps], seed: int) -> None:
 def lit_views(
     asset: Asset, seed: int
 ) -> Callable[[Sequence[Maps], Sequence[Camera]], list[Float[np.ndarray, "h w 3"]]]:
-    """A function that draws maps from cameras under the studio's light, on white, sRGB; what all such pictures share
-    (rays, light, open sky) is made once."""
+    """A function that renders maps from cameras under the studio's light, on white, sRGB.
+
+    Rays, light and ambient occlusion are computed once for all pictures.
+    """
     from mistyle.jobs.report.draw import sky, studio_light
     from mistyle.render.lookdev.studio import Studio, prefiltered
     from mistyle.render.mitsuba.draw import tracer

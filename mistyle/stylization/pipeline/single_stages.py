@@ -1,4 +1,4 @@
-"""The verbs `render` and `bake`: single stages for people who draw or paint the views themselves."""
+"""The verbs `render` and `bake`: single stages for users who paint the views themselves."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -57,21 +57,21 @@ def render_views(
 
 
 def claim_views(mesh: Path, out: Path, settings: Settings, overwrite: bool) -> list[Path]:
-    """The inputs of `mistyle render`; UsageError where it would cover one of them or a file that is not mistyle's."""
+    """The inputs of `mistyle render`; UsageError where it would overwrite one of them or a foreign file."""
     inputs = [*input_files(mesh), *filter(None, (settings.rig.file, settings.draw.scene))]
     claim(out, files_of_views(settings), inputs=inputs, overwrite=overwrite)
     return inputs
 
 
 def claim_baked(mesh: Path, views: Path, out: Path, name: str, overwrite: bool) -> list[Path]:
-    """The same of `mistyle bake`, as far as it is known before the mesh is read."""
+    """The same for `mistyle bake`, for the outputs known before the mesh is read."""
     inputs = [*input_files(mesh), views]
     claim(out, [f"{name}.glb", f"{name}.json"], inputs=inputs, overwrite=overwrite)
     return inputs
 
 
 def files_of_views(settings: Settings) -> list[str]:
-    """What a folder of views will consist of; of a rig made for the mesh, of all views that it may choose from."""
+    """File names of a folder of views; for next-best-view rigs those of all candidate cameras."""
     from mistyle.core.camera import rig
     from mistyle.geometry.next_best_view import candidate_cameras
     from mistyle.io.cameras.views import file_names, read_cameras
@@ -88,7 +88,7 @@ def files_of_views(settings: Settings) -> list[str]:
 def bake_views(
     mesh: Path, views: Path, out: Path, settings: Settings, name: str, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
-    """`mistyle bake`: anyone's pictures of known cameras projected onto the texture (section 4.1.4)."""
+    """`mistyle bake`: project pictures of known cameras onto the texture (section 4.1.4)."""
     from mistyle.deliver.asset import asset_names
     from mistyle.io.cameras.views import read_views, view_cameras
 
@@ -119,10 +119,12 @@ def bake_views(
 def baked_sets(
     asset: Asset, views: Sequence[View], settings: Settings, shares: list[float]
 ) -> Iterator[tuple[Texels, Maps]]:
-    """Texture set after texture set, made when it is asked for: its texels, and its own material with what the views
-    show in place of the albedo. `shares` receives how much of each set some view saw."""
+    """Texels and maps of each texture set, computed lazily: its own material with the views' colours as albedo.
+
+    `shares` receives the share of each set's texels that a view saw.
+    """
     for part in range(len(asset.mesh.parts)):
-        # No name here holds a set: it can go before the next one is made.
+        # No local name keeps a set alive: it can be freed before the next one is computed.
         yield baked_set(asset, part, views, settings, shares)
 
 
@@ -139,12 +141,12 @@ def baked_set(
 
 
 def tell_views(mesh: Mesh, views: Sequence[View], progress: Progress) -> None:
-    """Every picture's overlap with the mesh's outline, and warnings about the cameras; alpha is the coverage."""
+    """Report every picture's overlap with the mesh's outline, and warn about cameras; alpha is the coverage."""
     from mistyle.solver.cameras.outline_check import check_outlines, overlap_line, overlap_notes
 
     names = [view.camera.name for view in views]
-    found = check_outlines(mesh, [view.camera for view in views], (view.coverage > 0.5 for view in views))
-    if np.isfinite(found.overlap).any():
-        progress.say(overlap_line(names, found.overlap))
+    outlines = check_outlines(mesh, [view.camera for view in views], (view.coverage > 0.5 for view in views))
+    if np.isfinite(outlines.overlap).any():
+        progress.say(overlap_line(names, outlines.overlap))
     fix = "Check the cameras' axes, and that they are in working units (camera.json of `mistyle render`)."
-    progress.note(*overlap_notes(names, found, LEAST_OVERLAP, fix, trusted=True))
+    progress.note(*overlap_notes(names, outlines, LEAST_OVERLAP, fix, trusted=True))

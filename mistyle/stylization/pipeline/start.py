@@ -1,4 +1,4 @@
-"""What a job that paints begins with: the atlas with the asset's own maps, the cameras, and the views."""
+"""First stages of a painting job: the atlas with the asset's own maps, the cameras, and the views."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -20,7 +20,7 @@ def texels_stage(run: Any, asset: Asset) -> Atlas:
 
 
 def lay_out(asset: Asset, settings: Settings, report: Report) -> Atlas:
-    """Rasterise every texture set and lay the asset's own material into it."""
+    """Rasterise every texture set and resample the asset's own material into it."""
     texels, start = [], []
     for part in range(len(asset.mesh.parts)):
         where, maps = lay_out_one(asset, part, settings)
@@ -40,7 +40,7 @@ def lay_out_one(asset: Asset, part: int, settings: Settings) -> tuple[Texels, Ma
 
 
 def own_maps(asset: Asset, settings: Settings) -> list[OwnMaps]:
-    """The asset's own material as its file has it, for pictures that need no atlas: each map at its own resolution."""
+    """The asset's own material without an atlas: each map at its file's resolution."""
     from mistyle.render.lookdev.scenes import material_maps
 
     metallic = "zero" if settings.fit.metallic == "zero" else "keep"
@@ -48,7 +48,8 @@ def own_maps(asset: Asset, settings: Settings) -> list[OwnMaps]:
 
 
 def cameras_of(settings: Settings, mesh: Mesh, say: Callable[[str], None]) -> list[Camera]:
-    """The rig in visiting order, from the settings, from a file, or made for the mesh (then it says what it sees)."""
+    """The rig in visiting order: from the settings, from a file, or by next-best-view selection (`say` gets its
+    coverage)."""
     if settings.rig.kind == "nbv":
         from mistyle.render.mitsuba.rigs import next_best_views
 
@@ -72,8 +73,7 @@ def draw(
     say: Callable[[str], None],
     read: bool = True,
 ) -> None:
-    """Render the views and write them with their cameras and lights; `read` says whether anything reads their
-    colours."""
+    """Render the views and write them with their cameras and lights; `read`: whether a stylizer reads their colours."""
     from mistyle.core.light import lights
     from mistyle.io.cameras.views import write_views
     from mistyle.render.mitsuba.draw import draw_views
@@ -81,5 +81,5 @@ def draw(
     template = settings.draw.scene or "paper_views"
     cameras = cameras_of(settings, asset.mesh, say)
     views = draw_views(asset.mesh, maps, cameras, template, settings.draw.samples(read), settings.seed, report)
-    # What lit these very views, so that they can be fitted to.
+    # The lights of these views, so that the fit can use them.
     write_views(folder, views, lights(str(template)), paper_files=settings.draw.paper_files)

@@ -1,7 +1,7 @@
-"""The main job from top to bottom, in the order of the paper's section 4.
+"""The `stylize` job, stage by stage, in the order of the paper's section 4.
 
-Each stage is kept in the run folder under a key made of its inputs, its settings and the keys of what it stands on,
-so that a killed run goes on from the last finished stage and a changed setting redoes only what depends on it.
+The run folder caches each stage under a key of its inputs, its settings and its predecessors' keys. A killed run
+resumes after the last finished stage; a changed setting reruns only the dependent stages.
 """
 
 from collections.abc import Iterable, Sequence
@@ -52,8 +52,8 @@ from mistyle.stylization.settings import Settings
 
 
 @dataclass(frozen=True)
-class Made:
-    """Everything a job made, as the report wants it."""
+class StylizedJob:
+    """All results of a job, for the report."""
 
     job: Job
     style: Picture
@@ -73,8 +73,8 @@ class Made:
 def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     """Mesh + one style picture -> the same mesh with stylized maps (the whole of section 4).
 
-    Returns the paths of what was written and the figures of `run.json`. Raises a MistyleError for everything that a
-    user can mend; what was finished before stays and is taken over by the next run.
+    Returns the written paths and the figures of `run.json`. Raises a MistyleError for every error that a user can
+    fix; finished stages stay, and the next run reuses them.
     """
     from mistyle.deliver.colour import read_style
     from mistyle.deliver.export import check, deliver
@@ -89,36 +89,36 @@ def stylize(job: Job, progress: Progress) -> dict[str, Any]:
     check_generative(job.settings, progress.say)
     check_finish(job.settings)
     if job.settings.stylizer != "embedded":
-        from mistyle.stylization.pipeline.sweep import refuse_what_is_not_kept
+        from mistyle.stylization.pipeline.sweep import refuse_unsupported
 
-        refuse_what_is_not_kept(job.settings)
+        refuse_unsupported(job.settings)
     with (
         Run(job, progress, EVERY_STAGE) as run,
         kept(job.settings, run.hidden.root, counts, PLAIN, TILED, STYLED) as look_again,
     ):
         start_engines(job.settings)
-        made = _stages(run, files, style, look_again)
-        progress.note(*made.asset.source.notes, *style.notes, *made.fit.notes, *old_report(job))
+        result = _stages(run, files, style, look_again)
+        progress.note(*result.asset.source.notes, *style.notes, *result.fit.notes, *old_report(job))
         if job.settings.report.detail != "none":
-            report_stage(run, made, progress)
-        return deliver(job, progress) | write_summary(made, run)
+            report_stage(run, result, progress)
+        return deliver(job, progress) | write_summary(result, run)
 
 
-def report_stage(run: Run, made: Made, progress: Progress) -> None:
-    """The page and the pictures that show a person what was made."""
+def report_stage(run: Run, result: StylizedJob, progress: Progress) -> None:
+    """The stage "report": the page and its pictures."""
     from mistyle.stylization.report.page import job_report
 
     inputs = [run.job.settings.report, run.job.name]
-    run.stage("report", ["asset"], inputs, lambda folder, r: job_report(folder, made, progress, r))
+    run.stage("report", ["asset"], inputs, lambda folder, r: job_report(folder, result, progress, r))
 
 
 def inputs_of(job: Job) -> list[Path]:
-    """Every file and folder of the user's that the job reads."""
+    """All user files and folders that the job reads."""
     s = job.settings
     return [*input_files(job.mesh), job.style, *paint_files(s.paint), *filter(None, (s.rig.file, s.draw.scene))]
 
 
-def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> Made:
+def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -> StylizedJob:
     s = run.job.settings
     asset = mesh_stage(run, files)
     look_again(*size_of(asset))
@@ -146,7 +146,9 @@ def _stages(run: Run, files: Sequence[Path], style: Picture, look_again: Look) -
     repaired = replace(repaired, maps=tuple(maps))
     tell_edits(run)
     light = light_left(asset.mesh, atlas.texels, repaired.maps, s.seed)
-    return Made(run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light, finishing)
+    return StylizedJob(
+        run.job, style, asset, atlas, views, baked, stylized, fitted, repaired, folder, looks, light, finishing
+    )
 
 
 def refined_stages(
@@ -181,21 +183,21 @@ def refined_stages(
 def retouched_stage(
     run: Run, asset: Asset, atlas: Atlas, baked: Baked, stylized: Sequence[View]
 ) -> tuple[Baked, Sequence[View]]:
-    """What a person painted into the stylized views, laid into the texture and into the other views."""
+    """The stage "retouch": user edits of the stylized views, baked into the texture and the other views."""
     from mistyle.stylization.pipeline.retouch import retouch
 
     s, edited, folder = run.job.settings, run.edited["stylized"], run.visible.root / "stylized"
-    made = run.record(
+    retouched = run.record(
         "retouch",
         ["bake", "stylized"],
         [s.bake],
         lambda r: retouch(asset, atlas, baked, stylized, edited, folder, s, r),
     )
-    return made.baked, made.views
+    return retouched.baked, retouched.views
 
 
 def masks_stage(run: Run, asset: Asset, atlas: Atlas, baked: Baked, fitted: Any) -> list[np.ndarray]:
-    """Which texels are painted again (section 4.3), as pictures in `masks/` that a person may repaint."""
+    """Masks of the texels to repaint (section 4.3), as pictures in `masks/` that a user may edit."""
     from mistyle.stylization.inpaint.repair import struggle_mask
 
     s = run.job.settings
@@ -213,8 +215,7 @@ def masks_stage(run: Run, asset: Asset, atlas: Atlas, baked: Baked, fitted: Any)
 def painted_stages(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View]
 ) -> tuple[Baked, list[View], FinishRecord | None]:
-    """From the style to the painted texture and its views: the stages 'surface', 'bake', 'finish' where it is wanted,
-    and 'stylized'."""
+    """The stages 'surface', 'bake', 'finish' (if enabled) and 'stylized': the painted texture and its views."""
     s = run.job.settings
     if s.stylizer != "embedded":
         from mistyle.stylization.pipeline.sweep import swept_stages
@@ -235,12 +236,12 @@ def painted_stages(
 
 
 def views_stage(run: Run, asset: Asset, atlas: Atlas) -> list[View]:
-    """Section 4.1.1: the views of the mesh with its own material, drawn or taken over."""
+    """Section 4.1.1: the views of the mesh with its own material, rendered or cached."""
     from mistyle.io.cameras.views import read_views
 
     s = run.job.settings
     inputs = [s.rig, s.rig.file, s.draw, s.draw.scene, s.seed]
-    # The embedded stylizer paints the surface: of the views it reads depth, normals and masks.
+    # The embedded stylizer paints the surface: it reads only the views' depth, normals and masks.
     read = s.stylizer != "embedded"
 
     def write(folder: Path, report: Report) -> None:
@@ -258,7 +259,7 @@ def fit(
     settings: Settings,
     report: Report,
 ) -> Any:
-    """Section 4.2: normal and roughness, then albedo; of views that show known light, solved for under it."""
+    """Section 4.2: normal and roughness, then albedo; views under known light are solved for first."""
     from mistyle.stylization.mvst.unlight import unlit
     from mistyle.stylization.optimise.lit_views import lit_phases
     from mistyle.stylization.optimise.two_phase import FitStart, FitTargets, two_phase
@@ -294,8 +295,7 @@ def repair(
     settings: Settings,
     report: Report,
 ) -> Repaired:
-    """Section 4.3: under the masks (where the fit struggled or nothing was seen) take the painting again, or let
-    Paint3D paint; blend at the edges."""
+    """Section 4.3: repaint the masked texels (struggling or unseen) from the painting or by Paint3D; blend at edges."""
     from mistyle.stylization.inpaint.fill import from_paint
     from mistyle.stylization.inpaint.repair import repair as repair_part
     from mistyle.stylization.surface.layers import painted_mask, protected
@@ -310,7 +310,7 @@ def repair(
     if network is not None:
         del network, again
         release(settings)
-        # The weight-free inpainter takes the painting again, to which phase 1 has fitted normal and roughness already.
+        # The weight-free inpainter needs no such step: phase 1 has already fitted normal and roughness to the painting.
         maps = settle_relief(asset, atlas, maps, masks, views, settings, lambda done: report(0.3 + 0.7 * done))
     if settings.paint.protect is not None:
         own = [painted_mask(settings.paint.protect, texels) for texels in atlas.texels]
@@ -364,6 +364,6 @@ def write_asset(
     report: Report,
     edited: Edited = UNEDITED,
 ) -> None:
-    """The files that other programs open, set after set; `edited` holds textures that a person painted over."""
+    """Write the delivered files, set after set; `edited` holds textures that a user painted over."""
     provenance = {"mesh": job.mesh.name, "style": job.style.name, "seed": job.settings.seed}
     asset_files.write(folder, job, asset, sets, provenance, report, edited)

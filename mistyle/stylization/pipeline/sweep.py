@@ -1,4 +1,4 @@
-"""The stages of a job whose stylizer paints one view at a time: sweep over the views, bake them, show them."""
+"""Stages of a view-by-view stylizer: sweep over the views, bake them, write the stylized views."""
 
 import shutil
 from collections.abc import Sequence
@@ -15,7 +15,7 @@ from mistyle.stylization.mvst.sweep import Masker, PaintedView, Stylizer, Swept,
 from mistyle.stylization.records import Atlas, Baked
 from mistyle.stylization.settings import Settings
 
-KEPT = "sweep"  # the folder in work/ that holds the views of an unfinished sweep
+VIEW_STORE = "sweep"  # the folder in work/ that holds the views of an unfinished sweep
 
 
 def swept_stages(
@@ -33,7 +33,7 @@ def swept_stages(
 
         inputs = [sweep_key(run, style, views), s.paint, s.sweep, s.seed]
     painted = run.record("surface", ["texels", "views"], inputs, lambda r: swept(run, asset, style, atlas, views, r))
-    shutil.rmtree(run.hidden.root / KEPT, ignore_errors=True)
+    shutil.rmtree(run.hidden.root / VIEW_STORE, ignore_errors=True)
     stylized = [finished(view, one) for view, one in zip(views, painted, strict=True)]
     chosen = fit_settings(s)
     lit = chosen.painted == "with-light" and chosen.unlight > 0
@@ -42,19 +42,19 @@ def swept_stages(
         "bake", ["surface"], [s.bake, *light], lambda r: bake(asset, stylized, painted, atlas, s, r, lit)
     )
     if baked.taken is not None:
-        run.progress.note(said_of_light(baked.taken))
+        run.progress.note(unlight_note(baked.taken))
     shown = run.stage("stylized", ["bake"], [], lambda folder, r: write_views(folder, stylized, (), progress=r))
     return baked, read_views(shown)
 
 
-def refuse_what_is_not_kept(settings: Settings) -> None:
-    """Refuse what only a stylizer of the whole surface can follow, and a segmenter that is not there."""
+def refuse_unsupported(settings: Settings) -> None:
+    """UsageError for settings that only the embedded stylizer supports; refuses a missing segmenter."""
     paint = settings.paint
     named = {"paint.slots": paint.slots, "paint.height": paint.height, "paint.gloss": paint.gloss}
-    wrong = [name for name, value in named.items() if value]
-    if wrong:
+    unsupported = [name for name, value in named.items() if value]
+    if unsupported:
         raise UsageError(
-            f"{', '.join(wrong)}: --stylizer {settings.stylizer} paints views and cannot follow that;"
+            f"{', '.join(unsupported)}: --stylizer {settings.stylizer} paints views and does not support that;"
             " leave it out, or use --stylizer embedded"
         )
     masker_of(settings)
@@ -84,7 +84,7 @@ def masker_of(settings: Settings) -> Masker | None:
 def swept(
     run: Run, asset: Asset, style: Picture, atlas: Atlas, views: Sequence[View], report: Report
 ) -> tuple[PaintedView, ...]:
-    """Paint the views one after another; what is finished is kept in work/ until all are."""
+    """Paint the views one after another; work/ keeps finished views until the sweep ends."""
     s = run.job.settings
     network = s.stylizer == "diffusion"
     if network:
@@ -94,7 +94,7 @@ def swept(
     else:
         paint = stylizer_of(asset, style, atlas, s, lambda done: report(0.1 * done))
     painter = ViewPainter(paint, masker_of(s), keeps_outlines=not network)
-    store = ViewStore(run.hidden.root / KEPT, run.keys["surface"])
+    store = ViewStore(run.hidden.root / VIEW_STORE, run.keys["surface"])
     result = sweep(views, painter, s.sweep, s.seed, lambda done: report(0.1 + 0.9 * done), store)
     run.progress.say(sentence(result))
     del paint, painter
@@ -104,7 +104,7 @@ def swept(
 
 
 def sentence(result: Swept) -> str:
-    """What a person wants to know of a sweep."""
+    """Summary of a sweep: mean known share, and the least overlap of the segmenter's masks."""
     later = [result.painted[k].known for k in result.order[1:]]
     share = float(np.mean(later)) if later else 0.0
     text = f"each later view was on average {100 * share:.0f} % known from the views before"
@@ -121,8 +121,10 @@ def bake(
     report: Report,
     lit: bool,
 ) -> Baked:
-    """Section 4.1.4: every texel takes the colour of the view that faces it most; what no view saw takes the nearest
-    colour of its island. Of `lit` views the painted light is divided out first."""
+    """Section 4.1.4: every texel takes the colour of the view that faces it most.
+
+    Unseen texels take the nearest colour of their island. `lit` views have their painted light divided out first.
+    """
     from mistyle.atlas.bake import backproject, fill
     from mistyle.atlas.texels import pad
     from mistyle.stylization.mvst.unlight import gain, share, unlit
@@ -137,12 +139,14 @@ def bake(
         views = unlit(views, gains)
     maps, seen = [], []
     for part, (texels, start) in enumerate(zip(atlas.texels, atlas.start, strict=True)):
-        found = backproject(views, texels, settings.bake, mesh=asset.mesh)
-        coated = replace(start, albedo=pad(fill(found, texels), texels, settings.atlas.padding), known=found.known)
+        projected = backproject(views, texels, settings.bake, mesh=asset.mesh)
+        coated = replace(
+            start, albedo=pad(fill(projected, texels), texels, settings.atlas.padding), known=projected.known
+        )
         if settings.paint.protect is not None:
             coated = protected(coated, start, painted_mask(settings.paint.protect, texels))
         maps.append(coated)
-        seen.append(found.seen)
+        seen.append(projected.seen)
         report((part + 1) / len(atlas.texels))
     return Baked(tuple(maps), tuple(seen), (), tuple(gains), taken)
 
@@ -160,11 +164,11 @@ def bare_shape(asset: Asset, views: Sequence[View], settings: Settings) -> list[
     return [luminance(view.rgb) for view in drawn]
 
 
-def said_of_light(taken: float) -> str:
-    """What a person should know of light that was taken out of the views."""
+def unlight_note(taken: float) -> str:
+    """The note on the share of light that was divided out of the views."""
     if taken == 0:
-        return "no light was found in the stylized views that the lights of the rendered ones explain (fit.unlight)."
+        return "the stylized views show no shading of the rendered views' lights (fit.unlight)."
     return (
-        f"{100 * taken:.0f} % of the shading under the rendered views' lights was found in the stylized views and "
-        "divided out before the texture took their colours (fit.unlight)."
+        f"the stylized views show {100 * taken:.0f} % of the shading under the rendered views' lights; the bake "
+        "divided it out (fit.unlight)."
     )

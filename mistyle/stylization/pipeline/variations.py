@@ -1,4 +1,4 @@
-"""`--variations N`: one style picture tried several ways on a mesh, quickly, on one contact sheet to choose from."""
+"""`--variations N`: a contact sheet of quick variations of one style picture on a mesh."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -18,21 +18,21 @@ from mistyle.stylization.settings import Settings
 
 SAMPLES, RESOLUTION = 40_000, 384
 VIEWS = (0, 13)  # of the paper's rig: front right and front left
-STROKES = (1.0, 1.6, 0.7)  # sizes of strokes, as factors, that take turns
+STROKES = (1.0, 1.6, 0.7)  # alternating factors of the stroke size
 COLUMNS = 4
 SHEET = "variations.png"
 
 
 @dataclass(frozen=True)
 class Variation:
-    """What one picture of the sheet was made with."""
+    """Settings of one picture of the sheet, and their command-line label."""
 
     label: str
     settings: Settings
 
 
 def variations(settings: Settings, count: int) -> list[Variation]:
-    """Other seeds, and every second time strokes of another size; the first is the job as it stands."""
+    """The job's settings first, then other seeds; every second variation has another stroke size."""
     result = []
     for k in range(count):
         factor = STROKES[(k // 2 + 1) % len(STROKES)] if k % 2 else 1.0
@@ -51,7 +51,7 @@ def variations(settings: Settings, count: int) -> list[Variation]:
 def sheet(
     mesh: Path, style: Path, out: Path, settings: Settings, count: int, progress: Progress, *, overwrite: bool = False
 ) -> dict[str, Any]:
-    """Write OUT/variations.png; returns its path and, picture by picture, the options that make it."""
+    """Write OUT/variations.png; returns its path and the options of each picture."""
     from mistyle.deliver.colour import read_style
     from mistyle.jobs import start
     from mistyle.jobs.inputs import input_files

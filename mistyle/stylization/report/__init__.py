@@ -1,1 +1,1 @@
-"""The report of a stylization: its page, its figures, how the style reads."""
+"""The report of a stylization job: page, metrics, measures of the style picture."""

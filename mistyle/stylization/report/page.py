@@ -1,4 +1,4 @@
-"""What the report of a job shows: its pictures are drawn here, its page is made by `jobs/report/page.py`."""
+"""Content of a stylization job's report: pictures, steps and metrics; `jobs/report/page.py` renders the page."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -39,135 +39,140 @@ UNFITTED = (
 )
 
 
-def job_report(folder: Path, made: Any, progress: Progress, report: Callable[[float], None]) -> None:
-    """Draw the pictures and write `index.html` and `overview.png` (mesh, style, result) into `folder`; for a full
-    report `beauty.png` (path-traced) and the turntable's frames, `turntable/*.png` and `turntable.webp`, too."""
+def job_report(folder: Path, result: Any, progress: Progress, report: Callable[[float], None]) -> None:
+    """Draw the pictures and write `index.html` and `overview.png` (mesh, style, result) into `folder`.
+
+    A full report also has `beauty.png` (path-traced) and the turntable's frames, `turntable/*.png` and
+    `turntable.webp`.
+    """
     from mistyle.io.images.write import write_png
 
-    settings = made.job.settings
+    settings = result.job.settings
     full = settings.report.detail == "full"
-    looks = (made.repaired.maps, made.atlas.start, *(() if settings.keeps_painting else (made.baked.maps,)))
-    drawn = draw(made.asset, looks, settings, lambda done: report(0.7 * done), turning=2, path_traced=full)
+    looks = (result.repaired.maps, result.atlas.start, *(() if settings.keeps_painting else (result.baked.maps,)))
+    drawn = draw(result.asset, looks, settings, lambda done: report(0.7 * done), turning=2, path_traced=full)
     after, bare, *before = drawn.close
     best = after if drawn.traced is None else drawn.traced
     if full:
         write_turn(folder / "turntable", drawn.turns[0])
         write_png(folder / "beauty.png", best)
-    write_png(folder / "overview.png", side_by_side([bare, made.style.rgb, best]))
+    write_png(folder / "overview.png", side_by_side([bare, result.style.rgb, best]))
     report(0.8)
     named = STAGES | RETOUCH | FINISH | FIRST
     page = Report(
-        title=made.job.name,
-        mesh=made.job.mesh.name,
-        style=made.job.style.name,
-        painting=ReportPicture(made.style.rgb, f"The style: {made.job.style.name}"),
+        title=result.job.name,
+        mesh=result.job.mesh.name,
+        style=result.job.style.name,
+        painting=ReportPicture(result.style.rgb, f"The style: {result.job.style.name}"),
         turntable=tuple(drawn.turns[0]),
         plain=tuple(drawn.turns[1]),
         made=f"mistyle {versions()['mistyle']}, seed {settings.seed}",
-        facts=facts(made),
+        facts=facts(result),
         notes=tuple(Note(text) for text in progress.notes),
         steps=steps(
-            made,
+            result,
             [
                 BeforeAfter(ReportPicture(b, "as baked"), ReportPicture(after, "after fit and repair"), SAME)
                 for b in before
             ],
         ),
-        maps=map_sets(made),
-        model=page_model(made.folder / f"{made.job.name}.glb"),
+        maps=map_sets(result),
+        model=page_model(result.folder / f"{result.job.name}.glb"),
         timings=tuple(Timing(named[k], v, k in progress.reused) for k, v in progress.seconds.items()),
-        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k.split(".")[-1]]) for k, v in figures(made).items()),
+        figures=tuple(Figure(k, f"{v:.4g}", *MEANINGS[k.split(".")[-1]]) for k, v in figures(result).items()),
         settings=setting_groups(settings),
         versions=tuple(versions().items()),
-        files=file_list(made.folder, made.job.name),
+        files=file_list(result.folder, result.job.name),
     )
     write_report(folder / "index.html", page)
 
 
-def map_sets(made: Any) -> tuple[MapSet, ...]:
-    """The final maps of every texture set, and what there is to lay over them."""
-    sets, longest = [], Sizes().of(kind_of_maps(len(made.asset.mesh.parts)))
-    for k, (name, texels) in enumerate(zip(made.asset.mesh.parts, made.atlas.texels, strict=True)):
-        pulled = report_overlays.struggle(made.fit.struggle[k], made.fit.touched[k], texels, longest)
+def map_sets(result: Any) -> tuple[MapSet, ...]:
+    """The final maps of every texture set, with their overlays."""
+    sets, longest = [], Sizes().of(kind_of_maps(len(result.asset.mesh.parts)))
+    for k, (name, texels) in enumerate(zip(result.asset.mesh.parts, result.atlas.texels, strict=True)):
+        pulled = report_overlays.struggle(result.fit.struggle[k], result.fit.touched[k], texels, longest)
         over = (
-            report_overlays.coverage(made.baked.seen[k], len(made.views), texels, longest),
+            report_overlays.coverage(result.baked.seen[k], len(result.views), texels, longest),
             *((pulled,) if pulled is not None else ()),
-            report_overlays.repaired(made.repaired.mask[k], texels, longest),
+            report_overlays.repaired(result.repaired.mask[k], texels, longest),
         )
-        sets.append(MapSet(name, map_shots(made.repaired.maps[k], longest), over))
+        sets.append(MapSet(name, map_shots(result.repaired.maps[k], longest), over))
     return tuple(sets)
 
 
-def facts(made: Any) -> tuple[tuple[str, str], ...]:
-    """What the mesh is, in a line of figures."""
-    mesh = made.asset.mesh
+def facts(result: Any) -> tuple[tuple[str, str], ...]:
+    """Counts of the mesh, its textures and the views."""
+    mesh = result.asset.mesh
     return (
         ("faces", f"{len(mesh.faces):,}"),
         ("texture sets", str(len(mesh.parts))),
-        ("texture size", f"{made.job.settings.atlas.size}²"),
-        ("UVs", {"kept": "the mesh's own", "shifted": "the mesh's own", "new": "new"}[made.asset.source.uv]),
-        ("views", str(len(made.views))),
+        ("texture size", f"{result.job.settings.atlas.size}²"),
+        ("UVs", {"kept": "the mesh's own", "shifted": "the mesh's own", "new": "new"}[result.asset.source.uv]),
+        ("views", str(len(result.views))),
     )
 
 
-def steps(made: Any, refined: Sequence[BeforeAfter]) -> tuple[Step, ...]:
+def steps(result: Any, refined: Sequence[BeforeAfter]) -> tuple[Step, ...]:
     """The stages in the order of the paper; `refined` are pictures before and after fit and repair."""
     views = Step(
         "Views of the mesh",
         "Every camera of the rig, with the mesh's own material.",
         "4.1.1",
-        shots=tuple(ReportPicture(view_picture(v), angle(v.camera)) for v in made.views),
+        shots=tuple(ReportPicture(view_picture(v), angle(v.camera)) for v in result.views),
         columns=8,
     )
     stylized = Step(
         "Stylized views",
         (
             "The surface is painted once, so the views agree by construction."
-            if made.job.settings.stylizer == "embedded"
+            if result.job.settings.stylizer == "embedded"
             else "Views are painted one after another and keep the pixels that earlier views show."
         )
         + " Paint one over in stylized/ and rerun: the paint goes into the texture.",
         "4.1.3",
-        shots=tuple(ReportPicture(view_picture(v), angle(v.camera)) for v in made.stylized),
-        facts=look_facts(made.looks),
+        shots=tuple(ReportPicture(view_picture(v), angle(v.camera)) for v in result.stylized),
+        facts=look_facts(result.looks),
         columns=8,
     )
-    parts, longest = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True)), Sizes().of(kind_in_step(3))
+    parts, longest = list(zip(result.asset.mesh.parts, result.atlas.texels, strict=True)), Sizes().of(kind_in_step(3))
     baked = Step(
         "Bake",
         "How many views see each texel: dark blue none, yellow many.",
         "4.1.4",
         shots=tuple(
-            ReportPicture(heat(made.baked.seen[k], len(made.views), t, longest), f"{name}: seen by views", sharp=True)
+            ReportPicture(
+                heat(result.baked.seen[k], len(result.views), t, longest), f"{name}: seen by views", sharp=True
+            )
             for k, (name, t) in enumerate(parts)
         ),
         columns=3,
     )
-    finish = () if made.finishing is None else (finish_step(made),)
-    return (views, stylized, baked, *finish, *refining(made, refined, longest))
+    finish = () if result.finishing is None else (finish_step(result),)
+    return (views, stylized, baked, *finish, *refining(result, refined, longest))
 
 
-def refining(made: Any, pairs: Sequence[BeforeAfter], longest: int) -> tuple[Step, ...]:
-    """Fit and repair, or why there was none."""
-    if made.job.settings.keeps_painting:
+def refining(result: Any, pairs: Sequence[BeforeAfter], longest: int) -> tuple[Step, ...]:
+    """The steps of fit and repair, or the reason why none ran."""
+    if result.job.settings.keeps_painting:
         return (Step("Normal and roughness", UNFITTED, "4.2"),)
-    parts = list(zip(made.asset.mesh.parts, made.atlas.texels, strict=True))
+    parts = list(zip(result.asset.mesh.parts, result.atlas.texels, strict=True))
     fit = Step(
         "Differentiable fit",
         "Normal and roughness under directional light, then albedo under ambient light. "
-        + (undone_where() if made.job.settings.fit.judge else "Every phase is kept: fit.judge is off."),
+        + (undone_where() if result.job.settings.fit.judge else "Every phase is kept: fit.judge is off."),
         "4.2",
         pairs=tuple(pairs),
-        facts=fit_facts(made.fit),
+        facts=fit_facts(result.fit),
     )
     repair = Step(
         "Repair",
-        "Texels that the fit could not settle or that no view saw, painted again from the surface. The masks lie in "
+        "Texels that did not converge in the fit or that no view saw, repainted from the surface. The masks are in "
         "masks/: edit one and rerun to repair its white texels.",
         "4.3",
         shots=tuple(
             ReportPicture(
-                mask_over(made.repaired.mask[k], made.repaired.maps[k], t, longest), f"{name}: repaired texels"
+                mask_over(result.repaired.mask[k], result.repaired.maps[k], t, longest), f"{name}: repaired texels"
             )
             for k, (name, t) in enumerate(parts)
         ),
@@ -176,19 +181,19 @@ def refining(made: Any, pairs: Sequence[BeforeAfter], longest: int) -> tuple[Ste
     return (fit, repair)
 
 
-def finish_step(made: Any) -> Step:
-    """The stage 'finish': the painting before and after, and its figures."""
-    (before, after), moved = made.finishing.style, f"{made.finishing.moved:.3f} (sRGB, root mean square)"
+def finish_step(result: Any) -> Step:
+    """The stage 'finish': the painting before and after, and its metrics."""
+    (before, after), moved = result.finishing.style, f"{result.finishing.moved:.3f} (sRGB, root mean square)"
     return Step(
         "Finish",
-        "Style losses of VGG-19 on many rendered crops, each compared with its own places in the painting.",
-        pairs=(finish_pair(made.asset, made.finishing, close_up(made.job.settings)),),
-        facts=(("style loss", f"{before:.4g} → {after:.4g}"), ("albedo moved by", moved)),
+        "Style losses of VGG-19 on many rendered crops, each compared with its source region in the painting.",
+        pairs=(finish_pair(result.asset, result.finishing, close_up(result.job.settings)),),
+        facts=(("style loss", f"{before:.4g} → {after:.4g}"), ("albedo change", moved)),
     )
 
 
 def angle(camera: Camera) -> str:
-    """Where a view is taken from, in few characters."""
+    """A camera's azimuth and elevation, else its name."""
     known = np.isfinite(camera.azimuth) and np.isfinite(camera.elevation)
     return f"{camera.azimuth:.0f}° / {camera.elevation:+.0f}°" if known else camera.name
 
@@ -199,16 +204,19 @@ def view_picture(view: View) -> np.ndarray:
 
 
 def fit_facts(fit: Any) -> tuple[tuple[str, str], ...]:
-    """Each phase: kept (and what got worse all the same) or undone, and the figures that decided."""
-    kept = [(phase, _kept(fit, phase) if good else "undone: a metric got worse") for phase, good in fit.kept.items()]
+    """Each phase: kept (with metrics that got worse within the tolerance) or undone, and its metrics."""
+    phases = [
+        (phase, _judgement(fit, phase) if accepted else "undone: a metric got worse")
+        for phase, accepted in fit.kept.items()
+    ]
     figures = []
     for name, (before, after) in fit.figures.items():
         undone = "" if fit.kept[name.partition(".")[0]] else f" (undone: the result has {before:.4g})"
         figures.append((name, f"{before:.4g} → {after:.4g}{undone}"))
-    return (*kept, *figures)
+    return (*phases, *figures)
 
 
-def _kept(fit: Any, phase: str) -> str:
+def _judgement(fit: Any, phase: str) -> str:
     pairs = {name.partition(".")[2]: pair for name, pair in fit.figures.items() if name.startswith(f"{phase}.")}
     if set(pairs) != set(TOLERANCE):
         return "kept, not judged"

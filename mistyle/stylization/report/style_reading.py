@@ -1,4 +1,4 @@
-"""How a job's style pictures read and which settings follow: for the console, run.json and the report."""
+"""Measures of a job's style pictures and the settings derived from them, for the console, run.json and the report."""
 
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -14,7 +14,7 @@ from mistyle.stylization.surface.settings import ResolvedSettings
 
 @dataclass(frozen=True)
 class StyleLook:
-    """One style picture: its file name, its measures, and the settings that it is painted with."""
+    """One style picture: its file name, its measures, its settings, and the names of those `chosen` from it."""
 
     name: str
     reading: StyleReading
@@ -22,7 +22,7 @@ class StyleLook:
     chosen: tuple[str, ...]
 
     def record(self) -> dict[str, Any]:
-        """For run.json: the measures, the settings that can follow from them, and which of these did."""
+        """For run.json: the measures, the settings that can derive from them, and which of these did."""
         settings = {name: getattr(self.settings, name) for name in FROM_PAINTING}
         return {
             "picture": self.name,
@@ -33,7 +33,7 @@ class StyleLook:
 
 
 def style_looks(style: Picture, name: str, settings: Settings, progress: Progress) -> tuple[StyleLook, ...]:
-    """Read the style and the pictures of slots, and say in a line each what follows; nothing for diffusion."""
+    """Measure the style and the slots' pictures, and report one line for each; empty for diffusion."""
     from mistyle.deliver.colour import read_style as read_file
     from mistyle.stylization.surface.layers import masked_style
 
@@ -45,25 +45,25 @@ def style_looks(style: Picture, name: str, settings: Settings, progress: Progres
         if path.is_file():  # a slot without its picture is refused where slots are placed
             pictures[slot.rpartition("=")[0] + "=" + path.name] = read_file(path, settings.colour)
     looks = tuple(look(picture, called, settings) for called, picture in pictures.items())
-    for one in looks:
-        progress.say(f"{one.name}: {told(one)}")
+    for entry in looks:
+        progress.say(f"{entry.name}: {sentence(entry)}")
     return looks
 
 
 def look(picture: Picture, name: str, settings: Settings) -> StyleLook:
-    """One picture's measures and settings."""
+    """Measures and settings of one picture."""
     reading = read_style(picture.rgb, picture.alpha)
     chosen = tuple(key for key in FROM_PAINTING if getattr(settings.surface, key) is None)
     return StyleLook(name, reading, settled(picture.rgb, picture.alpha, settings.surface, reading), chosen)
 
 
-def told(one: StyleLook) -> str:
-    """What was read and what follows, in a line."""
-    return f"{measures(one.reading)}; so {choices(one)}"
+def sentence(one: StyleLook) -> str:
+    """Measures and settings in one line."""
+    return f"{measures(one.reading)}; settings: {choices(one)}"
 
 
 def measures(reading: StyleReading) -> str:
-    """The measures of a picture in words."""
+    """The measures of a picture as text."""
     grid = "x".join(str(side) for side in reading.pixel_grid)
     return (
         f"unit {reading.unit:.2f} of the long side (clarity {reading.clarity:.2f}), lines {reading.line_likeness:.2f}, "
@@ -73,18 +73,18 @@ def measures(reading: StyleReading) -> str:
 
 
 def choices(one: StyleLook) -> str:
-    """The settings that follow from a picture, and those that were set."""
+    """The settings derived from a picture, and those the user set."""
     shown = {name: getattr(one.settings, name) for name in FROM_PAINTING}
     shown["crop"] = "/".join(f"{share:.3f}" for share in one.settings.crop)
-    own = [f"{name} {value}" for name, value in shown.items() if name in one.chosen]
-    kept = [f"{name} {value} (set)" for name, value in shown.items() if name not in one.chosen]
-    return ", ".join(own + kept)
+    chosen = [f"{name} {value}" for name, value in shown.items() if name in one.chosen]
+    fixed = [f"{name} {value} (set)" for name, value in shown.items() if name not in one.chosen]
+    return ", ".join(chosen + fixed)
 
 
 def look_facts(looks: tuple[StyleLook, ...]) -> tuple[tuple[str, str], ...]:
-    """For the report: a line of measures and a line of settings a picture."""
+    """For the report: one line of measures and one of settings for each picture."""
     return tuple(
         fact
         for one in looks
-        for fact in ((f"{one.name}, as read", measures(one.reading)), (f"{one.name}, settings", choices(one)))
+        for fact in ((f"{one.name}, measures", measures(one.reading)), (f"{one.name}, settings", choices(one)))
     )

@@ -1,4 +1,4 @@
-"""`run.json` of `stylize`: its inputs and settings, how long it took, and how good it is."""
+"""`run.json` of `stylize`: inputs, settings, timings, memory peaks and quality metrics."""
 
 from typing import Any, Literal
 
@@ -8,8 +8,8 @@ from mistyle.jobs.versions import peak_gb, versions
 from mistyle.measure.baked_light import BakedLight
 
 
-def write_summary(made: Any, run: Run) -> dict[str, Any]:
-    """Write `run.json` and return what the caller wants to know: paths, figures, timings."""
+def write_summary(result: Any, run: Run) -> dict[str, Any]:
+    """Write `run.json` and return paths, metrics, timings and notes."""
     job = run.job
     path = job.out / "run.json"
     seconds = merged_seconds(path, run)
@@ -24,12 +24,12 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
         "seconds": seconds,
         "peak_gb": max(peak_gb(), earlier(path).get("peak_gb", 0.0) if run.progress.reused else 0.0),
         "peaks_gb": merged_peaks(path, run),
-        "figures": figures(made),
+        "figures": figures(result),
         "notes": list(run.progress.notes),
     }
     record = summary | {
         "inputs": {"mesh": job.mesh.name, "style": job.style.name},
-        "style": [look.record() for look in made.looks],
+        "style": [look.record() for look in result.looks],
         "seed": job.settings.seed,
         "settings": job.settings.model_dump(mode="json"),
         "versions": versions(),
@@ -38,7 +38,7 @@ def write_summary(made: Any, run: Run) -> dict[str, Any]:
     return summary
 
 
-# What each figure of `figures` means, and which way is up; those of the fit are named <phase>.<figure>.
+# Meaning and better direction of each metric of `figures`; the fit's are named <phase>.<metric>.
 MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
     "residual": ("residual of lit views under their own light, relative to the views", "lower"),
     "painted_share": ("share of the covered texels whose albedo was painted", "higher"),
@@ -52,7 +52,7 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
         "largest correlation of the log albedo with an axis of the normal or with openness",
         "lower",
     ),
-    "style_before": ("distance of VGG-19's statistics to the painting's, on crops that no step used, before", "lower"),
+    "style_before": ("distance of VGG-19's statistics to the painting's, on held-out crops, before", "lower"),
     "style_after": ("the same after the finish", "lower"),
     "moved": ("root mean square change of the albedo by the finish, sRGB units", ""),
     "detail": ("correlation of the render's fine lightness with the stylized views' after this phase", "higher"),
@@ -62,33 +62,37 @@ MEANINGS: dict[str, tuple[str, Literal["higher", "lower", ""]]] = {
 
 
 def light_figures(light: BakedLight | None) -> dict[str, float]:
-    """How much light the finished albedo holds; nothing where it cannot be said."""
+    """Baked light left in the finished albedo; empty where it is not measurable."""
     if light is None:
         return {}
     ratio = {} if light.ratio is None else {"light_up_over_down": light.ratio}
     return ratio | {"light_correlation": light.strongest}
 
 
-def finish_figures(made: Any) -> dict[str, float]:
-    """What the finish did to the style loss and to the albedo; nothing where there was none."""
-    if made is None:
+def finish_figures(finishing: Any) -> dict[str, float]:
+    """Style loss before and after the finish, and the albedo's change; empty without a finish."""
+    if finishing is None:
         return {}
-    return {"finish.style_before": made.style[0], "finish.style_after": made.style[1], "finish.moved": made.moved}
+    return {
+        "finish.style_before": finishing.style[0],
+        "finish.style_after": finishing.style[1],
+        "finish.moved": finishing.moved,
+    }
 
 
-def figures(made: Any) -> dict[str, float]:
-    """How good the result is, over all texture sets. Of a phase that was undone, the figures are those before it."""
-    covered = [t.covered for t in made.atlas.texels]
+def figures(result: Any) -> dict[str, float]:
+    """Quality metrics over all texture sets. An undone phase reports its metrics from before it."""
+    covered = [t.covered for t in result.atlas.texels]
     total = max(sum(int(c.sum()) for c in covered), 1)
 
     def share(masks: Any) -> float:
         return sum(int((m & c).sum()) for m, c in zip(masks, covered, strict=True)) / total
 
     return {
-        "painted_share": share([m.known for m in made.repaired.maps]),
-        "seen_share": share([s > 0 for s in made.baked.seen]),
-        "repaired_share": share(made.repaired.mask),
-        **light_figures(made.light),
-        **finish_figures(made.finishing),
-        **{name: pair[made.fit.kept[name.partition(".")[0]]] for name, pair in made.fit.figures.items()},
+        "painted_share": share([m.known for m in result.repaired.maps]),
+        "seen_share": share([s > 0 for s in result.baked.seen]),
+        "repaired_share": share(result.repaired.mask),
+        **light_figures(result.light),
+        **finish_figures(result.finishing),
+        **{name: pair[result.fit.kept[name.partition(".")[0]]] for name, pair in result.fit.figures.items()},
     }

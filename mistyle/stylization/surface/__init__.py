@@ -1,1 +1,1 @@
-"""The weight-free painter: guided patch synthesis on surface samples."""
+"""Weight-free painter: guided patch synthesis on surface samples."""

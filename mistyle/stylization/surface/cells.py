@@ -1,8 +1,8 @@
-"""Points in cubic cells, and what is near what: thinning to blue noise, and lists of neighbours.
+"""Spatial hash grid of points: blue-noise thinning and neighbour lists.
 
-A cell is found by a hash of its three whole numbers. Several cells may share a bucket: distances decide, so that a
-stranger in a bucket costs time and changes nothing. Everything runs in Dr.Jit; a thread reads what others wrote in the
-kernel before and writes only its own point.
+A cell's bucket is a hash of its three integer coordinates. Several cells may share a bucket: distance tests reject
+points of other cells, which cost time only. Everything runs in Dr.Jit; a thread reads only the previous kernel's values
+and writes only its own point.
 """
 
 from collections.abc import Callable
@@ -17,17 +17,17 @@ from mistyle.stylization.surface.kernels import floats, whole
 
 PRIMES = (73856093, 19349663, 83492791)
 UNDECIDED, STAYS, GONE = 0, 1, 2
-FEWEST = 12  # bits of a bucket's number: with few points too, cells that are near rarely share a bucket
+FEWEST = 12  # least bits of a bucket index, so that with few points, too, nearby cells rarely share a bucket
 
 
 @dataclass(frozen=True)
 class PointGrid:
-    """Points by bucket: those of bucket b stand in rows range[2 b] to range[2 b + 1] of the sorted arrays.
+    """Points by bucket: those of bucket b are rows range[2 b] to range[2 b + 1] of the sorted arrays.
 
-    at      flat (n 4): position, and a number of the point's own
-    facing  flat (n 4): normal, and its number in the order of before
-    row     where each point of before stands now
-    crowd   how many points a point meets in its own bucket, itself included, on average
+    at      flat (n 4): position, and the point's number
+    facing  flat (n 4): normal, and its index in the input order
+    row     row of each input point
+    crowd   mean number of points in a point's own bucket, itself included
     """
 
     size: float
@@ -46,7 +46,7 @@ def point_grid(
     size: float,
     number: Int[np.ndarray, " n"] | None = None,
 ) -> PointGrid:
-    """Points sorted into cubes of side `size`; `number` (under 2^32) goes along with them."""
+    """Points sorted into cubes of side `size`, with their `number` (under 2^32)."""
     count = len(positions)
     buckets = 1 << max(int(np.ceil(np.log2(max(count, 2)))), FEWEST)
     # The same float32 arithmetic as in the kernels, so that both agree on a point's cell.
@@ -80,7 +80,7 @@ def each_near(
 ) -> tuple[Any, ...]:
     """Fold `visit(row, inside, *state)` over the rows of the 27 cells about `point`.
 
-    Where `inside` is false the row means nothing; some rows belong to strangers, and with few points some come twice.
+    Where `inside` is false the row is invalid. Some rows belong to other cells; with few points some repeat.
     """
     import drjit as dr
 
@@ -109,10 +109,10 @@ def each_near(
 
 
 def thin(dj: ModuleType, grid: PointGrid, radius: float) -> Bool[np.ndarray, " n"]:
-    """Which points stay when a point removes all others of its side within `radius`, taken by falling number.
+    """Mask of the points that stay when, by falling number, each removes all others of its side within `radius`.
 
-    Found in parallel rounds: a point that outranks all its undecided neighbours stays, and who is near one that stays
-    is gone. `radius` is at most the cells' size. The answer is in the points' order of before.
+    Parallel rounds: a point that outranks all undecided neighbours stays, and its neighbours are removed. `radius` is
+    at most the cells' size. The mask is in the input order.
     """
     import drjit as dr
 
@@ -139,16 +139,16 @@ def _fates(dj: ModuleType, grid: PointGrid, fate: Any, i: Any, limit: Any) -> An
 
     own: Any = dr.gather(dj.Array4f, grid.at, i)
     normal: Any = dr.gather(dj.Array4f, grid.facing, i)
-    mine = number(own[3])
+    own_number = number(own[3])
 
     def visit(j: Any, inside: Any, beaten: Any, gone: Any) -> tuple[Any, Any]:
-        other, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
-        step = [other[axis] - own[axis] for axis in range(3)]
+        neighbour, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
+        step = [neighbour[axis] - own[axis] for axis in range(3)]
         near = inside & (step[0] * step[0] + step[1] * step[1] + step[2] * step[2] <= limit) & (j != i)
         near &= facing[0] * normal[0] + facing[1] * normal[1] + facing[2] * normal[2] > 0
-        its = dr.gather(dj.UInt, fate, j)
-        beaten |= near & (its == UNDECIDED) & (number(other[3]) > mine)
-        return beaten, gone | (near & (its == STAYS))
+        neighbour_fate = dr.gather(dj.UInt, fate, j)
+        beaten |= near & (neighbour_fate == UNDECIDED) & (number(neighbour[3]) > own_number)
+        return beaten, gone | (near & (neighbour_fate == STAYS))
 
     beaten, gone = each_near(dj, grid, own, (dj.Bool(False), dj.Bool(False)), visit)
     return dr.select(gone, dj.UInt(GONE), dr.select(beaten, dj.UInt(UNDECIDED), dj.UInt(STAYS)))
@@ -162,7 +162,7 @@ def near(
     turning: float,
     most: int,
 ) -> Int[np.ndarray, "n k"]:
-    """Up to `most` points j with |p_j - p_i|^2 + (turning |n_j - n_i|)^2 < reach^2, own index in the places left."""
+    """Up to `most` points j with |p_j - p_i|^2 + (turning |n_j - n_i|)^2 < reach^2, padded with the own index."""
     import drjit as dr
 
     count = len(positions)
@@ -174,8 +174,8 @@ def near(
     listed = whole(dj, np.repeat(np.arange(count, dtype=np.uint32), most))
 
     def visit(j: Any, inside: Any, held: Any) -> tuple[Any]:
-        other, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
-        away = dr.square(other[0] - own[0]) + dr.square(other[1] - own[1]) + dr.square(other[2] - own[2])
+        neighbour, facing = dr.gather(dj.Array4f, grid.at, j), dr.gather(dj.Array4f, grid.facing, j)
+        away = dr.square(neighbour[0] - own[0]) + dr.square(neighbour[1] - own[1]) + dr.square(neighbour[2] - own[2])
         turn = [dr.square(facing[axis] - normal[axis]) for axis in range(3)]
         away += weight * (turn[0] + turn[1] + turn[2])
         take = inside & (away < limit) & (held < most)

@@ -1,4 +1,4 @@
-"""The nearest-neighbour field: which place of the exemplar each sample of a level takes."""
+"""Nearest-neighbour field: the exemplar place of each sample of a level."""
 
 from dataclasses import dataclass
 from types import ModuleType
@@ -16,7 +16,7 @@ LEAST_TARGET = 0.1  # target use of a pixel at least
 
 @dataclass(frozen=True)
 class NearestNeighbourField:
-    """A place of the exemplar for each sample; x, y in pixels of that page (index coordinates)."""
+    """A place in the exemplar for each sample; x, y in pixels of that page (index coordinates)."""
 
     page: Int[np.ndarray, " n"]
     x: Float[np.ndarray, " n"]
@@ -24,7 +24,7 @@ class NearestNeighbourField:
 
 
 def within(exemplar: Exemplar, page: np.ndarray, x: np.ndarray, y: np.ndarray) -> NearestNeighbourField:
-    """Places kept so far from the edges that the whole patch lies on the page."""
+    """Places clamped so that the whole patch lies on the page."""
     height, width = exemplar.shapes[page].T
     border = kernels.BORDER
     return NearestNeighbourField(
@@ -43,15 +43,15 @@ def from_pixels(exemplar: Exemplar, pixel: Int[np.ndarray, " n"]) -> NearestNeig
 
 
 def pixels(exemplar: Exemplar, field: NearestNeighbourField) -> Int[np.ndarray, " n"]:
-    """The flat index of the pixel in which each place lies; the inverse of `from_pixels`."""
+    """The flat index of each place's pixel; the inverse of `from_pixels`."""
     row = np.rint(field.y).astype(np.int64)
     return exemplar.starts[field.page] + row * exemplar.shapes[field.page, 1] + np.rint(field.x).astype(np.int64)
 
 
 def usage(exemplar: Exemplar, field: NearestNeighbourField) -> Float[np.ndarray, " k"]:
-    """How often each pixel of the unturned picture is in use, over its 5x5 neighbourhood; 1 is its target use.
+    """Use of each pixel of the unturned picture over its 5x5 neighbourhood, relative to its target use.
 
-    A surface smaller than the picture (wide strokes) shows a part of it: a pixel that is used once is not too frequent.
+    A surface smaller than the picture (wide strokes) shows only a part of it, so a single use is not above the target.
     """
     height, width = exemplar.size
     count = np.bincount(exemplar.origin[pixels(exemplar, field)], minlength=height * width).reshape(height, width)
@@ -73,7 +73,7 @@ def on_host(field: kernels.FieldArrays) -> NearestNeighbourField:
 def exemplar_arrays(
     dj: ModuleType, exemplar: Exemplar, colour: Any, descriptor: Float[np.ndarray, "m 24"]
 ) -> kernels.ExemplarArrays:
-    """The exemplar as arrays of Dr.Jit, with its colours (already there) and the descriptors of its pixels."""
+    """The exemplar as arrays of Dr.Jit, with its colours (already on the device) and its pixels' descriptors."""
     return kernels.ExemplarArrays(
         height=kernels.floats(dj, exemplar.shapes[:, 0]),
         width=kernels.floats(dj, exemplar.shapes[:, 1]),

@@ -1,7 +1,7 @@
-"""The inner loops, fused by Dr.Jit: choosing neighbours, describing patches, voting, searching, looking up.
+"""Fused Dr.Jit kernels of the synthesis: neighbour tables, patch descriptors, votes, search, look-ups.
 
 Every function takes the array module to run on as its first argument: `drjit.llvm` (CPU) or `drjit.cuda`. A thread
-reads what others wrote in the kernel before and writes only its own sample: nothing depends on the order of threads.
+reads only the previous kernel's values and writes only its own sample, so results do not depend on thread order.
 """
 
 from collections.abc import Callable
@@ -14,19 +14,19 @@ from jaxtyping import Bool, Float, Int
 
 from mistyle.core.drjit_arrays import aligned
 
-TURNED = np.uint32(1 << 31)  # the bit of a table entry that says the neighbour's picture is upside down
-PAGES = 4  # the picture in its four quarter turns
+TURNED = np.uint32(1 << 31)  # bit of a table entry whose neighbour's picture is turned by 180 degrees
+PAGES = 4  # quarter turns of the picture
 WIDTH = 24  # floats per style pixel: 16 patch components, 3 colour, 2 orientation, 1 band, 2 unused by pixels
 PATCH = 16
-LINEAR = 21  # how many of them enter the squared distance with weight one; the band follows at this index
-CLOSED = 22  # index at which a sample says what share of the price of leaving a stroke is due there, 0..1
+LINEAR = 21  # number of components in the squared distance with weight one; the band has this index
+CLOSED = 22  # index of a sample's share of the coherence price, 0..1
 BORDER = 2  # half a patch: centres keep this far from a page's edge
 SIGMA = 1.6  # of the vote's Gaussian, in samples
-FOLLOW = (7, 11, 13, 17, 2, 10, 14, 22)  # table entries at distance 1 and 2 along the axes, whose place is continued
+FOLLOW = (7, 11, 13, 17, 2, 10, 14, 22)  # table entries at distance 1 and 2 along the axes, used by the coherent search
 BESIDE = (7, 11, 13, 17)  # table entries of the four nearest neighbours
-SEEN = 8  # leading patch components by which a seam is seen
-HIDDEN_SEAM = 0.3  # share of the price of leaving a stroke that is due where both pictures show the same
-STAY = 0.1  # price of going on with a piece that is as large as it may get: more than any place is better than another
+SEEN = 8  # leading patch components that measure a seam's visibility
+HIDDEN_SEAM = 0.3  # share of the coherence price at an invisible seam
+STAY = 0.1  # price of extending a piece of the largest size: exceeds any difference between places
 PROBES = np.array(
     [(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, 1), (1, -1), (-1, -1), (0, 3), (0, -3), (3, 0), (-3, 0)], np.float32
 )
@@ -44,8 +44,8 @@ class Tables:
 
 @dataclass(frozen=True)
 class ExemplarArrays:
-    """The exemplar on the device: sizes and first pixels of its four pages; per pixel its colour, its descriptor and
-    the pixel of the unturned picture."""
+    """The exemplar on the device: sizes and first pixels of its four pages; per pixel colour, descriptor and pixel of
+    the unturned picture."""
 
     height: Any
     width: Any
@@ -66,7 +66,7 @@ class FieldArrays:
 
 @dataclass(frozen=True)
 class TargetDescriptors:
-    """Per sample the descriptor that it looks for (as wide as a style pixel's), and the weight of its band."""
+    """Per sample the target descriptor (as wide as a style pixel's), and the weight of its band."""
 
     descriptor: Any
     band_weight: Any
@@ -74,7 +74,7 @@ class TargetDescriptors:
 
 @dataclass(frozen=True)
 class PatchSizeLimit:
-    """1 for samples whose picture no neighbour may go on with, else 0; and the radius (pixels) where that holds."""
+    """1 for samples whose piece neighbours may not extend, else 0; and the radius (pixels) of this limit."""
 
     sample: Any
     around: Any
@@ -84,9 +84,9 @@ class PatchSizeLimit:
 class Prices:
     """Costs of a place besides its descriptor.
 
-    weights  flat: coherence, variety, one over the squared difference of patches that makes a seam count in full
-    use      per pixel of the unturned picture how often it is taken (1 = its target)
-    limit    pieces that are as large as they may get
+    weights  flat: coherence, variety, one over the squared patch difference of a fully visible seam
+    use      use of each pixel of the unturned picture (1 = its target)
+    limit    pieces of the largest size
     """
 
     weights: Any
@@ -117,7 +117,7 @@ def tables(
     turned: Bool[np.ndarray, "n 25"],
     offsets: Float[np.ndarray, "n 25 2"],
 ) -> Tables:
-    """Neighbourhoods moved to the device."""
+    """Copy neighbourhoods to the device."""
     index = neighbours.astype(np.uint32) | np.where(turned, TURNED, np.uint32(0))
     weight = np.exp(-(offsets**2).sum(axis=2) / np.float32(2 * SIGMA**2))
     return Tables(len(neighbours), whole(dj, index), floats(dj, offsets), floats(dj, weight))
@@ -135,7 +135,7 @@ class Frames:
 
 
 def choose_neighbours(dj: ModuleType, frame: Frames, near: Int[np.ndarray, "n k"]) -> Int[np.ndarray, "n 25"]:
-    """For every grid position (row by row, x fastest) the sample of `near` that lies nearest to it.
+    """For every grid position (row by row, x fastest) the nearest sample of `near`.
 
     Nearest means smallest |p_j - p_i - h (dx t + dy s)|^2 + (3 h)^2 |n_j - n_i|^2; the first of equals is taken.
     """
@@ -145,7 +145,7 @@ def choose_neighbours(dj: ModuleType, frame: Frames, near: Int[np.ndarray, "n k"
     candidates = whole(dj, near)
     i = dr.arange(dj.UInt, count)
     own_p, own_n = dr.gather(dj.Array3f, frame.position, i), dr.gather(dj.Array3f, frame.normal, i)
-    # Opaque: a literal would be compiled in, one kernel for every mesh.
+    # Opaque: a literal would compile one kernel for every mesh.
     scale = dr.opaque(dj.Float, 1 / frame.spacing)
     x_axis = dr.gather(dj.Array3f, frame.tangent, i) * scale
     y_axis = dr.gather(dj.Array3f, frame.across, i) * scale
@@ -180,8 +180,8 @@ def choose_neighbours(dj: ModuleType, frame: Frames, near: Int[np.ndarray, "n k"
 def offsets(
     dj: ModuleType, frame: Frames, neighbours: Int[np.ndarray, "n 25"]
 ) -> tuple[Bool[np.ndarray, "n 25"], Float[np.ndarray, "n 25 2"]]:
-    """For every table entry: whether the neighbour's tangent points the other way, and where (x, y) the sample lies in
-    the neighbour's frame, in spacings, cut at +-4."""
+    """For every table entry: whether the neighbour's tangent is opposite, and the sample's position (x, y) in the
+    neighbour's frame, in spacings, clamped to +-4."""
     import drjit as dr
 
     entry = dr.arange(dj.UInt, neighbours.size)
@@ -209,7 +209,7 @@ def describe(dj: ModuleType, table: Tables, colour: Any, basis: Any, mean: Any) 
 
 
 def describe_pixels(dj: ModuleType, colour: Any, shapes: Int[np.ndarray, "4 2"], basis: Any, mean: Any) -> Any:
-    """Patch components of every pixel of the four pages (each height x width = `shapes`); wrong at a page's border."""
+    """Patch components of every pixel of the four pages (height x width in `shapes`); invalid at a page's border."""
     import drjit as dr
 
     area = int(shapes[0].prod())
@@ -248,7 +248,7 @@ def _components(dj: ModuleType, count: int, member: Callable[[Any], Any], colour
 
 
 def vote(dj: ModuleType, table: Tables, exemplar: ExemplarArrays, field: FieldArrays) -> Any:
-    """The colour of every sample, flat (n 3): what the patches of its 25 neighbours show where it lies, averaged."""
+    """The colour of every sample, flat (n 3): the weighted mean of its 25 neighbours' patches at its position."""
     import drjit as dr
 
     i = dr.arange(dj.UInt, table.count)
@@ -284,7 +284,7 @@ def vote(dj: ModuleType, table: Tables, exemplar: ExemplarArrays, field: FieldAr
 def continued(
     dj: ModuleType, table: Tables, exemplar: ExemplarArrays, field: FieldArrays, slot: Any
 ) -> tuple[Any, Any, Any]:
-    """Where a sample would lie if it went on with the picture of the neighbour in table entry `slot`: page, x, y."""
+    """A sample's place (page, x, y) if it continues the picture of its neighbour in table entry `slot`."""
     import drjit as dr
 
     entry = dr.gather(dj.UInt, table.neighbour, slot)
@@ -306,9 +306,9 @@ def search(
     prices: Prices,
     also: FieldArrays | None = None,
 ) -> tuple[Any, FieldArrays]:
-    """One round: every sample takes the best of its own place, those its neighbours suggest, and fixed steps about it.
+    """One round: every sample takes the best of its own place, its neighbours' continued places, and fixed offsets.
 
-    `also` offers one more place per sample (from `exhaustive`). Returns costs and places.
+    `also` is one more candidate per sample (from `exhaustive`). Returns costs and places.
     """
     import drjit as dr
 
@@ -350,7 +350,7 @@ def _cost(
     targets: TargetDescriptors,
     prices: Prices,
 ) -> Callable[[Any, Any, Any], Any]:
-    """The cost of taking a place (page, x, y), for all samples; neighbours stand where `field` has them."""
+    """The cost of a place (page, x, y), for all samples, with neighbours' places from `field`."""
     import drjit as dr
 
     i = dr.arange(dj.UInt, table.count)
@@ -374,19 +374,19 @@ def _cost(
         total = variety * dr.gather(dj.Float, prices.use, dr.gather(dj.UInt, exemplar.origin, pixel))
         own = _descriptor(dj, exemplar.descriptor, pixel, SEEN)
         for k in range(WIDTH // 4):
-            here = own[k] if k < len(own) else dr.gather(dj.Array4f, exemplar.descriptor, pixel * (WIDTH // 4) + k)
-            gap = target[k] - here
+            entries = own[k] if k < len(own) else dr.gather(dj.Array4f, exemplar.descriptor, pixel * (WIDTH // 4) + k)
+            gap = target[k] - entries
             if k < LINEAR // 4:
                 total += dr.squared_norm(gap)
             else:
                 total += dr.square(gap[0]) + band_weight * dr.square(gap[1])
-        for k, (other, u, v) in enumerate(beside):
+        for k, (neighbour_page, u, v) in enumerate(beside):
             away = dr.square(u - x) + dr.square(v - y)
             apart = sum((dr.squared_norm(a - b) for a, b in zip(own, shown[k], strict=True)), start=dj.Float(0))
             visible = HIDDEN_SEAM + (1 - HIDDEN_SEAM) * dr.minimum(apart * seam, 1)
-            price = coherence * visible * dr.select(other == page, dr.minimum(away, 4) / 4, 1)
+            price = coherence * visible * dr.select(neighbour_page == page, dr.minimum(away, 4) / 4, 1)
             if around is not None:
-                near = dr.select(other == page, dr.maximum(1 - away / around, 0), 0)
+                near = dr.select(neighbour_page == page, dr.maximum(1 - away / around, 0), 0)
                 price = dr.select(closed[k] > 0, STAY * near, price)
             total += price
         return total
@@ -395,7 +395,7 @@ def _cost(
 
 
 def _inside(dj: ModuleType, exemplar: ExemplarArrays, page: Any, x: Any, y: Any) -> tuple[Any, Any]:
-    """A place moved so far from the page's edges that its patch lies on the page."""
+    """A place clamped so that its patch lies on the page."""
     import drjit as dr
 
     width, height = dr.gather(dj.Float, exemplar.width, page), dr.gather(dj.Float, exemplar.height, page)
@@ -411,7 +411,7 @@ def _pixel_at(dj: ModuleType, exemplar: ExemplarArrays, page: Any, x: Any, y: An
 
 
 def _descriptor(dj: ModuleType, values: Any, index: Any, width: int) -> list[Any]:
-    """The first `width` entries of a descriptor, by fours."""
+    """The first `width` entries of a descriptor, in groups of four."""
     import drjit as dr
 
     return [dr.gather(dj.Array4f, values, index * (WIDTH // 4) + k) for k in range(width // 4)]

@@ -1,5 +1,7 @@
-"""The paint on an asset: which picture goes where, what of the asset's own look stays, and what the painting
-says about height and gloss (before the paper's 4.2, which then refines those maps)."""
+"""Paint layers of an asset: pictures per area, protected areas, content guide, and the painting's relief and gloss.
+
+The paper's 4.2 later refines those maps.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -19,38 +21,38 @@ from mistyle.stylization.surface.guides.linefield import DirectionConstraint
 from mistyle.stylization.surface.lookup import PaintedSurface
 from mistyle.stylization.surface.settings import SurfaceSettings
 
-PICTURE_STROKES = 32  # strokes side by side along a picture's long side, by which `stroke_size` is turned into a scale
-FEW_TEXELS = 200_000  # texels that are asked for content, or for a painted direction
+PICTURE_STROKES = 32  # strokes along a picture's long side, to convert `stroke_size` into a scale
+FEW_TEXELS = 200_000  # texels sampled for content or for a painted direction
 PLAIN = 0.004  # standard deviation of lightness (0..1) below which an albedo has no content
 ROUGHEST, SMOOTHEST = 1.0, 0.08
-FLOW_FREE, FLOW_SURE = 0.1, 0.5  # distances from mid grey up to which, and from which on, a painted direction counts
+FLOW_FREE, FLOW_SURE = 0.1, 0.5  # distances from mid grey at which a painted direction has weight 0 and 1
 
 
 @dataclass(frozen=True)
 class StyleLayers:
-    """One solution a picture, and per texture set which of them each texel takes (0: the job's own style)."""
+    """One solution per picture, and per texture set each texel's solution index (0: the job's own style)."""
 
     solutions: tuple[PaintedSurface, ...]
     choice: tuple[np.ndarray, ...]
 
 
 def masked_style(style: Picture, mask: Path | None) -> Picture:
-    """The style with the dark parts of a mask picture (of any size) taken out."""
+    """The style picture, transparent in the dark parts of a mask picture (of any size)."""
     if mask is None:
         return style
     from mistyle.io.read import read_picture
 
     light = resize(read_picture(mask).rgb.mean(axis=2), style.rgb.shape[:2])
     if not (light > 0.5).any():
-        raise InputRefused(f"{mask}: dark everywhere; a style mask is light where the picture may be used")
+        raise InputRefused(f"{mask}: dark everywhere; expected a style mask that is light in the usable parts")
     alpha = np.ones(style.rgb.shape[:2], np.float32) if style.alpha is None else style.alpha
     return replace(style, alpha=(alpha * (light > 0.5)).astype(np.float32))
 
 
 def scaled(surface: SurfaceSettings, asset: Asset, stroke_size: float | None) -> SurfaceSettings:
-    """`stroke_scale` such that a stroke (a 32nd of the picture) is `stroke_size` of the mesh's own units wide.
+    """The settings with the `stroke_scale` that makes a stroke (a 32nd of the picture) `stroke_size` mesh units wide.
 
-    Refused where that is beyond what the number of samples can show.
+    Raises InputRefused where the number of samples cannot resolve it.
     """
     if stroke_size is None:
         return surface
@@ -62,7 +64,7 @@ def scaled(surface: SurfaceSettings, asset: Asset, stroke_size: float | None) ->
     per_unit = float(np.cbrt(abs(np.linalg.det(asset.source.work_from_user[:3, :3]))))
 
     def stroke(scale: float) -> float:
-        """Width of a stroke in the mesh's units at a stroke_scale, as far as that is possible."""
+        """Width of a stroke in the mesh's units at a stroke_scale, within the possible range."""
         size = finest_size(surface.model_copy(update={"stroke_scale": scale}))
         return float(size * spacing / PICTURE_STROKES / per_unit)
 
@@ -78,9 +80,9 @@ def scaled(surface: SurfaceSettings, asset: Asset, stroke_size: float | None) ->
 def slot_masks(
     asset: Asset, texels: Sequence[Texels], slots: Sequence[str]
 ) -> tuple[list[Path], list[list[Bool[np.ndarray, "h w"]]]]:
-    """The pictures of `slots` and, per picture and texture set, the texels that take it.
+    """The pictures of `slots` and, per picture and texture set, the mask of its texels.
 
-    SLOT names a material (all of its texels) or is a picture in the mesh's UVs (texels where it is light).
+    SLOT is a material (all its texels) or a picture in the mesh's UVs (its light texels).
     """
     pictures, masks = [], []
     for slot in slots:
@@ -112,9 +114,9 @@ def painted_mask(path: Path, texels: Texels) -> Bool[np.ndarray, "h w"]:
 
 
 def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.ndarray, np.ndarray], np.ndarray] | None:
-    """Lightness (encoded luminance, 0..1) of the asset's own albedo at surface points; None where it is of one colour.
+    """Lightness (encoded luminance, 0..1) of the asset's own albedo at surface points; None for a uniform albedo.
 
-    The nearest of about 200,000 texels of the same side answers.
+    Uses the nearest of about 200,000 texels of the same side.
     """
     if not any(t.covered.any() for t in texels):
         return None
@@ -128,13 +130,15 @@ def content(texels: Sequence[Texels], start: Sequence[Maps]) -> Callable[[np.nda
 def nearest_texels(
     texels: Sequence[Texels],
 ) -> tuple[Callable[[np.ndarray, np.ndarray], np.ndarray], list[Int[np.ndarray, " n"]]]:
-    """About FEW_TEXELS of the covered texels, as flat indices of each set, and which of them, counted through all sets,
-    lies nearest to points (positions, normals) of the surface, of the same side."""
+    """About FEW_TEXELS covered texels, as flat indices of each set, and a function to the nearest of them.
+
+    It takes surface points (positions, normals) and returns texels of the same side, counted through all sets.
+    """
     from scipy.spatial import KDTree
 
     counts = np.cumsum([0] + [int(t.covered.sum()) for t in texels])
     every = max(int(counts[-1]) // FEW_TEXELS, 1)
-    reach = np.float32(0.02)  # working units by which a turn of the normal by one radian counts
+    reach = np.float32(0.02)  # working units per radian between normals
     spans = zip(texels, counts[:-1], counts[1:], strict=True)
     chosen = [np.flatnonzero(t.covered)[int(-first % every) : end - first : every] for t, first, end in spans]
     both = zip(texels, chosen, strict=True)
@@ -148,11 +152,10 @@ def nearest_texels(
 
 
 def painted_direction(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -> DirectionConstraint | None:
-    """Where strokes shall run by a picture in the mesh's UVs (row 0 is v = 1): red and green, less one half, are the
-    direction along u and v. The further a colour is from mid grey, and the more opaque, the more it counts; half way is
-    fully.
+    """Stroke directions from a picture in the mesh's UVs (row 0 is v = 1).
 
-    Lines have no sign: opposite colours mean the same.
+    Red and green, minus one half, are the direction along u and v. The weight grows with the distance from mid grey
+    (full at half of the range) and with opacity. Lines have no sign: opposite colours are equal.
     """
     if path is None:
         return None
@@ -174,8 +177,8 @@ def painted_direction(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -
     world /= np.maximum(np.linalg.norm(world, axis=1, keepdims=True), 1e-9)
     if not counts.any():
         raise InputRefused(
-            f"{path}: mid grey or transparent everywhere; a direction map holds stroke directions in red (along u) "
-            "and green (along v)"
+            f"{path}: mid grey or transparent everywhere; expected stroke directions in red (along u) and green "
+            "(along v)"
         )
 
     def direction(where: np.ndarray, facing: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -187,7 +190,7 @@ def painted_direction(path: Path | None, mesh: Mesh, texels: Sequence[Texels]) -
 
 @dataclass(frozen=True)
 class TexelBand:
-    """Chosen texels of some rows of a texture set; `at` masks them within these rows."""
+    """Selected texels of a band of rows of a texture set; `at` masks them within these rows."""
 
     texels: Texels
     rows: slice
@@ -199,7 +202,7 @@ class PaintRelief:
     """A painting's relief at some texels, in row order.
 
     gradient  of its height (world, along the surface)
-    dull      what the paint adds to the roughness
+    dull      the paint's offset of the roughness
     """
 
     gradient: Float[np.ndarray, "t 3"]
@@ -215,10 +218,10 @@ def lay_relief(
     mesh: Mesh,
     tangents: Float[np.ndarray, "f 3 4"],
 ) -> None:
-    """Bend the normals of `maps` by `height` times the painting's slope, and add `gloss` times its dullness to their
-    roughness, in place, for the texels of a band.
+    """Add the painting's relief to `maps`, in place, for the texels of a band.
 
-    The normal that the asset's map shows is bent, not overwritten. `tangents` are `corner_tangents` of the mesh.
+    Normals tilt by `height` times the painting's slope; roughness grows by `gloss` times its dullness. The asset's own
+    normal map is tilted, not overwritten. `tangents` are `corner_tangents` of the mesh.
     """
     texels, rows, at = band.texels, band.rows, band.at
     normal, roughness = maps.normal[rows], maps.roughness[rows]
@@ -234,7 +237,7 @@ def lay_relief(
 
 
 def protected(maps: Maps, start: Maps, mask: Bool[np.ndarray, "h w"]) -> Maps:
-    """The maps with the asset's own look where the mask says so."""
+    """The maps with the asset's own values under the mask."""
     chosen = mask[..., None]
     return replace(
         maps,

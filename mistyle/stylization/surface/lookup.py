@@ -1,4 +1,4 @@
-"""The painted surface: any point of it answers with a colour of the painting, at the painting's own resolution."""
+"""Look-up of colour and relief at any point of a painted surface, at the painting's own resolution."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ from mistyle.stylization.surface.samples import Level, as_points, lifted, worker
 
 CHUNK = 1 << 19
 BLEND = 0.25  # of the Gaussian between the nearest samples of a piece, in spacings
-AROUND = 8  # samples that vote on which piece of the painting a point belongs to
+AROUND = 8  # samples that vote on a point's piece of the painting
 VOTE = 0.9  # of the vote's Gaussian, in spacings
 NEAREST = 4  # samples whose pictures are blended
 CRISP = {"cut": 8.0, "blend": 2.0}  # power of a piece's share of the votes, by kind of border
@@ -24,18 +24,18 @@ CRISP = {"cut": 8.0, "blend": 2.0}  # power of a piece's share of the votes, by 
 
 @dataclass(frozen=True)
 class PaintedSurface:
-    """Where each sample of the surface lies in the painting.
+    """The place of each surface sample in the painting.
 
     positions, normals  of the samples, working space
     tangent             unit, the picture's x at quarter turn 0; y is tangent x normal
-    turn                quarter turns (counter-clockwise) by which the painting is turned at this sample
+    turn                quarter turns (counter-clockwise) of the painting at this sample
     centre              (x, y) in pixels of the unturned painting, pixel centres at +0.5
     spacing             mean distance h of samples
     scale               pixels of the painting per spacing, along its x and y
     painting            encoded sRGB, 0..1
-    glaze               what is added to the painting's lightness at this sample (Lab / 100), smooth over the surface
-    piece               which samples go on with one another's picture: equal numbers
-    crisp               power of a piece's share of the votes about a point, at borders of pieces
+    glaze               offset of the painting's lightness at this sample (Lab / 100), smooth over the surface
+    piece               label of the sample's piece: samples that continue one another's picture have equal labels
+    crisp               power of a piece's share of the votes around a point, at borders of pieces
     whole_pixels        the painting's pixels are squares of one colour (no bilinear look-up)
     """
 
@@ -106,8 +106,8 @@ def colour(
 
     The three samples nearest in [p, 3 h n] each continue their piece of the painting to the point; their colours are
     blended by exp(-(d^2 - d0^2) / (2 (0.25 h)^2)). `footprint` is the distance between neighbouring queries (a texel, a
-    pixel) in working units: the painting is blurred to it, 0 leaves it sharp. A point off the surface gets the colour
-    of the nearest sample's tangent plane.
+    pixel) in working units; the painting is blurred to it, 0: no blur. A point off the surface gets the colour of the
+    nearest sample's tangent plane.
     """
     glazed = bool(surface.glaze.any())
     out = np.empty((len(positions), 3), np.float32)
@@ -127,8 +127,8 @@ def relief(
     footprint: float = 0.0,
     device: str = "llvm",
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """The gradient of the painted height along the surface (world vectors, root mean square about 1), and what the
-    painting adds to the roughness. A height h bends the unit normal n to that of n - grad h."""
+    """The gradient of the painted height along the surface (world vectors, root mean square about 1), and the
+    painting's offset of the roughness. A height h tilts the unit normal n to the direction of n - grad h."""
     own = reliefs.relief(surface.painting)
     picture = np.concatenate([own.slope, own.dull[..., None]], axis=2)
     gradient, dull = np.empty((len(positions), 3), np.float32), np.empty(len(positions), np.float32)
@@ -147,8 +147,8 @@ def looked_up(
     *,
     slopes: bool = False,
 ) -> Iterator[tuple[slice, Float[np.ndarray, "m 4"], Int[np.ndarray, "m k"], Float[np.ndarray, "m k"]]]:
-    """What a picture as large as the painting shows at surface points, in chunks: which points, values, nearest samples
-    and their weights. `slopes` takes the first two channels for a vector along the picture's x and y."""
+    """Samples of a picture of the painting's size at surface points, in chunks: points, values, nearest samples and
+    their weights. With `slopes`, the first two channels are a vector along the picture's x and y."""
     dj = kernels.module(device)
     tree = as_points(surface.positions, surface.normals, surface.spacing).tree
     pixel = surface.spacing / max(surface.scale)  # one pixel of the painting on the surface
@@ -169,10 +169,10 @@ def looked_up(
 def blended(
     distance: Float[np.ndarray, "n k"], index: Int[np.ndarray, "n k"], piece: Int[np.ndarray, " m"], crisp: float
 ) -> tuple[Int[np.ndarray, "n j"], Float[np.ndarray, "n j"]]:
-    """Which of the nearest samples (distances in spacings, ascending) show at a point, and their weights.
+    """Selected nearest samples (distances in spacings, ascending) of a point, and their weights.
 
-    The samples about a point vote on its piece of the painting, so that a border between pieces is a smooth line and
-    not the zigzag of single samples; within a piece the nearest sample shows.
+    The samples around a point vote on its piece of the painting. So a border between pieces is a smooth line, not the
+    zigzag of single samples; within a piece the nearest sample dominates.
     """
     keep = min(NEAREST, distance.shape[1])
     near = distance**2 - distance[:, :1] ** 2
@@ -196,7 +196,7 @@ def blended(
 
 
 def on_canvas(dj: ModuleType, surface: PaintedSurface, picture: Float[np.ndarray, "h w 3"]) -> Canvas:
-    """A painted surface on the device; `picture` is as large as its painting. Scales are pixels per working unit."""
+    """A painted surface on the device; `picture` has its painting's size. Scales are pixels per working unit."""
     import drjit as dr
 
     scale = np.array(surface.scale) / surface.spacing
@@ -222,9 +222,9 @@ def paint(
     slopes: bool = False,
     whole_pixels: bool = False,
 ) -> Float[np.ndarray, "n 4"]:
-    """Blend what the samples `index` show at `positions`: bilinear in the painting, or whole pixels.
+    """Blend the pictures of the samples `index` at `positions`: bilinear in the painting, or nearest pixels.
 
-    Coordinates are kept inside it. Three channels and 0; with `slopes` the first two as a vector in the world and the
+    Coordinates are clamped to it. Returns three channels and 0; with `slopes` the first two as a world vector, and the
     third.
     """
     import drjit as dr
@@ -262,7 +262,7 @@ def paint(
         shown = dr.lerp(upper, lower, y - top)
         value = dj.Array4f(shown[0], shown[1], shown[2], 0)
         if slopes:
-            # The turns above, the other way round.
+            # The inverse of the turns above.
             sx, sy = shown[0], shown[1]
             gu = dr.select(turn == 0, sx, dr.select(turn == 1, sy, dr.select(turn == 2, -sx, -sy)))
             gv = dr.select(turn == 0, sy, dr.select(turn == 1, -sx, dr.select(turn == 2, -sy, sx)))

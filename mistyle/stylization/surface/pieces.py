@@ -1,7 +1,7 @@
-"""How large the pieces are that the synthesis copies from the painting as they stand, and where they reach too far.
+"""Connected pieces that the synthesis copies from the painting, their labels and their extent.
 
-Neighbours on the surface that take neighbouring places of the painting belong to one piece. A large piece can show
-what the painting shows: a face, a house, lettering. The coarse levels decide the pieces, finer ones only redraw them.
+Neighbours on the surface with neighbouring places in the painting belong to one piece. A large piece can reproduce
+motifs of the painting: a face, a house, lettering. Coarse levels determine the pieces, finer levels only refine them.
 """
 
 import numpy as np
@@ -14,39 +14,39 @@ from mistyle.stylization.surface.field import NearestNeighbourField, pixels
 from mistyle.stylization.surface.kernels import BESIDE
 from mistyle.stylization.surface.samples import Level
 
-SAME = 2.0  # pixels by which a neighbour's picture may be missed and still be the same piece
+SAME = 2.0  # largest offset in pixels from a neighbour's continued picture within one piece
 
 
 def labels(level: Level, exemplar: Exemplar, field: NearestNeighbourField) -> Int[np.ndarray, " n"]:
-    """Which piece each sample belongs to, given its place."""
+    """The piece label of each sample."""
     page, x, y = field.page, field.x, field.y
     count, beside = len(page), np.array(BESIDE)
-    other, turned = level.neighbours[:, beside], level.turned[:, beside]
-    goes_on = np.stack([x[other], y[other]], axis=-1) + level.offsets[:, beside]
-    height, width = exemplar.shapes[page[other]].astype(np.float32).transpose(2, 0, 1)
+    neighbour, turned = level.neighbours[:, beside], level.turned[:, beside]
+    goes_on = np.stack([x[neighbour], y[neighbour]], axis=-1) + level.offsets[:, beside]
+    height, width = exemplar.shapes[page[neighbour]].astype(np.float32).transpose(2, 0, 1)
     goes_on = np.where(turned[..., None], np.stack([width - 1, height - 1], axis=-1) - goes_on, goes_on)
-    same = np.where(turned, (page[other] + 2) % 4, page[other]) == page[:, None]
+    same = np.where(turned, (page[neighbour] + 2) % 4, page[neighbour]) == page[:, None]
     jump = ((goes_on - np.stack([x, y], axis=-1)[:, None]) ** 2).sum(axis=-1)
-    here, there = np.nonzero(same & (jump < SAME**2))
-    joined = coo_matrix((np.ones(len(here), bool), (here, other[here, there])), shape=(count, count))
+    sample, slot = np.nonzero(same & (jump < SAME**2))
+    joined = coo_matrix((np.ones(len(sample), bool), (sample, neighbour[sample, slot])), shape=(count, count))
     return connected_components(joined, directed=False)[1]
 
 
 def reach(piece: Int[np.ndarray, " n"], at: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """How far each sample's place `at` is from the middle of its piece, in the unit of `at`."""
+    """Distance of each sample's place `at` from the centre of its piece, in the unit of `at`."""
     size = np.bincount(piece)
     middle = np.stack([np.bincount(piece, at[:, k]) / size for k in range(2)], axis=1)
     return np.linalg.norm(at - middle[piece], axis=1)
 
 
 def on_picture(exemplar: Exemplar, pixel: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 2"]:
-    """Where pixels of the exemplar lie in the unturned picture (x, y), in shares of its long side."""
+    """Positions (x, y) of exemplar pixels in the unturned picture, in shares of its long side."""
     height, width = exemplar.size
     origin = exemplar.origin[pixel]
     return np.stack([origin % width, origin // width], axis=1) / max(height, width)
 
 
 def too_far(level: Level, exemplar: Exemplar, field: NearestNeighbourField, largest: float) -> Bool[np.ndarray, " n"]:
-    """The samples at which a piece has got wider than `largest`, a share of the picture's long side."""
+    """The samples at which a piece is wider than `largest`, a share of the picture's long side."""
     at = on_picture(exemplar, pixels(exemplar, field))
     return reach(labels(level, exemplar, field), at) > largest / 2

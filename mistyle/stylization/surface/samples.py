@@ -1,7 +1,7 @@
-"""Points spread evenly over a surface, and the tables that let a point see its neighbours as pixels see theirs.
+"""Blue-noise surface samples, and tables of their 5x5 neighbourhoods, which replace a pixel grid.
 
-Distances between samples are taken in six dimensions, [position, 3 h normal]: two sides of a thin wall or of a crease
-lie far apart there although they touch in space, so nothing painted on one side reaches the other.
+Distances between samples are six-dimensional, [position, 3 h normal]. Two sides of a thin wall or of a crease are far
+apart although they touch in space. So paint on one side does not reach the other.
 """
 
 from dataclasses import dataclass
@@ -17,13 +17,13 @@ from mistyle.core.rows import distinct
 from mistyle.geometry.normals import crease_normals, same_points
 from mistyle.stylization.surface import cells, kernels
 
-OVERSAMPLING = 5  # candidates per sample asked for
-YIELD = 0.8  # points that stay, per one asked for
+OVERSAMPLING = 5  # candidates per requested sample
+YIELD = 0.8  # remaining points per requested sample
 COINCIDENT_ROUNDS = 4
-SPACING = 0.8  # least distance of two samples, in sqrt(area per sample asked for)
-NORMAL_REACH = 3.0  # a turn of the normal by one radian counts as this many sample spacings
-NEAR_REACH = 4.0  # spacings within which the 5 x 5 table is chosen, turns of the normal counted as above
-NEAR = 60  # and how many samples are looked at: such a disc holds 50
+SPACING = 0.8  # least distance of two samples, in sqrt(area per requested sample)
+NORMAL_REACH = 3.0  # sample spacings per radian between normals
+NEAR_REACH = 4.0  # spacings within which the 5 x 5 table is chosen, with normals as above
+NEAR = 60  # candidates for the table: such a disc holds 50 samples
 CROWDED = 25.0  # candidates in a cell, on average, above which coincident layers are thinned on a grid first
 GRID = np.array([(dx, dy) for dy in range(-2, 3) for dx in range(-2, 3)], np.float32)  # (25 2): row by row, x fastest
 CENTRE = 12
@@ -44,9 +44,9 @@ class Level:
     """Points with tangent frames and 5 x 5 neighbourhoods; entry k of a row belongs to the grid position GRID[k].
 
     tangent     along the stroke, the picture's x; y is `across`
-    directed    0..1, how sure the tangent's direction is
+    directed    0..1, certainty of the tangent's direction
     neighbours  the sample nearest to p + h (dx tangent + dy across)
-    turned      whether that neighbour's tangent points the other way, its picture being turned by 180 degrees
+    turned      whether that neighbour's tangent is opposite, so that its picture is turned by 180 degrees
     offsets     (x, y) of the sample in its neighbour's frame, in spacings, within -4..4
     """
 
@@ -60,12 +60,12 @@ class Level:
 
 
 def unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
-    """Vectors at length one; zero stays zero."""
+    """Vectors normalised to length one; zero stays zero."""
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-20)
 
 
 def workers() -> int:
-    """As many threads for k-d trees as Dr.Jit uses, so that one setting rules both; the answers do not depend on it."""
+    """Threads for k-d trees, as many as Dr.Jit uses, so that one setting controls both; results do not depend on it."""
     import drjit
 
     return max(int(drjit.thread_count()), 1)
@@ -74,7 +74,7 @@ def workers() -> int:
 def sample_normals(mesh: Mesh) -> Float[np.ndarray, "f 3 3"]:
     """Per-corner normals for samples: smooth up to 50 degrees, sharp beyond, on the side of the shading normals.
 
-    The mesh's own shading normals do not serve: smoothed around the rim of a thin wall, they would join its sides.
+    The mesh's own shading normals are unsuitable: smoothed around the rim of a thin wall, they would join its sides.
     """
     normals = face_normals(mesh)
     inward = ((normals * mesh.corner_normals.sum(axis=1)).sum(axis=1) < 0)[:, None]
@@ -104,7 +104,7 @@ def spread(
         )
     candidates = OVERSAMPLING * count
     share = np.cumsum(areas) / area
-    # side="right" passes over faces without area: their share equals that of the face before.
+    # side="right" skips faces without area: their share equals that of the face before.
     face = np.searchsorted(share, (np.arange(candidates) + rng.random(candidates)) / candidates, side="right")
     face = np.minimum(face, np.flatnonzero(areas > 0)[-1])
     root, v = np.sqrt(rng.random(candidates, np.float32)), rng.random(candidates, np.float32)
@@ -114,15 +114,15 @@ def spread(
     order = in_order(positions)
     positions, normals = positions[order], normals[order]
     radius = SPACING * float(np.sqrt(area / count))
-    kept = thin(positions, normals, radius, rng, dj)
-    # Layers that coincide count several times in the area but hold the points of one: draw nearer until enough stay.
+    selected = thin(positions, normals, radius, rng, dj)
+    # Coincident layers count several times in the area but hold one layer's points: shrink the radius for more.
     for _ in range(COINCIDENT_ROUNDS):
-        if len(kept) > count / 2:
+        if len(selected) > count / 2:
             break
-        radius *= max(0.25, float(np.sqrt(len(kept) / (YIELD * count))))
-        kept = thin(positions, normals, radius, rng, dj)
-    own_area = radius**2 / SPACING**2 * len(kept) / YIELD
-    return as_points(positions[kept], normals[kept], float(np.sqrt(min(area, 1.1 * own_area) / len(kept))))
+        radius *= max(0.25, float(np.sqrt(len(selected) / (YIELD * count))))
+        selected = thin(positions, normals, radius, rng, dj)
+    own_area = radius**2 / SPACING**2 * len(selected) / YIELD
+    return as_points(positions[selected], normals[selected], float(np.sqrt(min(area, 1.1 * own_area) / len(selected))))
 
 
 def combined(
@@ -146,7 +146,7 @@ def as_points(positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n
 def lifted(
     positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], spacing: float
 ) -> Float[np.ndarray, "n 6"]:
-    """[position, 3 h normal]: the space in which neighbours are sought."""
+    """[position, 3 h normal]: the space of neighbour searches."""
     return np.concatenate([positions, normals * np.float32(NORMAL_REACH * spacing)], axis=1, dtype=np.float64)
 
 
@@ -157,7 +157,7 @@ def thin(
     rng: np.random.Generator,
     dj: ModuleType,
 ) -> Int[np.ndarray, " m"]:
-    """Which points stay when a point removes all others of its side within `radius`, taken in random order."""
+    """Indices of the points that stay when, in random order, each removes all others of its side within `radius`."""
     grid = cells.point_grid(dj, positions, normals, radius, rng.permutation(len(positions)))
     if grid.crowd <= CROWDED:
         return np.flatnonzero(cells.thin(dj, grid, radius))
@@ -169,13 +169,13 @@ def thin(
 def first_per_cell(
     positions: Float[np.ndarray, "n 3"], normals: Float[np.ndarray, "n 3"], size: float
 ) -> Bool[np.ndarray, " n"]:
-    """One point per cubic cell and octant of the normal: bounds the crowd where many layers coincide."""
+    """Mask of one point per cubic cell and octant of the normal: bounds the density of coincident layers."""
     cell = np.floor(positions / size).astype(np.int64)
     octant = (normals > 0) @ np.array([1, 2, 4])
     key = np.concatenate([cell, octant[:, None]], axis=1)
-    kept = np.zeros(len(positions), bool)
-    kept[distinct(key)[0]] = True
-    return kept
+    mask = np.zeros(len(positions), bool)
+    mask[distinct(key)[0]] = True
+    return mask
 
 
 def morton(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
@@ -184,7 +184,7 @@ def morton(positions: Float[np.ndarray, "n 3"]) -> Int[np.ndarray, " n"]:
     cell = ((positions - low) * (1023 / max(float((high - low).max()), 1e-20))).astype(np.int64)
     code = np.zeros(len(positions), np.int64)
     for axis in range(3):
-        # Two zero bits between every two of the ten bits.
+        # Insert two zero bits between neighbouring bits.
         bits = cell[:, axis]
         for shift, mask in ((16, 0x30000FF), (8, 0x300F00F), (4, 0x30C30C3), (2, 0x9249249)):
             bits = (bits | (bits << shift)) & mask
@@ -210,7 +210,7 @@ def nearest(
 def carry(
     source: SurfacePoints, values: Float[np.ndarray, "n ..."], target: SurfacePoints
 ) -> Float[np.ndarray, "m ..."]:
-    """Values of one set of points at another: the four nearest, weighted by 1 / (distance + 0.3 h)."""
+    """Values interpolated from one point set to another: the four nearest, weighted by 1 / (distance + 0.3 h)."""
     distance, index = nearest(source, target, 4)
     weight = 1 / (distance + np.float32(0.3 * source.spacing))
     weight /= weight.sum(axis=1, keepdims=True)
@@ -220,7 +220,7 @@ def carry(
 def drop(
     source: SurfacePoints, values: Float[np.ndarray, "n ..."], target: SurfacePoints
 ) -> Float[np.ndarray, "m ..."]:
-    """Values of one set of points at another: those of the nearest."""
+    """Values of the nearest points, from one point set to another."""
     return values[nearest(source, target, 1)[1][:, 0]]
 
 
@@ -229,7 +229,7 @@ def with_tables(
 ) -> Level:
     """A level from its points and tangents (unit, orthogonal to the normals): adds the 5 x 5 tables.
 
-    Seen from outside with x along the tangent, `across` = tangent x normal points down, as y does in a picture.
+    Seen from outside with x along the tangent, `across` = tangent x normal points down, like a picture's y.
     """
     across = unit(np.cross(tangent, points.normals))
     h = points.spacing
@@ -247,7 +247,7 @@ def with_tables(
 
 
 def smooth(level: Level, values: Float[np.ndarray, " n"], times: int) -> Float[np.ndarray, " n"]:
-    """The mean over the 5 x 5 neighbourhood, `times` over."""
+    """The mean over the 5 x 5 neighbourhood, repeated `times` times."""
     for _ in range(times):
         values = values[level.neighbours].mean(axis=1, dtype=np.float32)
     return values

@@ -1,4 +1,4 @@
-"""What a user may choose about the painting of the surface."""
+"""Settings of the surface painter."""
 
 from pathlib import Path
 from typing import Annotated, Literal
@@ -7,7 +7,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class PlainSettings(BaseModel):
-    """The embedded stylizer's choices that do not depend on the painting."""
+    """Settings of the embedded stylizer that do not depend on the painting."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -22,45 +22,45 @@ class PlainSettings(BaseModel):
         default=1.7,
         ge=0.0,
         le=6.0,
-        description="contrast of those strokes, in standard deviations of the painting's own",
+        description="contrast of detail strokes, in standard deviations of the painting's own",
     )
     glaze: float = Field(
         default=0.0,
         ge=0.0,
         le=1.0,
-        description="share of what the strokes still lack in light and dark that is laid over them, where the painting "
-        "has middle tones; 0 leaves the painting's own colours untouched",
+        description="share of the strokes' tone error that a smooth glaze corrects, if the painting has middle tones; "
+        "0 keeps the painting's own colours",
     )
     keep_content: float = Field(
         default=0.5,
         ge=0.0,
         le=1.0,
-        description="how much the light and dark of the asset's own texture count, against those of its shape",
+        description="weight of the own texture's light and dark, against those of the shape",
     )
     liveliness: float = Field(
         default=0.8,
         ge=0.0,
         le=1.0,
-        description="0 uses colours as often as the painting does, 1 prefers where it has strokes",
+        description="0 uses colours as often as the painting does, 1 prefers areas with strokes",
     )
     palette_mix: float = Field(
         default=0.0,
         ge=0.0,
         le=1.0,
-        description="0 leaves colours the areas they have in the painting, 1 gives rare ones as much as common ones",
+        description="0 keeps each colour's share of the painting's area, 1 gives rare colours as much as common ones",
     )
     largest_piece: float = Field(
         default=1.0,
         gt=0.0,
         le=1.0,
-        description="about how large a piece of the painting may be copied as it is, in shares of its long side: 0.1 "
-        "breaks up faces, houses and lettering; 1 sets no bound",
+        description="approximate largest copied piece of the painting, in shares of its long side: 0.1 breaks up "
+        "faces, houses and lettering; 1 sets no bound",
     )
     variety: float = Field(
         default=0.016, ge=0.0, le=0.05, description="price of using a part of the painting more often than the others"
     )
     orientation: float = Field(
-        default=0.02, ge=0.0, le=0.5, description="how strictly strokes follow the line field of the surface"
+        default=0.02, ge=0.0, le=0.5, description="weight of the surface's line field in the strokes' direction"
     )
     direction: Literal["curvature", "up", "around"] = Field(
         default="curvature",
@@ -70,8 +70,8 @@ class PlainSettings(BaseModel):
         default=0.0,
         ge=0.0,
         le=1.0,
-        description="how much sky light and openness are painted into the albedo, for hand-painted looks; 0 keeps "
-        "light out of it: parts take colours of their own, creases and ridges take strokes",
+        description="share of sky light and openness in the albedo, for hand-painted looks; 0: no light, so parts take "
+        "colours of their own, creases and ridges take strokes",
     )
     bake_light: float = Field(
         default=0.0,
@@ -93,9 +93,9 @@ Crop = Share | tuple[Share, Share, Share, Share]
 
 
 class SurfaceSettings(PlainSettings):
-    """The embedded stylizer's choices. Weights belong to the cost of `mistyle.stylization.surface.synthesis`.
+    """Settings of the embedded stylizer. Weights refer to the cost of `mistyle.stylization.surface.synthesis`.
 
-    What is None is read from the painting (`mistyle.stylization.surface.exemplar.chosen.resolved`).
+    None: derived from the painting (`mistyle.stylization.surface.exemplar.chosen.resolved`).
     """
 
     levels: Levels | None = Field(
@@ -105,12 +105,12 @@ class SurfaceSettings(PlainSettings):
     )
     detail: Detail | None = Field(
         default=None,
-        description="how strongly creases and ridges demand dark and light strokes; unset: from the painting "
+        description="weight of dark and light strokes at creases and ridges; unset: from the painting "
         "(4, down to 3 for flat ones)",
     )
     palette: Palette | None = Field(
         default=None,
-        description="how strictly a place takes the colour that optimal transport gave it; unset: from the painting "
+        description="weight of the colour that optimal transport assigns to a place; unset: from the painting "
         "(0.2, down to 0.05 for graphic ones)",
     )
     stroke_coherence: Coherence | None = Field(
@@ -120,27 +120,27 @@ class SurfaceSettings(PlainSettings):
     )
     modelling: Modelling | None = Field(
         default=None,
-        description="how much every hollow and bump attracts dark and light strokes, beside creases and ridges; unset: "
+        description="weight of dark and light strokes at all hollows and bumps, besides creases and ridges; unset: "
         "from the painting (1 for brushwork, down to 0 for graphic ones)",
     )
     look_up: LookUp | None = Field(
         default=None,
-        description="how pixels of the painting are looked up; unset: nearest for pixel art, else bilinear",
+        description="filter of look-ups in the painting; unset: nearest for pixel art, else bilinear",
     )
     borders: Borders | None = Field(
         default=None,
-        description="how pieces of the painting meet: cut along an edge, or blended; unset: cut for graphic paintings, "
-        "else blend",
+        description="borders between pieces of the painting: cut along an edge, or blended; unset: cut for graphic "
+        "paintings, else blend",
     )
     crop: Crop | None = Field(
         default=None,
         description="share of the picture left out along each border (frames, paper), or four of them: top, left, "
-        "bottom, right; unset: the borders that the picture shows",
+        "bottom, right; unset: the detected borders",
     )
 
 
 class ResolvedSettings(PlainSettings):
-    """`SurfaceSettings` with every choice made."""
+    """`SurfaceSettings` without None."""
 
     levels: Levels
     detail: Detail
@@ -153,19 +153,19 @@ class ResolvedSettings(PlainSettings):
 
 
 class PaintSettings(BaseModel):
-    """Where the paint goes and what it leaves."""
+    """Placement of pictures, protected areas, stroke size, relief and gloss."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     slots: tuple[str, ...] = Field(
         default=(),
-        description="further pictures: SLOT=PICTURE, SLOT being a material of the mesh or a mask picture in its UVs",
+        description="further pictures: SLOT=PICTURE, where SLOT is a material of the mesh or a mask picture in its UVs",
     )
     style_mask: Path | None = Field(default=None, description="picture as large as the style: dark parts are not used")
     direction_map: Path | None = Field(
         default=None,
         description="picture in the mesh's UVs: red and green are the strokes' direction along u and v, as in engines' "
-        "flow maps; mid grey and transparent parts leave it to `surface.direction`",
+        "flow maps; mid grey and transparent parts use `surface.direction`",
     )
     protect: Path | None = Field(default=None, description="picture in the mesh's UVs: light parts keep their own look")
     stroke_size: float | None = Field(
@@ -183,5 +183,5 @@ class PaintSettings(BaseModel):
         default=None,
         ge=0,
         le=2,
-        description="how much grooves and crests change the roughness; 1 by default",
+        description="weight of the roughness change at grooves and crests; 1 by default",
     )

@@ -1,4 +1,4 @@
-"""The weight-free stylizer: paints the surface once and answers for any point of it. Needs no network, no weights."""
+"""Weight-free stylizer: paints the surface once and evaluates it at any point, without a network."""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ def array_module() -> str:
 
 
 def open_sky(mesh: Mesh, seed: int) -> Occlusion:
-    """The share of open sky at points of a mesh, as the guides ask for it; the mesh is made ready for tracing once."""
+    """A function for the share of open sky at points of a mesh; builds the ray-tracing structure once."""
     from mistyle.render.mitsuba.draw import tracer
     from mistyle.render.mitsuba.occlusion import ambient_occlusion
 
@@ -39,11 +39,9 @@ def solve_surface(
     content: Content | None = None,
     direction: DirectionConstraint | None = None,
 ) -> PaintedSurface:
-    """Paint `mesh` in the style of a picture; see `mistyle.stylization.surface.synthesis.solve` for what it can and
-    cannot do.
+    """Paint `mesh` in the style of a picture; see `mistyle.stylization.surface.synthesis.solve` for limits and errors.
 
-    `content(positions, normals)` is the lightness (0..1) of a texture that the mesh has already, `direction` where
-    strokes shall run.
+    `content(positions, normals)` is the lightness (0..1) of the mesh's own texture, `direction` that of strokes.
     """
     from mistyle.stylization.surface.synthesis import SurfaceFields, solve
 
@@ -57,7 +55,7 @@ def surface_colour(
     normals: Float[np.ndarray, "n 3"],
     footprint: float = 0.0,
 ) -> Float[np.ndarray, "n 3"]:
-    """Encoded sRGB of surface points; `footprint` is the distance of neighbours, over which colour is averaged."""
+    """Encoded sRGB of surface points; `footprint` (working units): query spacing, over which colour is averaged."""
     from mistyle.stylization.surface.lookup import colour
 
     return colour(surface, positions, normals, footprint=footprint, device=array_module())
@@ -69,8 +67,8 @@ def surface_relief(
     normals: Float[np.ndarray, "n 3"],
     footprint: float = 0.0,
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Gradient of the painted height along the surface (root mean square about 1) and what the paint adds to the
-    roughness; `footprint` as in `surface_colour`."""
+    """Gradient of the painted height along the surface (root mean square about 1) and offset of the roughness;
+    `footprint` as in `surface_colour`."""
     from mistyle.stylization.surface.lookup import relief
 
     return relief(surface, positions, normals, footprint=footprint, device=array_module())

@@ -1,4 +1,4 @@
-"""Painting the surface: guided patch synthesis, coarse to fine, on a hierarchy of surface samples.
+"""Guided patch synthesis of the surface painting, coarse to fine, on a hierarchy of surface samples.
 
 After Image Analogies (Hertzmann et al. 2001), surface texture synthesis (Turk 2001, Wei and Levoy 2001) and the
 energy of StyLit (Fiser et al. 2016). A sample s has a 5x5 patch of neighbours in its tangent plane and takes the
@@ -7,15 +7,15 @@ place p (page, x, y) of the painting with the least
     |D_p - D_s|^2 + detail w(s) (band_p - relief std(band) d_s)^2 + variety use(p) / target use(p)
         + stroke_coherence * sum over 4 neighbours of seam [1 if on another page, else min(jump^2, 4) / 4]
 
-(down to a fifth at creases and ridges, where a stroke may end; about neighbours at which a copied piece has got too
-large, staying near costs instead: stylization/surface/pieces.py), where D joins 16 principal components of the patch
+The coherence term falls to a fifth at creases and ridges, where a stroke may end. Around neighbours whose copied piece
+is too large, nearness costs instead (stylization/surface/pieces.py). D joins 16 principal components of the patch
 (Lab / 100, over 5), the large-area colour (weights 1, 0.6, 0.6 times `palette`, five times that for paintings of two
-tones) and the stroke direction (`orientation`); d_s is the detail guide, w(s) = min(|d_s|, 1.5)^1.5, jump the distance
-in pixels from where the neighbour's picture would go on, and seam (0.3 to 1) how different the neighbour's picture,
-gone on with, and p look there: after the seam cost of graph-cut textures (Kwatra et al. 2003).
+tones) and the stroke direction (`orientation`). d_s is the detail guide, w(s) = min(|d_s|, 1.5)^1.5, and jump the
+distance in pixels from the neighbour's continued picture. seam (0.3 to 1) is the difference between the neighbour's
+continued picture and p: after the seam cost of graph-cut textures (Kwatra et al. 2003).
 
-The search is deterministic: all places are tried for all samples on the coarse levels; on every level a sample tries
-to go on with its neighbours' pictures (coherent search, Ashikhmin 2001) and a fixed set of steps about its own place.
+The search is deterministic. Coarse levels try all places for all samples. On every level a sample tries its neighbours'
+continued pictures (coherent search, Ashikhmin 2001) and a fixed set of offsets from its own place.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,20 +54,20 @@ __all__ = ["SurfaceSettings", "hierarchy", "solve", "synthesise"]
 
 LINE_POINTS = 7_500
 FULL_SIZE = 512  # long side of the painting on the finest level at 250,000 samples and stroke_scale 1
-LEAST_SIZE = 16  # and the least on the coarsest level
+LEAST_SIZE = 16  # least long side on the coarsest level
 LEAST_SAMPLES = 48  # on the coarsest level
-ROUNDS = (10, 8, 6, 6, 6)  # searches and votes from the coarsest level on; further levels take the last
+ROUNDS = (10, 8, 6, 6, 6)  # searches and votes from the coarsest level on; further levels use the last
 FINE_ROUNDS = 4  # on levels beyond the fifth
 SWEEPS = 3  # passes of the coherent search in each round
-ALL_PAIRS = 1.2e9  # sample-pixel pairs up to which all are tried, summed over the rounds of a level
+ALL_PAIRS = 1.2e9  # most sample-pixel pairs for exhaustive search, summed over the rounds of a level
 CHUNK_PAIRS = 8_000_000
-LOOSE = 0.8  # share of the price of leaving a stroke that is not due where the detail guide is at its strongest
+LOOSE = 0.8  # reduction of the coherence price where the detail guide is strongest
 INITIAL_JITTER = 0.004
 CHROMA = 0.6
-TWO_TONES = 5.0  # how many times as much the large-area colour of a painting without middle tones counts
-LEAST_AROUND = 4.0  # pixels about the end of a piece that count as the same piece
+TWO_TONES = 5.0  # factor of the large-area colour's weight for a painting without middle tones
+LEAST_AROUND = 4.0  # pixels around the end of a piece that count as the same piece
 TYPICAL_LOAD = 0.35  # mean urgency of detail at which its weight is the setting's
-UNREACHABLE = 1e3  # descriptor of pixels that must not be used: farther than anything else
+UNREACHABLE = 1e3  # descriptor of forbidden pixels: farther than any other
 
 
 @dataclass(frozen=True)
@@ -75,8 +75,8 @@ class SurfaceFields:
     """Fields over the surface, each a function of positions and unit normals (n, 3).
 
     occlusion  the share of open sky, 0..1
-    content    the lightness of a texture that the asset has already, 0..1
-    direction  where strokes shall run
+    content    the lightness of the asset's own texture, 0..1
+    direction  the direction of strokes, and its weight
     """
 
     occlusion: Occlusion
@@ -86,7 +86,7 @@ class SurfaceFields:
 
 @dataclass(frozen=True)
 class MeshGuides:
-    """The input of the synthesis: samples and their guides, coarse to fine, the picture, and settings without gaps."""
+    """Input of the synthesis: samples and their guides, coarse to fine, the picture, and resolved settings."""
 
     levels: tuple[Level, ...]
     guides: tuple[Guide, ...]
@@ -96,7 +96,7 @@ class MeshGuides:
 
 @dataclass(frozen=True)
 class ColourConstraints:
-    """Colours (Lab / 100) that samples have already: where `known`, they replace those of the vote."""
+    """Fixed colours (Lab / 100) of samples: where `known`, they replace those of the vote."""
 
     known: Bool[np.ndarray, " n"]
     colour: Float[np.ndarray, "n 3"]
@@ -111,9 +111,9 @@ def solve(
     progress: Callable[[float], None] = lambda done: None,
     device: str = "llvm",
 ) -> PaintedSurface:
-    """Paint `mesh` in the style of a picture, of whose transparent parts nothing is used.
+    """Paint `mesh` in the style of a picture; transparent parts of the picture are not used.
 
-    The answer holds for any point of the surface (`lookup.colour`) at the picture's own resolution. 250,000
+    The result can be evaluated at any point of the surface (`lookup.colour`) at the picture's own resolution. 250,000
     samples take about 20 CPU seconds and 0.9 GB. Raises InputRefused for a mesh without area and for an unusable
     picture. It copies pieces of the picture: recognisable objects in it (a star, an eye) may appear on the surface.
     """
@@ -140,7 +140,7 @@ def mesh_guides(
     dj: ModuleType,
     progress: Callable[[float], None] = lambda done: None,
 ) -> MeshGuides:
-    """Samples of the mesh and their guides; settings that are open are taken from the picture."""
+    """Samples of the mesh and their guides; unset settings are derived from the picture."""
     resolved = settled(picture.rgb, picture.alpha, settings)
     prepared = style.prepare(picture.rgb, resolved.crop, picture.alpha)
     levels = hierarchy(mesh, resolved, seed, dj, progress, fields.direction)
@@ -151,8 +151,8 @@ def mesh_guides(
 
 
 def level_count(settings: ResolvedSettings) -> int:
-    """Levels for these samples and strokes: one more per doubling of the painting's size in samples, so that the
-    coarsest level sees the same share of it; fewer where its painting or its samples would be too few."""
+    """Number of levels: one more per doubling of the painting's size in samples, so that the coarsest level covers the
+    same share of it; fewer where its painting or its number of samples would be too small."""
     size = finest_size(settings)
     count = settings.levels + round(float(np.log2(size / FULL_SIZE)))
     fewest = int(np.log2(settings.samples / LEAST_SAMPLES) / 2) + 1
@@ -195,7 +195,7 @@ def synthesise(
     progress: Callable[[float], None] = lambda done: None,
     constraints: Sequence[ColourConstraints] | None = None,
 ) -> tuple[NearestNeighbourField, style.Exemplar]:
-    """The field of the finest level, and the exemplar that it refers to; one entry of `constraints` per level."""
+    """The field of the finest level, and its exemplar; one entry of `constraints` per level."""
     levels, settings = base.levels, base.settings
     rng = np.random.default_rng([seed, 3])
     work = np.cumsum([0.02 + 4.0 ** (k - len(levels) + 1) for k in range(len(levels))])
@@ -217,7 +217,7 @@ def synthesise(
 def refined(
     coarse: Level, fine: Level, field: NearestNeighbourField, before: style.Exemplar, after: style.Exemplar
 ) -> NearestNeighbourField:
-    """The finer level's field: places of the nearest coarse samples, moved by the exact way between the two."""
+    """The finer level's initial field: places of the nearest coarse samples, moved by the exact offset between both."""
     parent = nearest(coarse.points, fine.points, 1)[1][:, 0]
     step = (fine.points.positions - coarse.points.positions[parent]) / np.float32(fine.points.spacing)
     tangent, across = coarse.tangent[parent], coarse.across[parent]
@@ -233,7 +233,7 @@ def refined(
 
 @dataclass(frozen=True)
 class LevelTask:
-    """One level's search: its samples and guide, the exemplar at its size, and how many rounds it takes."""
+    """One level's search: its samples and guide, the exemplar at its size, and its number of rounds."""
 
     level: Level
     guide: Guide
@@ -249,7 +249,7 @@ def paint_level(
     rng: np.random.Generator,
     dj: ModuleType,
 ) -> NearestNeighbourField:
-    """Search and vote in turn, from `start` or (None) from the places that the guides alone ask for."""
+    """Alternate search and vote, from `start` or (None) from the guides' own nearest places."""
     level, exemplar = task.level, task.exemplar
     basis = style.patch_basis(exemplar, rng)
     guide_scale = guide_weights(settings, exemplar)
@@ -258,36 +258,38 @@ def paint_level(
     lab = kernels.floats(dj, exemplar.lab)
     patches = kernels.describe_pixels(dj, lab, exemplar.shapes, axes, mean).numpy().reshape(-1, kernels.PATCH)
     described[exemplar.allowed, : kernels.PATCH] = patches[exemplar.allowed]
-    asked, band_weight = described_guide(task.guide, exemplar, settings, guide_scale)
+    descriptors, band_weight = described_guide(task.guide, exemplar, settings, guide_scale)
     if start is None:
-        start = by_guides(asked, band_weight, described, exemplar, rng)
+        start = by_guides(descriptors, band_weight, described, exemplar, rng)
     table = kernels.tables(dj, level.neighbours, level.turned, level.offsets)
     arrays = exemplar_arrays(dj, exemplar, lab, described)
     weight = kernels.floats(dj, band_weight)
     typical = float(described[exemplar.allowed, : kernels.SEEN].var(axis=0).sum())
     prices = kernels.floats(dj, np.array([settings.stroke_coherence, settings.variety, 1 / max(typical, 1e-6)]))
     field = on_device(dj, start)
-    complete = min(task.rounds, int(ALL_PAIRS // (len(asked) * len(described))))
+    complete = min(task.rounds, int(ALL_PAIRS // (len(descriptors) * len(described))))
     for turn in range(task.rounds):
         colour = constrained(kernels.vote(dj, table, arrays, field), task.constraints, dj)
-        asked[:, : kernels.PATCH] = kernels.describe(dj, table, colour, axes, mean).numpy().reshape(-1, kernels.PATCH)
-        targets = kernels.TargetDescriptors(kernels.floats(dj, asked), weight)
+        descriptors[:, : kernels.PATCH] = (
+            kernels.describe(dj, table, colour, axes, mean).numpy().reshape(-1, kernels.PATCH)
+        )
+        targets = kernels.TargetDescriptors(kernels.floats(dj, descriptors), weight)
         also = None
         if turn < complete:
             extra = settings.variety * usage(exemplar, on_host(field))[exemplar.origin]
-            also = on_device(dj, exhaustive(asked, band_weight, described, extra, exemplar))
+            also = on_device(dj, exhaustive(descriptors, band_weight, described, extra, exemplar))
         for _ in range(SWEEPS):
-            here = on_host(field)
-            use = kernels.floats(dj, usage(exemplar, here))
-            # Only where all places are tried is there a way out of a piece; finer levels redraw what these decided.
+            current = on_host(field)
+            use = kernels.floats(dj, usage(exemplar, current))
+            # Only exhaustive search can leave a piece; finer levels only refine the pieces of coarse ones.
             bound = settings.largest_piece < 1 and complete > 0
-            limit = patch_size_limit(level, exemplar, here, settings.largest_piece, dj) if bound else None
+            limit = patch_size_limit(level, exemplar, current, settings.largest_piece, dj) if bound else None
             field = kernels.search(dj, table, arrays, field, targets, kernels.Prices(prices, use, limit), also)[1]
     return on_host(field)
 
 
 def constrained(colour: Any, constraints: ColourConstraints | None, dj: ModuleType) -> Any:
-    """Voted colours, flat (n 3), with those that are known already in their place."""
+    """Voted colours, flat (n 3), replaced by known ones."""
     if constraints is None:
         return colour
     known, own = constraints.known[:, None], constraints.colour
@@ -297,7 +299,7 @@ def constrained(colour: Any, constraints: ColourConstraints | None, dj: ModuleTy
 def patch_size_limit(
     level: Level, exemplar: style.Exemplar, field: NearestNeighbourField, largest: float, dj: ModuleType
 ) -> kernels.PatchSizeLimit:
-    """Where no neighbour shall go on with the picture, since the piece is as large as it may get."""
+    """The samples whose piece neighbours may not extend, because it has the largest size."""
     far = too_far(level, exemplar, field, largest)
     height, width = exemplar.size
     around = max(largest * max(height, width), LEAST_AROUND)
@@ -305,9 +307,9 @@ def patch_size_limit(
 
 
 def guide_weights(settings: ResolvedSettings, exemplar: style.Exemplar) -> Float[np.ndarray, " 5"]:
-    """Square roots of the weights of colour (L, a, b) and stroke direction (2), by which descriptors are multiplied.
+    """Square roots of the weights of colour (L, a, b) and stroke direction (2), the descriptors' factors.
 
-    Where a painting has two tones only, its large-area colour is all that says where strokes are: it counts more.
+    In a painting of two tones only the large-area colour locates strokes, so its weight is larger.
     """
     stricter = 1 + (TWO_TONES - 1) * (1 - style.middle_tones(exemplar.lab[:, 0]))
     palette = settings.palette * stricter * np.array([1, CHROMA, CHROMA])
@@ -315,7 +317,7 @@ def guide_weights(settings: ResolvedSettings, exemplar: style.Exemplar) -> Float
 
 
 def described_exemplar(exemplar: style.Exemplar, guide_scale: Float[np.ndarray, " 5"]) -> Float[np.ndarray, "m 24"]:
-    """Descriptor of every pixel of the exemplar, its patch left empty, in the layout that `kernels.search` reads."""
+    """Descriptor of every exemplar pixel in the layout of `kernels.search`, with an empty patch."""
     out = np.zeros((len(exemplar.lab), kernels.WIDTH), np.float32)
     out[:, 16:19] = exemplar.broad * guide_scale[:3]
     out[:, 19:21] = exemplar.grain * guide_scale[3:]
@@ -327,26 +329,26 @@ def described_exemplar(exemplar: style.Exemplar, guide_scale: Float[np.ndarray, 
 def described_guide(
     guide: Guide, exemplar: style.Exemplar, settings: ResolvedSettings, guide_scale: Float[np.ndarray, " 5"]
 ) -> tuple[Float[np.ndarray, "n 24"], Float[np.ndarray, " n"]]:
-    """What every sample asks for, its patch left empty, and how much the band matters to it."""
+    """Target descriptor of every sample, with an empty patch, and the weight of its band."""
     out = np.zeros((len(guide.detail), kernels.WIDTH), np.float32)
     out[:, 16:19] = guide.colour * guide_scale[:3]
     out[:, 19] = guide.directed * guide_scale[3]
     out[:, 21] = guide.detail * np.float32(settings.relief * exemplar.band.std())
     out[:, kernels.CLOSED] = 1 - LOOSE * np.minimum(np.abs(guide.detail) / -CREASE, 1)
     weight = urgency(guide.detail)
-    # A scan that is bumpy all over would leave no stroke free: the more of it asks, the less each place may.
+    # A scan that is bumpy everywhere would constrain all strokes: the weight falls with the mean urgency.
     load = max(float(weight.mean()), 1e-6)
     weight = weight * (settings.detail * np.clip(np.sqrt(TYPICAL_LOAD / load), 0.6, 1.6))
     return out, weight.astype(np.float32)
 
 
 def urgency(detail: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """How much a detail guide matters at its own size, 0..1.84."""
+    """Weight 0..1.84 of a detail guide by its magnitude."""
     return np.minimum(np.abs(detail), 1.5) ** 1.5
 
 
 def exhaustive(
-    asked: Float[np.ndarray, "n 24"],
+    descriptors: Float[np.ndarray, "n 24"],
     band_weight: Float[np.ndarray, " n"],
     described: Float[np.ndarray, "m 24"],
     extra: Float[np.ndarray, " m"],
@@ -354,10 +356,10 @@ def exhaustive(
     first: int = 0,
     jitter: Callable[[tuple[int, int]], np.ndarray] | None = None,
 ) -> NearestNeighbourField:
-    """The pixel of least cost for every sample among all pixels, without the price of leaving a stroke.
+    """The pixel of least cost for every sample among all pixels, without the coherence price.
 
-    Squares are expanded, so that the whole table of costs is one matrix product; it is made in chunks. Entries before
-    `first` of the descriptors are left out; `jitter(shape)` is added to the costs.
+    Squares are expanded, so that the cost table is one matrix product, computed in chunks. Descriptor entries before
+    `first` are left out; `jitter(shape)` is added to the costs.
     """
     pixels = np.flatnonzero(exemplar.allowed)
     linear, band = described[pixels, first : kernels.LINEAR], described[pixels, kernels.LINEAR]
@@ -365,11 +367,11 @@ def exhaustive(
         [linear, band[:, None], (band**2)[:, None], ((linear**2).sum(axis=1) + extra[pixels])[:, None]], axis=1
     ).T
     weight = band_weight[:, None]
-    vector, level = asked[:, first : kernels.LINEAR], asked[:, kernels.LINEAR, None]
+    vector, level = descriptors[:, first : kernels.LINEAR], descriptors[:, kernels.LINEAR, None]
     left = np.concatenate([-2 * vector, -2 * weight * level, weight, np.ones_like(weight)], axis=1)
     rows = max(1, CHUNK_PAIRS // len(pixels))
-    best = np.empty(len(asked), np.int64)
-    for low in range(0, len(asked), rows):
+    best = np.empty(len(descriptors), np.int64)
+    for low in range(0, len(descriptors), rows):
         costs = left[low : low + rows] @ right
         if jitter is not None:
             costs += jitter(costs.shape)
@@ -378,16 +380,16 @@ def exhaustive(
 
 
 def by_guides(
-    asked: Float[np.ndarray, "n 24"],
+    descriptors: Float[np.ndarray, "n 24"],
     band_weight: Float[np.ndarray, " n"],
     described: Float[np.ndarray, "m 24"],
     exemplar: style.Exemplar,
     rng: np.random.Generator,
 ) -> NearestNeighbourField:
-    """The first choice, from colour, direction and detail alone; near ties are broken at random."""
+    """Initial places from colour, direction and detail alone; near ties are broken at random."""
     nothing = np.zeros(len(described), np.float32)
 
     def jitter(shape: tuple[int, int]) -> np.ndarray:
         return INITIAL_JITTER * rng.random(shape, dtype=np.float32)
 
-    return exhaustive(asked, band_weight, described, nothing, exemplar, kernels.PATCH, jitter)
+    return exhaustive(descriptors, band_weight, described, nothing, exemplar, kernels.PATCH, jitter)

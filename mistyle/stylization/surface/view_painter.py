@@ -1,6 +1,4 @@
-"""The weight-free stylizer, one view at a time: what `mistyle.stylization.mvst.sweep.sweep` asks for, without a
-network.
-"""
+"""Weight-free stylizer of single views, for `mistyle.stylization.mvst.sweep.sweep`."""
 
 from collections.abc import Callable
 
@@ -28,7 +26,7 @@ def stylizer(
 ) -> Stylizer:
     """A Stylizer of views of `mesh` in the style of a picture; it keeps outlines.
 
-    The guides are those of the embedded stylizer, found here once. Priors hold where they are known; see
+    The guides are those of the embedded stylizer, computed once. Known pixels of priors stay; see
     `mistyle.stylization.surface.view_samples.paint_view`.
     """
     from mistyle.stylization.surface import kernels

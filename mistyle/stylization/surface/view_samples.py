@@ -1,9 +1,8 @@
-"""The painting of one view: its pixels are the samples, its known pixels are pinned.
+"""Patch synthesis of one view: its pixels are the samples, its known pixels are pinned.
 
-What the surface asks of the painting (colours, detail, stroke directions) is found once on the mesh, so that all
-views ask for the same. A view is then painted like a flat sheet: samples lie on the pixel grid, 5x5 neighbourhoods
-are turned along the strokes and taken from the grid, and never reach over a depth step. Strokes keep their size in
-the picture, not on the surface: they are not foreshortened.
+The guides (colours, detail, stroke directions) are computed once on the mesh, so that all views share them. A view is
+then painted like a flat sheet: samples lie on the pixel grid. 5x5 neighbourhoods are rotated along the strokes, sampled
+from the grid, and never cross a depth step. Strokes have a constant size in the picture, without foreshortening.
 """
 
 from dataclasses import dataclass
@@ -22,18 +21,18 @@ from mistyle.stylization.surface.settings import ResolvedSettings
 from mistyle.stylization.surface.synthesis import ColourConstraints, MeshGuides, synthesise
 
 STEEP = 4.0  # depth per width of a surface seen at 76 degrees
-LEAST_STEP = 0.05  # a depth difference that may be one surface at any resolution
-FEWEST = 16  # samples a level must have
-PINNED_SHARE = 0.5  # of a cell's foreground that must be known for the cell to be pinned
-DEPTH_WEIGHT = 0.5  # of depth against the picture plane where the nearest samples of a pixel are sought
-MARGIN = 12  # finest cells around what is unknown that are painted with it, for its patches to lean on
-JOIN = (6.0, 1.5)  # pixels over which the painting is moved to the prior's colours beside it: tone, then strokes
+LEAST_STEP = 0.05  # depth difference within one surface at any resolution
+FEWEST = 16  # least samples of a level
+PINNED_SHARE = 0.5  # known share of a cell's foreground from which the cell is pinned
+DEPTH_WEIGHT = 0.5  # of depth against the picture plane in the search for a pixel's nearest samples
+MARGIN = 12  # finest cells around unknown pixels that are painted with them, as context for their patches
+JOIN = (6.0, 1.5)  # pixels over which the painting blends to the prior's colours: tone, then strokes
 TOWARDS = np.array([0.0, 0.0, -1.0], np.float32)  # the sheet's normal: to the viewer
 
 
 @dataclass(frozen=True)
 class ViewLevel:
-    """One level of a view: its samples as a flat level, in pixels, and which pixel and cell each of them is.
+    """One level of a view: its samples as a flat level, in pixels, with each sample's pixel and cell.
 
     pixel  flat index in the view       cell  flat index in the level's grid of `size` (rows, columns)
     """
@@ -51,8 +50,7 @@ def paint_view(
 ) -> Float[np.ndarray, "h w 3"]:
     """Encoded sRGB (0..1) of the view's foreground, zero elsewhere.
 
-    Where the prior knows a colour it is kept; the rest is painted to go on from it, together with a margin of what is
-    known around it.
+    The prior's known colours stay. The rest is painted to continue them, together with a margin of known pixels.
     """
     dj = kernels.module(device)
     result = np.zeros(view.rgb.shape, np.float32)
@@ -73,7 +71,7 @@ def paint_view(
 
 
 def beside_unknown(view: View, prior: Prior, margin: int) -> Bool[np.ndarray, "h w"]:
-    """The foreground that the prior does not know, and what lies within `margin` pixels of it."""
+    """The foreground unknown to the prior, dilated by `margin` pixels."""
     return view.mask & (distance_to(view.mask & ~prior.known) <= margin)
 
 
@@ -83,13 +81,13 @@ def footprint(view: View) -> float:
 
 
 def at_same_size(base: MeshGuides, level: ViewLevel, view: View) -> ResolvedSettings:
-    """The settings with which strokes are as large as on the mesh's own samples, whose spacing is no whole pixels."""
+    """The settings that give strokes the same size as on the mesh's samples, whose spacing is a fraction of pixels."""
     ratio = level.side * footprint(view) / base.levels[-1].points.spacing
     return base.settings.model_copy(update={"stroke_scale": base.settings.stroke_scale * ratio})
 
 
 def flat_positions(view: View, pixels: Int[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Pixel centres (x, y) and depth in pixels: near in the picture and near in depth is near here."""
+    """Pixel centres (x, y) and weighted depth, in pixels, for nearest-sample searches."""
     rows, columns = np.divmod(pixels, view.camera.size[1])
     depth = DEPTH_WEIGHT * view.depth.reshape(-1)[pixels] / footprint(view)
     return np.stack([columns + 0.5, rows + 0.5, depth], axis=1).astype(np.float32)
@@ -101,8 +99,8 @@ def finest_side(view: View, base: MeshGuides) -> int:
 
 
 def view_levels(view: View, active: Bool[np.ndarray, "h w"], base: MeshGuides) -> list[ViewLevel]:
-    """The levels of a view's active pixels, coarse to fine, cells twice as wide from level to level. Levels that would
-    have too few samples are left out."""
+    """The levels of a view's active pixels, coarse to fine; the cell width halves per level. Levels with fewer than
+    FEWEST samples are left out."""
     finest = finest_side(view, base)
     levels = []
     for k, (level, guide) in enumerate(zip(base.levels[::-1], base.guides[::-1], strict=True)):
@@ -114,7 +112,7 @@ def view_levels(view: View, active: Bool[np.ndarray, "h w"], base: MeshGuides) -
 
 
 def view_level(view: View, active: Bool[np.ndarray, "h w"], side: int, level: Level, guide: Guide) -> ViewLevel:
-    """One level with cells of side x side pixels; a cell's sample is its active pixel nearest to the middle."""
+    """One level with cells of side x side pixels; a cell's sample is its active pixel nearest to the centre."""
     pixel, cell, size = representatives(active, side)
     camera, width = view.camera, view.camera.size[1]
     px = np.stack([pixel % width, pixel // width], axis=1) + 0.5
@@ -137,7 +135,7 @@ def view_level(view: View, active: Bool[np.ndarray, "h w"], side: int, level: Le
 def representatives(
     mask: Bool[np.ndarray, "h w"], side: int
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"], tuple[int, int]]:
-    """For every cell with foreground the flat pixel index of its sample, its own flat index, and the grid's size."""
+    """Flat pixel index of the sample and flat cell index, for every cell with foreground; and the grid's size."""
     height, width = mask.shape
     rows, columns = -(-height // side), -(-width // side)
     padded = np.zeros((rows * side, columns * side), bool)
@@ -154,7 +152,7 @@ def representatives(
 def on_screen(
     view: View, px: Float[np.ndarray, "n 2"], depth: Float[np.ndarray, " n"], tangent: Float[np.ndarray, "n 3"]
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Tangents as they look in the picture, unit, z = 0, and how long they look there (1: not foreshortened)."""
+    """Tangents projected into the picture, unit, z = 0, and their projected length (1: not foreshortened)."""
     cam = tangent @ view.camera.cam_from_world[:3, :3].T
     ray = (px - np.asarray(view.camera.centre)) / view.camera.focal
     seen = cam[:, :2] - ray * cam[:, 2:]
@@ -173,9 +171,9 @@ def flat_level(
     depth: Float[np.ndarray, " n"],
     focal: float,
 ) -> Level:
-    """The 5x5 tables from the grid: the sample of the cell whose middle is nearest to a turned grid position.
+    """The 5x5 tables from the grid: the sample of the cell whose centre is nearest to a rotated grid position.
 
-    Off the foreground, or behind a depth step, half the way is tried; else the sample itself takes the place.
+    Off the foreground, or behind a depth step, half the distance is tried, then the sample itself.
     """
     rows, columns = size
     number = np.full(rows * columns, -1, np.int32)
@@ -184,30 +182,30 @@ def flat_level(
     place = points.positions[:, :2]
     own = np.arange(len(cell), dtype=np.int32)
     neighbours = np.tile(own[:, None], (1, len(GRID)))
-    middle = (int(points.spacing) - 1) // 2 + 0.5  # where in a whole cell its sample lies
+    middle = (int(points.spacing) - 1) // 2 + 0.5  # offset of the sample in a full cell
     for k, (dx, dy) in enumerate(GRID):
         if k == CENTRE:
             continue
         for share in (1.0, 0.5):
-            left = np.flatnonzero(neighbours[:, k] == own)
-            step = share * points.spacing * (dx * tangent[left, :2] + dy * across[left, :2])
-            column, row = np.floor((place[left] + step - middle) / points.spacing + 0.5).astype(np.int64).T
+            pending = np.flatnonzero(neighbours[:, k] == own)
+            step = share * points.spacing * (dx * tangent[pending, :2] + dy * across[pending, :2])
+            column, row = np.floor((place[pending] + step - middle) / points.spacing + 0.5).astype(np.int64).T
             inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-            other = number[np.where(inside, row * columns + column, 0)]
-            reach = STEEP * points.spacing * np.hypot(dx, dy) * depth[left] / focal
-            near = np.abs(depth[other] - depth[left]) <= np.maximum(LEAST_STEP, reach)
-            good = inside & (other >= 0) & near
-            neighbours[left[good], k] = other[good]
+            candidate = number[np.where(inside, row * columns + column, 0)]
+            reach = STEEP * points.spacing * np.hypot(dx, dy) * depth[pending] / focal
+            near = np.abs(depth[candidate] - depth[pending]) <= np.maximum(LEAST_STEP, reach)
+            valid = inside & (candidate >= 0) & near
+            neighbours[pending[valid], k] = candidate[valid]
     offsets = np.empty((*neighbours.shape, 2), np.float32)
-    way = (place[:, None] - place[neighbours]) / np.float32(points.spacing)
-    offsets[..., 0] = (way * tangent[neighbours][..., :2]).sum(axis=2)
-    offsets[..., 1] = (way * across[neighbours][..., :2]).sum(axis=2)
+    offset = (place[:, None] - place[neighbours]) / np.float32(points.spacing)
+    offsets[..., 0] = (offset * tangent[neighbours][..., :2]).sum(axis=2)
+    offsets[..., 1] = (offset * across[neighbours][..., :2]).sum(axis=2)
     turned = np.einsum("nc,nkc->nk", tangent, tangent[neighbours]) < 0
     return Level(points, tangent, across, directed, neighbours, turned, np.clip(offsets, -4, 4))
 
 
 def constrain(cell: Int[np.ndarray, " n"], side: int, view: View, prior: Prior) -> ColourConstraints:
-    """The prior's colours in cells of side x side pixels: the mean (in sRGB) of known pixels where they are enough."""
+    """The prior's colours in cells of side x side pixels: the sRGB mean of known pixels, from PINNED_SHARE on."""
     known = prior.known & view.mask
     colour = np.where(known[..., None], srgb_from_linear(prior.rgb), 0)
     shares = [_sums(values, side) for values in (known, view.mask)]
@@ -229,7 +227,7 @@ def _sums(values: np.ndarray, side: int) -> np.ndarray:
 def joined(
     painted: Float[np.ndarray, "h w 3"], prior: Prior, mask: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "h w 3"]:
-    """The prior where it is known, the painting elsewhere, moved beside the prior by what the two differ there."""
+    """The prior where known, the painting elsewhere, shifted near the prior by the difference of both."""
     known = prior.known & mask
     if not known.any():
         return painted

@@ -155,7 +155,7 @@ def test_bfloat16_only_where_the_card_has_it(monkeypatch, device, card, chosen):
     assert models_load.precision_of(ModelSettings(), device) == getattr(torch, chosen)
     assert models_load.precision_of(ModelSettings(), "mps") == torch.float16
     if card is False:
-        with pytest.raises(EnvironmentMissing, match="this card does not compute it"):
+        with pytest.raises(EnvironmentMissing, match="this device does not support it"):
             models_load.precision_of(ModelSettings(precision="bfloat16"), device)
 
 

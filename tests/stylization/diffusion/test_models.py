@@ -152,7 +152,7 @@ def test_fetching_writes_the_layout_and_the_lock(hub, tmp_path):
     data[-1] ^= 1
     file.write_bytes(data)
     with pytest.raises(
-        EnvironmentMissing, match=r"sha256 is .*, expected .* as it was when it was taken in.*mistyle models fetch"
+        EnvironmentMissing, match=r"sha256 is .*, expected .* recorded when the file was added.*mistyle models fetch"
     ):
         models.find("depth", folder)
 
@@ -244,7 +244,7 @@ def test_the_cache_serves_where_no_folder_is_given(tmp_path, monkeypatch):
 def test_files_copied_by_hand_are_compared_with_the_published_ones(tmp_path, capsys, monkeypatch):
     folder = tmp_path / "models"
     shutil.copytree(tiny_models.folder() / "sdxl", folder / "sdxl")  # without the lock beside it
-    words = r"/vae/\w+.safetensors: sha256 is \w+, expected 1598f3d2\w+, .*mistyle models adopt sdxl"
+    words = r"/vae/\w+.safetensors: sha256 is \w+, expected 1598f3d2\w+ as in .*mistyle models adopt sdxl"
     with pytest.raises(EnvironmentMissing, match=words):
         models.find("sdxl", folder)
     monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "cache"))
@@ -256,7 +256,7 @@ def test_files_copied_by_hand_are_compared_with_the_published_ones(tmp_path, cap
     assert main(["models", "adopt", "sdxl", "--models", str(folder)]) == 0
     assert models.find("sdxl", folder) == folder / "sdxl"
     assert main(["models", "adopt", "depth", "--models", str(folder)]) == 4
-    assert "depth is not there" in capsys.readouterr().err
+    assert "depth is missing" in capsys.readouterr().err
     published = hashlib.sha256((folder / "sdxl/vae/diffusion_pytorch_model.safetensors").read_bytes()).hexdigest()
     pinned = replace(models.MODELS["sdxl"], sha256={"vae/diffusion_pytorch_model.safetensors": published})
     monkeypatch.setitem(models.MODELS, "sdxl", pinned)
@@ -264,7 +264,7 @@ def test_files_copied_by_hand_are_compared_with_the_published_ones(tmp_path, cap
     assert models.find("sdxl", folder) == folder / "sdxl"
     assert list(models.read_lock(folder)["sdxl"]["files"]) == ["vae/diffusion_pytorch_model.safetensors"]
     (folder / "sdxl/vae/diffusion_pytorch_model.safetensors").write_bytes(b"x")
-    with pytest.raises(EnvironmentMissing, match="changed or broke"):
+    with pytest.raises(EnvironmentMissing, match="has changed since"):
         models.find("sdxl", folder)
 
 
@@ -336,7 +336,7 @@ def test_no_code_of_others_is_ever_run():
 def test_an_unknown_device_is_refused():
     if torch.cuda.is_available():
         pytest.skip("there is a GPU")
-    with pytest.raises(EnvironmentMissing, match="torch sees no such device"):
+    with pytest.raises(EnvironmentMissing, match="torch finds no such device"):
         models_load.device_of(ModelSettings(device="cuda"))
 
 
@@ -380,7 +380,7 @@ def test_single_files_are_found_by_their_models_names(tmp_path, monkeypatch, cap
     # Torchvision's own file is known by eight digits of its hash, BiRefNet's by all of them.
     (tmp_path / "vgg19").mkdir()
     shutil.copy(folder / "vgg19" / "vgg19-dcbb9e9d.pth", tmp_path / "vgg19")
-    with pytest.raises(EnvironmentMissing, match=r"expected dcbb9e9d, which is the file.*models adopt vgg19"):
+    with pytest.raises(EnvironmentMissing, match=r"expected dcbb9e9d as in torchvision.*models adopt vgg19"):
         models.file("vgg19", tmp_path)
     digits = hashlib.sha256((tmp_path / "vgg19" / "vgg19-dcbb9e9d.pth").read_bytes()).hexdigest()[:8]
     known = replace(models.MODELS["vgg19"], sha256={"vgg19-dcbb9e9d.pth": digits})
@@ -391,7 +391,7 @@ def test_single_files_are_found_by_their_models_names(tmp_path, monkeypatch, cap
     with pytest.raises(EnvironmentMissing, match=r"no --models DIR was given; download https"):
         models.file("birefnet", None)
     assert main(["models", "fetch", "birefnet", "--models", str(tmp_path), "--allow-download"]) == 2
-    assert "does not lie on the hub: download https" in capsys.readouterr().err
+    assert "is not on the hub: download https" in capsys.readouterr().err
 
 
 def test_the_paper_preset_names_what_it_lacks_and_what_needs_nothing(tmp_path, monkeypatch):

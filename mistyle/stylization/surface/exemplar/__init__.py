@@ -1,1 +1,1 @@
-"""The style picture as the painter sees it."""
+"""Exemplar of the style picture: preparation, measures, derived settings and relief."""

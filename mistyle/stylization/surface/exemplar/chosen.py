@@ -1,4 +1,4 @@
-"""Which settings a painting asks for: the table of `mistyle/stylization/README.md` as functions of its reading."""
+"""Settings derived from a painting's measures: the table of `mistyle/stylization/README.md` as functions."""
 
 import numpy as np
 from jaxtyping import Float
@@ -7,27 +7,27 @@ from mistyle.stylization.surface.exemplar.reading import StyleReading, read_styl
 from mistyle.stylization.surface.settings import ResolvedSettings, SurfaceSettings
 
 FROM_PAINTING = ("levels", "detail", "palette", "stroke_coherence", "modelling", "look_up", "borders", "crop")
-FLAT_SHARE = 0.2  # of the area in flat regions from which on a painting is wholly flat
+FLAT_SHARE = 0.2  # share of flat area at which `flat` reaches 1
 FEW_TONES = 2
-LINED = (0.6, 0.75)  # line-likeness at which a painting begins to be graphic, and at which it wholly is
-RIGHT_ANGLED = (0.1, 0.3)  # the same for how rectilinear it is
+LINED = (0.6, 0.75)  # line-likeness at which its term of `graphic` is 0 and 1
+RIGHT_ANGLED = (0.1, 0.3)  # the same for `rectilinear`
 CLEAR = (0.25, 0.5)  # the same for the clarity of its unit
-GRAPHIC = 0.5  # from which on pieces are cut
-LARGE_UNIT = 0.2  # in long sides: a unit that five levels do not see
+GRAPHIC = 0.5  # value of `graphic` from which pieces are cut
+LARGE_UNIT = 0.2  # in long sides: a unit too large for five levels
 COHERENCE = (0.08, 0.1)  # brushwork, graphic
 DETAIL = (4.0, 3.0)  # modelled, flat
 PALETTE = (0.2, 0.05)  # brushwork, graphic
 
 
 def flat(reading: StyleReading) -> float:
-    """How flat a painting is, 0..1: areas of one colour, few tones, or pixel art."""
+    """Flatness 0..1 of a painting: areas of one colour, few tones, or pixel art."""
     if min(reading.pixel_grid) > 0 or reading.tones <= FEW_TONES:
         return 1.0
     return float(np.clip(reading.flatness / FLAT_SHARE, 0, 1))
 
 
 def graphic(reading: StyleReading) -> float:
-    """How much a painting lives by structure, 0..1: flat areas, lines, right angles, a clear unit."""
+    """Graphic structure 0..1 of a painting: flat areas, lines, right angles, a clear unit."""
     lined = np.interp(reading.line_likeness, LINED, (0, 1))
     square = np.interp(reading.rectilinear, RIGHT_ANGLED, (0, 1))
     clear = np.interp(reading.clarity, CLEAR, (0, 1))
@@ -35,7 +35,7 @@ def graphic(reading: StyleReading) -> float:
 
 
 def from_painting(reading: StyleReading) -> dict[str, object]:
-    """The value of every setting of FROM_PAINTING that the painting asks for."""
+    """The derived value of every setting of FROM_PAINTING."""
     share = graphic(reading)
     return {
         "levels": 6 if reading.unit > LARGE_UNIT else 5,
@@ -50,23 +50,23 @@ def from_painting(reading: StyleReading) -> dict[str, object]:
 
 
 def between(ends: tuple[float, float], share: float) -> float:
-    """From the first end to the second, geometrically, to three digits."""
+    """Geometric interpolation between two ends, rounded to three digits."""
     return float(f"{ends[0] * (ends[1] / ends[0]) ** share:.3g}")
 
 
 def is_open(settings: SurfaceSettings | ResolvedSettings) -> bool:
-    """Whether a setting is left to the painting."""
+    """Whether any setting is derived from the painting."""
     return any(getattr(settings, name) is None for name in FROM_PAINTING)
 
 
 def resolved(settings: SurfaceSettings, reading: StyleReading | None) -> ResolvedSettings:
-    """The settings with all that was left open taken from the reading; none is needed where nothing is open."""
+    """The settings with unset ones derived from the reading; it may be None if all are set."""
     own: dict[str, object] = {name: value for name, value in settings.model_dump().items() if value is not None}
     if isinstance(own.get("crop"), float):
         own["crop"] = (own["crop"],) * 4
     if is_open(settings):
         if reading is None:
-            raise ValueError("settings are open, so a reading of the painting is needed")
+            raise ValueError("some settings are unset, so a reading of the painting is needed")
         own = from_painting(reading) | own
     return ResolvedSettings.model_validate(own)
 
@@ -77,7 +77,7 @@ def settled(
     settings: SurfaceSettings | ResolvedSettings,
     reading: StyleReading | None = None,
 ) -> ResolvedSettings:
-    """The settings with every choice made; reads the picture (encoded sRGB) where one is open and no reading given."""
+    """The settings with unset ones derived; measures the picture (encoded sRGB) if needed and `reading` is None."""
     if isinstance(settings, ResolvedSettings):
         return settings
     if reading is None and is_open(settings):

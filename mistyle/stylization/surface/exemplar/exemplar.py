@@ -1,4 +1,4 @@
-"""The painting as the synthesis sees it: four quarter turns, each pixel with its colour, patch and guides."""
+"""Exemplar of the synthesis: the painting in four quarter turns, each pixel with colour, patch and guides."""
 
 from dataclasses import dataclass
 
@@ -10,23 +10,23 @@ from mistyle.core.errors import InputRefused
 from mistyle.core.image import erode, nearest_fill
 from mistyle.stylization.surface import kernels
 
-LONGEST = 2048  # pixels along the longer side that are kept
-SLIMMEST = 3  # a picture longer than this many times its width is mirrored until it is not
+LONGEST = 2048  # largest long side, pixels
+SLIMMEST = 3  # largest aspect ratio; slimmer pictures are repeated by mirroring
 BROAD = 1 / 48  # blur that leaves only the large areas of colour, in long sides
-FORM = 0.12  # of that: the blur under which strokes still show the form
+FORM = 0.12  # of BROAD: blur that keeps the form in the strokes
 BASIS_PATCHES = 10_000
 PALETTE_SIZE = 256
 PALETTE_COLOURS = 20_000
-TWO_TONED = 0.95  # share of the variance of lightness between two tones from which on a painting has no others
+TWO_TONED = 0.95  # between-class share of the variance of lightness from which a painting has two tones only
 RARITY_CELL = 0.05  # Lab / 100
 Crop = tuple[float, float, float, float]  # top, left, bottom, right, in shares of the height or width
 UNCROPPED: Crop = (0.0, 0.0, 0.0, 0.0)
-RAREST = 0.01  # share of the most common colour's pixels below which a colour is no rarer
+RAREST = 0.01  # share of the most common colour's pixels below which rarity does not grow
 
 
 @dataclass(frozen=True)
 class StyleImage:
-    """A style picture: encoded sRGB 0..1, and which of its pixels may be used."""
+    """A style picture: encoded sRGB 0..1, and the mask of its usable pixels."""
 
     rgb: Float[np.ndarray, "h w 3"]
     opaque: Bool[np.ndarray, "h w"]
@@ -39,9 +39,9 @@ class Exemplar:
     lab     CIE Lab / 100            broad   the same, blurred: the large areas of colour
     grain   (cos 2t, sin 2t) times 0..1, t being the direction of the strokes from the x axis
     band    lightness of middle-sized strokes, around 0
-    origin  which pixel of the unturned page this is
-    target_use  of those pixels: how often each should be used, 1 on average
-    allowed whether a whole 5x5 patch fits there and is opaque
+    origin  index of the pixel in the unturned page
+    target_use  desired use of each of those pixels, 1 on average
+    allowed whether a whole opaque 5x5 patch fits there
     """
 
     size: tuple[int, int]
@@ -70,14 +70,14 @@ def lab_from_srgb(rgb: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]
 
 
 def lightened(rgb: Float[np.ndarray, "n 3"], by: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Encoded sRGB with `by` added to its lightness (Lab / 100), cut to what a screen shows."""
+    """Encoded sRGB with `by` added to its lightness (Lab / 100), clipped to the sRGB gamut."""
     lab = lab_from_srgb(rgb[None])[0]
     lab[:, 0] = np.clip(lab[:, 0] + by, 0, 1)
     return np.clip(cv2.cvtColor(lab[None] * np.float32(100), cv2.COLOR_Lab2RGB)[0], 0, 1)
 
 
 def inside(shape: tuple[int, ...], crop: Crop) -> tuple[slice, slice]:
-    """The rows and columns that a crop leaves; at least one of each."""
+    """The remaining rows and columns after a crop; at least one of each."""
     spans = []
     for axis in (0, 1):
         first, last = int(shape[axis] * crop[axis]), shape[axis] - int(shape[axis] * crop[axis + 2])
@@ -88,10 +88,10 @@ def inside(shape: tuple[int, ...], crop: Crop) -> tuple[slice, slice]:
 def filled(
     rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] | None
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """The picture within 0..1, transparent pixels with the colour of the nearest opaque one, and which are opaque."""
+    """The picture within 0..1, transparent pixels in the colour of the nearest opaque one, and the opaque mask."""
     size = f"the style picture ({rgb.shape[1]} x {rgb.shape[0]})"
     if rgb.size == 0 or not np.isfinite(rgb).all():
-        raise InputRefused(f"{size} is empty or holds NaN or infinite values; use another one")
+        raise InputRefused(f"{size} is empty or has NaN or infinite values; use another one")
     picture = np.clip(rgb, 0, 1).astype(np.float32)
     opaque = np.ones(picture.shape[:2], bool) if alpha is None else alpha > 0.5
     if not opaque.any():
@@ -102,10 +102,10 @@ def filled(
 def prepare(
     rgb: Float[np.ndarray, "h w 3"], crop: Crop = UNCROPPED, alpha: Float[np.ndarray, "h w"] | None = None
 ) -> StyleImage:
-    """A painting fit for synthesis: cropped (shares at the top, left, bottom, right), at most 2048 px long, at least
-    8 px and a third of its length wide.
+    """Prepare a painting for synthesis: cropped (shares at the top, left, bottom, right), at most 2048 px long, at
+    least 8 px and a third of its length wide.
 
-    Transparent pixels take the colour of the nearest opaque one. Refuses a picture without any usable pixel.
+    Transparent pixels take the colour of the nearest opaque one. Raises InputRefused without any usable pixel.
     """
     window = inside(rgb.shape, crop)
     picture, opaque = filled(rgb[window], None if alpha is None else alpha[window])
@@ -127,7 +127,7 @@ def long_side(shape: tuple[int, ...], long: float) -> tuple[int, int]:
 
 
 def resized(picture: Float[np.ndarray, "h w *c"], size: tuple[int, int]) -> Float[np.ndarray, "h2 w2 *c"]:
-    """A picture at another size: area average when smaller, bilinear when larger (no colour that was not there)."""
+    """A picture at another size: area average when smaller, bilinear when larger (no new extreme colours)."""
     smaller = size[0] < picture.shape[0]
     return cv2.resize(picture, size[::-1], interpolation=cv2.INTER_AREA if smaller else cv2.INTER_LINEAR)
 
@@ -138,11 +138,11 @@ def blurred(picture: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def for_bilinear(picture: np.ndarray) -> np.ndarray:
-    """The picture whose bilinear lookups come nearest to `picture` itself, which they would blur; edges repeated.
+    """Prefilter that compensates the blur of bilinear look-ups; edges repeated.
 
     The quasi-interpolation [-1/12, 7/6, -1/12] of Condat, Blu and Unser (Beyond interpolation: optimal reconstruction
-    by quasi-interpolation, ICIP 2005): lookups at any place between pixels blur by a variance of 1/6 on average. Edges
-    overshoot, by a twelfth of their step along each axis.
+    by quasi-interpolation, ICIP 2005): look-ups between pixels blur by a variance of 1/6 on average. Edges overshoot by
+    a twelfth of their step along each axis.
     """
     kernel = np.array([-1, 14, -1]) / 12
     return cv2.sepFilter2D(picture, -1, kernel, kernel, borderType=cv2.BORDER_REPLICATE)
@@ -155,7 +155,7 @@ def grain(lightness: Float[np.ndarray, "h w"]) -> Float[np.ndarray, "h w 2"]:
     reach = max(1.5, max(lightness.shape) / 128)
     xx, yy, xy = (blurred(v, reach) for v in (gx * gx, gy * gy, gx * gy))
     # The gradient's doubled angle is (xx - yy, 2 xy); strokes run across the gradient, which negates both.
-    # The constant keeps flat areas, whose gradient is rounding and paper grain, without a direction.
+    # The constant suppresses directions in flat areas, where the gradient is rounding and paper grain.
     return np.stack([yy - xx, -2 * xy], axis=2) / (xx + yy + 1e-5)[..., None]
 
 
@@ -188,7 +188,7 @@ def exemplar(painting: StyleImage, long: float, liveliness: float, mix: float = 
         grain=turned(direction) * sign,
         band=turned(band),
         origin=turned(origin),
-        # Where nothing is opaque at this size, transparent pixels (filled from their neighbours) must do.
+        # If nothing is opaque at this size, use transparent pixels (filled from their neighbours).
         allowed=turned(opaque if opaque.any() else inner),
         target_use=(demand(lab, broad, sigma, liveliness) * rarity(broad, mix)).reshape(-1),
     )
@@ -207,10 +207,10 @@ def patch_basis(exemplar: Exemplar, rng: np.random.Generator) -> Basis:
     sample = []
     for k in range(kernels.PAGES):
         height, width = exemplar.shapes[k]
-        mine = (
+        pixel = (
             chosen[(chosen >= exemplar.starts[k]) & (chosen < exemplar.starts[k] + height * width)] - exemplar.starts[k]
         )
-        row, column = mine // width, mine % width
+        row, column = pixel // width, pixel % width
         lab = page(exemplar, exemplar.lab, k)
         sample.append(np.stack([lab[row + dy, column + dx] for dy in range(-2, 3) for dx in range(-2, 3)], axis=1))
     patches = np.concatenate(sample).reshape(-1, 75).astype(np.float64)
@@ -220,10 +220,10 @@ def patch_basis(exemplar: Exemplar, rng: np.random.Generator) -> Basis:
 
 
 def middle_tones(lightness: Float[np.ndarray, "..."]) -> float:
-    """0 for a picture of two tones or one, 1 for one that has middle tones too.
+    """0 for a picture of one or two tones, 1 for one with middle tones.
 
-    By the share of the variance of lightness that the best single threshold explains (Otsu 1979): 1 for two values,
-    0.75 for evenly spread ones.
+    Uses the share of the variance of lightness that the best single threshold explains (Otsu 1979): 1 for two values,
+    0.75 for a uniform distribution.
     """
     values = np.sort(lightness.reshape(-1).astype(np.float64))
     values = values[:: max(len(values) // 4096, 1)]
@@ -239,16 +239,16 @@ def middle_tones(lightness: Float[np.ndarray, "..."]) -> float:
 def demand(
     lab: Float[np.ndarray, "h w 3"], broad: Float[np.ndarray, "h w 3"], sigma: float, liveliness: float
 ) -> Float[np.ndarray, "h w"]:
-    """How much of each part of the painting is asked for, 1 on average: evenly, or (liveliness 1) by its contrast."""
+    """Target use of each part of the painting, 1 on average: uniform, or (liveliness 1) by its contrast."""
     busy = np.sqrt(blurred(((lab - broad) ** 2).sum(axis=2), sigma))
     return (1 - liveliness) + liveliness * busy / max(float(busy.mean()), 1e-6)
 
 
 def rarity(colours: Float[np.ndarray, "*n 3"], mix: float) -> Float[np.ndarray, "*n"]:
-    """Weights by which a pixel of a rare colour counts more: how many pixels share its cell of Lab space, to the -mix.
+    """Weights that favour pixels of rare colours: the pixel count of a pixel's cell in Lab space, to the power -mix.
 
-    Cells are RARITY_CELL wide and blurred, so that a colour's neighbours count too; with mix 1 every cell that is not
-    nearly empty gets the same total. 1 on average.
+    Cells are RARITY_CELL wide and blurred, so that similar colours count too. With mix 1 every cell that is not nearly
+    empty has the same total. 1 on average.
     """
     if mix == 0:
         return np.ones(colours.shape[:-1], np.float32)
@@ -266,16 +266,16 @@ def rarity(colours: Float[np.ndarray, "*n 3"], mix: float) -> Float[np.ndarray, 
 def palette(
     painting: StyleImage, liveliness: float, rng: np.random.Generator, mix: float = 0.0
 ) -> Float[np.ndarray, "n 3"]:
-    """Large-area colours (Lab / 100) in the proportions in which the surface shall have them.
+    """Large-area colours (Lab / 100) in the surface's target proportions.
 
-    `liveliness` 0 takes them as the painting has them, 1 by how much is going on where they are: a large empty sky or
-    paper ground then no longer fills the surface. `mix` as in `rarity`.
+    `liveliness` 0 uses the painting's proportions, 1 weights colours by local contrast: a large empty sky or paper
+    ground then no longer fills the surface. `mix` as in `rarity`.
     """
     size = long_side(painting.opaque.shape, PALETTE_SIZE)
     small = lab_from_srgb(resized(painting.rgb, size))
     sigma = max(0.6, max(small.shape[:2]) * BROAD)
     broad = blurred(small, sigma)
-    # Never quite zero, so that a picture with a single opaque pixel still has a palette.
+    # Above zero, so that a picture with a single opaque pixel still has a palette.
     opaque = np.maximum(resized(painting.opaque.astype(np.float32), size), 1e-6)
     weight = demand(small, broad, sigma, liveliness) * opaque * rarity(broad, mix)
     share = np.cumsum(weight.reshape(-1).astype(np.float64))

@@ -1,7 +1,7 @@
-"""What a painting is like: the size of its strokes or tiles, how flat, how lined, how many tones, which pixels.
+"""Measures of a painting: size of strokes or tiles, flatness, line-likeness, number of tones, pixel grid.
 
-Read once before the synthesis, which takes its settings from it (`mistyle.stylization.surface.exemplar.chosen`).
-Nothing is learned: all of it is counted from the picture, the same way every time.
+They are computed once before the synthesis, whose settings derive from them
+(`mistyle.stylization.surface.exemplar.chosen`). Nothing is learned: they are deterministic image statistics.
 """
 
 from dataclasses import dataclass
@@ -13,21 +13,21 @@ from jaxtyping import Float
 from mistyle.stylization.surface.exemplar import edges
 from mistyle.stylization.surface.exemplar import exemplar as style
 
-LONG = 512  # pixels along the longer side at which most is read
-FINE = 1.0  # pixels of blur before local differences are taken: noise of paper, canvas and JPEG stays out
-FLAT_WINDOW = 9  # pixels (of LONG) across which a flat region does not change
-FLAT = 0.012  # standard deviation of Lab / 100 in such a window that still counts as flat
+LONG = 512  # pixels along the longer side for most measures
+FINE = 1.0  # pixels of blur before local differences, against noise of paper, canvas and JPEG
+FLAT_WINDOW = 9  # pixels (of LONG) of the window for flat regions
+FLAT = 0.012  # largest standard deviation of Lab / 100 in a flat window
 MOST_TONES = 8
 EXPLAINED = 0.95  # share of the variance of lightness that the tones explain
 BINS = 64
 SCALES, LEAST_SCALE = 16, 0.6  # blurs in steps of sqrt(2), from this one on (pixels of LONG)
-PERIOD = 5.33  # wavelength, in blurs, at which the difference of two such blurs is greatest
-PROMINENT = 0.04  # share by which a maximum over scales stands out
-LOCAL = 4.0  # blurs above which the composition begins
+PERIOD = 5.33  # wavelength, in blurs, of the largest difference between two such blurs
+PROMINENT = 0.04  # least relative prominence of a maximum over scales
+LOCAL = 4.0  # blurs above which contrast belongs to the composition
 LARGEST_UNIT = 0.35  # in long sides
-RAYS = 24  # directions, 7.5 degrees apart, along which it is looked for
-ALL_BUT = 0.8  # of the clearest peak: among peaks as clear as this the nearest is the period
-PERIODIC = 0.12  # rise of the autocorrelation from its first dip to the next peak that counts as a period
+RAYS = 24  # search directions, 7.5 degrees apart
+ALL_BUT = 0.8  # of the clearest peak: the nearest peak at least as clear is the period
+PERIODIC = 0.12  # least rise of the autocorrelation from its first dip to a period's peak
 ANGLES = 36
 STANDS_OUT = 1.6  # times the mean of the histogram of directions
 AXIS_WIDTH = 10.0  # degrees on both sides of an axis
@@ -37,17 +37,17 @@ AXIS_WIDTH = 10.0  # degrees on both sides of an axis
 class StyleReading:
     """A painting's own measures; shares are 0..1.
 
-    unit          width of the unit that structure is made of (tile, stroke with its gap), in long sides
-    clarity       how much of the contrast at the unit's scale is missing at coarser ones
-    line_likeness share of the contrast that runs along lines
-    flatness      share of the area that is of one colour, out of noise
-    tones         tones of lightness that explain 95 % of its variance, at most 8
-    pixel_grid    sides (down, across) of one art pixel in picture pixels; 0 where it is no pixel art
+    unit          width of the structural unit (tile, stroke with its gap), in long sides
+    clarity       relative loss of contrast from the unit's scale to coarser ones
+    line_likeness share of the contrast along lines
+    flatness      share of the area with uniform colour, up to noise
+    tones         number of tones that explain 95 % of the variance of lightness, at most 8
+    pixel_grid    sides (down, across) of one art pixel in picture pixels; 0 where it is not pixel art
     directions    dominant directions of lines, degrees counter-clockwise from the picture's x axis, 0..180
-    rectilinear   how much of the contrast runs along two axes at right angles
-    border        what is not picture on each side (top, left, bottom, right), shares of the height or width
+    rectilinear   share of the contrast along two axes at right angles
+    border        border outside the picture (top, left, bottom, right), shares of the height or width
 
-    Lettering, cartouches and signatures are not found: `paint.style_mask` takes them out.
+    Lettering, cartouches and signatures are not detected: `paint.style_mask` excludes them.
     """
 
     unit: float
@@ -62,7 +62,7 @@ class StyleReading:
 
 
 def read_style(rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] | None = None) -> StyleReading:
-    """Read a picture (encoded sRGB 0..1) of any size, as `style.prepare` takes it.
+    """Measure a picture (encoded sRGB 0..1) of any size, prepared by `style.prepare`.
 
     Transparent pixels take the colour of the nearest opaque one; a picture with transparent parts has no border.
     """
@@ -93,7 +93,7 @@ def read_style(rgb: Float[np.ndarray, "h w 3"], alpha: Float[np.ndarray, "h w"] 
 
 
 def flatness(lab: Float[np.ndarray, "h w 3"]) -> float:
-    """Share of the area in which a window hardly changes."""
+    """Share of the area with little change within a window."""
     calm = style.blurred(lab, FINE)
     side = (FLAT_WINDOW, FLAT_WINDOW)
     mean, square = cv2.blur(calm, side), cv2.blur(calm**2, side)
@@ -122,9 +122,9 @@ def tone_count(lightness: Float[np.ndarray, "h w"]) -> int:
 def structural_unit(lab: Float[np.ndarray, "h w 3"]) -> tuple[float, float]:
     """Width of the unit in long sides, and its clarity (0..1).
 
-    The scale (Lindeberg 1998) is the first at which the contrast between one blur and the next has a maximum. Where the
-    autocorrelation of what is finer than a few such scales has a clear peak, its lag is the unit, along some direction
-    or on average over all.
+    The scale (Lindeberg 1998) is the first maximum of the contrast between successive blurs. A clear peak in the
+    autocorrelation of detail finer than a few such scales overrides it: its lag is the unit. The autocorrelation is
+    along one direction or averaged over all.
     """
     long = max(lab.shape[:2])
     sigma, clarity = first_scale(lab)
@@ -137,8 +137,8 @@ def structural_unit(lab: Float[np.ndarray, "h w 3"]) -> tuple[float, float]:
 
 
 def first_scale(lab: Float[np.ndarray, "h w 3"]) -> tuple[float, float]:
-    """The blur (pixels) of the first maximum of contrast over scales, or of the highest contrast where none stands out;
-    and the share by which contrast falls after it."""
+    """The blur (pixels) of the first prominent maximum of contrast over scales, else of the highest contrast; and the
+    relative fall of contrast after it."""
     scales = LEAST_SCALE * np.sqrt(2) ** np.arange(SCALES)
     largest = max(lab.shape[:2]) * LARGEST_UNIT / PERIOD
     scales = scales[: max(4, int((scales <= largest).sum()) + 1)]
@@ -155,7 +155,7 @@ def first_scale(lab: Float[np.ndarray, "h w 3"]) -> tuple[float, float]:
 
 
 def correlations(fine: Float[np.ndarray, "h w"], long: int) -> list[Float[np.ndarray, " n"]]:
-    """Autocorrelation over the lag in pixels: on average over all directions, and along RAYS of them."""
+    """Autocorrelation over the lag in pixels: averaged over all directions, and along RAYS of them."""
     fine = fine * np.outer(np.hanning(fine.shape[0]), np.hanning(fine.shape[1]))
     shape = [cv2.getOptimalDFTSize(2 * n) for n in fine.shape]
     table = np.fft.irfft2(np.abs(np.fft.rfft2(fine, shape)) ** 2, shape)
@@ -169,7 +169,7 @@ def correlations(fine: Float[np.ndarray, "h w"], long: int) -> list[Float[np.nda
 
 
 def first_peak(curve: Float[np.ndarray, " n"]) -> tuple[int, float]:
-    """Lag of the first peak after the first dip, and its height over the dip; height 0 where there is none."""
+    """Lag of the first peak after the first dip, and its height over the dip; height 0 for none."""
     smooth = np.convolve(np.pad(curve, 1, mode="edge"), [0.25, 0.5, 0.25], "valid")
     rising = np.flatnonzero(np.diff(smooth) > 0)
     if len(rising) == 0:
@@ -183,7 +183,7 @@ def first_peak(curve: Float[np.ndarray, " n"]) -> tuple[int, float]:
 
 
 def line_reading(lightness: Float[np.ndarray, "h w"]) -> tuple[float, tuple[float, ...], float]:
-    """Line-likeness, the dominant directions and how rectilinear they are, from the structure tensor."""
+    """Line-likeness, the dominant directions and the rectilinear share, from the structure tensor."""
     calm = style.blurred(lightness, FINE)
     gx, gy = cv2.Scharr(calm, cv2.CV_32F, 1, 0) / 32, cv2.Scharr(calm, cv2.CV_32F, 0, 1) / 32
     energy = gx**2 + gy**2

@@ -1,7 +1,7 @@
-"""Height and gloss that a painting suggests: strokes stand proud, cracks, grout and outlines lie deep and are dull.
+"""Estimated height and gloss of a painting: strokes are raised; cracks, grout and outlines are deep and dull.
 
-Nothing in a picture says how thick its paint is; this is a guess by lightness, good enough for a first normal and
-roughness map, which the fit then refines.
+A picture does not determine the thickness of its paint. This heuristic by lightness gives a first normal and roughness
+map, which the fit refines.
 """
 
 from dataclasses import dataclass
@@ -12,27 +12,27 @@ from jaxtyping import Float
 
 from mistyle.stylization.surface.exemplar.exemplar import blurred, lab_from_srgb
 
-FINE, BROAD = 1 / 700, 1 / 60  # widths (long sides of the painting) between which strokes are looked for
-GROOVE = 1 / 80  # and the widest groove
-STEADY = 0.02  # local contrast of lightness (Lab / 100) under which strokes are paper grain
-LEAST_SLOPE = 1e-3  # height per pixel under which a picture is flat: rounding
-DULL, SHINY = 0.3, 0.12  # roughness that a groove adds, and that a stroke's crest takes away
+FINE, BROAD = 1 / 700, 1 / 60  # range of stroke widths, in long sides of the painting
+GROOVE = 1 / 80  # widest groove
+STEADY = 0.02  # local contrast of lightness (Lab / 100) below which texture is paper grain
+LEAST_SLOPE = 1e-3  # height per pixel below which a picture is flat: rounding
+DULL, SHINY = 0.3, 0.12  # roughness added at a groove, and subtracted at a stroke's crest
 
 
 @dataclass(frozen=True)
 class Relief:
-    """Per pixel of a painting: the slope of its height along x and y (root mean square 1 together), and what is to be
-    added to the roughness."""
+    """Per pixel of a painting: the slope of its height along x and y (root mean square 1 together), and the offset of
+    the roughness."""
 
     slope: Float[np.ndarray, "h w 2"]
     dull: Float[np.ndarray, "h w"]
 
 
 def height_and_grooves(painting: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Height, how much of a groove a pixel is (0..1), and how much of a stroke's crest (-1..1).
+    """Height, groove strength (0..1) and crest strength (-1..1) of each pixel.
 
-    A stroke's crest is light against its surroundings, in units of the contrast there; a groove is a dark line narrower
-    than GROOVE (a black top-hat).
+    A stroke's crest is lighter than its surroundings, in units of local contrast; a groove is a dark line narrower than
+    GROOVE (a black top-hat).
     """
     long = max(painting.shape[:2])
     light = blurred(lab_from_srgb(painting)[..., 0], max(0.6, FINE * long))
@@ -47,7 +47,7 @@ def height_and_grooves(painting: Float[np.ndarray, "h w 3"]) -> tuple[np.ndarray
 
 
 def relief(painting: Float[np.ndarray, "h w 3"]) -> Relief:
-    """Slopes and dullness of an encoded sRGB painting; flat where it is flat."""
+    """Slopes and dullness of an encoded sRGB painting; zero slopes for a flat one."""
     height, groove, crest = height_and_grooves(painting)
     smooth = blurred(height, max(0.6, FINE * max(painting.shape[:2])))
     slope = np.stack([cv2.Scharr(smooth, cv2.CV_32F, 1, 0), cv2.Scharr(smooth, cv2.CV_32F, 0, 1)], axis=2) / 32

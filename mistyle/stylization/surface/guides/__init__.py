@@ -1,1 +1,1 @@
-"""What each surface point asks of the painting: tone, colour, direction."""
+"""Guides of the synthesis at surface points: tone, colour, detail and stroke direction."""

@@ -1,7 +1,8 @@
-"""Light and dark that the strokes still lack, laid over them as a painter lays a glaze.
+"""Glaze: a smooth lightness correction over the synthesised strokes.
 
-The synthesis takes strokes as they are, so that some places end lighter or darker than the form asks. What is missing
-between strokes and large areas is added to the lightness, smoothly: strokes, being finer, keep their contrast and hue.
+The synthesis copies strokes unchanged, so some places are lighter or darker than the detail guide. The difference in
+the band between strokes and large areas is added to the lightness. Strokes are finer, so they keep their contrast and
+hue.
 """
 
 from collections.abc import Sequence
@@ -14,7 +15,7 @@ from mistyle.stylization.surface.guides.guides import Guide
 from mistyle.stylization.surface.samples import Level, carry, drop, smooth
 from mistyle.stylization.surface.settings import PlainSettings
 
-THICKEST = 0.12  # lightness (Lab / 100) that a glaze adds or takes at most
+THICKEST = 0.12  # largest change of lightness (Lab / 100)
 
 
 def glaze(
@@ -24,10 +25,9 @@ def glaze(
     exemplar: style.Exemplar,
     settings: PlainSettings,
 ) -> Float[np.ndarray, " n"]:
-    """What to add to the `lightness` (Lab / 100) of the finest level's samples; zero for paintings of two tones.
+    """The offset of the finest level's `lightness` (Lab / 100); zero for paintings of two tones.
 
-    The detail guide says how light a place should be against its surroundings; the same band of the lightness that the
-    samples show is taken from it.
+    It is the detail guide's target lightness against the surroundings, minus the same band of the samples' lightness.
     """
     strength = settings.glaze * style.middle_tones(exemplar.lab[:, 0])
     fine = levels[-1]
@@ -35,13 +35,13 @@ def glaze(
         return np.zeros(len(fine.directed), np.float32)
     shown = band(levels, lightness)
     target = guide.detail * np.float32(settings.relief * exemplar.band.std())
-    sure = np.minimum(np.abs(guide.detail), 1).astype(np.float32)
-    missing = np.float32(strength) * sure * (target - shown)
+    certainty = np.minimum(np.abs(guide.detail), 1).astype(np.float32)
+    missing = np.float32(strength) * certainty * (target - shown)
     return smooth(fine, np.clip(missing, -THICKEST, THICKEST), 2)
 
 
 def band(levels: Sequence[Level], values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Values of the finest level between a smoothing over strokes and one over large areas, as the detail guide's."""
+    """Band-pass of the finest level's values between strokes and large areas, like the detail guide's."""
     fine, middle, coarse = levels[-1], levels[-2], levels[-3]
     sharp = smooth(fine, values, 2)
     medium = smooth(middle, drop(fine.points, sharp, middle.points), 2)

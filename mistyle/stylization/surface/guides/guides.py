@@ -1,8 +1,7 @@
-"""What every place of the surface asks of the painting: how light, which colour, and where dark and light must be.
+"""Guides of the synthesis at every surface point: tone, colour, and light and dark detail.
 
-All of it comes from the shape alone and is the same from every side: places that follow its parts, creases and ridges.
-Light from above and openness (ambient occlusion) count as far as `form` says. The painting answers with its own range
-of values.
+They derive from the shape alone, independent of the view: fields that follow its parts, creases and ridges. `form`
+weights light from above and openness (ambient occlusion). Values are mapped to the painting's own range.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,16 +19,16 @@ from mistyle.stylization.surface.settings import ResolvedSettings
 Occlusion = Callable[[np.ndarray, np.ndarray], np.ndarray]
 Content = Callable[[np.ndarray, np.ndarray], np.ndarray]  # positions, normals -> lightness 0..1 of the asset's texture
 ROTATIONS = 30
-LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, while colours are transported
-FIELD_POINTS = 6_000  # samples at most on which the places are found
-MIDDLE, SPREAD = 0.5, 0.22  # mean and standard deviation of the tone of places
-HOLLOW = 0.4  # tone that a full hollow loses and a full ridge gains by CONVEX: parts end at their creases
-CALM = 0.65  # share of the palette's spread of lightness between places, where the shape alone chooses them
-LEAST_DETAIL = 0.05  # difference of tone between two smoothings that counts as full detail
-CONVEX = 0.4  # how much of a ridge or bulge counts, against a hollow
-LEAST_CONTENT = 0.02  # standard deviation of a texture's lightness from which on it counts in full
-HIDDEN = 0.05  # share of open sky under which a place is taken for invisible
-STANDING = -0.85  # height of the normal under which a place is taken for what the thing stands on
+LIGHTNESS_LEAD = 2.5  # spread of lightness, in spreads of chroma, during colour transport
+FIELD_POINTS = 6_000  # largest number of samples for the place fields
+MIDDLE, SPREAD = 0.5, 0.22  # mean and standard deviation of the place fields' tone
+HOLLOW = 0.4  # tone subtracted at a full hollow, and, times CONVEX, added at a full ridge: parts end at their creases
+CALM = 0.65  # share of the palette's spread of lightness, where the shape alone sets the tone
+LEAST_DETAIL = 0.05  # least difference of tone between two smoothings at full detail
+CONVEX = 0.4  # weight of a ridge or bulge against a hollow
+LEAST_CONTENT = 0.02  # standard deviation of a texture's lightness at full weight
+HIDDEN = 0.05  # share of open sky below which a point counts as invisible
+STANDING = -0.85  # height of the normal below which a point counts as the underside
 
 
 @dataclass(frozen=True)
@@ -51,8 +50,8 @@ def level_guides(
 ) -> list[Guide]:
     """Guides of all levels, coarse to fine. `palette` is Lab/100 of the blurred painting, a few thousand colours.
 
-    `content` is the lightness of a texture that the surface has already; `settings.keep_content` is its share in tone
-    and detail, `settings.form` that of sky light and openness, `settings.modelling` that of all hollows and bumps.
+    `content` is the lightness of the surface's own texture; `settings.keep_content` is its share in tone and detail,
+    `settings.form` that of sky light and openness, `settings.modelling` that of all hollows and bumps.
     """
     middle = max(len(levels) - 2, 0)
     base = levels[middle].points
@@ -67,14 +66,14 @@ def level_guides(
     if settings.form > 0:
         tone = mixed(tone, lit, settings.form)
         details = mixed(details, detail(levels, lit, cavity), settings.form)
-    kept = 0.0
+    content_share = 0.0
     if content is not None and settings.keep_content > 0:
         lightness = [content(level.points.positions, level.points.normals).astype(np.float32) for level in levels]
-        kept = settings.keep_content * min(float(lightness[-1].std()) / LEAST_CONTENT, 1.0)
-        tone, details = with_content(levels, tone, details, lightness, kept)
+        content_share = settings.keep_content * min(float(lightness[-1].std()) / LEAST_CONTENT, 1.0)
+        tone, details = with_content(levels, tone, details, lightness, content_share)
     shown = (openness > HIDDEN) & (base.normals[:, 1] > STANDING)
     colour = colour_field(tone[middle], fields, shown, palette, rng)
-    typical, spread = palette[:, 0].mean(), CALM + (1 - CALM) * max(settings.form, kept)
+    typical, spread = palette[:, 0].mean(), CALM + (1 - CALM) * max(settings.form, content_share)
     colour[:, 0] = typical + spread * (colour[:, 0] - typical)
     return [
         Guide(carry(base, colour, level.points), own, level.directed)
@@ -85,14 +84,15 @@ def level_guides(
 def mixed(
     first: Sequence[Float[np.ndarray, " _"]], second: Sequence[Float[np.ndarray, " _"]], share: float
 ) -> list[Float[np.ndarray, " _"]]:
-    """Level by level, the share of the second laid over the first."""
+    """Per level, the blend of both with the given share of the second."""
     return [(1 - share) * a + share * b for a, b in zip(first, second, strict=True)]
 
 
 def places(levels: Sequence[Level], base: SurfacePoints, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """`place_fields` at the points of `base`, found on the finest level that is small enough.
+    """`place_fields` at the points of `base`, computed on the finest level with at most FIELD_POINTS samples.
 
-    The first, of lightness, grows upwards in the mean: heads and lids are light, and dark strokes draw their features.
+    The first, for lightness, increases upwards on average: heads and lids are light, and dark strokes draw their
+    features.
     """
     small = next((level for level in reversed(levels) if len(level.directed) <= FIELD_POINTS), levels[0])
     fields = carry(small.points, place_fields(small, drop(base, openness, small.points)), base)
@@ -107,7 +107,7 @@ def tones(
 ) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
     """Tone (about 0..1) and cavity (-1..1, positive in hollows) of every level.
 
-    `openness` (ambient occlusion, 1 = open) and the cavity belong to the second finest level, where they are smooth;
+    `openness` (ambient occlusion, 1 = open) and the cavity are from the second finest level, where they are smooth;
     each level has its own normals.
     """
     middle = levels[max(len(levels) - 2, 0)]
@@ -115,20 +115,20 @@ def tones(
     fine_cavity = smooth(middle, cavity_of(middle), 1)
     broad_cavity = carry(coarse.points, smooth(coarse, cavity_of(coarse), 1), middle.points)
     hollow = (bounded(fine_cavity, 95, LEAST_RELIEF, 1) + bounded(broad_cavity, 95, LEAST_RELIEF, 1)) / 2
-    # Round things are convex nearly everywhere: counted in full, flat places among them would look like hollows.
+    # Round shapes are convex nearly everywhere: with full weight, their flat places would look like hollows.
     hollow = np.where(hollow < 0, CONVEX * hollow, hollow)
     tone, cavity = [], []
     for level in levels:
         own = level is middle
-        open_here = openness if own else carry(middle.points, openness, level.points)
-        hollow_here = hollow if own else carry(middle.points, hollow, level.points)
+        level_openness = openness if own else carry(middle.points, openness, level.points)
+        level_hollow = hollow if own else carry(middle.points, hollow, level.points)
         normals = level.points.normals
         sky = 0.5 + 0.5 * normals[:, 1]
-        shade = 0.35 + 0.65 * open_here
-        key = (0.75 * (0.5 + 0.5 * normals @ KEY.astype(np.float32)) ** 1.2 + 0.25 * sky) * shade - 0.16 * hollow_here
-        top = sky * shade - 0.2 * hollow_here
+        shade = 0.35 + 0.65 * level_openness
+        key = (0.75 * (0.5 + 0.5 * normals @ KEY.astype(np.float32)) ** 1.2 + 0.25 * sky) * shade - 0.16 * level_hollow
+        top = sky * shade - 0.2 * level_hollow
         tone.append((bake_light * key + (1 - bake_light) * top).astype(np.float32))
-        cavity.append(hollow_here.astype(np.float32))
+        cavity.append(level_hollow.astype(np.float32))
     return tone, cavity
 
 
@@ -139,9 +139,9 @@ def with_content(
     content: Sequence[Float[np.ndarray, " _"]],
     share: float,
 ) -> tuple[list[Float[np.ndarray, " _"]], list[Float[np.ndarray, " _"]]]:
-    """Tone and details with that share given over to the lightness of the asset's own texture, at its contrast.
+    """Tone and details blended with the lightness of the asset's own texture, at its contrast.
 
-    The texture's lightness is brought to the tone's mean.
+    The texture's lightness is shifted to the tone's mean.
     """
     shift = np.float32(tone[-1].mean() - content[-1].mean())
     own = [lightness + shift for lightness in content]
@@ -166,7 +166,7 @@ def detail(
 
 
 def normal_scores(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Values replaced by those a standard normal variable takes at the same ranks."""
+    """Values replaced by the standard normal quantiles of their ranks."""
     from scipy.special import ndtri
 
     rank = np.empty(len(values))
@@ -175,7 +175,7 @@ def normal_scores(values: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
 
 
 def at_quantiles(values: Float[np.ndarray, " n"], of: Float[np.ndarray, " m"]) -> Float[np.ndarray, " n"]:
-    """Values replaced, in their order, by the quantiles of another set (ties by position)."""
+    """Values replaced, in rank order, by the quantiles of another set (ties by position)."""
     share = (np.arange(len(values)) + 0.5) / len(values)
     result = np.empty(len(values))
     result[np.argsort(values, kind="stable")] = np.interp(share, (np.arange(len(of)) + 0.5) / len(of), np.sort(of))
@@ -189,12 +189,12 @@ def colour_field(
     palette: Float[np.ndarray, "m 3"],
     rng: np.random.Generator,
 ) -> Float[np.ndarray, "n 3"]:
-    """A smooth colour (Lab/100) at every point; over those `shown` the palette keeps its own proportions.
+    """A smooth colour (Lab/100) at every point; over the `shown` points the palette keeps its proportions.
 
     Optimal transport by iterated one-dimensional transport along rotated axes (Pitie, Kokaram and Dahyot 2007), from
-    a description of the place (its tone and the second and third of `fields`) to the palette: light places get light
-    colours, and what lies together on the surface gets colours that lie together in the palette. The others (the inside
-    of a pot and what it stands on) take no share; each gets the colour of the shown point most like it.
+    (tone, second and third of `fields`) to the palette. Light points get light colours; neighbours on the surface get
+    neighbours in the palette. Hidden points (the inside or underside of a pot) take no share; each gets the colour of
+    the most similar shown point.
     """
     from scipy.spatial import KDTree
 
@@ -218,7 +218,7 @@ def colour_field(
 def transport(
     source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "m 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "n 3"]:
-    """The source moved until its distribution is the target's; ends on the unrotated axes, exact in each of them."""
+    """The source transported to the target's distribution; ends on the unrotated axes, exact in each of them."""
     for step in range(ROTATIONS + 1):
         rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0] if step < ROTATIONS else np.eye(3)
         turned, aim = source @ rotation, target @ rotation

@@ -1,8 +1,8 @@
-"""The direction in which strokes run: a smooth field of lines (not arrows) in the tangent planes.
+"""Line field of stroke directions: smooth, unsigned, in the tangent planes.
 
-Lines are held as 3x3 tensors, so opposite directions are the same and disagreeing ones cancel into "no direction".
-They follow the direction of least curvature where the surface bends more one way than the other, and lines of equal
-tone where the shading has a slope; elsewhere they run level. Diffusion over the surface joins these into one field.
+Lines are 3x3 tensors, so opposite directions are equal, and conflicting ones cancel into "no direction". They follow
+the direction of least curvature where curvature is anisotropic, and lines of equal tone where the shading has a slope;
+elsewhere they are horizontal. Diffusion over the surface joins these into one field.
 """
 
 from collections.abc import Callable
@@ -18,12 +18,12 @@ UP = np.array([0.0, 1.0, 0.0])
 AROUND = 17  # neighbours of a point, itself included
 ROUNDS = 60
 HOLD = 0.06  # share of the data in each round of diffusion
-LEVEL_LINES = 0.02  # weight of horizontal strokes where nothing else speaks
-PAINTED_LINES = 2.0  # weight of strokes whose direction somebody painted: as much as a form can say
+LEVEL_LINES = 0.02  # weight of horizontal strokes, effective without other data
+PAINTED_LINES = 2.0  # weight of strokes from a direction map: the largest weight of the form
 
 DirectionConstraint = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
-"""What a person wants: (positions, normals) of surface points -> unit directions (n, 3) along the surface, and how much
-they count against the form, 0..1."""
+"""User-defined directions: (positions, normals) of surface points -> unit directions (n, 3) along the surface, and
+their weight against the form, 0..1."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ def line_field(
 ) -> LineField:
     """The field at `points` (5,000 to 10,000 are enough; the diffusion reaches some tens of spacings).
 
-    `follow` "curvature" asks the form; "up" makes strokes run up and down, "around" level, wherever the surface is not
-    level itself. Where `direction` counts it takes the place of either.
+    `follow` "curvature" uses the form; "up" makes strokes vertical, "around" horizontal, wherever the surface is not
+    horizontal itself. `direction` replaces these by its weight.
     """
     index = nearest(points, points, AROUND)[1]
     normals = points.normals.astype(np.float64)
     weight = ((normals[index] * normals[:, None]).sum(axis=2) > 0.1).astype(np.float64)
-    data = observed(points, normals, index, weight) if follow == "curvature" else asked(normals, follow)
+    data = observed(points, normals, index, weight) if follow == "curvature" else axis_lines(normals, follow)
     if direction is not None:
         towards, share = direction(points.positions, points.normals)
         data = (1 - share)[:, None, None] * data + PAINTED_LINES * lines(towards.astype(np.float64), share)
@@ -58,8 +58,8 @@ def line_field(
     return LineField(points, tensors.astype(np.float32))
 
 
-def asked(normals: Float[np.ndarray, "n 3"], follow: str) -> Float[np.ndarray, "n 3 3"]:
-    """Lines along the vertical or around it, surer the steeper the surface stands."""
+def axis_lines(normals: Float[np.ndarray, "n 3"], follow: str) -> Float[np.ndarray, "n 3 3"]:
+    """Lines along the vertical or around it, with more weight on steeper surfaces."""
     level = np.cross(normals, UP)
     steep = (level**2).sum(axis=1)
     return lines(np.cross(level, normals) if follow == "up" else level, np.ones(len(normals))) * steep[:, None, None]
@@ -68,13 +68,13 @@ def asked(normals: Float[np.ndarray, "n 3"], follow: str) -> Float[np.ndarray, "
 def observed(
     points: SurfacePoints, normals: Float[np.ndarray, "n 3"], index: np.ndarray, weight: Float[np.ndarray, "n k"]
 ) -> Float[np.ndarray, "n 3 3"]:
-    """What each point itself says about the direction, before diffusion."""
+    """Each point's own direction data, before diffusion."""
     first = any_tangent(normals)
     basis = np.stack([first, np.cross(normals, first)], axis=2)  # (n 3 2)
     smoothed = normals
     for _ in range(3):
         smoothed = unit((smoothed[index] * weight[..., None]).sum(axis=1))
-    # Shading alone, without occlusion: what counts is where the form turns, and that is cheap and noise-free.
+    # Shading alone, without occlusion: it shows changes of the form, is cheap and has no noise.
     tone = 0.5 * smoothed @ KEY + 0.5 * smoothed[:, 1]
     away = points.positions[index].astype(np.float64) - points.positions[:, None]
     local = np.einsum("nkc,nci->nki", away, basis) * weight[..., None]
@@ -104,7 +104,7 @@ def lines(directions: Float[np.ndarray, "n 3"], weight: Float[np.ndarray, " n"])
 
 
 def confidence(strength: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """0..1, one from the 80th percentile on; all zero where nothing stands out from rounding."""
+    """0..1, one from the 80th percentile on; all zero where the strength is at rounding level."""
     top = float(np.percentile(strength, 80))
     return np.clip(strength / top, 0, 1) if top > 1e-6 else np.zeros_like(strength)
 
@@ -116,7 +116,7 @@ def any_tangent(normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 
 def directions(field: LineField, points: SurfacePoints) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, " n"]]:
-    """Unit tangents at `points` and how sure they are (0..1: difference over sum of the tensor's eigenvalues)."""
+    """Unit tangents at `points` and their certainty (0..1: difference over sum of the tensor's eigenvalues)."""
     distance, index = nearest(field.points, points, 4)
     weight = 1 / (distance + 1e-6)
     weight /= weight.sum(axis=1, keepdims=True)
@@ -130,5 +130,5 @@ def directions(field: LineField, points: SurfacePoints) -> tuple[Float[np.ndarra
     c = np.einsum("ni,nij,nj->n", second, tensors, second, optimize=True)
     angle = np.arctan2(2 * b, a - c) / 2
     tangent = unit(first * np.cos(angle)[:, None] + second * np.sin(angle)[:, None])
-    sure = np.hypot(a - c, 2 * b) / np.maximum(a + c, 1e-9)
-    return tangent.astype(np.float32), np.clip(sure, 0, 1).astype(np.float32)
+    certainty = np.hypot(a - c, 2 * b) / np.maximum(a + c, 1e-9)
+    return tangent.astype(np.float32), np.clip(certainty, 0, 1).astype(np.float32)

@@ -1,8 +1,8 @@
-"""Where on the surface a colour goes when no light decides: places that follow the parts of the shape.
+"""Place fields: smooth functions over the surface that follow its parts and assign colours without light.
 
-The lowest vibrations of the surface change where it is narrow or creased and rest on its parts, so that an ear, a leg
-or a lid takes a colour of its own. What a light could explain of them (the direction of the surface, openness) is taken
-out, so that the albedo holds no shading.
+The lowest Laplacian eigenvectors change where the surface is narrow or creased and are nearly constant on its parts. So
+an ear, a leg or a lid has its own colour. Their components explained by light (surface direction, openness) are
+removed, so that the albedo has no shading.
 """
 
 import numpy as np
@@ -12,15 +12,15 @@ from scipy.sparse import csr_matrix, diags, identity
 from mistyle.stylization.surface.samples import Level
 
 FIELDS = 3  # one for lightness, two for the axes of chroma
-MODES = 24  # vibrations among which the fields are chosen
-FIRM = 0.45  # share of a vibration that must be left when the light is taken out of it
-CONCAVE = 8.0  # how much a crease of one radian inwards loosens two neighbours
-SHIFT = 1e-5  # keeps the factorised matrix regular; far below the first vibration
-TURNED = 0.5  # height of the normal from which on a place counts as facing up (or down)
+MODES = 24  # candidate eigenvectors for the fields
+FIRM = 0.45  # least share of an eigenvector that must remain without the light's component
+CONCAVE = 8.0  # decay of two neighbours' weight per radian of a concave crease
+SHIFT = 1e-5  # keeps the factorised matrix regular; far below the first eigenvalue
+TURNED = 0.5  # height of the normal from which a point counts as facing up (or down)
 
 
 def light(normals: Float[np.ndarray, "n 3"], openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 8"]:
-    """What any light from afar could paint: a constant, the normal, facing up and down, openness and its square."""
+    """Regressors of distant light: a constant, the normal, facing up and down, openness and its square."""
     up = normals[:, 1:2]
     columns = [np.ones_like(up), normals, up > TURNED, up < -TURNED, openness[:, None], openness[:, None] ** 2]
     return np.concatenate(columns, axis=1).astype(np.float64)
@@ -31,25 +31,25 @@ def without(values: Float[np.ndarray, "n k"], explained: Float[np.ndarray, "n m"
     return values - explained @ np.linalg.lstsq(explained, values, rcond=1e-6)[0]
 
 
-def vibrations(level: Level, count: int) -> Float[np.ndarray, "n k"]:
+def laplacian_modes(level: Level, count: int) -> Float[np.ndarray, "n k"]:
     """The lowest eigenvectors of the surface's graph Laplacian, without the constant one; unit variance.
 
-    Neighbours across a concave crease are loosely bound (Au et al. 2012, concavity-aware fields), so that the vectors
-    step at the borders of parts. Fewer come back where the level has few samples.
+    Neighbours across a concave crease have small weights (Au et al. 2012, concavity-aware fields), so that the vectors
+    step at the borders of parts. Returns fewer vectors for a level of few samples.
     """
     from scipy.sparse.linalg import eigsh
 
     size = len(level.directed)
     count = min(count, max(size // 8, 1))
     positions, normals = level.points.positions.astype(np.float64), level.points.normals.astype(np.float64)
-    other = level.neighbours
-    away = positions[other] - positions[:, None]
+    neighbour = level.neighbours
+    away = positions[neighbour] - positions[:, None]
     length = np.maximum(np.linalg.norm(away, axis=2), 1e-12)
-    bend = ((normals[other] - normals[:, None]) * away).sum(axis=2) / length
-    weight = np.exp(-CONCAVE * np.maximum(-bend, 0)) * (other != np.arange(size)[:, None])
-    rows = np.repeat(np.arange(size), other.shape[1])
-    bound = csr_matrix((weight.reshape(-1), (rows, other.reshape(-1))), shape=(size, size))
-    # Pieces of the mesh that do not touch are bound as loosely as can be, so that each vibrates as a whole first.
+    bend = ((normals[neighbour] - normals[:, None]) * away).sum(axis=2) / length
+    weight = np.exp(-CONCAVE * np.maximum(-bend, 0)) * (neighbour != np.arange(size)[:, None])
+    rows = np.repeat(np.arange(size), neighbour.shape[1])
+    bound = csr_matrix((weight.reshape(-1), (rows, neighbour.reshape(-1))), shape=(size, size))
+    # Disconnected pieces of the mesh get minimal weights, so that the lowest vectors are constant on each.
     bound = (bound + bound.T) / 2 + loose(positions)
     degree = np.asarray(bound.sum(axis=1))[:, 0]
     scale = diags(1 / np.sqrt(degree))
@@ -63,7 +63,7 @@ def vibrations(level: Level, count: int) -> Float[np.ndarray, "n k"]:
 
 
 def loose(positions: Float[np.ndarray, "n 3"]) -> csr_matrix:
-    """Weak bonds between points that are near in space, whatever side of the surface they are on."""
+    """Small weights between points near in space, independent of the surface's side."""
     from scipy.spatial import KDTree
 
     size, reach = len(positions), min(8, len(positions))
@@ -74,12 +74,12 @@ def loose(positions: Float[np.ndarray, "n 3"]) -> csr_matrix:
 
 
 def place_fields(level: Level, openness: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n 3"]:
-    """Three smooth fields over the surface (mean 0, standard deviation 1) of which no light explains anything linear.
+    """Three smooth fields over the surface (mean 0, standard deviation 1), linearly independent of light.
 
-    The first of the vibrations of which enough is left when the light is taken out, lowest first; where too few are,
-    the others follow in the order of what is left of them.
+    They are the lowest eigenvectors with a share of at least FIRM after removal of the light's component. If too few
+    qualify, the others follow by remaining share.
     """
-    modes = vibrations(level, MODES)
+    modes = laplacian_modes(level, MODES)
     rest = without(modes, light(level.points.normals, openness))
     left = rest.std(axis=0)
     order = np.concatenate([np.flatnonzero(left >= FIRM), np.argsort(-left, kind="stable")])
