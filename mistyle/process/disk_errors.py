@@ -1,4 +1,4 @@
-"""What went wrong with a disk or a file, as a sentence: full, not to be written, taken away, not there any more."""
+"""Errors of disks and files as messages: disk full, not writable, removed while in use, missing."""
 
 import contextlib
 import errno
@@ -21,11 +21,11 @@ NOTHING = "nothing half-written was left there"
 
 
 @contextlib.contextmanager
-def told(path: Path, temporary: Path | None = None) -> Iterator[None]:
-    """Turn what goes wrong with writing `path` into a MistyleError; anything else passes through.
+def translated(path: Path, temporary: Path | None = None) -> Iterator[None]:
+    """Turn disk errors while writing `path` into a MistyleError; other errors pass through.
 
-    `temporary` is the file or folder that is written meanwhile. A writer that hides the system's error (a library's
-    RuntimeError, an OSError without number) is asked again: a probe is written beside it.
+    `temporary` is the file or folder that is written meanwhile. Some writers hide the system's error (a library's
+    RuntimeError, an OSError without errno). A probe file written beside the target then finds the cause.
     """
     try:
         yield
@@ -79,19 +79,19 @@ def _sentence(error: Exception, path: Path, temporary: Path | None) -> MistyleEr
 
 
 def _gone(temporary: Path, code: int | None, named: Path | None) -> bool:
-    """Whether what is written to was taken away: its folder, or itself."""
+    """Whether the temporary file or its folder was removed."""
     return not temporary.parent.is_dir() or (
         code == errno.ENOENT and named is not None and _within(named, temporary) and not temporary.exists()
     )
 
 
 def _shown(path: Path) -> Path:
-    """The path as it will be called when it is complete."""
+    """The path under its final name."""
     return Path(*(re.sub(r"^\.(.+)\.tmp-.+-\d+-\d+(\.\w+)?$", r"\1", part) for part in path.parts))
 
 
 def _probed(folder: Path, temporary: Path | None) -> int | None:
-    """What the system says to another megabyte in the folder, or of a file that stands at the allowed size."""
+    """The errno of writing another megabyte to the folder; EFBIG where a file has the largest allowed size."""
     limit = _largest_file()
     if limit is not None and temporary is not None and temporary.exists():
         every = temporary.rglob("*") if temporary.is_dir() else [temporary]
@@ -100,9 +100,9 @@ def _probed(folder: Path, temporary: Path | None) -> int | None:
     probe = folder / f".probe.tmp-{os.getpid()}"
     try:
         with open(probe, "wb", buffering=0) as file:
-            left = PROBE if limit is None else min(PROBE, limit)
-            while left > 0:
-                left -= file.write(b"\0" * left) or 0
+            remaining = PROBE if limit is None else min(PROBE, limit)
+            while remaining > 0:
+                remaining -= file.write(b"\0" * remaining) or 0
             os.fsync(file.fileno())
     except OSError as error:
         return error.errno
@@ -113,7 +113,7 @@ def _probed(folder: Path, temporary: Path | None) -> int | None:
 
 
 def _largest_file() -> int | None:
-    """How large a file may become, where the system limits that."""
+    """The file size limit (RLIMIT_FSIZE) in bytes; None without one."""
     try:
         import resource
     except ImportError:  # Windows
@@ -132,15 +132,15 @@ def _within(path: Path, folder: Path) -> bool:
 
 
 def unexpected(error: OSError) -> MistyleError | None:
-    """The sentence for a file that could not be used outside of what `told` watches: an input that has vanished.
+    """The message for a file error outside `translated`, for example a vanished input.
 
-    None for what only a mistake in mistyle itself explains.
+    None for errors that only a defect of mistyle explains.
     """
     named = _named(error)
     if error.errno in FULL:
         where = "" if named is None else f"{named}: "
         return MistyleError(f"{where}the disk is full ({os.strerror(error.errno or 0)}); free some space and run again")
-    if error.errno is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):  # NumPy's words
+    if error.errno is None and re.fullmatch(r"\d+ requested and \d+ written", str(error)):  # NumPy's message
         return MistyleError(
             f"a file could not be written to its end ({error}): the disk is full, or files may not grow so large. The "
             f"folder for temporary files counts too ({tempfile.gettempdir()}; TMPDIR names another); run again"

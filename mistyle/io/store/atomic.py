@@ -37,10 +37,10 @@ def atomic_write(path: Path, data: bytes | Callable[[Path], None]) -> None:
     file nor a temporary one; any other error passes through.
     """
     temporary = hidden(path, next(COUNTER), "tmp", path.suffix)
-    with disk_errors.told(path):
+    with disk_errors.translated(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        with disk_errors.told(path, temporary):
+        with disk_errors.translated(path, temporary):
             if callable(data):
                 data(temporary)
             else:
@@ -68,12 +68,12 @@ def atomic_folder(
     target = Path(os.path.realpath(target))  # a link to a folder elsewhere stays a link
     count = next(COUNTER)
     temporary, old = hidden(target, count, "tmp"), hidden(target, count, "old")
-    with disk_errors.told(target):
+    with disk_errors.translated(target):
         target.parent.mkdir(parents=True, exist_ok=True)
         clean_leftovers(target.parent, name=target.name)
         temporary.mkdir()
     try:
-        with disk_errors.told(target, temporary):
+        with disk_errors.translated(target, temporary):
             write(temporary)
             flush_all(temporary)
             (put or swap)(temporary, target, old)

@@ -36,7 +36,7 @@ class Keeper:
         replace those of the same names in a folder that is the user's.
         """
         self.root, self._say, self._overwrite = Path(os.path.abspath(root)), say, overwrite
-        with disk_errors.told(self.root):
+        with disk_errors.translated(self.root):
             self.root.mkdir(parents=True, exist_ok=True)
             self._owner = lock.take(self.root / LOCK)
         self._release = weakref.finalize(self, lock.release, self.root / LOCK, self._owner)

@@ -199,7 +199,7 @@ def replace_files(
     def whole() -> bool:
         return _wholly(root, by) and not any(stays(name) for name in read_written(root).files)
 
-    with disk_errors.told(root):
+    with disk_errors.translated(root):
         root.parent.mkdir(parents=True, exist_ok=True)
     clean_leftovers(root.parent, name=root.name)
     if root.is_dir():
@@ -210,7 +210,7 @@ def replace_files(
     count = next(COUNTER)
     temporary = hidden(place, count, "tmp")
     try:
-        with disk_errors.told(root, temporary):
+        with disk_errors.translated(root, temporary):
             temporary.mkdir()
             fill(temporary)
             new = {name: sha256_file(temporary / name) for name in files_of(temporary)}
@@ -269,10 +269,10 @@ def write_file(root: Path, name: str, data: bytes, *, overwrite: bool = False) -
     if name in written.files and os.path.lexists(path) and not ours(root, name, written):
         places = (path.with_stem(f"{path.stem}.edited-{n}") for n in itertools.count(1))
         aside = next(place for place in places if not os.path.lexists(place))
-        with disk_errors.told(path):
+        with disk_errors.translated(path):
             os.rename(path, aside)
     _refuse_file(root, name, written, overwrite)
-    with disk_errors.told(root):
+    with disk_errors.translated(root):
         root.mkdir(parents=True, exist_ok=True)
     entry = Entry("run", (*_hashes(written, name), hashlib.sha256(data).hexdigest()))
     _write_record(root, Written({**written.files, name: entry}, written.folders))
