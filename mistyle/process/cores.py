@@ -35,7 +35,7 @@ def use_threads(count: int) -> None:
 
 
 def in_pieces(place: memoryview, fill: Callable[[int, memoryview], None], threads: int) -> None:
-    """Call `fill(at, piece)` for all of `place`, PIECE bytes at a time, on `threads` threads. Errors of `fill` propagate.
+    """Call `fill(at, piece)` for all of `place`, PIECE bytes at a time, on `threads` threads. Its errors propagate.
 
     A large copy spends most of its time on page faults, which the system serves per thread.
     """

@@ -192,11 +192,11 @@ def install_torch(python: Path, venv: Path) -> None:
     raise SetupError(failure)
 
 
-def _check_room(venv: Path, needed: float, purpose: str) -> None:
+def _check_room(venv: Path, needed: float, part: str) -> None:
     free = shutil.disk_usage(venv).free
     if free < needed:
         raise SetupError(
-            f"{venv} has {free / 1e9:.1f} GB of free disk space, {purpose} needs {needed / 1e9:.1f} GB; make room and run "
+            f"{venv} has {free / 1e9:.1f} GB of free disk space, {part} needs {needed / 1e9:.1f} GB; make room and run "
             "the same command again"
         )
 
@@ -293,9 +293,9 @@ def _sentence(output: str) -> str:
         )
     # pip prints the second message for a single package that is pinned twice and does not exist.
     if missing := re.search(r"No matching distribution found for (\S+)|Cannot install (\S+) because", output):
-        platform_text = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
+        system = f"Python {platform.python_version()} on {platform.system()} {platform.machine()}"
         return (
-            f"the registry cannot be reached or has no {missing[1] or missing[2]} for {platform_text} (mistyle is tested with "
+            f"the registry cannot be reached or has no {missing[1] or missing[2]} for {system} (mistyle is tested with "
             "3.11, 3.12 and 3.13)"
         )
     errors = re.findall(r"^\s*(?:ERROR|error): (.+)$", output, re.MULTILINE)
