@@ -239,7 +239,7 @@ def lights_of_views(
     unknown = sorted(set(own) - set(names))
     if unknown and common is not None:
         raise InputRefused(
-            f'{where}: "views" names {unknown[0]!r}, which is none of the {len(names)} views ({names[0]!r}, ...). '
+            f'{where}: "views" names {unknown[0]!r}, which is not one of the {len(names)} views ({names[0]!r}, ...). '
             "Write the view's name as in the camera file."
         )
     missing = [name for name in names if name not in own]

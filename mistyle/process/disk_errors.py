@@ -17,7 +17,7 @@ BROKEN = tuple(
     getattr(errno, name) for name in ("EIO", "ENXIO", "ENODEV", "ESTALE", "EREMOTEIO") if hasattr(errno, name)
 )
 PROBE = 1 << 20
-NOTHING = "nothing half-written was left there"
+NOTHING = "no partial file remains"
 
 
 @contextlib.contextmanager
@@ -43,7 +43,7 @@ def _sentence(error: Exception, path: Path, temporary: Path | None) -> MistyleEr
     if temporary is not None and _gone(temporary, code, named):
         return MistyleError(
             f"{_shown(temporary.parent)}: this folder was removed while it was being written to. "
-            "Run the same command again, which begins anew"
+            "Run the same command again to start anew"
         )
     if code is None:
         code = _probed(temporary if temporary is not None and temporary.is_dir() else path.parent, temporary)
@@ -57,13 +57,13 @@ def _sentence(error: Exception, path: Path, temporary: Path | None) -> MistyleEr
         )
     if code == errno.EFBIG:
         return MistyleError(
-            f"{path}: a file grew beyond what is allowed here ({os.strerror(code)}); {NOTHING}. "
+            f"{path}: a file exceeded the allowed size ({os.strerror(code)}); {NOTHING}. "
             "Raise the limit (ulimit -f), or choose an output folder on another disk, and run the same command again"
         )
     if code in BROKEN and inside:
         return MistyleError(
             f"{path}: the disk, or the connection to it, failed ({os.strerror(code)}). "
-            "See to it, and run the same command again"
+            "Check the disk, and run the same command again"
         )
     if code == errno.EROFS or (code in NOT_TO_BE_WRITTEN and inside):
         return UsageError(
@@ -149,7 +149,7 @@ def unexpected(error: OSError) -> MistyleError | None:
         return None
     if error.errno in (errno.ENOENT, errno.ENOTDIR):
         return InputRefused(
-            f"{named}: found nothing; it was removed or renamed while the job ran, or never was there. "
+            f"{named}: found nothing; it was removed or renamed while the job ran, or never existed. "
             "Put it back, and run the same command again"
         )
     if error.errno in NOT_TO_BE_WRITTEN:

@@ -148,8 +148,8 @@ def set_up(folder: Path, extras: set[str], system: bool) -> None:
             extras = extras | set(record.get("extras", ()))
             if not packages_ready(folder, record, extras):
                 if in_clone():
-                    say("the packages come first: on a bare machine about 1 GB to fetch and 2 GB on the disk")
-                    say(f"with the CUDA build of torch (a GPU, or no CPU build to be had) it adds {install.CUDA_SIZE}")
+                    say("installing the packages: on a bare machine about 1 GB to download and 2 GB on the disk")
+                    say(f"with the CUDA build of torch (a GPU, or no CPU build available) it adds {install.CUDA_SIZE}")
                 if record:
                     write_record(folder, {k: v for k, v in record.items() if k != "key"})
                 install.packages(folder, python_of(folder), extras)

@@ -189,5 +189,5 @@ def _weights() -> Row:
         "and name it: export MISTYLE_VGG=FILE, or mistyle stylize … --vgg FILE"
     )
     if path:
-        return Row("VGG-19 weights", f"MISTYLE_VGG names {path}, which is not there", "optional", fix)
+        return Row("VGG-19 weights", f"MISTYLE_VGG names {path}, which does not exist", "optional", fix)
     return Row("VGG-19 weights", "none; the embedded features need none", "optional", fix)

@@ -299,7 +299,7 @@ def _sentence(output: str) -> str:
             "3.11, 3.12 and 3.13)"
         )
     errors = re.findall(r"^\s*(?:ERROR|error): (.+)$", output, re.MULTILINE)
-    return f"pip failed: {errors[-1].strip().rstrip('.') if errors else 'it gave no reason'}"
+    return f"pip failed: {errors[-1].strip().rstrip('.') if errors else 'it printed no reason'}"
 
 
 def _run(*line: str, cwd: str | None = None, timeout: float | None = None) -> subprocess.CompletedProcess[str]:

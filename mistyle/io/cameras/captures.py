@@ -183,7 +183,7 @@ def reading_notes(path: Path, shots: Sequence[CapturedPicture]) -> tuple[str, ..
         applied = [key for key in ("applied_transform", "applied_scale") if read_json(file).get(key) is not None]
         if applied:
             notes.append(
-                f"{' and '.join(applied)} of {file.name} were undone: the cameras stand in the space of the "
+                f"{' and '.join(applied)} of {file.name} were inverted: the cameras are in the space of the "
                 "reconstruction. A mesh in nerfstudio's own space needs --align."
             )
     return tuple(notes)
@@ -253,14 +253,14 @@ def check_pixels(captures: Captures, progress: Callable[[float], None] = lambda 
         rgb, counts = captures.load(k)
         if not counts.any():
             empty += 1
-            notes.append(f"{camera.name}: no pixel counts; all are saturated, masked out or see no object.")
+            notes.append(f"{camera.name}: no valid pixel; all are saturated, masked out or miss the object.")
         elif not rgb[counts].any():
             black += 1
-            notes.append(f"{camera.name}: black wherever it counts.")
+            notes.append(f"{camera.name}: all valid pixels are black.")
         progress((k + 1) / len(captures))
     if len(captures) and black + empty == len(captures):
         raise InputRefused(
-            f"the references: found {black} pictures that are black and {empty} without a pixel that counts, of "
+            f"the references: found {black} pictures that are black and {empty} without a valid pixel, of "
             f"{len(captures)}; expected pictures of the object. Check exposure, masks and the light."
         )
     if len(captures) < 3:

@@ -192,9 +192,7 @@ def picture_of_view(
     candidates = edited or ([] if exr is not None else existing)
     if len(candidates) > 1:
         names = ", ".join(path.name for path in candidates)
-        raise refuse(
-            folder, f"{names} for the view '{camera.name}'", "one picture per view", "Keep the one that counts"
-        )
+        raise refuse(folder, f"{names} for the view '{camera.name}'", "one picture per view", "Keep one of them")
     if not candidates and exr is None:
         found = f"no picture for the view '{camera.name}'"
         raise refuse(folder, found, f"{camera.name}.exr, .png or .jpg", "Add it, or take the view out of camera.json")

@@ -231,7 +231,7 @@ def _check_indices(d: Document, path: Path) -> None:
     def check(label: str, index: int | None, items: list[Any]) -> None:
         if index is not None and not 0 <= index < len(items):
             raise refuse(
-                path, f"{label} {index}", f"0 to {len(items) - 1}" if items else "none, for there are none", AGAIN
+                path, f"{label} {index}", f"0 to {len(items) - 1}" if items else "none, since the list is empty", AGAIN
             )
 
     for view in d.bufferViews:

@@ -123,13 +123,13 @@ def _unseen(tree: Tree, index: int) -> list[str]:
     name, notes = _name(tree, index), []
     if shadeless(entry):
         notes.append(
-            f"Material '{name}' is black and shows its emission alone: that was taken as its albedo, and finished "
-            "assets have it so."
+            f"Material '{name}' is black and shows only its emission, which was read as its albedo, also in "
+            "finished assets."
         )
     elif emits(entry):
         notes.append(
-            f"Material '{name}' emits light, which the views that are painted leave out; it stays in a finished asset "
-            "and is added to the painting."
+            f"Material '{name}' emits light, which painted views omit; it stays in a finished asset and is added "
+            "to the painting."
         )
     if "KHR_materials_unlit" in entry.get("extensions", {}):
         notes.append(f"Material '{name}' is unlit: without --lit, viewers of a result show its albedo alone.")
@@ -142,15 +142,13 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
     if sees_through(tree, index):
         mode = "cut out" if entry["alphaMode"] == "MASK" else "blended"
         notes.append(
-            f"Material '{name}' is {mode} by its alpha, which stays in a finished asset; the views that are painted "
-            "show it whole."
+            f"Material '{name}' is {mode} by its alpha, which stays in a finished asset; painted views show it opaque."
         )
     more = sorted(n for n in entry.get("extensions", {}) if n.startswith("KHR_materials_") and n not in _READ)
     drawn = [n for n in more if n in _DRAWN]
     if drawn:
         notes.append(
-            f"Material '{name}' has {', '.join(drawn)}, which stays in a finished asset; the views that are painted "
-            "leave it out."
+            f"Material '{name}' has {', '.join(drawn)}, which stays in a finished asset; painted views omit it."
         )
     with_maps = [n for n in drawn if any(k.endswith("Texture") for k in extension(entry["extensions"], n))]
     if any(n != "KHR_materials_specular" for n in with_maps):
@@ -167,7 +165,7 @@ def _left_out(tree: Tree, index: int, name: str) -> list[str]:
         )
     elif "pbrMetallicRoughness" not in entry and "KHR_materials_unlit" not in entry.get("extensions", {}):
         notes.append(
-            f"Material '{name}' leaves metalness and roughness open: it is drawn as rough metal, glTF's default, and "
+            f"Material '{name}' sets neither metalness nor roughness: it is drawn as rough metal, glTF's default, and "
             "painted as a dielectric of roughness 0.5."
         )
     return notes

@@ -78,7 +78,7 @@ def colour_space(name: str, config: str | None = None, *, linear: bool = True) -
         message = str(error).split("\n")[0][:200]
         raise UsageError(
             f"--colorspace {name!r}: {where} does not relate its colours to other spaces ({message}); it needs the "
-            "role aces_interchange, as the ACES configs have it"
+            "role aces_interchange, which the ACES configs have"
         ) from None
     return ColourSpace(space.getName(), where, _interop(to_working) if linear else "", to_working, from_working)
 

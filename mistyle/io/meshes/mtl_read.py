@@ -240,7 +240,7 @@ def _converted(name: str, stmt: Statement, pixels: np.ndarray, linear: bool, not
 def _channel(pixels: Shaped[np.ndarray, "h w 3"], stmt: Statement, notes: list[str]) -> Shaped[np.ndarray, "h w"]:
     """The channel that `-imfchan` names; red where it names none."""
     if stmt.channel in ("m", "z"):
-        notes.append(f"Channel {stmt.channel} of texture {stmt.file} is not read; red was taken.")
+        notes.append(f"Channel {stmt.channel} of texture {stmt.file} is not read; red was used.")
     if stmt.channel == "l":
         return fractions(pixels) @ np.array([0.2126, 0.7152, 0.0722], np.float32)
     return np.ascontiguousarray(pixels[..., {"g": 1, "b": 2}.get(stmt.channel, 0)])

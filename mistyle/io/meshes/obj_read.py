@@ -265,11 +265,11 @@ def _entry_of(name: str, library: dict[str, MtlEntry], stated: bool, notes: list
         return library[name]
     matches = [entry for key, entry in library.items() if name and key.casefold() == name.casefold()]
     if len(matches) == 1:
-        notes.append(f"Material '{name}' was taken for '{matches[0].name}' of its library.")
+        notes.append(f"Material '{name}' was matched to '{matches[0].name}' of its library.")
         return matches[0]
     if not stated and len(library) == 1:
         (entry,) = library.values()
-        notes.append(f"No face states a material (usemtl): '{entry.name}', the only one of its library, was taken.")
+        notes.append(f"No face states a material (usemtl): '{entry.name}', the only one of its library, was used.")
         return entry
     return None
 

@@ -134,7 +134,7 @@ def _textured(raw: Raw, files: list[str], face: dict, polygon: Int[np.ndarray, "
     number = face.get("texnumber", np.zeros(0))
     numbered = len(number) > polygon.max(initial=0)
     if len(files) > 1 and not numbered:
-        notes = (*notes, "Its header names several textures, but faces have no texnumber; the first was taken.")
+        notes = (*notes, "Its header names several textures, but faces have no texnumber; the first was used.")
     with np.errstate(invalid="ignore"):
         file_number = np.nan_to_num(number[polygon]) if numbered else np.zeros(len(polygon))
         which = np.clip(file_number, 0, len(files) - 1).astype(np.int64)

@@ -31,7 +31,9 @@ MAX_TORN = 0.05  # largest difference (linear) of two faces' vertex colours in o
 PALETTE = 4  # mean texels a face, below which a texture is a palette
 FACE_TEXELS = 64  # of a palette's face after resampling
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
-SIDEWAYS = "The mesh seems to lie on its side: it is tallest along z and its base is there. --up z turns it upright."
+SIDEWAYS = (
+    "The mesh seems to lie on its side: it is tallest along z and its base is at an end of z. --up z turns it upright."
+)
 UnwrapMode = Literal["keep", "new", "auto"]
 
 
@@ -173,7 +175,7 @@ def _normals(
     if not fine.all():
         bad = int((~fine).sum())
         notes.append(
-            f"{bad} of {fine.size} corner normals are missing, zero or not finite: computed ones took their place."
+            f"{bad} of {fine.size} corner normals are missing, zero or not finite: computed ones replace them."
         )
         normals = np.where(fine[..., None], normals, crease_normals(work, raw.faces, points))
     return normals.astype(np.float32)
@@ -250,8 +252,8 @@ def _add_notes(name: str, verdicts: tuple[Verdict, ...], instances: bool, notes:
         )
     if shared > 0.005:
         notes.append(
-            f"Shells of material '{name}' lie on top of each other in UV space and share {shared:.0%} of its texels; "
-            "of each the one that comes first in the file is painted."
+            f"Shells of material '{name}' overlap in UV space and share {shared:.0%} of its texels; the first of them "
+            "in the file is painted."
         )
     if mirrored > 0.005:
         notes.append(f"{mirrored:.0%} of the UV area of material '{name}' is mirrored; it was kept as authored.")

@@ -60,7 +60,7 @@ def read_stl(path: Path, max_faces: int) -> Raw:
         with np.errstate(invalid="ignore"):  # a signalling NaN in a damaged file
             corners = rows["corners"].reshape(-1, 3).astype(np.float64)
         if more:
-            notes.append(f"{more} byte(s) after the last face were passed over.")
+            notes.append(f"{more} byte(s) after the last face were ignored.")
         if b"COLOR=" in data[:80] or (rows["attribute"] & 0x8000).any():
             notes.append("Face colours (STL attributes) were not read.")
     elif text:

@@ -95,7 +95,7 @@ def receive(read: Read, copy: Copy | None = None) -> tuple[Any, dict[str, Any]]:
         if address is None:
             _fill(read, place)
         elif copy is None:
-            raise BrokenMessage("an array that was lent to no one")
+            raise BrokenMessage("a lent array without a copy function")
         else:
             copy(address, place)
     try:

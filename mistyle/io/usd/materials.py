@@ -99,7 +99,7 @@ def outside(usd_material: UsdMaterial, uvs: Float[np.ndarray, "n 3 2"] | None) -
         leaves = (np.nanmin(lookup, axis=(0, 1)) < -OUTSIDE) | (np.nanmax(lookup, axis=(0, 1)) > 1 + OUTSIDE)
         modes = {mode for mode, out in zip(texture.wrap, leaves, strict=True) if out}
         if "black" in modes:
-            notes.append(f"Texture {texture.file} is black outside the unit square; its last texels were taken there.")
+            notes.append(f"Texture {texture.file} is black outside the unit square; its border texels were used there.")
         if modes - set(WRAPS):
             notes.append(f"Texture {texture.file} has no wrap mode and was repeated outside the unit square.")
     return notes
@@ -133,7 +133,7 @@ def read_material(pxr: Any, material: Any, root: Path, budget: Budget, time: Any
     unpainted = [n for n in UNPAINTED if _differs(_source(pxr, surface.GetInput(n), time), UNPAINTED[n])]
     if unpainted:
         notes.append(
-            f"The {' and '.join(unpainted)} of material '{name}' is drawn; paintings and finished assets leave it out."
+            f"The {' and '.join(unpainted)} of material '{name}' is drawn; paintings and finished assets omit it."
         )
     if _source(pxr, surface.GetInput("useSpecularWorkflow"), time):
         notes.append(f"Material '{name}' has the specular workflow: it is drawn so, and painted as not metallic.")

@@ -145,7 +145,7 @@ class CornerValues:
             primvar = uv_primvar(self.pxr, self.mesh, [name] if name else [])
             if primvar and name and primvar.GetPrimvarName() != name:
                 self.notes.append(
-                    f"There are no texture coordinates '{name}' on a mesh; '{primvar.GetPrimvarName()}' were taken."
+                    f"A mesh has no texture coordinates '{name}'; '{primvar.GetPrimvarName()}' were used."
                 )
             values = self._spread(primvar, 2, "UVs") if primvar else None
             if values is not None:
@@ -207,6 +207,6 @@ def _spread(
     }
     count, index = where.get(str(interpolation), (-1, shape.corner))
     if count != len(table) or table.shape[1] != width:
-        notes.append(f"{what} of another number than {interpolation} values need were left out.")
+        notes.append(f"{what} were left out: their number does not match their interpolation ({interpolation}).")
         return None
     return table[index]

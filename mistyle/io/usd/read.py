@@ -208,7 +208,7 @@ def _material_of(pxr: Any, prim: Any, notes: list[str]) -> Any:
         return material
     material = binding.ComputeBoundMaterial(tokens.full)[0]
     if material:
-        notes.append("Materials that are bound for full renders alone were taken.")
+        notes.append("Materials bound only for full renders were used.")
     return material
 
 
