@@ -2,7 +2,7 @@
 
 UVs of `Mesh.corner_uvs`: v up, and every consumer takes them **modulo 1** (textures repeat). Reading shifts whole UV
 islands by integers into the unit square. An island that fits the square but crosses its border (u from -0.05 to 0.99)
-keeps its place and its faces stay whole, so single coordinates may lie anywhere in [-1, 2]. A fragment outside the
+keeps its place, and its faces stay whole. So single coordinates may lie anywhere in [-1, 2]. A fragment outside the
 square belongs to the texel on the other side, and a texture fetch wraps. A new unwrapping never leaves the square.
 
 Faces may share texels (stacked or mirrored shells, instances of one glTF mesh): the face that comes first in

@@ -21,8 +21,8 @@ MITSUBA_FROM_OPENCV = np.diag([-1.0, -1.0, 1.0, 1.0])
 class Camera:
     """A pinhole camera with square pixels.
 
-    `world_from_cam` is a rigid motion (OpenCV axes), `focal` and `centre` are in pixels, `size` is (height, width),
-    azimuth and elevation (degrees) name the view and are NaN where they have no meaning.
+    `world_from_cam` is a rigid motion (OpenCV axes), `focal` and `centre` are in pixels, `size` is (height, width).
+    Azimuth and elevation (degrees) name the view and are NaN where undefined.
     """
 
     world_from_cam: Float[np.ndarray, "4 4"]

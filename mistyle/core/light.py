@@ -18,8 +18,8 @@ is enough. "frame" is "world" where it is left out, "turn" 0 and "scale" 1.
 Directions and axes are unit vectors that point TOWARDS the light. Colours are linear Rec.709. `irradiance` is what a
 surface that faces the light receives; a point light of `intensity` i at distance d gives irradiance i / d²; one at the
 camera's origin is a co-located flash; `radiance` arrives from every direction; an environment is a latitude-longitude
-picture of linear radiance times `scale`, laid out as `environment_directions` says and then turned by `turn` degrees
-about +Y (from +Z towards +X), its file (.exr or .hdr) is found beside `lights.json`; a spherical Gaussian (world
+picture of linear radiance times `scale` in the layout of `environment_directions`, turned by `turn` degrees about +Y
+(from +Z towards +X); its file (.exr or .hdr) lies beside `lights.json`; a spherical Gaussian (world
 frame) sends amplitude · exp(sharpness · (axis · w - 1)) from direction w; "scene" means that only the named Mitsuba
 scene file describes the light. The world is the cameras' world, and lengths are in its units.
 """

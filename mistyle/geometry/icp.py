@@ -68,8 +68,8 @@ def in_masks(
 def visual_hull(
     cameras: Sequence[Camera], masks: Sequence[Bool[np.ndarray, "h w"]], cells: int = HULL
 ) -> Float[np.ndarray, "n 3"]:
-    """Points on the surface of the visual hull, in the cameras' space, from a grid about the point closest to the rays
-    through the masks' middles. ValueError where the masks' cones do not intersect."""
+    """Points on the surface of the visual hull, in the cameras' space. The grid is centred at the point closest to the
+    rays through the masks' middles. ValueError where the masks' cones do not intersect."""
     rays = [_middle(camera, mask) for camera, mask in zip(cameras, masks, strict=True) if mask.any()]
     # The point closest to all rays: sum of (I - d dᵀ)(x - o) = 0.
     lhs, rhs = np.zeros((3, 3)), np.zeros(3)
@@ -223,7 +223,8 @@ def _closest_step(matrix: np.ndarray, points: np.ndarray, surface: _Surface, tri
 
 def _offsets(matrix: np.ndarray, points: np.ndarray, surface: _Surface) -> np.ndarray:
     """Distance of the points from the mesh, in its units: from the nearest surface point's plane, which is finer than
-    the points' spacing, or from that point where the plane, extended beyond an edge, is much closer."""
+    the points' spacing. Where the plane, extended beyond an edge, is much closer, it is the distance from that
+    point."""
     local, distance, index = _matched(matrix, points, surface)
     plane = ((local - surface.position[index]) * surface.normal[index]).sum(axis=1)
     return np.where(np.abs(plane) < distance / 2 - 0.02, distance, plane)

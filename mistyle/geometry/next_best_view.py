@@ -1,6 +1,6 @@
-"""Next-best-view rigs (paper 6.2.1, future work): the fewest cameras that see a surface well.
+"""Next-best-view rigs (an open point of paper 6.2.1): the fewest cameras that see a surface well.
 
-The surface is a set of points of equal area, `weight` (c s) is the cosine at which each of c candidate cameras
+The surface is a set of points of equal area. `weight` (c s) is the cosine at which each of c candidate cameras
 faces each of them, max(0, n . (c - P) / |c - P|) as in `stages.backproject`, and 0 where the point is hidden or out of
 the frame. A view sees a point well at a weight of `least` or more. This module has no meshes and no rays.
 """
@@ -63,8 +63,8 @@ def overlaps(weight: Float[np.ndarray, "c s"], least: float) -> Float[np.ndarray
 def choose(weight: Float[np.ndarray, "c s"], least: float = 0.4, least_overlap: float = 0.4, most: int = 32) -> Choice:
     """A small set of at most `most` candidates that together see every reachable point well.
 
-    Neighbouring views overlap: the rig is connected in the graph of views with an overlap of `least_overlap` or more,
-    so an earlier view can be warped into each view but the first. The search is greedy from STARTS first views: it adds
+    Neighbouring views overlap: the rig is connected in the graph of views with an overlap of `least_overlap` or more.
+    So an earlier view can be warped into each view but the first. The search is greedy from STARTS first views: it adds
     the candidate with the largest gain per view, counting the overlapping views on the path to it. Then it exchanges
     single views, then it drops views as long as an exchange compensates. Greedy alone stays within 1 + ln s of the
     smallest set (Chvatal 1979) when the overlap does not bind. Where `most` binds, the search maximises the covered

@@ -31,8 +31,8 @@ def standing(positions: Float[np.ndarray, "n 3"], centre: Float[np.ndarray, "3"]
 
 
 def lies_on_its_side(positions: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> bool:
-    """Whether Z clearly points up: the form is tallest along z, stands on its lower z end and far worse on the upper
-    one, and falls over on both ends of y and x."""
+    """Whether Z clearly points up: the form is tallest along z and stands on its lower z end, far worse on the upper
+    one. It falls over on both ends of y and x."""
     weight = np.linalg.norm(area_vectors(positions, faces), axis=1)
     used = positions[np.unique(faces[weight > 0])] if (weight > 0).any() else positions[:0]
     if len(used) < 4:

@@ -227,7 +227,7 @@ def _pack_to(
     """Search the largest scale at which the charts fit the atlas.
 
     Packing costs much more than estimating: a chart of w x h at scale s takes about (w s + padding) (h s + padding)
-    texels, which gives the scale for a target area. The packer's result then corrects the target area.
+    texels. This gives the scale for a target area. The packer's result then corrects the target area.
     """
     boxes = _boxes(vertices[index], chart)
     aim = FULLNESS * resolution**2

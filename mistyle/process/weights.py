@@ -72,10 +72,9 @@ def _check(table: Any, size: int) -> None:
 
 
 def tensors(path: Path) -> dict[str, Any]:
-    """Name to torch tensor of a .safetensors file (mapped, copied page by page where it is written to), an .npz
-    archive, or a pickle of a table of tensors, whatever its ending. Raises InputRefused.
+    """Name to torch tensor of a .safetensors file, an .npz archive, or a pickle of a table of tensors with any ending.
 
-    Types that torch lacks (8-bit floats) are skipped.
+    A .safetensors file is mapped copy-on-write. Raises InputRefused. Types that torch lacks (8-bit floats) are skipped.
     """
     if Path(path).suffix.lower() == ".safetensors":
         table, start = header(path)

@@ -105,7 +105,7 @@ def _renderers() -> list[Row]:
     library = os.environ.get("DRJIT_LIBLLVM_PATH", "")
     variants = [llvm.Variant(v, library if v.startswith("llvm") else "") for v in VARIANTS]
     with ThreadPoolExecutor() as pool:
-        answers = dict(zip(VARIANTS, pool.map(lambda found: llvm.probe(sys.executable, found), variants), strict=True))
+        answers = dict(zip(VARIANTS, pool.map(lambda v: llvm.probe(sys.executable, v), variants), strict=True))
     any_works = any(answer.works for answer in answers.values())
     result = [Row("mitsuba", _version("mitsuba"), "ok")]
     for variant, answer in answers.items():

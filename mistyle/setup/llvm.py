@@ -20,7 +20,7 @@ from mistyle.setup.environment import with_llvm
 
 Say = Callable[[str], None]
 
-# Best tested first; a distribution offers one or two of them.
+# The newest tested version first; a distribution offers one or two of them.
 PACKAGES = ("libllvm19", "libllvm20", "libllvm21", "libllvm22", "libllvm18", "libllvm17t64", "libllvm17")
 RETRIES = ("-o", "Acquire::Retries=3")
 PLACES = (

@@ -98,8 +98,8 @@ class _Transforms(BaseModel):
 
 @dataclass(frozen=True)
 class CameraFrame:
-    """One photograph of a camera model: its name (unique), its files as the model names them, its pose, its lens, and
-    the pixels of the files (stored or upright) that these two describe."""
+    """One photograph of a camera model: its name (unique), its files as the model names them, its pose and its lens.
+    `pixels` are the pixels of the files (stored or upright) that pose and lens describe."""
 
     name: str
     picture: str

@@ -9,8 +9,8 @@ lengths are removed by resampling.
 A camera describes either stored pixels or upright ones (EXIF orientation, see io/cameras/camera_files.py):
 `CapturedPicture.pixels`, for both the picture and the mask of a view.
 
-Valid pixels are finite, not saturated (an encoded channel at its maximum), wholly inside the alpha (a partly covered
-pixel shows the background too) and inside the user's mask.
+Valid pixels are finite, not saturated (an encoded channel at its maximum), wholly inside the alpha and inside the
+user's mask. A partly covered pixel shows the background too.
 
 The exposures' file is `{"ev": {picture: stops, ...}}` (the picture is 2^stops times as bright as the radiance),
 `{"factor": {picture: factor, ...}}`, or the names and stops alone.

@@ -131,10 +131,10 @@ def read_views(folder: Path) -> list[View]:
 
     A view's colours come from `<name>.exr`. A `<name>.png` (or .jpg, .webp, .tif) that was edited or added since we
     wrote the folder (camera.json has the PNG's sha256) takes precedence. A foreign folder needs one picture per view.
-    Alpha is the mask. Where an EXR has the geometry layers, depth, normal, uv and
-    part are read; else depth is infinite, normal and uv are zero and part is -1 (to be traced from the mesh), and the
-    mask is the alpha's (everything where there is none). A picture of another size but the same aspect ratio moves
-    the camera to that size; the EXR's geometry is then not used.
+    Alpha is the mask. Where an EXR has the geometry layers, depth, normal, uv and part are read. Else they must be
+    traced from the mesh: depth is infinite, normal and uv are zero, part is -1, and the mask is the alpha's (full
+    without one). A picture of another size but the same aspect ratio moves the camera to that size; the EXR's geometry
+    is then not used.
     """
     folder = Path(folder)
     cameras = _entries(folder)

@@ -79,8 +79,10 @@ def _check_depth(tree: Any, path: Path) -> None:
 
 
 def load_gltf(path: Path, say: Callable[[str], None] = lambda note: None) -> tuple[dict[str, Any], Buffers]:
-    """The JSON and the buffers of a .glb or .gltf file, checked: types and ranges of all fields that are used later,
-    indices, buffer lengths against the extent of accessors and views, the node graph (a forest), required extensions.
+    """The JSON and the buffers of a .glb or .gltf file, checked.
+
+    Checks: types and ranges of the fields in use; indices; buffer lengths against the extent of accessors and views;
+    the node graph (a forest); required extensions.
 
     Buffers come from the file, from data URIs or from files in the folder of `path` or below; no network is used.
     Compressed copies of uncompressed data are removed from the JSON. `say` receives notes on them, and on properties

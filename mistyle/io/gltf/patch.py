@@ -4,8 +4,8 @@ Nodes, names, skins, animations, cameras, extras and extensions are copied uncha
 These change: textures of the painted materials, and TANGENT (MikkTSpace) of the painted primitives. Their COLOR_0 is
 removed, since viewers would multiply the painting by it (it is part of the albedo). A mesh that was unwrapped anew, or
 whose texture coordinates were transformed, gets the next free TEXCOORD set. Where corners of one vertex need different
-tangents or texture coordinates, copies of the vertex with all its attributes (joints, weights, morph targets, custom
-ones) are appended, so old vertex indices stay valid.
+tangents or texture coordinates, copies of the vertex are appended, so old vertex indices stay valid. The
+copies have all attributes (joints, weights, morph targets, custom ones).
 """
 
 import copy

@@ -1,8 +1,8 @@
 """Packing of maps into the texture files of a target program: channels, normal convention, bit depth.
 
 The layout follows each program's own documentation: glTF and Unreal pack occlusion, roughness and metallic
-(Unreal's normals are DirectX's, green down), Unity stores smoothness = 1 - roughness in alpha, beside metallic (URP)
-or in a mask map of metallic, occlusion, detail, smoothness (HDRP); film renderers read one float EXR a map.
+(Unreal's normals are DirectX's, green down). Unity stores smoothness = 1 - roughness in alpha, beside metallic (URP) or
+in a mask map of metallic, occlusion, detail, smoothness (HDRP). Film renderers read one float EXR a map.
 """
 
 from collections.abc import Callable

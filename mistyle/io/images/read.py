@@ -49,7 +49,7 @@ def read_pixels(path: Path, pixels: Pixels = "upright") -> tuple[np.ndarray, np.
     Size is checked in the header before decoding (at most MAX_PIXELS). Embedded colour profiles are converted to sRGB,
     EXIF orientation is applied (not with `pixels` "stored"), CMYK, palettes, grey and 16-bit files are converted. The
     first of several pictures is read. `notes` lists the conversions. InputRefused for files that are not pictures of a
-    known format (SVG and PDF among them), for truncated or damaged ones, and for ones of no or too many pixels.
+    known format (such as SVG and PDF), for truncated or damaged files, and for no or too many pixels.
     """
     path = Path(path)
     data = read_bytes(path, MAX_PICTURE_BYTES)

@@ -74,9 +74,9 @@ def _plain(name: str) -> RawMaterial:
 
 
 def _sorted_lines(data: bytes) -> dict[bytes, list]:
-    """The statements' arguments by keyword; `usemtl_at`, `o_at` and `g_at` hold the number of faces before each,
-    `others` all other keywords, `counts` the numbers of v, vt and vn before each face (where face indices are
-    negative)."""
+    """The statements' arguments by keyword; `usemtl_at`, `o_at` and `g_at` hold the number of faces before each.
+    `others` are all other keywords; `counts` the numbers of v, vt and vn before each face (for negative face
+    indices)."""
     statements: dict[bytes, list] = {k: [] for k in (b"v", b"vt", b"vn", b"f", b"mtllib", b"counts", b"others")}
     statements |= {k: [] for name in STATED for k in (name, name + b"_at")}
     others: dict[bytes, None] = {}
@@ -106,20 +106,20 @@ def _sorted_lines(data: bytes) -> dict[bytes, list]:
     return statements | {b"others": list(others)}
 
 
-def _table(lines: list[bytes], width: int, path: Path, what: str) -> Float[np.ndarray, "n w"]:
+def _table(lines: list[bytes], width: int, path: Path, label: str) -> Float[np.ndarray, "n w"]:
     """The first `width` numbers of every line."""
     if not lines:
         return np.zeros((0, width))
     widths = {len(line.split()) for line in lines}
     if len(widths) == 1 and (columns := widths.pop()) >= width and b"#" not in lines[0]:
-        return parse_numbers(b" ".join(lines), path, what).reshape(-1, columns)[:, :width]
+        return parse_numbers(b" ".join(lines), path, label).reshape(-1, columns)[:, :width]
     rows = [line.partition(b"#")[0].split()[:width] for line in lines]
     if width == 2:
         rows = [row + [b"0"] * (2 - len(row)) for row in rows]  # one-dimensional textures leave v out
     short = next((i for i, row in enumerate(rows) if len(row) < width), None)
     if short is not None:
-        raise refuse(path, f"line {short + 1} of its {what} with {len(rows[short])} numbers", f"{width}", AGAIN)
-    return parse_numbers(b" ".join(b" ".join(row) for row in rows), path, what).reshape(-1, width)
+        raise refuse(path, f"line {short + 1} of its {label} with {len(rows[short])} numbers", f"{width}", AGAIN)
+    return parse_numbers(b" ".join(b" ".join(row) for row in rows), path, label).reshape(-1, width)
 
 
 def _colours(lines: list[bytes], path: Path) -> Float[np.ndarray, "v 3"] | None:
@@ -158,11 +158,11 @@ def _corners(
         before = np.repeat(np.array(lines[b"counts"]).reshape(-1, 3), sizes, axis=0)
         index = np.where(index < 0, before + index + 1, index)
         index[index < 0] = 2**31
-    for column, (count, what) in enumerate(zip(counts, ("vertex", "texture coordinate", "normal"), strict=True)):
+    for column, (count, label) in enumerate(zip(counts, ("vertex", "texture coordinate", "normal"), strict=True)):
         top = int(index[:, column].max(initial=0))
         if top > count:
             shown = "before the first" if top == 2**31 else top
-            raise refuse(path, f"a face that uses {what} {shown}", f"1 to {count}", AGAIN)
+            raise refuse(path, f"a face that uses {label} {shown}", f"1 to {count}", AGAIN)
     if (index[:, 0] == 0).any():
         raise refuse(path, "a face that uses vertex 0", f"1 to {counts[0]}", AGAIN)
     return index - 1, sizes

@@ -47,9 +47,12 @@ class _PlyElement:
 
 
 def read_ply(path: Path, max_faces: int) -> Raw:
-    """PLY with polygons of any size, or triangle strips; normals nx ny nz, texture coordinates per vertex (u v, s t,
-    texture_u texture_v) or per face corner (the list texcoord), pictures named by `comment TextureFile` (several by the
-    faces' texnumber), and colours of vertices or faces, which are the albedo where no picture is."""
+    """PLY with polygons of any size, or triangle strips.
+
+    Also read: normals nx ny nz; texture coordinates per vertex (u v, s t, texture_u texture_v) or per face corner (the
+    list texcoord); pictures of `comment TextureFile` (several by the faces' texnumber); colours of vertices or faces,
+    which are the albedo where no picture is.
+    """
     data = read_bytes(path)
     data = unmarked(data) if data.startswith(b"\xef\xbb\xbf") else data
     elements, form, start = _ply_header(data, path)

@@ -11,7 +11,7 @@ MAX_EARS = 500
 MAX_COORDINATE = 1e18
 
 
-def parse_numbers(text: bytes, path: Path, what: str) -> Float[np.ndarray, " n"]:
+def parse_numbers(text: bytes, path: Path, label: str) -> Float[np.ndarray, " n"]:
     """All numbers of a text separated by white space; refuses all other tokens."""
     tokens = text.split()
     try:
@@ -19,7 +19,7 @@ def parse_numbers(text: bytes, path: Path, what: str) -> Float[np.ndarray, " n"]
     except ValueError as error:
         bad = next((t for t in tokens if not _is_number(t)), b"")
         raise refuse(
-            path, f"{bad[:40].decode('ascii', 'replace')!r} among {what}", "a number", "Export the mesh again"
+            path, f"{bad[:40].decode('ascii', 'replace')!r} among {label}", "a number", "Export the mesh again"
         ) from error
 
 
@@ -109,11 +109,11 @@ def _turn(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray | np.float6
     return (b[0] - a[0]) * (c[..., 1] - a[1]) - (b[1] - a[1]) * (c[..., 0] - a[0])
 
 
-def check_indices(index: Int[np.ndarray, "..."], count: int, path: Path, what: str) -> None:
+def check_indices(index: Int[np.ndarray, "..."], count: int, path: Path, label: str) -> None:
     """Refuse indices outside 0..count-1."""
     if index.size and (index.min() < 0 or index.max() >= count):
         bad = int(index.max() if index.max() >= count else index.min())
-        raise refuse(path, f"a face that uses {what} {bad}", f"0 to {count - 1}", "Export the mesh again")
+        raise refuse(path, f"a face that uses {label} {bad}", f"0 to {count - 1}", "Export the mesh again")
 
 
 def check_positions(positions: Float[np.ndarray, "v 3"], path: Path) -> None:
@@ -127,8 +127,8 @@ def check_positions(positions: Float[np.ndarray, "v 3"], path: Path) -> None:
         raise refuse(path, found, f"at most {MAX_COORDINATE:.0e}", "Scale the mesh")
 
 
-def too_many(count: int, limit: int, path: Path, what: str = "faces") -> None:
+def too_many(count: int, limit: int, path: Path, label: str = "faces") -> None:
     """Refuse more than `limit` elements."""
     if count > limit:
         fix = "Simplify the mesh (Blender: Decimate), or raise --max-faces"
-        raise refuse(path, f"{count} {what}", f"at most {limit}", fix)
+        raise refuse(path, f"{count} {label}", f"at most {limit}", fix)

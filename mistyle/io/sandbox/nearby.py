@@ -46,9 +46,9 @@ def named_file(
     """The file that `where` names, and its actual place if that differs from the name.
 
     The literal name is tried first, relative to each folder of `roots`. Then its last parts are searched there,
-    ignoring case, and for a `picture` its last part in the folder `textures` of a root or beside it: the only folder
-    outside the roots that is ever opened. None without such a file. Raises InputRefused where there is none and the
-    name leads out of the roots.
+    ignoring case. For a `picture`, its last part is also searched in the folder `textures` of a root or beside it: the
+    only folder outside the roots that is ever opened. None without such a file. Raises InputRefused where there is none
+    and the name leads out of the roots.
     """
     name = name.strip().strip('"')
     refused: InputRefused | None = None

@@ -1,8 +1,8 @@
 """Reader process: decodes untrusted files; serves requests from stdin on stdout until stdin ends.
 
 io/sandbox/reader_process.py runs it as `python -m mistyle.io.sandbox.reader_child`. It may not write files
-(RLIMIT_FSIZE 0, and an audit hook that refuses to open for writing, to remove, to start programs and to make sockets),
-its address space and processor time are limited anew for every request, and it leaves no core file. Without a
+(RLIMIT_FSIZE 0). An audit hook refuses to open for writing, to remove, to start programs and to make sockets. Every
+request gets new limits on address space and processor time. The process leaves no core file. Without a
 `resource` module (Windows) only the audit hook applies. The parent handles interrupts and stop requests.
 """
 

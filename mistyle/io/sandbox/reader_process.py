@@ -1,7 +1,7 @@
 """Client of the reader process: one child process opens and decodes untrusted files.
 
-The child (io/sandbox/reader_child.py) is started once per process, when the first file is read or `start` is called,
-and serves one request after another, from any thread. It returns decoded values (io/sandbox/rpc_codec.py). A file on
+The child (io/sandbox/reader_child.py) is started once per process, at the first file or by `start`. It serves one
+request after another, from any thread. It returns decoded values (io/sandbox/rpc_codec.py). A file on
 which it crashes, hangs or runs out of memory is refused with a sentence; the next file gets a new child. A forked copy
 of this process starts its own child. The child ends with its parent, however that ends.
 
@@ -180,8 +180,8 @@ class Reader:
 def ask(task: str, path: Path, *arguments: Any) -> Any:
     """The result of `task` (io/sandbox/reader_tasks.py) for the file at `path`, decoded in the child.
 
-    Raises the task's own errors (InputRefused and related, with their messages), InputRefused where the child crashed,
-    hung or ran out of memory over the file, EnvironmentMissing where no child can be started.
+    Raises the task's own errors (InputRefused and related, with their messages). InputRefused where the child crashed,
+    hung or ran out of memory over the file; EnvironmentMissing where no child can be started.
     """
     size = _size(path)
     with _lock:

@@ -177,7 +177,7 @@ def _text(path: Path, expected: str) -> str:
 
 
 def plain(tree: Any, path: Path) -> Any:
-    """The tree, if it holds only numbers, texts, truth values, lists and tables, at most MAX_VALUES (a YAML alias may
+    """The tree, if it holds only numbers, texts, truth values, lists and tables. At most MAX_VALUES (a YAML alias may
     repeat a value millions of times), nested at most MAX_DEPTH deep."""
     level, count = [tree], 0
     for _ in range(MAX_DEPTH):

@@ -1,7 +1,7 @@
 """Output folders: mistyle replaces only files that it wrote itself.
 
-`.mistyle.written` in an output folder lists those files with their sha256, and the subfolders that mistyle owns
-(the stages of a run, each with its own list in done.json). All other content belongs to the user: bytes, names, times,
+`.mistyle.written` in an output folder lists those files with their sha256, and the subfolders that mistyle owns:
+the stages of a run, each with its own list in done.json. All other content belongs to the user: bytes, names, times,
 links and empty folders stay. A verb refuses, before it works, to replace a file that is not in the list or has changed
 since. `overwrite` replaces files of colliding names, never an input, and deletes nothing.
 """

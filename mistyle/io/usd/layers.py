@@ -67,8 +67,9 @@ def locate(root: Path, anchor: PackagedFile, reference: str) -> PackagedFile:
 def check_layers(pxr: Any, path: Path) -> list[Path]:
     """Open the file and all layers that it is composed of, one by one, each only after its name and size passed.
 
-    Returns the files. Refused: names that lead out of the folder or to a network, layers of other formats, packages
-    that are compressed or nested, value clips (which would be opened later), too many or too large files.
+    Returns the files. Refused: names that lead out of the folder or to a network, layers of other formats, and
+    compressed or nested packages. Also refused: value clips (USD would open them later), and too many or too large
+    files.
     """
     root, start = path.resolve().parent, PackagedFile(path.resolve())
     pending, seen = [start], {str(start)}

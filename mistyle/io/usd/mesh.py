@@ -178,9 +178,9 @@ class CornerValues:
                 result[rows] = np.clip(np.nan_to_num(values[rows], nan=1.0), 0, 1)
         return result
 
-    def _spread(self, primvar: Any, width: int, what: str) -> Float[np.ndarray, "f 3 w"] | None:
+    def _spread(self, primvar: Any, width: int, label: str) -> Float[np.ndarray, "f 3 w"] | None:
         table = table_of(primvar, self.time)
-        return _spread(table, primvar.GetInterpolation(), self.shape, width, what, self.notes)
+        return _spread(table, primvar.GetInterpolation(), self.shape, width, label, self.notes)
 
 
 def table_of(primvar: Any, time: Any) -> Float[np.ndarray, "n w"] | None:
@@ -192,12 +192,12 @@ def table_of(primvar: Any, time: Any) -> Float[np.ndarray, "n w"] | None:
 
 
 def _spread(
-    values: Any, interpolation: str, shape: Polygons, width: int, what: str, notes: list[str]
+    values: Any, interpolation: str, shape: Polygons, width: int, label: str, notes: list[str]
 ) -> Float[np.ndarray, "f 3 w"] | None:
     """A primvar's values at every triangle corner; None, with a note, where their number is wrong."""
     if values is None or len(values) == 0:
         return None
-    table = np.array(values, np.float32).reshape(len(values), -1)[:, : width if what == "UVs" else None]
+    table = np.array(values, np.float32).reshape(len(values), -1)[:, : width if label == "UVs" else None]
     where = {
         "faceVarying": (len(shape.vertices), shape.corner),
         "vertex": (len(shape.points), shape.vertices[shape.corner]),
@@ -207,6 +207,6 @@ def _spread(
     }
     count, index = where.get(str(interpolation), (-1, shape.corner))
     if count != len(table) or table.shape[1] != width:
-        notes.append(f"{what} were left out: their number does not match their interpolation ({interpolation}).")
+        notes.append(f"{label} were left out: their number does not match their interpolation ({interpolation}).")
         return None
     return table[index]
