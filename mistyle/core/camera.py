@@ -193,5 +193,5 @@ def binned(camera: Camera, by: int) -> Camera:
 
 
 def in_frame(camera: Camera, px: Float[np.ndarray, "*n 2"]) -> Bool[np.ndarray, "*n"]:
-    """Which pixel coordinates lie inside the image."""
+    """Mask of the pixel coordinates inside the image."""
     return (px[..., 0] >= 0) & (px[..., 1] >= 0) & (px[..., 0] < camera.size[1]) & (px[..., 1] < camera.size[0])

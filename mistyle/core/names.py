@@ -139,7 +139,7 @@ def shortened(pattern: str, fields: Mapping[str, object], long: Sequence[str], l
 
 
 def uses(pattern: str, field: str) -> int:
-    """How often a format pattern names a field."""
+    """Number of uses of a field in a format pattern."""
     return sum(name == field for _, name, _, _ in string.Formatter().parse(pattern))
 
 

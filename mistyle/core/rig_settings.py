@@ -29,6 +29,9 @@ class RigSettings(BaseModel):
         description="for kind 'nbv': every surface point needs a view at this cosine or more",
     )
     overlap: float = Field(
-        default=0.4, ge=0.0, lt=1.0, description="for kind 'nbv': the share of surface that neighbouring views share"
+        default=0.4,
+        ge=0.0,
+        lt=1.0,
+        description="for kind 'nbv': the least overlap of neighbouring views, a share of their points",
     )
     candidates: int = Field(default=500, ge=4, le=4096, description="for kind 'nbv': cameras to choose from")

@@ -99,7 +99,7 @@ def _clean(positions: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.nda
 
 
 def _repeats(faces: Int[np.ndarray, "f 3"]) -> Int[np.ndarray, " f"]:
-    """How many earlier faces have the same three points."""
+    """Number of earlier faces with the same three points."""
     from mistyle.geometry.uvs import group_rows
 
     corners = np.sort(faces, axis=1)

@@ -87,15 +87,15 @@ def _tests(arguments: list[str]) -> int:
 
 def enter(arguments: Sequence[str], *, extras: set[str], system: bool = False) -> None:
     """Set up what is missing; return only inside the right Python with LLVM's variables set, else run it instead."""
-    folder, inside_venv = home(), inside()
-    if os.environ.pop(ENTERED, "") == str(folder) and inside_venv:
+    folder, right_python = home(), inside()
+    if os.environ.pop(ENTERED, "") == str(folder) and right_python:
         return
     if system or not ready(folder, extras):
         set_up(folder, extras, system)
     record = read_record(folder)
     say(_banner(folder, record))
     environment = with_llvm(record["llvm"]["library"], record["llvm"]["folders"], os.environ)
-    if inside_venv and environment.get("LD_LIBRARY_PATH") == os.environ.get("LD_LIBRARY_PATH"):
+    if right_python and environment.get("LD_LIBRARY_PATH") == os.environ.get("LD_LIBRARY_PATH"):
         os.environ.update(environment)
         return
     sys.exit(_over(arguments, environment))

@@ -31,7 +31,9 @@ MAX_TORN = 0.05  # largest difference (linear) of two faces' vertex colours in o
 PALETTE = 4  # mean texels a face, below which a texture is a palette
 FACE_TEXELS = 64  # of a palette's face after resampling
 Y_FROM_Z = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])  # (x, y, z) with Z up -> (x, z, -y)
-SIDEWAYS = "The mesh seems to lie on its side: it is tallest along z and its base is at the lower z end. --up z turns it upright."
+SIDEWAYS = (
+    "The mesh seems to lie on its side: it is tallest along z, with its base at the lower end. --up z turns it upright."
+)
 UnwrapMode = Literal["keep", "new", "auto"]
 
 
