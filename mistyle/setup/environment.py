@@ -119,7 +119,7 @@ def print_of(library: str) -> list[int]:
 
 
 def with_llvm(library: str, folders: Sequence[str], base: Mapping[str, str]) -> dict[str, str]:
-    """`base` with the variables that make Dr.Jit load `library`; `folders` hold libraries that LLVM needs."""
+    """`base` with the variables that make Dr.Jit load `library`; `folders` hold dependencies that the system lacks."""
     result = dict(base)
     if library:
         result["DRJIT_LIBLLVM_PATH"] = library
