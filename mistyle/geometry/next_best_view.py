@@ -1,8 +1,8 @@
 """Next-best-view rigs (an open point of paper 6.2.1): the fewest cameras that see a surface well.
 
 The surface is a set of points of equal area. `weight` (c s) is the cosine at which each of c candidate cameras
-faces each of them, max(0, n . (c - P) / |c - P|) as in `stages.backproject`, and 0 where the point is hidden or out of
-the frame. A view sees a point well at a weight of `least` or more. This module has no meshes and no rays.
+faces each of them, max(0, n . (c - P) / |c - P|) as in `atlas.bake.backproject`, and 0 where the point is hidden or out
+of the frame. A view sees a point well at a weight of `least` or more. This module has no meshes and no rays.
 """
 
 from collections.abc import Sequence

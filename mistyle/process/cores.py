@@ -17,7 +17,7 @@ def use_threads(count: int) -> None:
     """Set the thread count of torch, OpenCV and the BLAS of NumPy and SciPy in this process to `count`.
 
     The last digits of a matrix product depend on the count. By default a BLAS takes all cores, however many shards
-    share them. Dr.Jit has its own count: `render/device.use`.
+    share them. Dr.Jit has its own count: `render/mitsuba/device.use`.
     """
     # torch spins for milliseconds after each operation, on cores that Dr.Jit's threads and other jobs need: most of a
     # fit's processor time. OpenMP reads this variable when it is loaded; a user's value stays.

@@ -75,9 +75,7 @@ def image_of(tree: Tree, texture: int) -> int | None:
     """The index of a texture's image; None without a readable one."""
     entry, images = tree["textures"][texture], tree.get("images", [])
     named = [entry.get("extensions", {}).get(name) for name in ("EXT_texture_webp", "EXT_texture_avif")]
-    sources = [alternative.get("source") for alternative in named if isinstance(alternative, dict)] + [
-        entry.get("source")
-    ]
+    sources = [option.get("source") for option in named if isinstance(option, dict)] + [entry.get("source")]
     return next((s for s in sources if isinstance(s, int) and 0 <= s < len(images)), None)
 
 

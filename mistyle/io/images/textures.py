@@ -81,7 +81,7 @@ def add_textures(builder: Builder, pictures: Pictures, stem: str, *, repeat: boo
 
 
 def drop_emission(material: Tree) -> None:
-    """Remove a material's emission, which its albedo now contains (gltf_infos.py `shadeless`)."""
+    """Remove a material's emission, which its albedo now contains (io/gltf/infos.py `shadeless`)."""
     for key in ("emissiveTexture", "emissiveFactor"):
         material.pop(key, None)
     drop_extension(material, "KHR_materials_emissive_strength")

@@ -1,4 +1,4 @@
-"""Frozen records as trees of plain JSON, for the disk (records.py) and the reader process (rpc_codec.py).
+"""Frozen records as trees of plain JSON, for the disk (records.py) and the reader process (io/sandbox/rpc_codec.py).
 
 The caller handles arrays and the names of classes.
 """
