@@ -104,7 +104,7 @@ def test_every_candidate_is_tried_until_one_works(private, monkeypatch, tmp_path
     libraries = [tmp_path / "a", tmp_path / "b", tmp_path / "c"]
     tried = []
 
-    def probe(python: str, found: llvm.Found, timeout: float = 0) -> llvm.Answer:
+    def probe(python: str, found: llvm.Variant, timeout: float = 0) -> llvm.Answer:
         tried.append((found.library, bool(found.folders)))
         works = found.library.endswith("b") and bool(found.folders)
         return llvm.Answer(works, "19.1.7" if works else "", "LLVM ERROR: Cannot select")
